@@ -28,8 +28,7 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import codec
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.runtime.composed import Composed
-from palpate_conductor.collector import Collector
-from palpate_conductor.tree import FrameTree
+from palpate_conductor.collector import Collector, FrameTree
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
 

@@ -35,8 +35,8 @@ def serve(tree: str, answers: IO[str]) -> None:
     import palpate_models  # noqa: PLC0415
     from palpate.run.composed import load_services  # noqa: PLC0415
     from palpate.run.roles import WORKERS  # noqa: PLC0415
-    from palpate_bus.runtime.collection import rare_collections  # noqa: PLC0415
     from palpate_bus.runtime.composed import Composed  # noqa: PLC0415
+    from palpate_bus.runtime.process import rare_collections  # noqa: PLC0415
 
     try:
         from palpate_models.scenario.load import load_scenario  # noqa: PLC0415

@@ -21,8 +21,9 @@ from palpate_bus.messages import (
     Vector3,
 )
 from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
-from palpate_conductor.result import RunResult
+from palpate_conductor.outcome import RunResult
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)
@@ -177,6 +178,6 @@ def result(c: Collected, failure: str | None = None) -> RunResult:
         start_time_s=0.5,
         blame={},
         counters={},
-        failure=failure,
+        failure=Failure(FailureCode.ROLE_LOST, failure, ("tissue",)) if failure else None,
         lost={"tissue": 12_345_000_000} if failure else {},
     )

@@ -49,7 +49,7 @@ def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
         if KILL_AFTER_PHASE in line.split() and killed_at is None:
             time.sleep(1.0)
             children = psutil.Process(run.pid).children(recursive=True)
-            target = next(child for child in children if f"palpate_{role}" in child.cmdline())
+            target = next(child for child in children if ["palpate.service", role] == child.cmdline()[2:4])
             target.kill()
             killed_at = time.monotonic()
         if killed_at is not None and f"{role} lost at" in line and named_after is None:

@@ -219,10 +219,10 @@ def test_one_line_of_the_compose_file_puts_it_on_the_bus(tmp_path: Path, monkeyp
     fixed = {**os.environ, **FIXED}
     composed = subprocess.run([sys.executable, __file__], env=fixed, capture_output=True, text=True, timeout=900, check=True)
     text = compose_file().read_text(encoding="utf-8")
-    line = "command: [python, -m, palpate_tissue]"
+    line = "command: [python, -m, palpate.service, tissue]"
     assert text.count(line) == 1
     swapped = tmp_path / "docker-compose.yml"
-    swapped.write_text(text.replace(line, "command: [python, -m, palpate_tissue, fmu]"), encoding="utf-8")
+    swapped.write_text(text.replace(line, "command: [python, -m, palpate.service, tissue, fmu]"), encoding="utf-8")
     monkeypatch.setenv("PALPATE_COMPOSE", str(swapped))
     finished = palpate_run("clean", tmp_path / "out", "--record", "none", "--seed", "3", settings=SETTINGS)
     assert finished.status == 0, finished.output

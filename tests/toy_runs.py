@@ -15,11 +15,11 @@ import zenoh
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
+from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.outcome import Patience, RunOutcome
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Patience, RunOutcome, Timing
 
 TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
 sys.path.insert(0, str(TOYS.parent))
@@ -31,7 +31,7 @@ APART = tuple((role,) for role in ROLES)
 
 @dataclass
 class Running:
-    """A toy run that is on."""
+    """A toy run in progress."""
 
     processes: dict[str, subprocess.Popen[bytes]]
     session: zenoh.Session
@@ -47,8 +47,16 @@ def run_toys(
     groups: Sequence[tuple[str, ...]] = APART,
     router: str = "",
 ) -> RunOutcome:
-    """`faults`: by role, what goes wrong with its transport (topic, kind, simulated second); `groups`: who shares a process;
-    `router`: all are clients of it.
+    """Run the toy services.
+
+    Args:
+        meddle: called in every turn of the conductor's loop
+        environment: added to that of the services
+        patience: time limits of the conductor
+        wallclock: run by the wall clock, not in lockstep
+        faults: by role, a fault of its transport (topic, kind, simulated second)
+        groups: roles of each process
+        router: if given, all processes are clients of it
     """
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=("robot", "control", "tissue"))
@@ -74,11 +82,11 @@ def run_toys(
         conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
         running = Running(processes, session, conductor)
 
-        def died() -> dict[str, str]:
+        def exited() -> dict[str, str]:
             return {role: f"status {code}" for role, child in processes.items() if (code := child.poll()) is not None}
 
         try:
-            return conductor.run(died, lambda _: meddle(running))
+            return conductor.run(exited, lambda _: meddle(running))
         finally:
             for child in processes.values():
                 try:
@@ -87,6 +95,12 @@ def run_toys(
                     child.kill()
                     child.wait()
             close_session(session)
+
+
+def assert_failed(outcome: RunOutcome, code: FailureCode, *roles: str) -> None:
+    assert outcome.failure is not None
+    assert outcome.failure.code is code, outcome.failure
+    assert set(outcome.failure.roles) == set(roles), outcome.failure
 
 
 def composed_hash() -> str:

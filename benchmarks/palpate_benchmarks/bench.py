@@ -22,7 +22,7 @@ from palpate.console import CaseDisplay, output_file
 from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 if TYPE_CHECKING:
-    from palpate_conductor.result import RunResult
+    from palpate_conductor.outcome import RunResult
     from palpate_models.scenario.schema import Scenario
 
 GROUPS = ("parts", "runs")
@@ -103,7 +103,7 @@ def _figures(run: Callable[[Path], RunResult]) -> dict[str, Any]:
         "real_time_factor": result.sim_time_s / max(result.wall_time_s, 1e-9),
         "command_to_first_tick_s": result.start_time_s,
         "run_hash": result.run_hash,
-        "failure": result.failure,
+        "failure": None if result.failure is None else result.failure.text,
         "blame": result.blame,
     }
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 
 import re
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from enum import StrEnum
 from math import isfinite
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
@@ -27,12 +28,11 @@ from palpate_bus.contract import Topic, contract
 from palpate_bus.implementations import module
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import close_session, open_session
-from palpate_conductor.conduct import conduct
+from palpate_conductor.conductor import conduct
 from palpate_conductor.grants import WALLCLOCK_LEAD
-from palpate_conductor.outcome import Patience, RunFailed
-from palpate_conductor.result import RunProgress, RunResult
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Timing
 from palpate_models.scenario.load import load_scenario
 
 SETTINGS: Final = (
@@ -52,11 +52,6 @@ MORE_N: Final = 2.0
 """How much the force may rise above its highest before a fault in contact ..."""
 CONTACT_N: Final = 1.0
 """... where it was more than this."""
-WENT_ON: Final = "went on: the scan was finished as if nothing had happened"
-COMPLETE: Final = "complete"
-WENT_WITHOUT: Final = "went on without what was struck"
-UNHARMED: Final = (COMPLETE, WENT_ON)
-"""Ends that need no cause."""
 LASTING: Final = frozenset({"nan", "stamp"})
 """Kinds that hit every message from then on; the others one."""
 BEFORE_CONTACT: Final = frozenset({"camera", "perception"})
@@ -65,8 +60,39 @@ ASSESSES: Final = "assessment"
 """The role whose faults may show after the scan only."""
 
 
+class CaseOutcome(StrEnum):
+    """How an examination with a fault ended."""
+
+    COMPLETED = "completed"
+    CONTINUED = "continued"
+    """The scan was finished as if there were no fault."""
+    CONTINUED_WITHOUT = "continued_without"
+    """Completed without the role that was struck."""
+    ENDED = "ended"
+    """Ended early; the text says why."""
+
+    @property
+    def unharmed(self) -> bool:
+        """True if no cause has to be named."""
+        return self in (CaseOutcome.COMPLETED, CaseOutcome.CONTINUED)
+
+
 class CaseOver(RunFailed):
-    """Reaction and end of a case are known."""
+    """Reaction and outcome of a case are known."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__(FailureCode.STOPPED, text)
+
+
+class Sign(NamedTuple):
+    """A message that something is wrong."""
+
+    source: str
+    """supervisor, driver or planning; empty for the conductor."""
+    text: str
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.text}" if self.source else self.text
 
 
 @dataclass(frozen=True)
@@ -106,8 +132,9 @@ class FaultFinding:
     peak_force_before_n: float = 0.0
     peak_force_n: float | None = None
     """Highest true contact force after the damage, every step of the tissue counted; None where nothing tells it."""
+    outcome: CaseOutcome = CaseOutcome.ENDED
     ended: str = ""
-    """How the run ended: complete, or the cause."""
+    """Text of the outcome: the cause where the run ended early."""
     named: bool = False
     """Whether what was noticed names the role or topic."""
     hung: bool = False
@@ -123,7 +150,7 @@ class FaultFinding:
     def good(self) -> bool:
         """Done, no hang, no force above the limits, results kept, nothing left behind; and its cause named unless it went on."""
         most = FORCE_LIMIT_N
-        goes_on = self.ended in (*UNHARMED, WENT_WITHOUT)  # then later forces are the scan's
+        goes_on = self.outcome is not CaseOutcome.ENDED  # then later forces are the scan's
         if self.peak_force_before_n > CONTACT_N and not goes_on:
             most = min(most, self.peak_force_before_n + MORE_N)
         return (
@@ -132,7 +159,7 @@ class FaultFinding:
             and (self.peak_force_n or 0.0) <= most
             and self.kept
             and not self.left_behind
-            and (self.ended in UNHARMED or self.named)
+            and (self.outcome.unharmed or self.named)
         )
 
 
@@ -162,36 +189,41 @@ class _Watch:
     since: float = 0.0
     held: int = 0
     seen_scan: int | None = None
-    before: Sequence[str] = ()
-    """What was said before the damage."""
-    signs: list[str] = field(default_factory=list)
+    before: Sequence[Sign] = ()
+    """Signs before the damage."""
+    signs: list[Sign] = field(default_factory=list)
+    outcome: CaseOutcome | None = None
+    """The outcome once it is known, before the run has ended."""
 
     def tell(self, progress: RunProgress) -> None:
-        """Called every 20 ms of wall time (`palpate_conductor.conductor.POLL_S`)."""
+        """Called every 20 ms of wall time (`palpate_conductor.conductor.TUNING`)."""
         if self.finding.injected_s is None:
             self._strike(progress)
             return
         new = [sign for sign in _signs(progress) if sign not in (*self.signs, *self.before)]
         if new and not self.signs:
             self.finding.detected_ms = round((monotonic() - self.since) * 1e3, 1)
-            self.finding.sign = new[0]
+            self.finding.sign = str(new[0])
         self.signs += new
         end = self._end(progress.collected.exam)
         if end is not None and not progress.trouble:  # else the conductor ends it itself, after what the survivors do is recorded
-            raise CaseOver(end)
+            self.outcome, text = end
+            raise CaseOver(text)
         if monotonic() - self.since > HANG_S:
             self.finding.hung = True
             for child in self.local.running.values():
                 child.kill()
 
-    def _end(self, exam: Any | None) -> str | None:
-        """How the examination ended, as soon as that is sure: going home and the last second of a run tell nothing new."""
+    def _end(self, exam: Any | None) -> tuple[CaseOutcome, str] | None:
+        """Return the outcome and its text as soon as they are known; the return home and the last second add nothing."""
         if exam is None:
             return None
-        if exam.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_DONE):
-            return COMPLETE if exam.phase == ExamState.PHASE_DONE else str(exam.message)
+        if exam.phase == ExamState.PHASE_DONE:
+            return CaseOutcome.COMPLETED, "complete"
+        if exam.phase == ExamState.PHASE_ABORTED:
+            return CaseOutcome.ENDED, str(exam.message)
         scanned = exam.phase == ExamState.PHASE_RETURN and not self.signs
-        return WENT_ON if scanned and self.target != ASSESSES else None
+        return (CaseOutcome.CONTINUED, "the scan was finished") if scanned and self.target != ASSESSES else None
 
     def _strike(self, progress: RunProgress) -> None:
         exam = progress.collected.exam
@@ -218,17 +250,19 @@ def _now_s(progress: RunProgress, *, wallclock: bool) -> float:
     return max(heard, heard / progress.real_time_factor - WALLCLOCK_LEAD / NS) if wallclock else heard
 
 
-def _signs(progress: RunProgress) -> list[str]:
-    """Everything that says that something is wrong."""
-    found = list(progress.trouble)
+def _signs(progress: RunProgress) -> list[Sign]:
+    """Return all messages that something is wrong."""
+    found = [Sign("", text) for text in progress.trouble]
     collected = progress.collected
     if collected.supervisor is not None and collected.supervisor.level != SupervisorState.LEVEL_OK:
-        found.append(f"supervisor: {collected.supervisor.reason}")
+        found.append(Sign("supervisor", collected.supervisor.reason))
     held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
-    found += [f"driver: {status.reason}" for status in held]
+    found += [Sign("driver", status.reason) for status in held]
     exam = collected.exam
-    if exam is not None and (exam.phase in (ExamState.PHASE_HELD, ExamState.PHASE_ABORTED) or "lost" in exam.message):
-        found.append(f"planning: {exam.message}")
+    if exam is not None and (
+        exam.phase in (ExamState.PHASE_HELD, ExamState.PHASE_ABORTED) or exam.reason == ExamState.REASON_SERVICE_LOST
+    ):
+        found.append(Sign("planning", exam.message))
     return found
 
 
@@ -298,10 +332,10 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     last = RunProgress(0, 0.0, collected, ())
     if finding.injected_s is not None:
         watch.signs += [sign for sign in _signs(last) if sign not in (*watch.signs, *watch.before)]
-        failed = result.failure is not None and result.failure not in UNHARMED
+        failed = result.failure is not None and not (watch.outcome is not None and watch.outcome.unharmed)
         if finding.detected_ms is None and (watch.signs or failed):
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
-            finding.sign = watch.signs[0] if watch.signs else str(result.failure)
+            finding.sign = str(watch.signs[0] if watch.signs else result.failure)
     split = (finding.injected_s or 0.0) * NS
     told = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
     forces = [(t, force) for t, force in told if isfinite(force)]  # the fault may be that it is told as NaN
@@ -310,25 +344,33 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     finding.peak_force_n = round(max(after), 2) if after else None
     exam = collected.exam
     done = exam is not None and exam.phase == ExamState.PHASE_DONE
-    finding.ended = result.failure or (COMPLETE if done else str(exam.message if exam is not None else "never began"))
+    completed = done and result.failure is None
+    finding.outcome = watch.outcome or (CaseOutcome.COMPLETED if completed else CaseOutcome.ENDED)
+    finding.ended = str(result.failure or ("complete" if done else exam.message if exam is not None else "never began"))
     if finding.injected_s is None:
-        finding.ended = f"the fault was never done: {finding.ended}"
-    finding.reaction = _reaction(collected, finding.ended)
-    said = [finding.sign, finding.ended, *watch.signs]
-    words = " ".join(re.sub(r"^(supervisor|driver|planning): ", "", sentence) for sentence in said)  # not who said it
+        finding.outcome, finding.ended = CaseOutcome.ENDED, f"the fault was never done: {finding.ended}"
+    finding.reaction = _reaction(collected, finding.outcome)
     producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
-    finding.named = any(re.search(rf"(?<![\w/]){name}(?!\w)", words) for name in (finding.where, producer))
+    found = {*result.lost, *(() if result.failure is None else (*result.failure.roles, *result.failure.topics))}
+    texts = [finding.ended, *(sign.text for sign in watch.signs)]
+    finding.named = not found.isdisjoint((finding.where, producer)) or mentioned((finding.where, producer), texts)
 
 
-def _reaction(collected: Any, ended: str) -> str:
+def mentioned(names: Iterable[str], texts: Iterable[str]) -> bool:
+    """True if one of the messages that an operator reads has one of the names."""
+    text = " ".join(texts)
+    return any(re.search(rf"(?<![\w/]){name}(?!\w)", text) for name in names)
+
+
+def _reaction(collected: Any, outcome: CaseOutcome) -> str:
     """What the arm did, by the strongest that was seen."""
     held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
     if held:
         return "safe hold"
     exam = collected.exam
     phases = (ExamState.PHASE_ABORTED, ExamState.PHASE_RETURN, ExamState.PHASE_RETRACT)
-    if exam is not None and exam.phase in phases and ended != WENT_ON:
+    if exam is not None and exam.phase in phases and outcome is not CaseOutcome.CONTINUED:
         return "lifted off"
     if collected.supervisor is not None and collected.supervisor.level == SupervisorState.LEVEL_SOFT_STOP:
         return "soft stop"
-    return "none needed" if ended in UNHARMED else "run ended"
+    return "none needed" if outcome.unharmed else "run ended"

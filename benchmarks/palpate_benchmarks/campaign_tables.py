@@ -12,7 +12,7 @@ from pydantic import TypeAdapter
 from rich.markup import escape
 from rich.table import Table
 
-from palpate_benchmarks.campaign import UNHARMED, WENT_WITHOUT, FaultFinding
+from palpate_benchmarks.campaign import CaseOutcome, FaultFinding
 from palpate_benchmarks.fault_kinds import KINDS
 
 FIELDS = tuple(field.name for field in fields(FaultFinding))
@@ -83,7 +83,7 @@ def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
         after = [f.detected_ms for f in cases if f.detected_ms is not None]
         outcomes: dict[str, int] = {}
         for finding in cases:
-            outcome = "went on" if finding.ended in (*UNHARMED, WENT_WITHOUT) else finding.reaction
+            outcome = finding.reaction if finding.outcome is CaseOutcome.ENDED else "went on"
             outcomes[outcome] = outcomes.get(outcome, 0) + 1
         rows.append(
             (

@@ -17,7 +17,7 @@ import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, Final
@@ -38,9 +38,8 @@ from palpate_bus.messages.codec import decode
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording
 from palpate_bus.wire.zenoh_config import close_session, open_session
-from palpate_conductor.conduct import conduct
-from palpate_conductor.result import RunProgress
-from palpate_conductor.timing import Timing
+from palpate_conductor.conductor import conduct
+from palpate_conductor.outcome import RunProgress, Timing
 from palpate_models.scenario.load import load_scenario
 
 Blow = Callable[[Mapping[str, psutil.Process]], None]
@@ -194,7 +193,8 @@ def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...
     with local.as_conductor():
         result = conduct(session, roles, tell, local.ended, timing, PATIENCE)
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
-    print(f"{RESULT}{json.dumps({'failure': result.failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
+    failure = None if result.failure is None else asdict(result.failure)
+    print(f"{RESULT}{json.dumps({'failure': failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
     close_session(session)
     local.stop(patience_s=3.0)
 

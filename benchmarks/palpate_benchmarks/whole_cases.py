@@ -6,12 +6,12 @@ Beside a fixed list there are drawn ones: a seed says which roles are struck, ho
 from __future__ import annotations
 
 import os
-import re
 import signal
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import asdict
 from pathlib import Path
 from random import Random
 from typing import Any, Final
@@ -21,12 +21,14 @@ import psutil
 from palpate.report.archive import EvidenceError
 from palpate.report.recover import recovered
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.campaign import COMPLETE, WENT_WITHOUT, FaultCase, FaultFinding
+from palpate_benchmarks.campaign import CaseOutcome, FaultCase, FaultFinding, mentioned
 from palpate_benchmarks.fault_kinds import SCARCE_KINDS
 from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, calm_rate, kept_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
+from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
+from palpate_bus.runtime.failure import FailureCode
 
 TOGETHER: Final = "+"
 DASHBOARD: Final = "dashboard"
@@ -52,7 +54,6 @@ SPINNING: Final = 8
 """Processes a core that want all of its time while a machine is starved."""
 LONGEST_S: Final = 0.6
 """Drawn cases strike within so much simulated time of contact: a line is no longer."""
-_SAID: Final = re.compile(r".*(the conductor is gone|nothing heard of the conductor).*")
 
 
 def is_whole(case: FaultCase) -> bool:
@@ -113,9 +114,9 @@ def _done(case: FaultCase, folder: Path, rate: float) -> Struck | None:
 
 
 def _culprits(case: FaultCase) -> list[str]:
-    """Words of which one has to be said of the cause."""
+    """Return the roles, failure codes or words of which one has to be named as the cause."""
     if case.kind == PARTITION:
-        return ["transport"]
+        return ["transport", FailureCode.TRANSPORT_LOST]
     return ["machine", "processor", "late", "expired"] if case.kind == "starve" else case.where.split(TOGETHER)
 
 
@@ -192,34 +193,40 @@ def _parted(case: FaultCase, folder: Path, rate: float) -> Struck | None:
 def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
     finding.injected_s = struck.struck_s
     finding.hung = struck.status is None or bool(struck.staying)
-    failure, kept = struck.said.get("failure"), True
+    failure: dict[str, Any] = struck.said.get("failure") or {}
     if not struck.said:
-        try:
-            failure, kept = _recovered(struck.folder)
-        except EvidenceError as error:
-            failure, kept = str(error), False
-    finding.kept = kept
-    finding.sign = _first_word(struck) if CONDUCTOR in roles else str(failure or ", ".join(struck.said.get("lost", ())))
-    finding.ended = str(failure or (WENT_WITHOUT if finding.kind in KINDS else COMPLETE))
-    words = f"{finding.sign} {finding.ended}"
-    finding.named = any(re.search(rf"(?<![\w/]){role}(?!\w)", words) for role in roles)
+        failure, finding.kept = _recovered(struck.folder)
+    text = failure.get("text", "")
+    finding.sign = _first_sign(struck) if CONDUCTOR in roles else text or ", ".join(struck.said.get("lost", ()))
+    if failure:
+        finding.outcome, finding.ended = CaseOutcome.ENDED, text
+    elif finding.kind in KINDS:
+        finding.outcome, finding.ended = CaseOutcome.CONTINUED_WITHOUT, "completed without what was struck"
+    else:
+        finding.outcome, finding.ended = CaseOutcome.COMPLETED, "complete"
+    found = {failure.get("code"), *failure.get("roles", ()), *struck.said.get("lost", ())}
+    finding.named = not found.isdisjoint(roles) or mentioned(roles, (finding.sign, finding.ended))
     _measure(finding, struck)
     remove_leftovers()
     finding.left_behind = str(struck.own) if struck.own.exists() else ""
 
 
-def _recovered(folder: Path) -> tuple[str, bool]:
-    """How a run without a conductor ended, and whether there is anything of what it had measured."""
-    _, result = recovered(folder)
-    return str(result.failure), bool(result.collected.exam_states)
+def _recovered(folder: Path) -> tuple[dict[str, Any], bool]:
+    """Return the failure of a run without a conductor, and True if anything that it had measured can be recovered."""
+    try:
+        _, result = recovered(folder)
+    except EvidenceError as error:
+        return {"text": str(error)}, False
+    return {} if result.failure is None else asdict(result.failure), bool(result.collected.exam_states)
 
 
-def _first_word(struck: Struck) -> str:
-    """What a service said of the conductor."""
+def _first_sign(struck: Struck) -> str:
+    """Return the log message of a service that lost the conductor."""
+    code = CONDUCTOR_LOST_LOG.partition(" ")[0]
     for path in sorted((struck.folder / "logs").glob("*.log")):
         for line in path.read_text(encoding="utf-8", errors="replace").splitlines():
-            if found := _SAID.fullmatch(line):
-                return f"{path.stem}: {found[1]}"
+            if code in line:
+                return f"{path.stem}: conductor lost: {line.partition(code)[2].strip()}"
     return ""
 
 
@@ -237,7 +244,7 @@ def _measure(finding: FaultFinding, struck: Struck) -> None:
     finding.peak_force_before_n = round(max((force for stamp, force in forces if stamp < split), default=0.0), 2)
     after = [force for stamp, force in forces if stamp >= split]
     finding.peak_force_n = round(max(after), 2) if after else None
-    if finding.ended in (COMPLETE, WENT_WITHOUT):
+    if finding.outcome is not CaseOutcome.ENDED:
         finding.reaction = "none needed"
     elif any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):
         finding.reaction = "safe hold"

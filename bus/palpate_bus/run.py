@@ -1,13 +1,10 @@
-"""The main of every service process: `python -m palpate_<role> [NAME_OR_FILE]`.
+"""Runs services in a process, to the end of the run.
 
-    from palpate_bus.run import main
-    from palpate_models.scenario.load import load_scenario
+`python -m palpate.service ROLE [NAME_OR_FILE]` does it for every service of this package. A program with a service of its own:
 
-    if __name__ == "__main__":
-        main("control", load_scenario)
+    run_service("control", lambda: MyControl())
 
-The word names an implementation or a file of your own (see `implementations`); without it the scenario's `services.control` says
-which. What the process is told about the run comes from `Settings`, which reads the environment.
+The settings of the run are read from the environment, see `palpate_bus.settings`.
 """
 
 from __future__ import annotations
@@ -24,26 +21,25 @@ import zenoh
 
 from palpate_bus.contract import MS, Role, contract
 from palpate_bus.implementations import create
-from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObserverNode
-from palpate_bus.runtime.priority import in_the_background
+from palpate_bus.runtime.process import rare_collections, run_in_background
 from palpate_bus.runtime.recording import RawRecorder, RecorderNode
 from palpate_bus.runtime.wallclock import WallClockNode
 from palpate_bus.service import Service
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
-from palpate_plugins import PluginError
+from palpate_errors import UserError
 
 EXIT_FAILED = 3
 
 
 @dataclass(frozen=True)
 class Hosted:
-    """A service that a process is to host: its role, how it joins the bus, and what makes it."""
+    """A service of a process: its role, how it joins the bus, and its factory."""
 
     role: str
     options: BusOptions
@@ -53,7 +49,7 @@ class Hosted:
 def _node(
     services: Sequence[Service], members: Mapping[str, Member], runtime: str
 ) -> LockstepNode | WallClockNode | ObserverNode | RecorderNode:
-    """What drives the services of a process. Raises BusConfigError for several of which one must have its own."""
+    """Return the node of a process. Raises BusConfigError if one of several services needs a process of its own."""
     first = services[0]
     member = members[first.role]
     apart = [service.role for service in services if runtime != "lockstep" or member.rules.roles[service.role].observer]
@@ -66,47 +62,37 @@ def _node(
     return RecorderNode(first, member) if isinstance(first, RawRecorder) else ObserverNode(first, member)
 
 
-def runtime() -> str:
-    """The runtime of this process, `lockstep` or `wallclock`."""
-    return Settings.read().runtime
-
-
-def stands_back(role: Role, runtime_name: str) -> bool:
-    """Whether a service gives way to others: observers do, and in lockstep all that are not in the 1 kHz loop."""
-    return role.observer or (runtime_name == "lockstep" and role.period > MS)
+def in_background(role: Role, runtime: str) -> bool:
+    """True for services of low priority: observers, and in lockstep all that are not in the 1 kHz loop."""
+    return role.observer or (runtime == "lockstep" and role.period > MS)
 
 
 class NamesServices(Protocol):
-    """What this module knows of a scenario."""
+    """The part of a scenario that chooses services."""
 
     @property
     def services(self) -> Any:
         """The chosen implementation of each role, as attributes."""
 
 
-def main(role: str, load: Callable[[str], NamesServices]) -> None:
-    """Runs the service of `role` to its end and leaves with status 0, or 3 when the run failed or was aborted.
-
-    `load` reads the scenario file that the settings name.
-    """
-    run_service(role, lambda: chosen(role, load, sys.argv[1:2]))
-
-
 def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str] = ()) -> Service:
-    """The service of `role` that the first word names, or else the scenario. Raises BusConfigError, PluginError."""
+    """Return the service of `role` that the first word names, or else the scenario that `load` reads.
+
+    Raises BusConfigError, PluginError.
+    """
     scenario = load(str(Settings.read().required("scenario", "want a scenario file, as `palpate prepare` writes it")))
     return create(role, words[0] if words else getattr(scenario.services, role, "default"), scenario)
 
 
 def run_service(role: str, make: Callable[[], Service], transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
-    """As `main`, for the service that `make` returns; `transport` carries its messages."""
+    """Run the service that `make` returns to its end, and exit as `host` does; `transport` carries its messages."""
     host(lambda: [Hosted(role, BusOptions.from_settings(Settings.read()), make)], role, transport)
 
 
 def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[[zenoh.Session], Transport] = Transport) -> None:
-    """Runs services to their end in this process, which is called `name` in the log, and leaves as `main` does.
+    """Run services to their end in this process, and exit with status 0, or 3 if the run failed or was aborted.
 
-    Those that join the bus in the same way share a session.
+    `name` is that of the process in the log. Services that join the bus in the same way share a session.
     """
     status = 0
     sessions: dict[BusOptions, zenoh.Session] = {}
@@ -115,16 +101,16 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         settings = Settings.read()
         logging.basicConfig(level=settings.log, format=f"%(asctime)s {name} %(levelname)s %(message)s", stream=sys.stderr)
         rules = contract()
-        places = hosted()
-        signal.signal(signal.SIGTERM, signal.default_int_handler)  # what is open is closed first
-        services = [place.make() for place in places]
-        if all(stands_back(rules.roles[place.role], settings.runtime) for place in places):
-            in_the_background()
-        sessions = {options: open_session(options) for options in dict.fromkeys(place.options for place in places)}
+        members_of_process = hosted()
+        signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that open files are closed
+        services = [one.make() for one in members_of_process]
+        if all(in_background(rules.roles[one.role], settings.runtime) for one in members_of_process):
+            run_in_background()
+        sessions = {options: open_session(options) for options in dict.fromkeys(one.options for one in members_of_process)}
         transports = {options: transport(session) for options, session in sessions.items()}
         members = {
-            place.role: Member(sessions[place.options], place.role, rules, settings.domain, transports[place.options])
-            for place in places
+            one.role: Member(sessions[one.options], one.role, rules, settings.domain, transports[one.options])
+            for one in members_of_process
         }
         node = _node(services, members, settings.runtime)
         with rare_collections():
@@ -136,7 +122,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         status = EXIT_FAILED
     except KeyboardInterrupt:
         status = EXIT_FAILED
-    except (BusConfigError, PluginError) as error:
+    except UserError as error:
         log.error("%s", error)
         status = EXIT_FAILED
     except Exception:
@@ -146,7 +132,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
 
 
 def leave(sessions: Iterable[zenoh.Session], status: int) -> None:
-    """Closes the sessions and ends the process: zenoh's own threads are not waited for."""
+    """Close the sessions and exit without waiting for zenoh's threads."""
     for session in sessions:
         close_session(session)
     sys.stderr.flush()

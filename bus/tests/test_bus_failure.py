@@ -7,8 +7,8 @@ import numpy as np
 from palpate_bus.contract import Edge, contract
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.runtime.failure import described
-from palpate_bus.runtime.lockstep import InputBuffer, Packet
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet
 
 ROW = contract().topics["joint_states"]
 NAMES = [f"lbr_A{k}" for k in range(1, 8)]
@@ -25,15 +25,26 @@ def joints(position: np.ndarray) -> bytes:
     return codec.encode(JointState(header(0), NAMES, position, np.zeros(7), np.zeros(7)), ROW.type)
 
 
-def test_what_keeps_to_the_contract_is_not_suspected() -> None:
-    assert described(ValueError("no"), [buffer(joints(np.zeros(7)))]) == "ValueError: no"
+def test_valid_inputs_are_not_named() -> None:
+    failure = Failure.of(ValueError("no"), "control", [buffer(joints(np.zeros(7)))])
+    assert failure == Failure(FailureCode.ROLE_FAILED, "ValueError: no", ("control",))
+    assert Failure.from_report("control", failure.report()) == failure
 
 
-def test_a_value_that_is_not_finite_is_named_with_topic_and_sender() -> None:
-    words = described(IndexError("index -9"), [buffer(joints(np.full(7, np.nan)))])
-    assert words.startswith("IndexError: index -9; joint_states from robot has position nan, the contract wants")
+def test_an_input_that_is_not_finite_is_named_with_topic_and_sender() -> None:
+    failure = Failure.of(IndexError("index -9"), "control", [buffer(joints(np.full(7, np.nan)))])
+    assert failure.topics == ("joint_states",)
+    assert failure.text.startswith("IndexError: index -9; joint_states from robot has position nan")
 
 
-def test_bytes_that_are_no_message_are_named_too() -> None:
-    words = described(ValueError("no"), [buffer(b"\x00\x01\x00\x00\xff")])
-    assert words.endswith("joint_states from robot cannot be decoded (5 bytes)")
+def test_an_input_that_cannot_be_decoded_is_named() -> None:
+    failure = Failure.of(ValueError("no"), "control", [buffer(b"\x00\x01\x00\x00\xff")])
+    assert failure.topics == ("joint_states",)
+
+
+def test_some_errors_have_a_code_of_their_own() -> None:
+    for error, code in (
+        (ForgedSenderError("twice", "joint_states"), FailureCode.FORGED),
+        (OSError(28, "No space left on device"), FailureCode.DISK_FULL),
+    ):
+        assert Failure.of(error, "control", ()).code is code

@@ -10,7 +10,7 @@ import pytest
 from palpate.fuzz.fuzz import all_targets, attempt, campaign, choose, mutate
 from palpate.fuzz.targets import Broken, FuzzTarget
 from palpate_bus.messages import RecordChunk, codec
-from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_models.scenario.load import ScenarioError, load_scenario
 
 

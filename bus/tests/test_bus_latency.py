@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate_bus.runtime.latency import BIN_NS, LatencyHistogram
+from palpate_bus.runtime.wallclock import BIN_NS, LatencyHistogram
 
 
 def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:

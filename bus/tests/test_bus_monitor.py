@@ -16,8 +16,7 @@ from palpate_bus.contract.conformance import Checker, leaves, numbers
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import duration_message, header
-from palpate_bus.monitor.diagnostics import RECENT_S, diagnostics
-from palpate_bus.monitor.health import Violation
+from palpate_bus.monitor.health import RECENT_S, Violation, diagnostics
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.testing.strategies import messages
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
@@ -72,11 +71,11 @@ class Bus:
                     self.sequences[name] += 1
                     payload = item if isinstance(item, bytes) else codec.encode(item, RULES.topics[name].type)
                     if name in self.monitor.listening:
-                        self.monitor.hear(name, round(wall * 1e9), self.sequences[name], self.entities[i].gid, payload, wall)
+                        self.monitor.receive(name, round(wall * 1e9), self.sequences[name], self.entities[i].gid, payload, wall)
             self.tick += 1
             if self.tick % LOOK_MS == 0:
-                self.monitor.see(self.entities, wall)
-                for violation in self.monitor.look(wall, round(wall * 1e9)):
+                self.monitor.set_entities(self.entities, wall)
+                for violation in self.monitor.check(wall, round(wall * 1e9)):
                     self.named.setdefault(f"{violation.topic} {violation.kind}", (self.tick, violation))
 
 
@@ -256,7 +255,7 @@ def test_a_sender_that_comes_back_is_judged_again() -> None:
     """A link that was lost for a moment takes all tokens with it."""
     bus = Bus()
     bus.run(1500)
-    bus.monitor.see([], bus.factor * bus.tick / 1000)
+    bus.monitor.set_entities([], bus.factor * bus.tick / 1000)
     bus.run(1500)
     assert bus.named == {}
     assert bus.monitor.time.progress == pytest.approx(0.5, abs=0.05)

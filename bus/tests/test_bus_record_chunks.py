@@ -5,7 +5,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate_bus.messages.codec import CodecError
-from palpate_bus.runtime.record_chunks import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
+from palpate_bus.runtime.output import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
 
 TOPICS = ("joint_states", "ft/wrench")
 messages = st.lists(

@@ -15,7 +15,7 @@ from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.messages import JointState, RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
-from palpate_bus.runtime.record_chunks import ChunkWriter
+from palpate_bus.runtime.output import ChunkWriter
 from palpate_bus.runtime.recording import RecorderNode
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import ReceivedSample
@@ -131,7 +131,7 @@ def test_it_waits_no_more_for_a_role_that_is_lost() -> None:
 def test_without_a_conductor_and_services_it_leaves_with_what_it_has() -> None:
     kept = Kept()
     member: Any = Bus()
-    with pytest.raises(RunAborted, match="the conductor is gone"):
+    with pytest.raises(RunAborted, match="token is gone"):
         RecorderNode(kept, member).run()
     assert kept.messages == [("joint_states", 7 * MS, 8)]
 

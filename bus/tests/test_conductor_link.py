@@ -20,7 +20,7 @@ from palpate_bus.runtime.conductor_link import (
     ConductorLink,
     RunAborted,
 )
-from palpate_bus.runtime.process_state import home
+from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.transport import ReceivedSample
 
 STEP_S = 0.01
@@ -54,7 +54,7 @@ class Bus:
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runtime: str) -> None:
         monkeypatch.setenv("PALPATE_RUNTIME", runtime)
         monkeypatch.setattr(conductor_link, "monotonic", lambda: self.now)
-        monkeypatch.setattr(conductor_link, "runs", lambda pid: self.runs and pid == PID)
+        monkeypatch.setattr(conductor_link, "is_running", lambda pid: self.runs and pid == PID)
         self.rules = contract()
         self.now = 100.0
         self.runs = False
@@ -73,7 +73,7 @@ class Bus:
 
     def say(self, command: int) -> None:
         name = HEARTBEAT if command == RunControl.HEARTBEAT else "palpate/control"
-        message = RunControl(command, PID, False, "", home())
+        message = RunControl(command, PID, False, "", pid_space())
         self.queues[name].waiting.append(codec.encode(message, CONTROL_TYPE))
 
     def link(self, grace_s: float = 0.0) -> ConductorLink:
@@ -135,7 +135,7 @@ def test_its_services_stay_for_the_grace_and_then_leave(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=2.0)
     assert wallclock.silence(link, 1.0) < 1.0
     lost_at = wallclock.now
-    with pytest.raises(RunAborted, match="nothing heard of the conductor"):
+    with pytest.raises(RunAborted, match="no heartbeat for"):
         while True:
             wallclock.now += STEP_S
             link.poll()

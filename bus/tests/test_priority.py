@@ -7,17 +7,17 @@ import subprocess
 import sys
 
 from palpate_bus.contract import contract
-from palpate_bus.run import stands_back
+from palpate_bus.run import in_background
 
 PROGRAM = """
 import os, sys, threading, time
-from palpate_bus.runtime.priority import BACKGROUND, in_the_background
-in_the_background()  # elsewhere than on Linux it lowers the priority at most
+from palpate_bus.runtime.process import BACKGROUND_NICENESS, run_in_background
+run_in_background()  # elsewhere than on Linux it lowers the priority at most
 after = threading.Thread(target=time.sleep, args=(30,), daemon=True)
 after.start()
 for thread in (0, after.native_id) if sys.platform == "linux" else ():
     assert os.sched_getscheduler(thread) == os.SCHED_BATCH
-    assert os.getpriority(os.PRIO_PROCESS, thread) == min(int(os.environ["HERE"]) + BACKGROUND, 19)
+    assert os.getpriority(os.PRIO_PROCESS, thread) == min(int(os.environ["HERE"]) + BACKGROUND_NICENESS, 19)
 """
 
 
@@ -28,6 +28,6 @@ def test_a_service_goes_behind_others_with_the_threads_that_it_starts() -> None:
 
 def test_all_but_the_loop_stand_back_in_lockstep_and_observers_always() -> None:
     roles = contract().roles
-    assert {name for name, role in roles.items() if not stands_back(role, "lockstep")} == {"robot", "tissue", "control"}
+    assert {name for name, role in roles.items() if not in_background(role, "lockstep")} == {"robot", "tissue", "control"}
     observers = {name for name, role in roles.items() if role.observer}
-    assert {name for name, role in roles.items() if stands_back(role, "wallclock")} == observers
+    assert {name for name, role in roles.items() if in_background(role, "wallclock")} == observers

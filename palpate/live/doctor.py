@@ -193,8 +193,8 @@ def _waiting(live: LiveMonitor) -> list[Remark]:
     findings = []
     now = monotonic()
     for role, report in sorted(live.reports.items()):
-        if now - report.heard > SILENT_S:
-            findings.append(Remark("progress", Severity.WARN, f"{role} has not reported for {now - report.heard:.0f} s"))
+        if now - report.received > SILENT_S:
+            findings.append(Remark("progress", Severity.WARN, f"{role} has not reported for {now - report.received:.0f} s"))
     if live.reports and live.monitor.time.progress == 0:
         for role, report in sorted(live.reports.items()):
             wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for no service"

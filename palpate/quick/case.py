@@ -23,7 +23,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.service import Service
 from palpate_conductor.collector import Collected
-from palpate_conductor.result import RunResult
+from palpate_conductor.outcome import RunResult
 from palpate_models.scenario.schema import Scenario
 
 RUNTIME: Final = "quick"

@@ -19,7 +19,8 @@ from palpate_bus.implementations import create
 from palpate_bus.messages import ExamState, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordedMessage, RecordingError
-from palpate_conductor.result import RunResult, given_up
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_conductor.outcome import RunResult, gave_up
 from palpate_models.scenario.load import seen, view_of
 from palpate_models.scenario.schema import Scenario
 
@@ -46,8 +47,8 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         except Exception as error:  # of the user's own, which may have been what ended the run
             note = f"; the assessment could not finish: {type(error).__name__}: {error}"
     reached = f"the recording ends at {recording.last / NS:.3f} s"
-    why = given_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
-    failure = f"recovered from a run that had no end: {reached}" + (f"; last: {why}" if why else "") + note
+    why = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
+    text = f"recovered from a run that had no end: {reached}" + (f"; last: {why}" if why else "") + note
     return run.scenario, RunResult(
         runtime=RUNTIME,
         collected=collected,
@@ -58,7 +59,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         start_time_s=0.0,
         blame={},
         counters={},
-        failure=failure,
+        failure=Failure(FailureCode.UNFINISHED, text, ("conductor",)),
         lost={"conductor": recording.last},
         earlier=earlier,
     )

@@ -35,7 +35,7 @@ from palpate.truth.pressed import press_patient
 from palpate.truth.surface import TrueBody
 from palpate_bus.runs.run_name import run_of
 from palpate_conductor.collector import Collected
-from palpate_conductor.result import RunResult
+from palpate_conductor.outcome import RunResult
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input
@@ -104,7 +104,8 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         run_hash=result.run_hash,
         digests=result.digests,
         resumed=len(result.earlier),
-        failure=result.failure,
+        failure=None if result.failure is None else result.failure.text,
+        failure_code=None if result.failure is None else result.failure.code,
         lost={role: t / 1e9 for role, t in result.lost.items()},
         samples=len(c.samples),
         skipped_targets=0 if c.exam is None else int(c.exam.targets_skipped),

@@ -8,6 +8,7 @@ from typing import Any, Final, Protocol
 from pydantic import BaseModel, ConfigDict
 
 from palpate.report.scoring import Scores
+from palpate_bus.runtime.failure import FailureCode
 
 Point = tuple[float, ...]
 
@@ -99,6 +100,8 @@ class Report(_Row):
     """How many examinations that broke off this one went on with; their samples and forces count here, times are of the last."""
     failure: str | None
     """Service and cause; null when the run completed."""
+    failure_code: FailureCode | None = None
+    """The same for programs, such as `role_lost`."""
     lost: dict[str, float]
     """Services that died, with the simulated time at which they fell silent [s]."""
     samples: int

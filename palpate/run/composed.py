@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import nullcontext, suppress
+from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
@@ -11,15 +12,13 @@ from palpate.run.interrupts import all_is_measured
 from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runtime.collection import rare_collections
 from palpate_bus.runtime.composed import Composed, ServiceFailed
+from palpate_bus.runtime.failure import Failure
+from palpate_bus.runtime.process import rare_collections
 from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
-from palpate_conductor.collector import Collector
-from palpate_conductor.outcome import in_words
-from palpate_conductor.result import RunProgress, RunResult, Tell, given_up
-from palpate_conductor.timing import SIM_LIMIT
-from palpate_conductor.tree import FrameTree
+from palpate_conductor.collector import Collector, FrameTree
+from palpate_conductor.outcome import SIM_LIMIT, RunProgress, RunResult, Tell, failure_of, gave_up
 from palpate_models.scenario.load import exam_input, seen, view_of
 from palpate_models.scenario.schema import Scenario
 
@@ -46,7 +45,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         [*load_services(scenario, workers(scenario)), *viewers, collector], taps=[recorder.record for recorder in recorders]
     )
     start = perf_counter()
-    failure = None
+    failure: Failure | None = None
     last = 0
     shown = start
 
@@ -64,12 +63,12 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
     except ServiceFailed as error:
-        failure = f"{error.role} lost at {error.t / NS:.3f} s: {error.why}"
+        failure = replace(error.failure, text=f"{error.role} lost at {error.t / NS:.3f} s: {error.failure}")
         lost = {error.role: error.t}
         last = error.t
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # whatever it is, what was measured is to be told
         interrupted = isinstance(error, KeyboardInterrupt)
-        failure, last = in_words(error, run.t), run.t
+        failure, last = failure_of(error, run.t), run.t
     all_is_measured()
     wall = perf_counter() - start
     facts = run.finish()
@@ -87,7 +86,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         start_time_s=start - begin,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
-        failure=failure or given_up(collector.collected),
+        failure=failure or gave_up(collector.collected),
         lost={**run.lost, **lost},
         interrupted=interrupted,
     )

@@ -22,7 +22,7 @@ from palpate_bus.contract.conformance import violations
 from palpate_bus.messages import RobotStatus
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.settings import RECORDING
-from palpate_conductor.result import RunResult
+from palpate_conductor.outcome import RunResult
 from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
@@ -62,7 +62,7 @@ def conclude(
 def _held(result: RunResult) -> str:
     """That the arm was held at last, and why, where the failure does not tell it."""
     changes = result.collected.status_changes
-    if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in (result.failure or ""):
+    if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in str(result.failure or ""):
         return ""
     return f"; the arm has been held since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
 

@@ -14,9 +14,9 @@ from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.zenoh_config import close_session, open_session
-from palpate_conductor.conduct import conduct
-from palpate_conductor.timing import Timing
-from palpate_conductor.tree import FrameTree
+from palpate_conductor.collector import FrameTree
+from palpate_conductor.conductor import conduct
+from palpate_conductor.outcome import Timing
 from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
 
 NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"

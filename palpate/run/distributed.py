@@ -14,12 +14,10 @@ from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_f
 from palpate.run.secure import SecureBus
 from palpate_bus import implementations
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
-from palpate_conductor.conduct import conduct
+from palpate_conductor.collector import FrameTree
+from palpate_conductor.conductor import conduct
 from palpate_conductor.handover import ROLES
-from palpate_conductor.outcome import Patience
-from palpate_conductor.result import RunProgress, RunResult, Tell
-from palpate_conductor.timing import Timing
-from palpate_conductor.tree import FrameTree
+from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, Timing
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 

@@ -35,9 +35,7 @@ from palpate.run.self_test import RATES, measure
 from palpate_bus.implementations import check_libraries
 from palpate_bus.security.keys import KeysError
 from palpate_bus.settings import BusConfigError, Settings
-from palpate_conductor.outcome import RunFailed
-from palpate_conductor.result import RunResult, Tell
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import RunFailed, RunResult, Tell, Timing
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
 

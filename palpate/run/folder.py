@@ -18,7 +18,7 @@ from palpate.run.options import Record
 from palpate.run.outlook import Outlook, in_words
 from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
-from palpate_conductor.result import RunProgress, Tell
+from palpate_conductor.outcome import RunProgress, Tell
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Exam
 

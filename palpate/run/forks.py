@@ -74,7 +74,7 @@ class Forks:
     def __init__(self, modules: Iterable[str]) -> None:
         """`modules` are imported once, by the fork server, which starts with the first process."""
         self._context = get_context("forkserver")
-        self._context.set_forkserver_preload(["palpate_bus.run", *modules])
+        self._context.set_forkserver_preload(["palpate.service", *modules])
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Forked:
         """Starts `command`, which must be a Python module's, with that environment; what it prints goes to `log`.

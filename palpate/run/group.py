@@ -1,6 +1,6 @@
 """`python -m palpate.run.group FILE`: the services of several roles in one process, as `palpate run` places them.
 
-FILE is JSON: by role, the words after `python -m palpate_ROLE`, and what is its own in the environment: each service is made with
+FILE is JSON: by role, the words after `python -m palpate.service ROLE` and its own environment: each service is made with
 the scenario file of its own view, and joins a secure bus with its own certificate.
 """
 

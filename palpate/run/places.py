@@ -18,10 +18,12 @@ from typing import Annotated, NamedTuple, NoReturn
 import typer
 
 from palpate.console import refuse
+from palpate.service import command as service_command
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.joining import NoBus, named_runs
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
 from palpate_errors import UserError
@@ -79,11 +81,11 @@ class Absent:
             )
             self.tell(self._sentences[role])
 
-    def explain(self, failure: str) -> str:
-        """The failure of a run, with what would have joined those who never answered."""
-        if "no answer from" not in failure:
+    def explain(self, failure: Failure) -> Failure:
+        """Return the failure, with the commands that start the roles that did not answer."""
+        if failure.code is not FailureCode.NO_ANSWER:
             return failure
-        return f"{failure.rstrip()} {'; '.join(words for role, words in self._sentences.items() if role in failure)}"
+        return failure.with_note("; ".join(text for role, text in self._sentences.items() if role in failure.roles))
 
 
 def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
@@ -130,7 +132,7 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
         return place.command
     implementations.check(role, service)
     word = str(Path(service).resolve()) if is_file(service) else service
-    return ("python", "-m", f"palpate_{role}", word)
+    return service_command(role, word)
 
 
 def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:

@@ -25,13 +25,14 @@ from palpate.run.group import command as group_command
 from palpate.run.options import Record
 from palpate.run.placement import Groups, PlacementError
 from palpate.run.secure import SecureBus
+from palpate.service import command as service_command
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Announcement, Run
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.settings import Settings, variable
 from palpate_bus.wire.tags import make_key
 from palpate_bus.wire.zenoh_config import mesh
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import view_of
 
@@ -56,8 +57,8 @@ class ServiceProcess:
 
     @property
     def words(self) -> tuple[str, ...] | None:
-        """What follows `python -m palpate_ROLE`; None for a program that is none of ours."""
-        ours = ("python", "-m", f"palpate_{self.role}")
+        """What follows `python -m palpate.service ROLE`; None for another program."""
+        ours = service_command(self.role)
         return self.command[len(ours) :] if self.command[: len(ours)] == ours else None
 
     def shared_words(self) -> tuple[str, ...]:
@@ -138,7 +139,7 @@ def how(code: int, log: Path) -> str:
     lines: list[str] = []
     with suppress(OSError):
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
-    hint = "" if code else ": does it call palpate_bus.run.main?"
+    hint = "" if code else ": does it call palpate_bus.run.run_service?"
     said = next((_LOGGED.sub("", line.strip()) for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
     return f"left with status {code}: {said}"
 

@@ -16,7 +16,7 @@ from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
 from palpate_bus.runs.operator_requests import WORDS
-from palpate_conductor.result import RunProgress
+from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam, Mode
 
 PHASES: Final = {

@@ -29,7 +29,7 @@ from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
 from palpate.study.code import code_digest
 from palpate.study.manifest import Case, file_hash
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Timing
 from palpate_models.scenario.schema import Scenario
 
 KIB: Final = 1024

@@ -2,16 +2,18 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import COMPLETE, WENT_ON, CaseOver, FaultCase, FaultFinding, _conclude, _Watch
+from palpate_benchmarks.campaign import CaseOutcome, CaseOver, FaultCase, FaultFinding, _conclude, _Watch
 from palpate_benchmarks.campaign_tables import csv_text, from_csv, markdown
 from palpate_bus.messages import ExamState
-from palpate_conductor.result import RunProgress
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_conductor.outcome import RunProgress
 
 
 def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
@@ -28,22 +30,22 @@ def in_phase(phase: int, message: str = "") -> RunProgress:
 
 
 @pytest.mark.parametrize(
-    ("phase", "end"),
+    ("phase", "outcome"),
     [
-        (ExamState.PHASE_DONE, COMPLETE),
-        (ExamState.PHASE_RETURN, WENT_ON),
-        (ExamState.PHASE_ABORTED, "aborted in phase SCAN: planning/setpoint refused"),
+        (ExamState.PHASE_DONE, CaseOutcome.COMPLETED),
+        (ExamState.PHASE_RETURN, CaseOutcome.CONTINUED),
+        (ExamState.PHASE_ABORTED, CaseOutcome.ENDED),
     ],
 )
-def test_a_case_is_over_as_soon_as_its_end_is_sure(phase: int, end: str) -> None:
-    progress = in_phase(phase, end)
+def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: CaseOutcome) -> None:
+    progress = in_phase(phase, "aborted: planning/setpoint refused")
     case = watch()
-    with pytest.raises(CaseOver, match=end):
+    with pytest.raises(CaseOver) as over:
         case.tell(progress)
-    _conclude(case.finding, case, result(progress.collected, failure=end))
-    assert case.finding.ended == end
+    _conclude(case.finding, case, replace(result(progress.collected), failure=over.value.failure))
+    assert case.finding.outcome is outcome
     assert case.finding.good
-    assert (case.finding.sign == "") == (end in (COMPLETE, WENT_ON)), "what goes on was not noticed"
+    assert (case.finding.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
 
 
 def test_what_assessment_does_shows_after_the_scan() -> None:
@@ -53,13 +55,17 @@ def test_what_assessment_does_shows_after_the_scan() -> None:
 
 def test_an_end_that_names_nobody_is_bad() -> None:
     case = watch()
-    _conclude(case.finding, case, result(collected(), failure="something went wrong"))
+    _conclude(case.finding, case, replace(result(collected()), failure=Failure(FailureCode.BLOCKED, "something went wrong")))
     assert not case.finding.good
 
 
 def test_the_page_sums_up_and_marks_what_is_bad() -> None:
-    fine = FaultFinding("kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, "robot lost", True)
-    slow = FaultFinding("kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, "tissue lost", True)
+    fine = FaultFinding(
+        "kill", "robot", "lockstep", 8.0, 20.0, "robot lost", "run ended", 5.0, 5.5, CaseOutcome.ENDED, "robot lost", True
+    )
+    slow = FaultFinding(
+        "kill", "tissue", "lockstep", 8.0, 40.0, "tissue lost", "run ended", 5.0, 26.0, CaseOutcome.ENDED, "tissue lost", True
+    )
     page = markdown([fine, slow])
     assert "1 of 2 as they should be; the largest force was 26.0 N." in page
     assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
@@ -70,7 +76,20 @@ def test_the_page_sums_up_and_marks_what_is_bad() -> None:
 
 def test_findings_come_back_from_their_file() -> None:
     found = [
-        FaultFinding("kill", "robot", "lockstep", 15.5, 33.2, 'robot, "gone"\nat once', "safe hold", 6.0, None, "x", named=True),
+        FaultFinding(
+            "kill",
+            "robot",
+            "lockstep",
+            15.5,
+            33.2,
+            'robot, "gone"\nat once',
+            "safe hold",
+            6.0,
+            None,
+            CaseOutcome.ENDED,
+            "x",
+            named=True,
+        ),
         FaultFinding("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False),
     ]
     assert from_csv(csv_text(found)) == found

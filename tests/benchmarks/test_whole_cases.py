@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 
 import psutil
@@ -13,6 +13,8 @@ import pytest
 from palpate_benchmarks.campaign import FaultCase, FaultFinding, cases
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
 from palpate_benchmarks.whole_cases import FIXED, _judge, _no_more, drawn, fixed, is_whole
+from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
+from palpate_bus.runtime.failure import Failure, FailureCode
 
 
 def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
@@ -77,22 +79,23 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
         assert not bad.good
 
 
-@pytest.mark.parametrize("named", ["control lost at 8.000 s: killed by signal 9", "something went wrong"])
-def test_what_the_conductor_says_is_judged(named: str, tmp_path: Path) -> None:
-    said = {"failure": named, "lost": ["control"], "forces": [[int(7e9), 5.0], [int(8.1e9), 5.5]]}
+@pytest.mark.parametrize("named", [True, False])
+def test_the_failure_of_the_run_is_judged(named: bool, tmp_path: Path) -> None:
+    failure = asdict(Failure(FailureCode.ROLE_LOST, "something failed", ("control",) if named else ()))
+    said = {"failure": failure, "lost": ["control"] if named else [], "forces": [[int(7e9), 5.0], [int(8.1e9), 5.5]]}
     struck = Struck(tmp_path, tmp_path / "gone", 0, said, 8.0, 1.0)
     finding = FaultFinding("kill", "control+recorder", "lockstep")
     _judge(finding, struck, ["control", "recorder"])
-    assert finding.good == ("control" in named)
-    assert (finding.peak_force_before_n, finding.peak_force_n, finding.ended) == (5.0, 5.5, named)
+    assert finding.good == named
+    assert (finding.peak_force_before_n, finding.peak_force_n, finding.ended) == (5.0, 5.5, "something failed")
 
 
 def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
-    (tmp_path / "logs" / "planning.log").write_text("2026 planning WARNING the conductor is gone\n", encoding="utf-8")
+    (tmp_path / "logs" / "planning.log").write_text(f"2026 planning WARNING {CONDUCTOR_LOST_LOG % 'gone'}\n", encoding="utf-8")
     finding = FaultFinding("kill", CONDUCTOR, "lockstep")
     _judge(finding, Struck(tmp_path, tmp_path / "gone", -9, {}, 8.0, 1.0), [CONDUCTOR])
-    assert finding.sign == "planning: the conductor is gone"
+    assert finding.sign == "planning: conductor lost: gone"
     assert finding.named
     assert not finding.kept
     assert not FaultCase("kill", CONDUCTOR, False).wallclock

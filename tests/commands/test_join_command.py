@@ -6,12 +6,14 @@ from pathlib import Path
 
 import pytest
 
+from palpate import service
 from palpate.run.places import Absent, PlaceError, ServicePlace, command_for, place_to_join, place_to_take, write_places
 from palpate_bus.runs.announcement import Run
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_plugins import PluginError
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
-COMMAND = ("python", "-m", "palpate_control")
+COMMAND = service.command("control")
 PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
 
 
@@ -47,8 +49,9 @@ def test_a_run_that_lacks_nobody_says_how_one_is_started(tmp_path: Path) -> None
 
 def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> None:
     waiting, (sentence,) = absent(tmp_path)
-    assert waiting.explain("control lost at 8.000 s: killed") == "control lost at 8.000 s: killed"
-    assert sentence in waiting.explain("not ready after 30 s: no answer from control. ")
+    lost = Failure(FailureCode.ROLE_LOST, "control lost at 8.000 s: killed", ("control",))
+    assert waiting.explain(lost) == lost
+    assert sentence in waiting.explain(Failure(FailureCode.NO_ANSWER, "not ready after 30 s", ("control",))).text
 
 
 def test_unknown_roles_and_implementations_are_answered_with_the_known_ones(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from types import SimpleNamespace
 from palpate_bus.messages import OperatorRequest
 from palpate_conductor.collector import Collected
 from palpate.run.progress import RunDisplay
-from palpate_conductor.result import RunProgress
+from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam
 from rich.console import Console
 

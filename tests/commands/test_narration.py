@@ -13,7 +13,7 @@ from palpate.run.progress import PHASES, USUAL, Narration, RunDisplay
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
-from palpate_conductor.result import RunProgress
+from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam
 from palpate_planning.stages import StrokeStage
 from palpate_planning.status import PHASE_OF, Phase

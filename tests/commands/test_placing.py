@@ -11,6 +11,7 @@ from pathlib import Path
 import pytest
 from typer.testing import CliRunner
 
+from palpate import service
 from palpate.commands import app_for
 from palpate.console import EXIT_BAD_INPUT
 from palpate.environment import given
@@ -20,7 +21,7 @@ from palpate.run.roles import OBSERVERS, WORKERS, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.runtime.group import Group
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Timing
 from palpate_models.scenario.load import load_scenario
 
 ROLES = (*WORKERS, *OBSERVERS)
@@ -67,7 +68,7 @@ def test_what_cannot_be_placed_is_refused_by_name(options: list[str], words: str
 def test_a_program_that_is_none_of_ours_shares_no_process() -> None:
     with pytest.raises(PlacementError, match=r"tissue is played by `\./my_tissue`"):
         ServiceProcess("tissue", ("./my_tissue",), {}).shared_words()
-    assert ServiceProcess("tissue", ("python", "-m", "palpate_tissue", "elastic"), {}).shared_words() == ("elastic",)
+    assert ServiceProcess("tissue", service.command("tissue", "elastic"), {}).shared_words() == ("elastic",)
 
 
 class Witness:

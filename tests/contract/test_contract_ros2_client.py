@@ -66,7 +66,7 @@ def test_a_ros_2_user_hears_robot_and_camera_and_stops_the_robot(tmp_path: Path)
         for role in ("camera", "robot"):
             rig = rigs[role] = LiveRig(bus, role, settings)
             stack.callback(rig.close)
-            stack.enter_context(started(shlex.join([sys.executable, "-m", f"palpate_{role}"]), role, settings, where, 0))
+            stack.enter_context(started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0))
         for role, rig in rigs.items():
             rig.await_implementation(120, ConformanceReport(role))
         reading = threading.Thread(target=lambda: lines.extend(client.stdout or ()), daemon=True)

@@ -17,7 +17,7 @@ from palpate.run.placement import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, workers, write_scenario_files
 from palpate_bus.contract import contract
-from palpate_conductor.timing import Timing
+from palpate_conductor.outcome import Timing
 from palpate_models.scenario.load import dump_scenario, load_scenario, view_of
 from palpate_models.scenario.schema import Scenario
 

@@ -1,4 +1,4 @@
-"""A monitor on a bus: it listens to every topic of the contract under any type, to liveliness tokens and to reports of services.
+"""A monitor on a bus: it subscribes to every topic of the contract under any type, to liveliness tokens and to service reports.
 
     with session(run.options()) as bus:
         monitor = LiveMonitor(bus, contract(), run.domain, rate=run.rate)
@@ -7,8 +7,7 @@
                 print(violation)
             sleep(0.05)
 
-Nothing computes in zenoh's callbacks: samples wait in channels until `poll`, which the owner calls often. It costs each producer
-of a 1 kHz topic one more subscriber.
+Samples wait in channels until `poll`, which the owner calls often. It costs each producer of a 1 kHz topic one more subscriber.
 """
 
 from __future__ import annotations
@@ -28,25 +27,25 @@ from palpate_bus.wire.liveliness import GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
 
 ROOM = 1 << 15
-"""Messages that wait for a poll, a topic."""
+"""Messages per topic that wait for a poll."""
 WALL_CLOCK_TICK = 10**17
 """A grant beyond this [ns] is a wall time: the common start of a wall-clock run."""
 
 
 @dataclass(frozen=True)
 class RoleReport:
-    """What a service last said of itself."""
+    """The last report of a service."""
 
     state: int
     tick: int
     """Last finished tick [ns]."""
     waiting_for: str
-    heard: float
+    received: float
     """By the monotonic clock [s]."""
 
 
 class LiveMonitor:
-    """A `Monitor` that listens to a bus, to all topics or to `topics` only; see `listen`."""
+    """A `Monitor` on a bus, for all topics or for `topics` only; see `listen`."""
 
     def __init__(
         self, session: zenoh.Session, rules: Contract, domain: int, topics: Iterable[str] | None = None, rate: float | None = None
@@ -55,7 +54,7 @@ class LiveMonitor:
         self.graph = GraphWatch(session, domain)
         self.reports: dict[str, RoleReport] = {}
         self.offsets: dict[str, float] = {}
-        """Smallest age [ms] of a message by topic: negative when the sender's clock is ahead of ours."""
+        """Smallest age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
         self._listeners: dict[str, _Listener] = {}
         self.listen(rules.topics if topics is None else topics)
@@ -69,7 +68,7 @@ class LiveMonitor:
         self._decode_report, self._decode_control = codec.decoder(report), codec.decoder(control)
 
     def listen(self, topics: Iterable[str]) -> None:
-        """Listens to `topics` and no others from now on."""
+        """Subscribe to `topics` and no others from now on."""
         chosen = set(topics)
         for name in self._listeners.keys() - chosen:
             self._listeners.pop(name).close()
@@ -78,28 +77,28 @@ class LiveMonitor:
         self.monitor.listen(chosen, monotonic())
 
     def poll(self) -> list[Violation]:
-        """Takes in what has come, judges, and returns what is newly wrong."""
+        """Process received messages and return new violations."""
         now = monotonic()
         self.graph.changes()
-        self.monitor.see(self.graph.alive.values(), now)
-        self._hear_control()
-        self._hear_reports(now)
+        self.monitor.set_entities(self.graph.alive.values(), now)
+        self._receive_control()
+        self._receive_reports(now)
         for listener in self._listeners.values():
             for sent, sequence, gid, payload in listener.drain(self.monitor, now):
-                self.monitor.hear(listener.topic.name, sent, sequence, gid, payload, now)
+                self.monitor.receive(listener.topic.name, sent, sequence, gid, payload, now)
                 age = (time_ns() - sent) / 1e6
                 self.offsets[listener.topic.name] = min(age, self.offsets.get(listener.topic.name, age))
-        return self.monitor.look(monotonic(), time_ns())
+        return self.monitor.check(monotonic(), time_ns())
 
     def close(self) -> None:
-        """Stops listening."""
+        """Close the subscriptions."""
         self.graph.close()
         for listener in self._listeners.values():
             listener.close()
         self._reports.undeclare()
         self._control.undeclare()
 
-    def _hear_control(self) -> None:
+    def _receive_control(self) -> None:
         while (sample := self._control.handler.try_recv()) is not None:
             try:
                 message = self._decode_control(sample.payload.to_bytes())
@@ -108,7 +107,7 @@ class LiveMonitor:
             if message.command == RunControl.GRANT and message.tick > WALL_CLOCK_TICK:
                 self.monitor.rate = self.monitor.rate or 1.0
 
-    def _hear_reports(self, now: float) -> None:
+    def _receive_reports(self, now: float) -> None:
         while (sample := self._reports.handler.try_recv()) is not None:
             try:
                 message = self._decode_report(sample.payload.to_bytes())
@@ -119,7 +118,7 @@ class LiveMonitor:
 
 
 class _Listener:
-    """Listens to one topic under any type and hash."""
+    """A subscription to one topic under any type and hash."""
 
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self.topic = topic
@@ -135,7 +134,7 @@ class _Listener:
         self._wanted = (topic.type, topic.type_hash)
 
     def drain(self, monitor: Monitor, now: float) -> list[tuple[int, int, bytes, bytes]]:
-        """Messages of the contract's type that came since last time: (source time [ns], sequence, GID, payload)."""
+        """Return new messages of the contract's type: (source time [ns], sequence, GID, payload)."""
         received = []
         while (sample := self._receive()) is not None:
             attachment = sample.attachment
@@ -157,5 +156,5 @@ class _Listener:
         return received
 
     def close(self) -> None:
-        """Stops listening."""
+        """Close the subscriptions."""
         self._subscriber.undeclare()

@@ -1,7 +1,7 @@
-"""The contract, enforced live: what every topic of a bus does against its row, from the contract alone.
+"""Checks every topic of a bus against its row of the contract.
 
-`Monitor` judges, without any transport: it is given messages (`hear`) and the nodes on the bus (`see`), and is asked (`look`).
-`LiveMonitor` in `live` listens on a bus for it. A violation names topic, sender, what is expected and what came.
+`Monitor` has no transport: its caller passes messages (`receive`) and entities on the bus (`set_entities`), and calls `check`.
+`LiveMonitor` in `live` does so on a bus. A violation names topic, sender, the expected and the received value.
 """
 
 from __future__ import annotations
@@ -13,37 +13,36 @@ from palpate_bus.contract import MS, Contract, Topic
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import codec
-from palpate_bus.monitor import timing
 from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
-from palpate_bus.monitor.streams import WINDOW_S, Stream
+from palpate_bus.monitor.streams import GRACE_S, WINDOW_S, BusTime, Stream, bus_time, is_due, timing_problems
 from palpate_bus.wire.liveliness import Entity, EntityKind
 
 
 class Monitor:
-    """Judges a bus by the contract. `rate`: how fast time passes in a run by the wall clock, 1 in real time; None in lockstep."""
+    """Checks a bus against the contract. `rate`: simulated per wall time in wall-clock mode; None in lockstep."""
 
     def __init__(self, rules: Contract, rate: float | None = None) -> None:
         self.rules = rules
         self.rate = rate
         self.active: dict[tuple[str, str, Kind, str], SeenViolation] = {}
         """Every violation so far, by (topic, sender, kind, field)."""
-        self.time = timing.BusTime(0.0, 0, None)
-        """How the bus's time moves, as of the last look."""
+        self.time = BusTime(0.0, 0, None)
+        """Progress of the bus time as of the last check."""
         self.listening: frozenset[str] = frozenset(rules.topics)
-        """Topics that are listened to; the others are not judged by what does not come. See `listen`."""
+        """Subscribed topics; silence of the others is not a violation."""
         self._kept: dict[str, TopicHealth] = {}
         self._streams: dict[str, dict[bytes, Stream]] = {name: {} for name in rules.topics}
         self._checkers = {name: Checker(topic) for name, topic in rules.topics.items()}
         self._decoders = {name: codec.decoder(topic.type) for name, topic in rules.topics.items()}
         self._nodes: dict[bytes, str] = {}
         self._left: set[bytes] = set()
-        """Senders that were on the bus and are no more."""
+        """Senders that have left the bus."""
         self._publishers: dict[str, set[str]] = {}
         self._since: dict[tuple[str, str], float] = {}
         self._news: list[Violation] = []
 
     def listen(self, names: Iterable[str], now: float) -> None:
-        """Sets the topics that are listened to from now on. The last findings on the others are kept."""
+        """Set the subscribed topics. The last findings on the others are kept."""
         chosen = frozenset(names)
         for name in self.listening - chosen:
             if self._streams[name]:
@@ -54,14 +53,14 @@ class Monitor:
                 self._since[name, node] = now
         self.listening = chosen
 
-    def see(self, entities: Iterable[Entity], now: float) -> None:
-        """Takes the entities on the bus (`GraphWatch.alive.values()`): they give senders their names, types and hashes."""
+    def set_entities(self, entities: Iterable[Entity], now: float) -> None:
+        """Set the entities on the bus (`GraphWatch.alive.values()`), which give the names, types and hashes of senders."""
         present = list(entities)
         before = self._nodes.keys()
         self._nodes = {entity.gid: entity.node for entity in present}
         self._left = (self._left | before) - self._nodes.keys()
         for streams in self._streams.values():
-            if not streams.keys().isdisjoint(self._nodes):  # another run's: what an earlier one sent is past
+            if not streams.keys().isdisjoint(self._nodes):  # another run's; messages of an earlier one are past
                 for gid in self._left & streams.keys():
                     del streams[gid]
         self._publishers = {}
@@ -78,13 +77,13 @@ class Monitor:
                 self._note(topic, entity.node, Kind.TYPE, _type(topic.type, topic.type_hash),
                            f"{_type(described.type, described.type_hash)}{'' if publishes else ' wanted'}", now)  # fmt: skip
 
-    def hear(self, name: str, sent: int, sequence: int, gid: bytes, payload: bytes, now: float) -> None:
-        """Takes a message of a topic: source time [ns, wall], sequence number, GID and CDR. `now` [s] is any steady clock."""
+    def receive(self, name: str, sent: int, sequence: int, gid: bytes, payload: bytes, now: float) -> None:
+        """Take a message of a topic: source time [ns, wall], sequence number, GID and CDR. `now` [s] is a steady clock."""
         topic = self.rules.topics[name]
         stream = self._streams[name].get(gid)
         if stream is None:
             stream = self._streams[name][gid] = Stream(self._sender(gid), now, sequence=sequence - 1)
-        if stream.sender.startswith("unknown") and gid in self._nodes:
+        if gid in self._nodes:
             stream.sender = self._nodes[gid]
         stream.count += 1
         stream.size += len(payload)
@@ -104,36 +103,36 @@ class Monitor:
             stream.stamp = stamp
 
     def garbage(self, name: str, why: str, now: float) -> None:
-        """Takes note of bytes on a topic that are no message."""
+        """Note bytes on a topic that are not a message."""
         self._note(self.rules.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
 
     def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes | None, now: float) -> None:
-        """Takes note of a message that came on a topic's key with another type or hash."""
+        """Note a message on a topic's key with another type or hash."""
         topic = self.rules.topics[name]
         sender = "unknown" if gid is None else self._sender(gid)
         self._note(topic, sender, Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
 
-    def look(self, now: float, wall: int) -> list[Violation]:
-        """Judges rates and ages; returns what is new since the last look. `wall` is the wall time [ns]. Call it often."""
+    def check(self, now: float, wall: int) -> list[Violation]:
+        """Check rates and ages; return the violations that are new. `wall` is the wall time [ns]. Call it often."""
         for streams in self._streams.values():
             for stream in streams.values():
                 stream.mark(now)
                 stream.ages.append((wall - stream.sent) / MS)
         rows = self.rules.topics
         periodic = [(rows[name], streams) for name, streams in self._streams.items() if rows[name].periodic]
-        there = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
-        self.time = timing.bus_time(there, self.rate)
+        present = (stream for _, streams in periodic for gid, stream in streams.items() if gid not in self._left)
+        self.time = bus_time(present, self.rate)
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for problem in timing.problems(topic, stream, self.time, self.rate, now):
+                    for problem in timing_problems(topic, stream, self.time, self.rate, now):
                         self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
-        self._judge_unheard(now)
+        self._check_silent(now)
         news, self._news = self._news, []
         return news
 
     def health(self) -> list[TopicHealth]:
-        """Every topic of the contract, in its order."""
+        """Return the health of every topic, in the contract's order."""
         return [self._health(topic) for topic in self.rules.topics.values()]
 
     def _health(self, topic: Topic) -> TopicHealth:
@@ -141,7 +140,7 @@ class Monitor:
         passed = [stream.passed() for stream in streams]
         seconds = max((p.seconds for p in passed), default=0.0)
         kept = self._kept.get(topic.name)
-        if kept is not None and seconds < timing.GRACE_S:
+        if kept is not None and seconds < GRACE_S:
             return self._kept_health(kept)
         messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
         own = [p.messages * 1e9 / p.stamps for p in passed if p.stamps]
@@ -149,7 +148,7 @@ class Monitor:
         alive: bool | None = None
         if topic.latched and senders:
             alive = bool(streams)
-        elif topic.periodic and senders and self.time.progress and seconds >= timing.GRACE_S:
+        elif topic.periodic and senders and self.time.progress and seconds >= GRACE_S:
             alive = messages > 0
         rate = messages / seconds if seconds else 0.0
         return TopicHealth(
@@ -161,14 +160,14 @@ class Monitor:
         )  # fmt: skip
 
     def _kept_health(self, kept: TopicHealth) -> TopicHealth:
-        """A topic as it was when it was last listened to, with its present senders and violations."""
-        there = tuple(sorted(self._publishers.get(kept.topic.name, set())))
-        return replace(kept, senders=there, violations=self._violations(kept.topic))
+        """Return a topic as of its last subscription, with its present senders and violations."""
+        senders = tuple(sorted(self._publishers.get(kept.topic.name, set())))
+        return replace(kept, senders=senders, violations=self._violations(kept.topic))
 
     def _violations(self, topic: Topic) -> int:
         return sum(seen.count for key, seen in self.active.items() if key[0] == topic.name)
 
-    # -- judgements
+    # -- checks
 
     def _sender(self, gid: bytes) -> str:
         return self._nodes.get(gid, f"unknown sender {gid.hex()[:8]}")
@@ -194,27 +193,27 @@ class Monitor:
         if missing > 0:
             stream.missing += missing
             self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}",
-                       f"{sequence}: {missing} missing, or lost on the way to this monitor", now)  # fmt: skip
+                       f"{sequence}: {missing} missing, or lost in transit to this monitor", now)  # fmt: skip
         elif missing < 0:
             self._note(topic, stream.sender, Kind.GAP, f"sequence {stream.sequence + 1}", f"{sequence} again", now)
         stream.sequence = max(stream.sequence, sequence)
 
     def _check_stamp(self, topic: Topic, stream: Stream, sequence: int, stamp: int, now: float) -> None:
         if stream.stamp is not None and stamp < stream.stamp:
-            self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: it goes backwards", now)
+            self._note(topic, stream.sender, Kind.STAMP, f"at least {stream.stamp} ns", f"{stamp} ns: backwards", now)
         elif topic.periodic and self.rate is None and stamp != (sequence - 1) * topic.period:
             expected = f"{(sequence - 1) * topic.period} ns, by its sequence number {sequence}"
             self._note(topic, stream.sender, Kind.STAMP, expected, f"{stamp} ns", now)
 
-    def _judge_unheard(self, now: float) -> None:
-        """Notes topics whose producer is on the bus but sent nothing."""
+    def _check_silent(self, now: float) -> None:
+        """Note topics whose producer is on the bus but has sent nothing."""
         for name, nodes in self._publishers.items():
             topic = self.rules.topics[name]
             if name not in self.listening:
                 continue
-            heard = {stream.sender for stream in self._streams[name].values()}
-            due = (topic.periodic and timing.is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
-            for node in nodes - heard:
+            active = {stream.sender for stream in self._streams[name].values()}
+            due = (topic.periodic and is_due(topic, self.time)) or (topic.latched and self.time.passed > 0)
+            for node in nodes - active:
                 waited = now - self._since[name, node]
                 if waited > WINDOW_S and due:
                     expected = "its latched message" if topic.latched else f"{1000 / topic.period_ms:g} Hz"

@@ -1,4 +1,4 @@
-"""Composed lockstep: all services in one process and no transport: one group that waits for nobody (see `group`)."""
+"""Composed lockstep: all services in one process, as one group without transport (see `group`)."""
 
 from __future__ import annotations
 
@@ -7,28 +7,26 @@ from contextlib import nullcontext, suppress
 from typing import Any
 
 from palpate_bus.contract import Contract, Topic, contract
-from palpate_bus.runtime.failure import described
+from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import Sent, Stepper, run_hash
 from palpate_bus.service import Service
+from palpate_errors import RunError
 
 Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
-
-
 CONDUCTOR = "conductor"
-"""The one observer without which there is no result."""
+"""The only observer that a run needs: without it there is no result."""
 
 
-class ServiceFailed(RuntimeError):
+class ServiceFailed(RunError):
     """A service raised. Names the role and the tick; the cause is chained."""
 
     def __init__(self, stepper: Stepper, t: int, cause: Exception) -> None:
         self.role = stepper.role.name
         self.t = t
-        self.why = described(cause, stepper.buffers.values())
-        """The cause, with the inputs that are not as they should be."""
-        super().__init__(f"{self.role} failed at {t / 1e9:.3f} s: {self.why}")
+        self.failure = Failure.of(cause, self.role, stepper.buffers.values())
+        super().__init__(f"{self.role} failed at {t / 1e9:.3f} s: {self.failure}")
 
 
 class Composed:
@@ -37,7 +35,7 @@ class Composed:
     run = Composed([RobotService(...), ...])
     run.run(lambda: end_tick, limit)
 
-    A service that raises ends the run; an observer or a tap that does is left out from then on (`lost`, `trouble`).
+    A service that raises ends the run. An observer or a tap that raises is left out from then on, see `lost` and `trouble`.
     """
 
     def __init__(self, services: Sequence[Service], rules: Contract | None = None, taps: Sequence[Tap] = ()) -> None:
@@ -47,9 +45,9 @@ class Composed:
         self._started = False
         self.t = 0
         self.lost: dict[str, int] = {}
-        """Observers that have failed, and at what tick [ns]."""
+        """Tick [ns] at which each failed observer raised."""
         self.trouble: list[str] = []
-        """A sentence for each."""
+        """Messages for the user about them."""
 
     def _send(self, sent: Sequence[Sent], t: int) -> None:
         self._group.deliver(sent)
@@ -62,7 +60,7 @@ class Composed:
                 self._leave_out("recorder", t, f"{type(error).__name__}: {error}")
 
     def start(self) -> None:
-        """Sends the latched messages."""
+        """Send the latched messages."""
         for stepper in self.steppers.values():
             try:
                 self._send(stepper.start(), 0)
@@ -71,7 +69,7 @@ class Composed:
         self._started = True
 
     def tick(self) -> None:
-        """Steps every service whose tick this is, then advances simulated time to the next."""
+        """Step the services that are due, then advance simulated time to the next tick."""
         t = self.t
         for stepper in self._group.due(t):
             try:
@@ -79,7 +77,7 @@ class Composed:
             except Exception as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
                     raise ServiceFailed(stepper, t, error) from error
-                self._leave_out(stepper.role.name, t, described(error, stepper.buffers.values()))
+                self._leave_out(stepper.role.name, t, Failure.of(error, stepper.role.name, stepper.buffers.values()).text)
                 self._group.leave_out(frozenset(self.lost))
                 continue
             if sent:
@@ -91,7 +89,7 @@ class Composed:
         self.trouble.append(f"{role} lost at {t / 1e9:.3f} s: {why}")
 
     def run(self, end: Callable[[], int | None], limit: int) -> int:
-        """Runs up to and including the tick [ns] that `end()` gives once it knows, at most to `limit`; returns the last tick."""
+        """Run up to and including the tick [ns] that `end()` returns once known, at most to `limit`; return the last tick."""
         if not self._started:
             self.start()
         last = limit
@@ -103,7 +101,7 @@ class Composed:
         return self.t - self._group.period
 
     def finish(self) -> dict[str, Mapping[str, Any]]:
-        """Finishes every service; returns what each reports. One that has failed need not."""
+        """Finish every service; return the facts of each. Errors of those that failed before are suppressed."""
         facts = {}
         for role, stepper in self.steppers.items():
             with suppress(Exception) if role in self.lost else nullcontext():
@@ -111,9 +109,9 @@ class Composed:
         return facts
 
     def run_hash(self) -> str:
-        """The run hash."""
+        """Return the run hash."""
         return run_hash(self.digests())
 
     def digests(self) -> dict[str, str]:
-        """Digest of each hashed topic."""
+        """Return the digest of each hashed topic."""
         return self._group.digests()

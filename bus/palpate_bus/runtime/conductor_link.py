@@ -1,7 +1,8 @@
-"""The conversation with the conductor: control messages and its heartbeat in, reports out.
+"""Communication of a service with the conductor: control messages and heartbeats in, reports out.
 
-A conductor that is gone, or whose heart has not been heard for the deadline of the contract, is lost. By the wall clock the
-services then go on for a grace, in which planning lifts the arm; in lockstep no time passes without grants: they leave at once.
+The conductor counts as lost when its token is gone or its heartbeat is late by the contract's deadline. In wall-clock mode the
+services then continue for a grace period in which planning lifts the arm; in lockstep they leave at once, since no time passes
+without grants.
 """
 
 from __future__ import annotations
@@ -15,8 +16,9 @@ from palpate_bus.contract import Contract
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.process_state import home, runs
+from palpate_bus.runtime.process import is_running, pid_space
 from palpate_bus.settings import Settings
+from palpate_errors import RunError
 
 log = logging.getLogger(__name__)
 
@@ -24,43 +26,43 @@ CONDUCTOR: Final = "conductor"
 HEARTBEAT: Final = "palpate/heartbeat"
 CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
 POLL_S = 0.05
-"""How often a waiting node looks for messages of the conductor."""
+"""Period at which a waiting node polls for control messages."""
 PROGRESS_S = 0.2
-"""How often a node reports its progress, by wall clock."""
+"""Period of progress reports, wall clock."""
 CONDUCTOR_SILENT_S = 10.0
-"""A conductor is lost after this time without a message while it has not started the run, or when it has no heartbeat."""
+"""Time without a message after which the conductor is lost before the run starts, or if it has no heartbeat."""
 CONDUCTOR_AWAITED_S = 120.0
 """The same before its first message: containers on a busy machine start tens of seconds apart."""
 LOCKSTEP_SILENT_S = 3.0
 """The same in lockstep, where nothing moves while nobody grants time."""
-LONGEST_LOOK_S = 0.1
-"""A node that has not looked for longer counts this much silence: it was itself kept from a core, and perhaps all were."""
+LONGEST_POLL_S = 0.1
+"""Longest silence counted between two polls: a node that polls later was itself without a core, and perhaps others were."""
 GONE_S = 0.01
-"""How often it is looked whether the conductor's token is still there, and for how long it must be missing: what the conductor
-said last is under way meanwhile."""
+"""Period at which the conductor's token is checked, and time for which it must be missing: its last message may be in transit."""
 BUSY_S = 2.0
-"""A silent conductor whose process runs all the same has no core: it is lost only after this time."""
+"""Limit for a silent conductor whose process runs, so that it is starved of CPU."""
 LOCKSTEP_BUSY_S = 30.0
-"""The same in lockstep, where waiting costs nothing: an overloaded machine keeps a conductor from its core for seconds."""
+"""The same in lockstep, where waiting is safe: an overloaded machine starves a conductor for seconds."""
 
-
-TRANSPORT_LOST: Final = "the bus is gone: its router does not answer any more"
+CONDUCTOR_LOST_LOG: Final = "conductor_lost: %s"
+"""Log format of every service; `palpate faults` finds it in the logs of runs that lost their conductor."""
+TRANSPORT_LOST: Final = "the router of the bus does not answer"
 
 
 def longest_silence_s(rules: Contract, wallclock: bool) -> float:
-    """How long [s] a conductor whose heart has begun to beat may be silent before its services take it for lost."""
+    """Return the silence [s] after which a conductor that has sent a heartbeat counts as lost."""
     return rules.internal[HEARTBEAT].deadline / NS if wallclock else LOCKSTEP_SILENT_S
 
 
-class RunAborted(RuntimeError):
+class RunAborted(RunError):
     """The conductor ended the run, or is lost."""
 
 
 class ConductorLink:
-    """The way in: control messages and heartbeats, heard once a process."""
+    """Receives control messages and heartbeats, once per process."""
 
     def __init__(self, member: Member, grace_s: float = 0.0) -> None:
-        """`grace_s` [s], in the time of the run, is how long the node goes on without a conductor that is lost."""
+        """`grace_s` is the simulated time [s] for which the node continues without the conductor."""
         self._member = member
         self._control = member.internal_subscription("palpate/control", CONTROL_TYPE)
         self._beats = member.internal_subscription(HEARTBEAT, CONTROL_TYPE)
@@ -71,71 +73,74 @@ class ConductorLink:
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
         self._patience_s = CONDUCTOR_AWAITED_S
         self._granted = self._beating = False
-        self._said = self._beaten = 0
-        """Numbers of the newest control message and heartbeat: one that comes again is no word of the conductor."""
+        self._control_sequence = self._beat_sequence = 0
+        """Last sequence numbers of control and heartbeat; duplicates are ignored."""
         self._silent_s = 0.0
-        self._looked = self._sought = self._lost_at = monotonic()
+        self._polled = self._checked = self._lost_at = monotonic()
         self._missed = False
-        """Whether the conductor's token was missing when it was looked for last."""
+        """True if the conductor's token was missing at the last check."""
         self._pid = 0
-        """The conductor's process, if it is one of this machine that we can look at; else 0."""
+        """The conductor's process id if we can inspect that process; else 0."""
         self.lost = ""
-        """Why the conductor counts as lost; empty while it lives."""
-        self.told = ""
-        """With which reason a message of the conductor ended the run; empty when none did."""
+        """Why the conductor is lost; empty while it is not."""
+        self.ended_by = ""
+        """Reason in the control message that ended the run; empty if none did."""
 
     def poll(self, timeout: float | None = None) -> Any | None:
-        """The next control message, or None. Raises RunAborted when told so, or when the conductor was lost for the grace."""
+        """Return the next control message, or None.
+
+        Raises RunAborted on an ABORT message, or if the conductor has been lost for the grace period.
+        """
         while (sample := self._control.get(timeout)) is not None:
-            if sample.sequence <= self._said:
+            if sample.sequence <= self._control_sequence:
                 self._control.garbage += 1
                 continue
-            self._said = sample.sequence
+            self._control_sequence = sample.sequence
             try:
                 message = self._decode(sample.payload)
             except codec.CodecError:
                 self._control.garbage += 1
                 continue
             self._granted = self._granted or message.command == RunControl.GRANT
-            self._heard()
+            self._on_message()
             if message.command == RunControl.ABORT:
-                self.told = message.reason or "no reason given"
+                self.ended_by = message.reason or "no reason given"
                 raise RunAborted(message.reason)
             return message
-        self._listen()
+        self._poll_heartbeat()
         if self.lost and monotonic() - self._lost_at >= self._grace_s:
             raise RunAborted(self.lost)
         return None
 
-    def _heard(self) -> None:
+    def _on_message(self) -> None:
         self._silent_s = 0.0
         self._patience_s = self._deadline_s if self._granted and self._beating else CONDUCTOR_SILENT_S
         if self.lost:
             log.warning("the conductor is back")
             self.lost = ""
 
-    def _listen(self) -> None:
-        """Takes the heartbeats that have come, and counts the silence."""
+    def _poll_heartbeat(self) -> None:
+        """Process received heartbeats and count the silence."""
         now = monotonic()
-        since, self._looked = min(now - self._looked, LONGEST_LOOK_S), now
+        since, self._polled = min(now - self._polled, LONGEST_POLL_S), now
         beat = None
         while (sample := self._beats.get(0)) is not None:
-            if sample.sequence > self._beaten:
-                self._beaten, beat = sample.sequence, sample
+            if sample.sequence > self._beat_sequence:
+                self._beat_sequence, beat = sample.sequence, sample
         if beat is not None:
-            self._take(beat.payload)
+            self._on_heartbeat(beat.payload)
             return
         self._silent_s += since
-        if self.lost or now - self._sought < GONE_S:
+        if self.lost or now - self._checked < GONE_S:
             return
-        self._sought = now
+        self._checked = now
         before, self._missed = self._missed, CONDUCTOR in self._member.gone()
         if before and self._missed:
-            self._lose(TRANSPORT_LOST if self._member.transport_lost() else "the conductor is gone")
-        elif self._silent_s > self._patience_s and (self._silent_s > self._busy_s or not (self._pid and runs(self._pid))):
-            self._lose(f"nothing heard of the conductor for {self._silent_s:.2f} s")
+            self._lose(TRANSPORT_LOST if self._member.transport_lost() else "the conductor's token is gone")
+        elif self._silent_s > self._patience_s and (self._silent_s > self._busy_s or not (self._pid and is_running(self._pid))):
+            self._lose(f"no heartbeat for {self._silent_s:.2f} s")
 
-    def _take(self, beat: bytes) -> None:
+    def _on_heartbeat(self, beat: bytes) -> None:
         try:
             message = self._decode(beat)
         except codec.CodecError:
@@ -143,21 +148,21 @@ class ConductorLink:
             return
         if not self._beating:
             self._beating = True
-            self._pid = int(message.tick) if message.reason == home() else 0
-        self._heard()
+            self._pid = int(message.tick) if message.reason == pid_space() else 0
+        self._on_message()
 
     def _lose(self, why: str) -> None:
         self.lost, self._lost_at = why, monotonic()
-        log.warning("%s", why)
+        log.warning(CONDUCTOR_LOST_LOG, why)
 
     @property
     def garbage(self) -> int:
-        """Control messages that cannot be decoded, or came again."""
+        """Control messages and heartbeats that cannot be decoded or are duplicates."""
         return self._control.garbage + self._beats.garbage
 
 
 class Reports:
-    """The way out: the reports of one role."""
+    """Sends the reports of one role."""
 
     def __init__(self, member: Member) -> None:
         self._member = member
@@ -166,26 +171,26 @@ class Reports:
         self._sequence = 0
         self._last = 0.0
 
-    def say(self, state: int, tick: int, waiting_for: str = "", detail: object = None) -> None:
-        """Sends a report now."""
+    def send(self, state: int, tick: int, waiting_for: str = "", detail: object = None) -> None:
+        """Send a report now."""
         self._sequence += 1
         self._last = monotonic()
         text = "" if detail is None else json.dumps(detail)
         message = ServiceReport(state, self._member.role, tick, waiting_for, text)
         self._publisher.put(self._encode(message), self._sequence)
 
-    def miss_conductor(self, tick: int, why: str) -> None:
-        """Says that the conductor is lost, for one that comes back."""
-        self.say(ServiceReport.PROGRESS, tick, CONDUCTOR, {"lost": why})
+    def conductor_lost(self, tick: int, why: str) -> None:
+        """Report that the conductor is lost, for the case that it returns."""
+        self.send(ServiceReport.PROGRESS, tick, CONDUCTOR, {"conductor_lost": why})
 
-    def obey(self, tick: int, why: str) -> None:
-        """Says that the service leaves, because a message in the conductor's name told it to."""
-        self.say(ServiceReport.PROGRESS, tick, "", {"told": why})
+    def aborted(self, tick: int, why: str) -> None:
+        """Report that the service leaves on an ABORT message, so that the conductor detects a forged one."""
+        self.send(ServiceReport.PROGRESS, tick, "", {"ended_by": why})
 
     def progress(self, tick: int, waiting_for: str = "") -> None:
-        """Reports progress if the last report is old enough, with what is suspicious about who sends to the service."""
+        """Report progress if the last report is old enough, with new suspicions about senders."""
         if monotonic() - self._last > PROGRESS_S:
             suspicions = self._member.suspicions()
             for complaint in (*self._member.complaints(), *suspicions):
                 log.error("%s", complaint)
-            self.say(ServiceReport.PROGRESS, tick, waiting_for, {"suspicions": suspicions} if suspicions else None)
+            self.send(ServiceReport.PROGRESS, tick, waiting_for, {"suspicions": suspicions} if suspicions else None)

@@ -1,26 +1,30 @@
-"""Distributed lockstep: processes over zenoh, conservative synchronisation with no master in the data path.
+"""Distributed lockstep: processes over zenoh, conservative synchronisation without a master in the data path.
 
-A node hosts one service, or a group of them that hear each other without the bus. It waits until each blocking input from another
-process has advanced far enough, steps the service, and sends. The conductor only says how far simulated time may go (grants),
-which roles were lost, and when to stop. A node never hangs: it leaves when the conductor falls silent.
+A node hosts one service, or a group whose members exchange messages without the bus. It waits until each blocking input from
+another process has advanced far enough, steps the service, and sends. A periodic topic shows by its messages that the producer
+has advanced; the event topics of a producer are advanced by the Advance message that closes each of its ticks. The conductor only
+grants simulated time, announces lost roles, and stops the run. A node never hangs: it leaves when the conductor is lost.
 """
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping, Sequence
-from time import perf_counter_ns
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from time import monotonic, perf_counter_ns
 from typing import Any
 
-from palpate_bus.messages import RunControl, ServiceReport
+import numpy as np
+
+from palpate_bus.contract import Contract, Edge
+from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import POLL_S
 from palpate_bus.runtime.group import Group
-from palpate_bus.runtime.lockstep import NEVER, Sent
+from palpate_bus.runtime.lockstep import NEVER, ForgedSenderError, InputBuffer, LockstepError, Packet, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
-from palpate_bus.runtime.process_state import whereabouts
-from palpate_bus.runtime.remote import Advances, RemoteInputs, awaited_elsewhere
+from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
+from palpate_bus.wire.transport import ReceivedSample, Sender, Subscription
 
 log = logging.getLogger(__name__)
 
@@ -29,7 +33,7 @@ class LockstepNode(Node):
     """A group of services in distributed lockstep."""
 
     def __init__(self, services: Sequence[Service], members: Mapping[str, Member]) -> None:
-        """`members` gives the membership of each role."""
+        """`members` gives the bus member of each role."""
         rules = next(iter(members.values())).rules
         self._group = Group(services, rules)
         roles = self._group.steppers.keys()
@@ -44,7 +48,7 @@ class LockstepNode(Node):
         self._last = False
 
     def _join(self) -> None:
-        """Answers the conductor's hellos until it grants the first tick."""
+        """Answer the conductor's hellos until it grants the first tick."""
         while self._horizon < 0:
             message = self._link.poll(POLL_S)
             if message is not None and message.command == RunControl.HELLO:
@@ -53,11 +57,11 @@ class LockstepNode(Node):
                     if seat in self._advances:
                         self._advances[seat].hello()
                     detail = {
-                        "missing": self._inputs[seat].unheard(),
+                        "missing": self._inputs[seat].missing_inputs(),
                         "process": [one.role for one in self._seats],
-                        **whereabouts(),
+                        **process_identity(),
                     }
-                    seat.reports.say(ServiceReport.READY, NEVER, detail=detail)
+                    seat.reports.send(ServiceReport.READY, NEVER, detail=detail)
             elif message is not None:
                 self._obey(message)
 
@@ -100,14 +104,14 @@ class LockstepNode(Node):
         seat.output.send(sent)
 
     def _attend(self, waiting_for: str = "") -> None:
-        """Reports what the whole process waits for, and does what the conductor says."""
+        """Report the topic that the process waits for, and process control messages."""
         for seat in self._seats:
             seat.progress(waiting_for)
         while (message := self._link.poll()) is not None:
             self._obey(message)
 
     def _await_horizon(self, t: int) -> bool:
-        """Waits until tick `t` is granted; False when the run ends before it."""
+        """Wait until tick `t` is granted; return False if the run ends before it."""
         while t > self._horizon:
             if self._last:
                 return False
@@ -123,3 +127,150 @@ class LockstepNode(Node):
         if seat is self._seats[0]:
             counts["garbage"] += self._link.garbage
         return {"digests": seat.stepper.digests(), **counts}
+
+
+ADVANCE_TYPE = "palpation_msgs/msg/Advance"
+ANOTHER_S = 0.05
+"""After a wrong sequence number: time to wait for a message that shows that two senders have one identity."""
+_decode = codec.decoder(ADVANCE_TYPE)
+_encode = codec.encoder(ADVANCE_TYPE)
+
+
+class RemoteInputs:
+    """The inputs of one service from other processes."""
+
+    def __init__(self, stepper: Stepper, member: Member, local: Collection[str]) -> None:
+        """`local` are the roles in this process, whose messages are delivered without the bus."""
+        self._stepper = stepper
+        self._now = member.transport.now
+        self._rules = member.rules
+        self._data: dict[str, Subscription] = {}
+        for name, buffer in stepper.buffers.items():
+            if buffer.topic.producer in local and not buffer.topic.open:
+                member.observed(buffer.topic)
+            else:
+                self._data[name] = member.subscription(buffer.topic)
+        remote = [stepper.buffers[name] for name in self._data]
+        self._awaited = tuple(buffer for buffer in remote if buffer.edge is not Edge.OBSERVE)
+        self._observed = tuple(buffer for buffer in remote if buffer.edge is Edge.OBSERVE)
+        producers = sorted({b.topic.producer for b in self._awaited if b.edge.blocking and not b.topic.periodic})
+        self._advances = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
+        self._last: dict[str, tuple[int, int]] = {}
+        """By topic, sequence number and sending time of the newest message."""
+        self._event_topics = {role: event_topics(self._rules, role) for role in producers}
+        self._closed = dict.fromkeys(producers, 0)
+        """By role, the sequence number of the newest Advance."""
+
+    def missing_inputs(self) -> list[str]:
+        """Return the keys, without their hash, of the awaited inputs on which no hello was received."""
+        inputs = [self._data[buffer.topic.name] for buffer in self._awaited] + list(self._advances.values())
+        for subscription in inputs:
+            while not subscription.hello_received and subscription.get(0) is not None:
+                pass
+        return [one.key.split("/RIHS01")[0] for one in inputs if not one.hello_received]
+
+    def lose(self, role: str) -> None:
+        """Stop waiting for messages of `role`."""
+        self._stepper.inbox.lost_roles.add(role)
+        for buffer in self._awaited:
+            if buffer.topic.producer == role:
+                buffer.lost = True
+
+    def await_tick(self, t: int, idle: Callable[[str], None]) -> None:
+        """Wait until the service may step at `t` [ns]; `idle` is called with the awaited topic at every timeout."""
+        for buffer in self._awaited:
+            if not buffer.ready(t):
+                self._await(buffer, t, idle)
+        for buffer in self._observed:
+            data = self._data[buffer.topic.name]
+            while (sample := data.get(0)) is not None:
+                buffer.deliver(Packet(sample.payload, t, sample.sequence))
+
+    def _await(self, buffer: InputBuffer, t: int, idle: Callable[[str], None]) -> None:
+        begin = perf_counter_ns()
+        data = self._data[buffer.topic.name]
+        advance = self._advances.get(buffer.topic.producer) if buffer.topic.event else None
+        waited = False
+        sample: ReceivedSample | None = None
+        while not buffer.ready(t):
+            source = data if advance is None or buffer.waits_for_data else advance
+            sample = source.get(0)
+            if sample is None:
+                waited = True
+                sample = source.get(POLL_S)
+            if sample is None:
+                idle(buffer.topic.name)
+            elif source is data:
+                self._accept(buffer, sample)
+            else:
+                self._settle(buffer.topic.producer, sample)
+        if waited and sample is not None:
+            duration = perf_counter_ns() - begin
+            self._stepper.blame.waited(buffer.topic.producer, duration, self._now() - sample.sent)
+
+    def _accept(self, buffer: InputBuffer, sample: ReceivedSample) -> None:
+        """Give the buffer a message. If its number is wrong, check if two senders share an identity."""
+        try:
+            buffer.accept(sample.sequence, sample.payload)
+        except LockstepError as error:
+            last = self._last.get(buffer.topic.name)
+            end = monotonic() + ANOTHER_S
+            doubled = last is not None and sample.sequence <= last[0] and sample.sent != last[1]
+            while not doubled and (later := self._data[buffer.topic.name].get(max(end - monotonic(), 0.0))) is not None:
+                doubled = later.sequence <= sample.sequence and later.sent != sample.sent
+            if doubled:
+                raise ForgedSenderError(
+                    f"{error}; two senders share an identity: a forged or doubled sender of "
+                    f"{buffer.topic.name}, not a loss of {buffer.topic.producer}",
+                    buffer.topic.name,
+                ) from None
+            raise
+        self._last[buffer.topic.name] = (sample.sequence, sample.sent)
+
+    def _settle(self, producer: str, sample: ReceivedSample) -> None:
+        last = self._closed[producer]
+        if sample.sequence != last + 1:
+            raise LockstepError(f"palpate/advance/{producer}: message {sample.sequence} came after {last}")
+        self._closed[producer] = sample.sequence
+        advance = _decode(sample.payload)
+        for name, sequence in zip(self._event_topics[producer], advance.sequences, strict=True):
+            buffer = self._stepper.buffers.get(name)
+            if buffer is not None:
+                buffer.advance(advance.tick, int(sequence))
+
+    def counts(self) -> dict[str, int]:
+        """Return the numbers of dropped messages: `garbage`, `foreign` ones of another sender, `forged` ones with a wrong tag."""
+        subscriptions = (*self._data.values(), *self._advances.values())
+        return {kind: sum(getattr(s, kind) for s in subscriptions) for kind in ("garbage", "foreign", "forged")}
+
+
+class Advances:
+    """Sends the Advance messages of one service."""
+
+    def __init__(self, stepper: Stepper, member: Member) -> None:
+        self._ports = [stepper.ports[name] for name in event_topics(member.rules, member.role)]
+        self._publisher: Sender = member.internal_publisher(f"palpate/advance/{member.role}", ADVANCE_TYPE, "control")
+        self._sequence = 0
+
+    def hello(self) -> None:
+        """Send the empty message that tests the edge."""
+        self._publisher.hello()
+
+    def close(self, t: int) -> None:
+        """Close the tick `t` [ns]."""
+        self._sequence += 1
+        message: Any = Advance(t, np.array([port.sequence for port in self._ports], np.uint32))
+        self._publisher.put(_encode(message), self._sequence)
+
+
+def event_topics(rules: Contract, role: str) -> tuple[str, ...]:
+    """Return the event topics of a role in contract order, the order of Advance.sequences."""
+    return tuple(topic.name for topic in rules.outputs(role) if topic.event)
+
+
+def awaited_elsewhere(rules: Contract, role: str, local: Collection[str]) -> Iterator[str]:
+    """Yield the event topics of a role for which a role in another process waits."""
+    for name in event_topics(rules, role):
+        readers = rules.topics[name].readers
+        if any(edge.blocking and reader not in local for reader, edge in readers.items()):
+            yield name

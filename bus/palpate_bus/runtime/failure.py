@@ -1,27 +1,107 @@
-"""Why a service failed: its error, and which of its inputs break the contract, since then their producer is at fault."""
+"""Why a run or a service failed, as a code for programs and a text for people."""
 
 from __future__ import annotations
 
+import errno
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from dataclasses import dataclass, replace
+from enum import StrEnum
 from traceback import walk_tb
 from typing import Any
 
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.messages.codec import CodecError, Message
-from palpate_bus.runtime.lockstep import InputBuffer, Packet
+from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, LockstepError, Packet
 from palpate_plugins import USER_MODULE
 
 
-def described(error: BaseException, buffers: Iterable[InputBuffer]) -> str:
-    """An error as text, followed by each input that breaks its row of the contract and the role that sends it.
+class FailureCode(StrEnum):
+    """Why a run ended early."""
 
-    Where a user's own file took part, its last line that did stands before the error.
-    """
-    words = [f"{_own_line(error)}{type(error).__name__}: {error}"]
-    with suppress(Exception):  # whatever is wrong with an input must not hide the error
-        words += invalid_inputs(buffers)
-    return "; ".join(words)
+    INTERRUPTED = "interrupted"
+    """By Ctrl-C or SIGTERM."""
+    STOPPED = "stopped"
+    """By the program that conducts the run."""
+    START_FAILED = "start_failed"
+    """A service raised or its process exited before the first tick."""
+    NO_ANSWER = "no_answer"
+    """A service did not answer before the first tick, or has an input without a sender."""
+    ROLE_LOST = "role_lost"
+    """A process exited or its connection closed."""
+    ROLE_FAILED = "role_failed"
+    """A service raised."""
+    FROZEN = "frozen"
+    """A process is stopped, or uses no processor time."""
+    BLOCKED = "blocked"
+    """No service finished a tick for too long."""
+    EXAM_SILENT = "exam_silent"
+    """Planning publishes no state in wall-clock mode."""
+    CONDUCTOR_LOST = "conductor_lost"
+    TRANSPORT_LOST = "transport_lost"
+    FORGED = "forged"
+    """A second sender uses the identity of a service or of the conductor."""
+    CONTRACT_BROKEN = "contract_broken"
+    DISK_FULL = "disk_full"
+    GAVE_UP = "gave_up"
+    """Planning aborted the examination."""
+    UNFINISHED = "unfinished"
+    """Recovered from a recording without an end."""
+    INTERNAL = "internal"
+    """An unexpected error in the conductor."""
+
+
+@dataclass(frozen=True)
+class Failure:
+    """Why a run failed. Programs use `code`, `roles` and `topics`; `text` is for people."""
+
+    code: FailureCode
+    text: str
+    roles: tuple[str, ...] = ()
+    """Roles that failed or are missing."""
+    topics: tuple[str, ...] = ()
+    """Topics whose messages break the contract."""
+
+    def __str__(self) -> str:
+        return self.text
+
+    def with_note(self, note: str) -> Failure:
+        """Return the same failure with `note` appended to its text."""
+        return replace(self, text=f"{self.text}; {note}")
+
+    @classmethod
+    def of(cls, error: BaseException, role: str, buffers: Iterable[InputBuffer]) -> Failure:
+        """Return the failure of the service `role` that raised `error`.
+
+        The text has the error, preceded by the last line of a user-defined file in its traceback, and each input that breaks the
+        contract with the role that sends it.
+        """
+        found: dict[str, str] = {}
+        with suppress(Exception):  # an invalid input must not hide the error
+            found = invalid_inputs(buffers)
+        code = FailureCode.ROLE_FAILED
+        if isinstance(error, ForgedSenderError):
+            code = FailureCode.FORGED
+        elif isinstance(error, OSError) and error.errno == errno.ENOSPC:
+            code = FailureCode.DISK_FULL
+        text = "; ".join((f"{_own_line(error)}{type(error).__name__}: {error}", *found.values()))
+        topics = dict.fromkeys([error.topic] if isinstance(error, LockstepError) and error.topic else []) | found
+        return cls(code, text, (role,), tuple(topics))
+
+    def report(self) -> dict[str, Any]:
+        """Return the detail of a ServiceReport, see `from_report`."""
+        return {"error": self.text, "code": self.code.value, "roles": self.roles, "topics": self.topics}
+
+    @classmethod
+    def from_report(cls, role: str, detail: Mapping[str, Any]) -> Failure:
+        """Return the failure that the service `role` reported."""
+        code = detail.get("code")
+        return cls(
+            FailureCode(str(code)) if code in {*FailureCode} else FailureCode.ROLE_FAILED,
+            str(detail.get("error", "unknown error")),
+            tuple(map(str, detail.get("roles", (role,)))),
+            tuple(map(str, detail.get("topics", ()))),
+        )
 
 
 def _own_line(error: BaseException) -> str:
@@ -33,22 +113,21 @@ def _is_own(names: Mapping[str, Any]) -> bool:
     return str(names.get("__name__", "")).startswith(USER_MODULE)
 
 
-def invalid_inputs(buffers: Iterable[InputBuffer]) -> list[str]:
-    """A sentence for each topic whose newest messages cannot be decoded or have values that the contract does not allow."""
-    found = []
+def invalid_inputs(buffers: Iterable[InputBuffer]) -> dict[str, str]:
+    """Return a sentence for each topic whose newest messages cannot be decoded or have values outside the contract."""
+    found = {}
     for buffer in buffers:
         for received in buffer.new or ([buffer.latest] if buffer.latest is not None else []):
-            wrong = _wrong(buffer, received)
-            if wrong:
-                found.append(f"{buffer.topic.name} from {buffer.topic.producer} {wrong}")
+            if fault := _fault(buffer, received):
+                found[buffer.topic.name] = f"{buffer.topic.name} from {buffer.topic.producer} {fault}"
                 break
     return found
 
 
-def _wrong(buffer: InputBuffer, received: Packet) -> str:
+def _fault(buffer: InputBuffer, received: Packet) -> str:
     try:
         message: Message = received.message or buffer.decode(received.payload)
     except CodecError:
         return f"cannot be decoded ({len(received.payload)} bytes)"
     faults = Checker(buffer.topic)(message)
-    return f"has {faults[0].field} {faults[0].got}, the contract wants {faults[0].expected}" if faults else ""
+    return f"has {faults[0].field} {faults[0].got}; the contract requires {faults[0].expected}" if faults else ""

@@ -1,8 +1,8 @@
 """Conservative synchronisation of one service, without any transport (Chandy and Misra 1979; Bryant 1977).
 
 A `Stepper` holds a service's input buffers and output ports. A message of a periodic topic carries its simulated time in its
-sequence number, (sequence - 1) * period; those of an event topic get theirs from the Advance message that closes a tick.
-So the wire format stays plain ROS 2, and inputs are consumed in (stamp, topic, sequence) order whatever order they arrive in.
+sequence number, (sequence - 1) * period; those of an event topic get theirs from the Advance message that closes a tick. So the
+wire format stays plain ROS 2, and inputs are consumed in (stamp, topic, sequence) order in whatever order they are received.
 """
 
 from __future__ import annotations
@@ -11,27 +11,76 @@ import hashlib
 import struct
 from collections import deque
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from time import perf_counter_ns
 
 from palpate_bus.contract import Contract, Edge, Topic
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
-from palpate_bus.runtime.blame import Blame
 from palpate_bus.service import Outbox, Service
+from palpate_errors import RunError
+
+
+@dataclass(slots=True)
+class Blame:
+    """Wall time [ns] of one service by activity, and waiting time by role."""
+
+    compute: int = 0
+    """In `step`, without decoding."""
+    encode: int = 0
+    decode: int = 0
+    send: int = 0
+    transport: int = 0
+    """Transit time of the messages that ended a wait."""
+    wait: int = 0
+    """Waiting for other services to step, without transport."""
+    steps: int = 0
+    waited_for: dict[str, int] = field(default_factory=dict)
+    """Waiting time [ns] by the role whose message ended the wait."""
+
+    def waited(self, role: str, duration: int, transport: int) -> None:
+        """Count one wait [ns] that ended with a message of `role`, whose transit took `transport` [ns]."""
+        transport = min(max(transport, 0), duration)
+        self.transport += transport
+        self.wait += duration - transport
+        self.waited_for[role] = self.waited_for.get(role, 0) + duration - transport
+
+    def per_step_us(self) -> dict[str, object]:
+        """Return means in microseconds per step, for the report."""
+        steps = max(self.steps, 1)
+        figures: dict[str, object] = {
+            name: round(getattr(self, name) / steps / 1e3, 2)
+            for name in ("compute", "decode", "encode", "send", "transport", "wait")
+        }
+        figures["steps"] = self.steps
+        figures["waited_for"] = {
+            role: round(duration / steps / 1e3, 2)
+            for role, duration in sorted(self.waited_for.items(), key=lambda item: -item[1])
+        }
+        return figures
+
 
 _CHAIN = struct.Struct("<qqq")
 _CHAIN_NS = 64_000_000
-"""Simulated time [ns] over which what was sent is gathered for the digests."""
+"""Simulated time [ns] over which messages are gathered before they are hashed."""
 NEVER = -1
-"""The tick of something that has not happened."""
+"""Tick before the first."""
 
 
-class LockstepError(RuntimeError):
-    """The dataflow broke: a gap in a sequence, or a service that does not keep to its contract."""
+class LockstepError(RunError):
+    """A sequence has a gap, or a service breaks its contract."""
+
+    def __init__(self, text: str, topic: str = "") -> None:
+        super().__init__(text)
+        self.topic = topic
+
+
+class ForgedSenderError(LockstepError):
+    """Two senders use one identity."""
 
 
 class Packet:
-    """A message as bytes with its stamp [ns] and sequence number, decoded when first looked at unless the message is known."""
+    """A message as bytes with its stamp [ns] and sequence number; decoded at first access unless the message is known."""
 
     __slots__ = ("message", "payload", "sequence", "stamp")
 
@@ -43,10 +92,10 @@ class Packet:
 
 
 class InputBuffer:
-    """What a service holds of one topic, and how far the producer has advanced.
+    """Received messages of one topic, and the progress of its producer.
 
-    `advanced` is the producer's tick [ns] up to which the topic is known completely; `new` are the messages of the current step,
-    `pending` those of later ones.
+    `advanced` is the producer's tick [ns] up to which all messages of the topic are here; `new` are the messages of the current
+    step, `pending` those of later ones.
     """
 
     __slots__ = (
@@ -72,7 +121,7 @@ class InputBuffer:
         self._last_sequence = 0
 
     def ready(self, t: int) -> bool:
-        """Whether the reader may step at `t` as far as this topic goes: its producer has reached the newest tick that counts."""
+        """True if this topic allows the reader to step at `t`: its producer has reached the newest tick that is read then."""
         if self.lost:
             return True
         if not self._blocks:
@@ -81,12 +130,15 @@ class InputBuffer:
         return limit < 0 or self.advanced >= limit - limit % self.grid
 
     def accept(self, sequence: int, payload: bytes) -> None:
-        """Takes a message off the wire. Raises LockstepError when one is missing before it."""
+        """Take a received message. Raises LockstepError if one before it is missing."""
         if sequence != self._last_sequence + 1:
             if sequence <= self._last_sequence:
-                raise LockstepError(f"{self.topic.name}: sequence {sequence} came again after {self._last_sequence}")
+                raise LockstepError(
+                    f"{self.topic.name}: sequence {sequence} is a duplicate after {self._last_sequence}", self.topic.name
+                )
             raise LockstepError(
-                f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing"
+                f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing",
+                self.topic.name,
             )
         self._last_sequence = sequence
         if self._periodic:
@@ -100,7 +152,7 @@ class InputBuffer:
             self._settle()
 
     def advance(self, tick: int, sequence: int) -> None:
-        """The producer has finished `tick`, having sent `sequence` messages of this event topic in all."""
+        """Record that the producer has finished `tick` and has sent `sequence` messages of this event topic so far."""
         self._advances.append((tick, sequence))
         self._settle()
 
@@ -115,21 +167,21 @@ class InputBuffer:
 
     @property
     def waits_for_data(self) -> bool:
-        """Whether an advance is known whose messages are not all here."""
+        """True if an advance is known whose messages are not all here."""
         return bool(self._advances)
 
     @property
     def holds_any(self) -> bool:
-        """Whether any message has come."""
+        """True if any message was received."""
         return bool(self.pending) or self.latest is not None
 
     def deliver(self, packet: Packet) -> None:
-        """Takes a message whose stamp is known (composed run, observers)."""
+        """Take a message whose stamp is known (composed run, observers)."""
         self.pending.append(packet)
         self.advanced = packet.stamp
 
     def take(self, t: int) -> None:
-        """Moves what the reader may see at `t` into `new` and `latest`."""
+        """Move the messages that the reader may read at `t` to `new` and `latest`."""
         limit = t - self.delay
         pending = self.pending
         if not pending or pending[0].stamp > limit:
@@ -159,7 +211,7 @@ class TickInbox:
         return message
 
     def latest(self, topic: str) -> Message | None:
-        """The newest message, or None before the first."""
+        """Return the newest message, or None before the first."""
         buffer = self._buffers[topic]
         packet = buffer.latest
         if packet is None:
@@ -168,28 +220,28 @@ class TickInbox:
         return self._decode(buffer, packet) if message is None else message
 
     def new(self, topic: str) -> list[Message]:
-        """The messages since the step before, oldest first."""
+        """Return the messages since the step before, oldest first."""
         buffer = self._buffers[topic]
         if not buffer.new:
             return []
         return [self._decode(buffer, one) if one.message is None else one.message for one in buffer.new]
 
     def raw(self, topic: str) -> Sequence[Packet]:
-        """The messages since the step before, undecoded."""
+        """Return the messages since the step before, undecoded."""
         return self._buffers[topic].new
 
     def stamp(self, topic: str) -> int | None:
-        """The simulated time [ns] of the newest message."""
+        """Return the simulated time [ns] of the newest message."""
         latest = self._buffers[topic].latest
         return None if latest is None else latest.stamp
 
     def lost(self, role: str) -> bool:
-        """Whether that role's service is gone."""
+        """True if the service of `role` is lost."""
         return role in self.lost_roles
 
 
 class OutputPort:
-    """One topic that a service writes: its sequence and the digest over all that it sent."""
+    """One topic that a service writes: its sequence number and the digest over all messages sent."""
 
     __slots__ = ("_digest", "_exact", "_unchained", "encode", "event", "latched", "period", "sequence", "topic")
 
@@ -203,10 +255,10 @@ class OutputPort:
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
         self._unchained: list[bytes] = []
-        """What is not in the digest yet: hashing each message by itself would cost more, and meet cold code."""
+        """Messages that are not in the digest yet; hashing each by itself costs more."""
 
     def pack(self, message: Message, t: int) -> Sent:
-        """Encodes and numbers a message that is sent at `t` [ns]."""
+        """Encode and number a message that is sent at `t` [ns]."""
         sequence = self.sequence = self.sequence + 1
         payload = self.encode(message)
         if self._digest is not None:
@@ -214,26 +266,26 @@ class OutputPort:
         return self, Packet(payload, t, sequence, message if self._exact else None)
 
     def chain(self) -> None:
-        """Takes what was packed since the last call into the digest, all in one go."""
+        """Add the messages packed since the last call to the digest."""
         if self._digest is not None:
             self._digest.update(b"".join(self._unchained))
             self._unchained.clear()
 
     def digest(self) -> str | None:
-        """Hexadecimal digest, None for a topic that is not hashed."""
+        """Return the hexadecimal digest, None for a topic that is not hashed."""
         self.chain()
         return None if self._digest is None else self._digest.hexdigest()
 
 
 Sent = tuple[OutputPort, Packet]
-"""A message on its way out."""
+"""A message to be sent."""
 
 
 class Stepper:
     """Drives one service: buffers in, step, ports out."""
 
     def __init__(self, service: Service, contract: Contract, strict: bool = True) -> None:
-        """`strict` holds the service to a message on every tick of its periodic topics; observers are never held to it."""
+        """`strict` requires a message on every tick of the periodic topics, except from observers."""
         self.service = service
         self.role = contract.roles[service.role]
         self.buffers = {
@@ -253,12 +305,12 @@ class Stepper:
         self._chain_every = max(_CHAIN_NS // self.role.period, 1)
 
     def start(self) -> list[Sent]:
-        """The latched messages, packed. They are numbered and stamped zero."""
+        """Return the latched messages, packed, with stamp zero."""
         sent = []
         for name, message in self.service.start().items():
             port = self._port(name)
             if not port.latched:
-                raise LockstepError(f"{self.role.name} sent {name} before the first tick, but it is not latched")
+                raise LockstepError(f"{self.role.name} sent {name} before the first tick, which is not a latched topic")
             sent.append(port.pack(message, 0))
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
@@ -266,9 +318,9 @@ class Stepper:
         return sent
 
     def step(self, t: int) -> list[Sent]:
-        """Steps the service at `t` [ns] and returns all that it sends, packed, in outbox order.
+        """Step the service at `t` [ns] and return the messages it sends, packed, in outbox order.
 
-        Raises LockstepError when the service leaves out a periodic message or sends one off its tick.
+        Raises LockstepError if a periodic message is missing or is sent off its tick.
         """
         blame = self.blame
         begin, decoded, encoded = perf_counter_ns(), blame.decode, blame.encode
@@ -282,7 +334,7 @@ class Stepper:
         return sent
 
     def parts(self, t: int) -> Iterator[list[Sent]]:
-        """As `step`, but yields what each part of the step sends before the next is computed."""
+        """As `step`, but yields the messages of each part of the step before the next is computed."""
         blame = self.blame
         begin, decoded = perf_counter_ns(), blame.decode
         for outbox in self._outboxes(t):
@@ -295,14 +347,14 @@ class Stepper:
         self._close(t)
 
     def _outboxes(self, t: int) -> Iterable[Outbox]:
-        """The service's step at `t` [ns] on what it may see then, in parts where it has any."""
+        """Return the outboxes of the service's step at `t` [ns], one for each part."""
         for buffer in self._all:
             if buffer.pending or buffer.new:
                 buffer.take(t)
         return (self.service.step(t, self.inbox),) if self._whole else self.service.parts(t, self.inbox)
 
     def _close(self, t: int) -> None:
-        """Checks that all is sent that was due at `t` [ns], and hashes when enough has gathered: by now it is on its way."""
+        """Check that all messages due at `t` [ns] were sent; hash if enough have gathered, now that they are on their way."""
         number = t // self.role.period + 1
         for port in self._steady:
             if port.sequence != number:
@@ -318,7 +370,7 @@ class Stepper:
             self.blame.encode += perf_counter_ns() - begin
 
     def _missing(self, port: OutputPort, t: int) -> LockstepError:
-        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns, which is a tick of its period")
+        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: it is due every {port.period} ns")
 
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent: list[Sent] = []
@@ -328,7 +380,7 @@ class Stepper:
             if port.event:
                 sent += [port.pack(one, t) for one in (message if isinstance(message, list) else (message,))]
             elif t % port.period:
-                raise LockstepError(f"{self.role.name} sent {name} at {t} ns, which is no tick of its period {port.period} ns")
+                raise LockstepError(f"{self.role.name} sent {name} at {t} ns: not a multiple of its period ({port.period} ns)")
             else:
                 sent.append(port.pack(message, t))
         return sent
@@ -338,16 +390,16 @@ class Stepper:
             return self.ports[name]
         except KeyError:
             raise LockstepError(
-                f"{self.role.name} sent {name}, which the contract does not give it; it may send {', '.join(self.ports)}"
+                f"{self.role.name} sent {name}, which is not its topic; by the contract it sends {', '.join(self.ports)}"
             ) from None
 
     def digests(self) -> dict[str, str]:
-        """Digest by topic, of the hashed ones."""
+        """Return the digest of each hashed topic."""
         return {name: digest for name, port in self.ports.items() if (digest := port.digest()) is not None}
 
 
 def run_hash(digests: Mapping[str, str]) -> str:
-    """The run hash: SHA-256 over the sorted (topic, digest) pairs of all services."""
+    """Return the run hash: SHA-256 over the sorted (topic, digest) pairs of all services."""
     pairs = hashlib.sha256()
     for topic, digest in sorted(digests.items()):
         pairs.update(f"{topic} {digest}\n".encode())

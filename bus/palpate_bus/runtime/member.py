@@ -1,7 +1,7 @@
-"""A role's membership of the bus: its session, its liveliness tokens, and how it publishes and subscribes by the contract.
+"""A role on the bus: its session, its liveliness tokens, and its publishers and subscriptions by the contract.
 
-What it declares shows in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer that publishes or wants a topic of the
-contract with another type or hash never connects with ours. ROS 2 is silent about that, so `complaints` reports it.
+Its declarations show in the ROS graph (`ros2 node list`, `ros2 topic info`). A peer with another type or hash of a topic never
+connects. ROS 2 does not report that, so `complaints` does.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from palpate_bus.wire.rmw import message_key, topic_key
 from palpate_bus.wire.transport import Sender, Subscription, Transport
 
 CHECK_S = 0.5
-"""How often the graph is looked at."""
+"""Period at which the graph is checked for mismatches."""
 
 
 class Member:
@@ -35,81 +35,81 @@ class Member:
         self.domain = domain
         self.graph = GraphWatch(session, domain)
         self._tokens = NodeTokens(session, role, domain, self.transport.ids)
-        self._heard: list[tuple[str, Subscription]] = []
-        self._said: set[str] = set()
+        self._subscriptions: list[tuple[str, Subscription]] = []
+        self._reported: set[str] = set()
         self._routed = bool(list(session.info.routers_zid()))
-        self._checked = 0.0
+        self._checked_at = 0.0
         self._changed = False
 
     def publisher(self, topic: Topic) -> Sender:
-        """A publisher of a topic of the contract."""
+        """Return a publisher of a topic of the contract."""
         qos = self.rules.qos[topic.qos]
         return self.transport.publisher(topic.name, topic_key(topic, self.domain), qos, self._tokens.publisher(topic, qos))
 
     def subscription(self, topic: Topic, history: bool = False) -> Subscription:
-        """A subscription to a topic of the contract; with `history`, of what a latched topic sent before."""
+        """Return a subscription to a topic of the contract; with `history`, including earlier messages of a latched topic."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
         decode = codec.decoder(topic.type) if topic.open else None
-        return self._listen(topic.name, self.transport.subscription(topic_key(topic, self.domain), history, decode))
+        return self._keep(topic.name, self.transport.subscription(topic_key(topic, self.domain), history, decode))
 
     def observed(self, topic: Topic) -> str:
-        """Declares a subscription that the caller makes; returns the key."""
+        """Declare a subscription that the caller makes; return its key."""
         self._tokens.subscription(topic, self.rules.qos[topic.qos])
         return topic_key(topic, self.domain)
 
     def internal_publisher(self, name: str, type_name: str, qos: str) -> Sender:
-        """A publisher of the runtime's own messages."""
+        """Return a publisher of the runtime's own messages."""
         key = message_key(name, type_name, self.domain)
         return self.transport.publisher(name, key, self.rules.qos[qos], self._tokens.node.gid)
 
     def internal_subscription(self, name: str, type_name: str) -> Subscription:
-        """A subscription to the runtime's own messages."""
-        return self._listen(name, self.transport.subscription(message_key(name, type_name, self.domain)))
+        """Return a subscription to the runtime's own messages."""
+        return self._keep(name, self.transport.subscription(message_key(name, type_name, self.domain)))
 
-    def _listen(self, name: str, subscription: Subscription) -> Subscription:
-        self._heard.append((name, subscription))
+    def _keep(self, name: str, subscription: Subscription) -> Subscription:
+        self._subscriptions.append((name, subscription))
         return subscription
 
     def suspicions(self) -> list[str]:
-        """What is new and wrong with who sends what this role hears, a sentence each, said once."""
-        found = (f"{name}: {why}" for name, subscription in self._heard if (why := subscription.suspicion))
-        new = [sentence for sentence in found if sentence not in self._said]
-        self._said.update(new)
+        """Return new suspicions about the senders of this role's inputs, each once."""
+        found = (f"{name}: {why}" for name, subscription in self._subscriptions if (why := subscription.suspicion))
+        new = [text for text in found if text not in self._reported]
+        self._reported.update(new)
         return new
 
     def transport_lost(self) -> bool:
-        """Whether all went through a router that is there no more: then nobody's silence says anything of himself."""
+        """True if all traffic went through a router that has closed, so that no silent role is at fault."""
         info = self.session.info
         return self._routed and not list(info.routers_zid()) and not list(info.peers_zid())
 
     def complaints(self) -> list[str]:
-        """New mismatches of message types on the bus, each said once; looks at most every `CHECK_S`."""
+        """Return new mismatches of message types on the bus, each once; checks at most every `CHECK_S`."""
         now = monotonic()
-        if now - self._checked < CHECK_S:
+        if now - self._checked_at < CHECK_S:
             return []
-        self._checked = now
-        self._catch_up()
+        self._checked_at = now
+        self._update()
         if not self._changed:
             return []
         self._changed = False
-        new = [sentence for sentence in mismatches(self.graph.alive.values()) if sentence not in self._said]
-        self._said.update(new)
+        new = [text for text in mismatches(self.graph.alive.values()) if text not in self._reported]
+        self._reported.update(new)
         return new
 
     def gone(self) -> frozenset[str]:
-        """Roles that were on the bus and are no more."""
-        self._catch_up()
+        """Return the roles that were on the bus and have left."""
+        self._update()
         return self.graph.gone()
 
     def alive(self, roles: Collection[str]) -> frozenset[str]:
-        """Those of `roles` that are on the bus now."""
-        self._catch_up()
+        """Return those of `roles` that are on the bus now."""
+        self._update()
         return self.graph.roles() & frozenset(roles)
 
-    def _catch_up(self) -> None:
+    def _update(self) -> None:
         self._changed = bool(self.graph.changes()) or self._changed
 
     def leave(self) -> None:
-        """Withdraws the tokens."""
+        """Withdraw the tokens."""
         self._tokens.undeclare()
         self.graph.close()

@@ -1,22 +1,23 @@
-"""What the services of a process go through, whatever clock drives them: join, start, step, report, leave."""
+"""Life of the services of a process in any runtime: join, start, step, report, leave."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.runtime.conductor_link import POLL_S, ConductorLink, Reports, RunAborted
-from palpate_bus.runtime.failure import described
+from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.lockstep import NEVER, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.output import ServiceOutput
 
 
 class Seat:
-    """A service's place in a node: what steps it, what it sends and reports by, and how far it is."""
+    """A service in a node, with its stepper, output, reports and progress."""
 
     def __init__(self, stepper: Stepper, member: Member) -> None:
         self.stepper = stepper
@@ -25,30 +26,30 @@ class Seat:
         self.output = ServiceOutput(member)
         self.reports = Reports(member)
         self.tick = NEVER
-        """The last tick that was stepped [ns]."""
+        """Last finished tick [ns]."""
         self._closed = False
 
     def progress(self, waiting_for: str = "") -> None:
-        """Reports progress if the last report is old enough."""
+        """Report progress if the last report is old enough."""
         self.reports.progress(self.tick, waiting_for)
 
     def finish(self, counts: Mapping[str, Any]) -> None:
-        """Closes the service and reports its end; `counts` is what the node has counted for it."""
+        """Close the service and report its end with the counts of the node."""
         self.output.flush(self.tick)
         facts = dict(self.close())
         detail = {"blame": self.stepper.blame.per_step_us(), "facts": facts, **counts}
-        self.reports.say(ServiceReport.FINISHED, self.tick, detail=detail)
+        self.reports.send(ServiceReport.FINISHED, self.tick, detail=detail)
 
-    def fail(self, why: str) -> None:
-        """Reports a failure and closes the service, whatever else goes wrong."""
+    def fail(self, failure: Failure) -> None:
+        """Reports a failure and closes the service; further errors are suppressed."""
         with suppress(Exception):
-            self.output.flush(self.tick)  # what others have heard belongs in the recording
-        self.reports.say(ServiceReport.FAILED, self.tick, detail={"error": why})
+            self.output.flush(self.tick)  # the recording needs every message that was sent
+        self.reports.send(ServiceReport.FAILED, self.tick, detail=failure.report())
         with suppress(Exception):
             self.close()
 
     def close(self) -> Mapping[str, Any]:
-        """Has the service close what it has open, once; returns its facts."""
+        """Finish the service, once; return its facts."""
         if self._closed:
             return {}
         self._closed = True
@@ -59,16 +60,16 @@ class Node(ABC):
     """The services of a process on the bus."""
 
     def __init__(self, seats: Sequence[Seat], member: Member, grace_s: float = 0.0) -> None:
-        """`member` hears the conductor for all of them; without it the node goes on for `grace_s` [s]."""
+        """`member` receives the control messages for all; without the conductor the node continues for `grace_s` [s]."""
         self._seats = tuple(seats)
         self._link = ConductorLink(member, grace_s)
         self._acting = self._seats[0]
-        """Whose turn it is."""
+        """The service that is stepped or finished now."""
 
     def run(self) -> None:
-        """Runs the services to the end of the run, and closes each in any case.
+        """Run the services to the end of the run, and close each in any case.
 
-        Raises what a service raises, after reporting it, RunAborted, or KeyboardInterrupt when asked to leave.
+        Raises an error of a service after reporting it, RunAborted, or KeyboardInterrupt on SIGTERM.
         """
         try:
             self._join()
@@ -85,39 +86,41 @@ class Node(ABC):
         except (RunAborted, KeyboardInterrupt):
             for seat in self._seats:
                 with suppress(Exception):
-                    seat.output.flush(seat.tick)  # what others have heard belongs in the recording
+                    seat.output.flush(seat.tick)  # the recording needs every message that was sent
                 if self._link.lost:
-                    seat.reports.miss_conductor(seat.tick, self._link.lost)
-                elif self._link.told:
-                    seat.reports.obey(seat.tick, self._link.told)
+                    seat.reports.conductor_lost(seat.tick, self._link.lost)
+                elif self._link.ended_by:
+                    seat.reports.aborted(seat.tick, self._link.ended_by)
                 with suppress(Exception):
                     seat.close()
             raise
         except Exception as error:
             culprit = self._acting
-            why = described(error, culprit.stepper.buffers.values())
+            failure = Failure.of(error, culprit.role, culprit.stepper.buffers.values())
+            if len(self._seats) > 1:
+                failure = replace(failure, text=f"{culprit.role}: {failure.text}")
             for seat in self._seats:
-                seat.fail(why if len(self._seats) == 1 else f"{culprit.role}: {why}")
+                seat.fail(failure)
             raise
 
     @abstractmethod
     def _join(self) -> None:
-        """Answers the conductor's hellos until it starts the run."""
+        """Answer the conductor's hellos until it starts the run."""
 
     @abstractmethod
     def _loop(self) -> None:
-        """Steps the services until the run ends."""
+        """Step the services until the run ends."""
 
     @abstractmethod
     def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
-        """Sends what a service gave out."""
+        """Send messages of a service."""
 
     @abstractmethod
     def _counts(self, seat: Seat) -> dict[str, Any]:
-        """What the node has counted and computed about a service's messages, for the conductor."""
+        """Return counts and digests of a service's messages, for the conductor."""
 
     def _await_end(self) -> None:
-        """Waits for the conductor's receipt."""
+        """Wait for the conductor's END message."""
         while True:
             message = self._link.poll(POLL_S)
             if message is not None and message.command == RunControl.END:

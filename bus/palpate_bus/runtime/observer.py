@@ -1,6 +1,6 @@
-"""The process of an observer: it is outside the barrier, reads what arrives and never slows a producer.
+"""The process of an observer: outside the barrier, it receives messages and never slows a producer.
 
-It sees the latest of the periodic topics, and every message of the others. A recorder is driven by `recording`.
+It receives the newest messages of periodic topics and every message of the others. `recording` drives recorders.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Packet, Stepper
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.process_state import whereabouts
+from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
 from palpate_bus.wire.transport import decoded
@@ -27,12 +27,12 @@ log = logging.getLogger(__name__)
 
 IDLE_S = 0.005
 RING = 64
-"""Messages of a periodic topic kept for an observer that sees the latest: enough for one of its periods at 1 kHz."""
+"""Messages kept of a periodic topic: enough for one period of an observer at 1 kHz."""
 FIFO = 1 << 17
 LEAVE_S = 2.0
-"""For how long an observer waits for those to leave whom it observes, once the run has ended; they do at once."""
+"""Limit for observed services to leave after the end of the run; they leave at once."""
 OBSERVERS_STAY_S = 8.0
-"""For how long an observer stays at most without a conductor: longer than all whom it observes, see `wallclock`."""
+"""Limit without a conductor: longer than that of the observed services, see `wallclock`."""
 
 
 class _Feed:
@@ -57,7 +57,7 @@ class _Feed:
         self._tagger = member.transport.tagger(key)
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
-        """Everything that came in since last time: (sequence, payload, message)."""
+        """Return the messages since the last call: (sequence, payload, message)."""
         received = []
         while (sample := self._try()) is not None:
             try:
@@ -71,7 +71,7 @@ class _Feed:
                 self.forged += 1
                 continue
             message = decoded(self._decode, payload)
-            if message is None:  # an observer knows no rightful sender, and must not end with what it gets
+            if message is None:  # an observer accepts every sender, and invalid bytes must not end it
                 self.garbage += 1
                 continue
             if sequence > self.sequence + 1 and not self.topic.open:
@@ -82,23 +82,23 @@ class _Feed:
 
 
 class ObservedService:
-    """A service outside the barrier with its feeds: the owner of the thread drains the feeds and steps the service."""
+    """A service outside the barrier, with its feeds. The owner of the thread calls `drain_and_step`."""
 
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
-        """`lossless` keeps every message of every topic, not just the latest of the periodic ones."""
+        """`lossless` keeps every message of every topic, not only the newest of the periodic ones."""
         self.stepper = Stepper(service, member.rules)
         self.feeds = [
             _Feed(member, buffer.topic, lossless or not buffer.topic.periodic) for buffer in self.stepper.buffers.values()
         ]
         self.publishers = {name: member.publisher(port.topic) for name, port in self.stepper.ports.items()}
         self.now = NEVER
-        """Newest simulated time [ns] seen."""
+        """Newest simulated time [ns] received."""
         self._stepped = NEVER
 
     def drain_and_step(self, last: bool = False) -> bool:
-        """Takes in what has come and steps the service if its period has passed; whether anything came.
+        """Process received messages and step the service if its period has passed; return True if there were any.
 
-        The `last` time it steps for whatever has come: by the wall clock events come after the last periodic message.
+        The `last` call steps for any message, since in wall-clock mode events may follow the last periodic message.
         """
         busy = self._drain()
         period = self.stepper.role.period
@@ -126,7 +126,7 @@ class ObservedService:
         return busy
 
     def counters(self) -> dict[str, object]:
-        """Garbage and missed messages, for the report."""
+        """Return the numbers of dropped and missed messages, for the report."""
         return {
             "garbage": sum(feed.garbage for feed in self.feeds),
             "forged": sum(feed.forged for feed in self.feeds),
@@ -135,7 +135,7 @@ class ObservedService:
 
 
 class ObservingNode(ABC):
-    """A process outside the barrier: it takes in what comes until the conductor ends the run."""
+    """A process outside the barrier: it receives messages until the conductor ends the run."""
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
@@ -146,31 +146,31 @@ class ObservingNode(ABC):
 
     @abstractmethod
     def _drain(self) -> bool:
-        """Takes in what has come; whether anything has."""
+        """Process received messages; return True if there were any."""
 
     @abstractmethod
     def _reached(self) -> int:
-        """The tick [ns] up to which everything was taken in."""
+        """Return the tick [ns] up to which everything was received."""
 
     @abstractmethod
     def _missing(self) -> list[str]:
-        """What has not been heard of before the run begins."""
+        """Return the inputs without a sender before the run begins."""
 
     @abstractmethod
     def _details(self) -> dict[str, Any]:
-        """Counts for the last report."""
+        """Return counts for the last report."""
 
     def _report(self) -> None:
         self._reports.progress(self._reached())
 
     @abstractmethod
     def _obey(self, message: Any) -> None:
-        """Does what the conductor says, other than to begin and to end."""
+        """Process a control message other than HELLO and END."""
 
     def run(self) -> None:
-        """Observes until the conductor ends the run, and has its service finish in any case.
+        """Observe until the conductor ends the run, and finish the service in any case.
 
-        Raises RunAborted when the conductor is lost and all who are observed have left, KeyboardInterrupt when asked to leave.
+        Raises RunAborted if the conductor is lost and all observed services have left, KeyboardInterrupt on SIGTERM.
         """
         try:
             while True:
@@ -190,37 +190,37 @@ class ObservingNode(ABC):
                     if message.command == RunControl.LOST:
                         self._observed -= {message.role}
                     self._obey(message)
-            self._take_the_rest()
+            self._drain_rest()
         except RunAborted as ended:
             log.warning("run aborted: %s", ended)
-            self._take_the_rest()
+            self._drain_rest()
             self._service.finish()
             raise
         except KeyboardInterrupt:
-            log.warning("run aborted: the process was asked to leave")
+            log.warning("run aborted by a signal")
             self._drain()
             self._service.finish()
             raise
         except Exception:
             with suppress(Exception):
-                self._service.finish()  # what was taken in is kept
+                self._service.finish()  # received data is kept
             raise
         facts = dict(self._service.finish())
-        self._reports.say(ServiceReport.FINISHED, self._reached(), detail={"facts": facts, **self._details()})
+        self._reports.send(ServiceReport.FINISHED, self._reached(), detail={"facts": facts, **self._details()})
 
-    def _take_the_rest(self) -> None:
-        """Takes in what still comes: the conductor's word may overtake what others sent before it, by ways of their own."""
+    def _drain_rest(self) -> None:
+        """Receive what is in transit: the conductor's message may overtake messages that others sent before it."""
         end = monotonic() + LEAVE_S
         while self._member.alive(self._observed) and monotonic() < end:
             if not self._drain():
                 sleep(IDLE_S)
-        sleep(IDLE_S)  # nor are a token's end and the data before it in order
+        sleep(IDLE_S)  # a token's end and the data before it are not ordered either
         while self._drain():
             pass
 
     def _hello(self) -> None:
         self._drain()
-        self._reports.say(ServiceReport.READY, NEVER, detail={"missing": self._missing(), **whereabouts()})
+        self._reports.send(ServiceReport.READY, NEVER, detail={"missing": self._missing(), **process_identity()})
 
 
 class ObserverNode(ObservingNode):

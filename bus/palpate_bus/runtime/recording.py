@@ -1,6 +1,6 @@
-"""The process of the recorder: it takes the chunks that every service sends, and reports up to which tick it has written.
+"""The process of the recorder: it receives the chunks of every service and reports up to which tick it has written.
 
-The conductor grants at most a second of simulated time beyond that, so nothing is lost: at worst the run is slower.
+The conductor grants at most a second of simulated time beyond that, so nothing is lost, but the run may be slower.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservingNode
-from palpate_bus.runtime.record_chunks import CHUNK_TYPE, unpack_chunk
+from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_bus.service import Service
 
 log = logging.getLogger(__name__)
@@ -26,13 +26,13 @@ _decode_clock = codec.decoder("rosgraph_msgs/msg/Clock")
 
 @runtime_checkable
 class RawRecorder(Protocol):
-    """A service that wants every message as bytes."""
+    """A service that takes every message as bytes."""
 
     trouble: str
-    """Why it records no more; empty while it does."""
+    """Why recording stopped; empty while it continues."""
 
     def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
-        """Takes one message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
+        """Take a message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
 
 
 class RecorderNode(ObservingNode):
@@ -48,8 +48,8 @@ class RecorderNode(ObservingNode):
         self._chunks = {role: member.internal_subscription(f"palpate/record/{role}", CHUNK_TYPE) for role in producers}
         self._covered = dict.fromkeys(producers, NEVER)
         self._numbers = dict.fromkeys(producers, 0)
-        """By role, the number of its newest chunk."""
-        # Messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others.
+        """By role, the sequence number of the newest chunk."""
+        # messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others
         direct = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
         direct.sort(key=lambda topic: topic.name != CLOCK)
         self._direct = [(topic, member.subscription(topic)) for topic in direct]
@@ -57,14 +57,14 @@ class RecorderNode(ObservingNode):
         self._lost: set[str] = set()
         self._messages = 0
         self._garbage = 0
-        self._told = ""
+        self._reported_trouble = ""
 
     def _reached(self) -> int:
-        """The tick [ns] up to which every living producer's messages are written."""
+        """Return the tick [ns] up to which the messages of every producer that is not lost are written."""
         return min((tick for role, tick in self._covered.items() if role not in self._lost), default=NEVER)
 
     def _missing(self) -> list[str]:
-        return [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.heard]
+        return [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.hello_received]
 
     def _details(self) -> dict[str, Any]:
         return {"messages": self._messages, "garbage": self._garbage + sum(chunk.garbage for chunk in self._chunks.values())}
@@ -77,10 +77,10 @@ class RecorderNode(ObservingNode):
             self._numbers[message.role] = 0
 
     def _report(self) -> None:
-        """Reports progress, and at once, and once, that nothing is recorded any more."""
-        if self._recorder.trouble != self._told:
-            self._told = self._recorder.trouble
-            self._reports.say(ServiceReport.PROGRESS, self._reached(), detail={"suspicions": [self._told]})
+        """Report progress, and once, without delay, that recording stopped."""
+        if self._recorder.trouble != self._reported_trouble:
+            self._reported_trouble = self._recorder.trouble
+            self._reports.send(ServiceReport.PROGRESS, self._reached(), detail={"suspicions": [self._reported_trouble]})
         super()._report()
 
     def _drain(self) -> bool:
@@ -88,7 +88,7 @@ class RecorderNode(ObservingNode):
         for role, chunks in self._chunks.items():
             while (sample := chunks.get(0)) is not None:
                 busy = True
-                if sample.sequence <= self._numbers[role]:  # it came again
+                if sample.sequence <= self._numbers[role]:  # a duplicate
                     self._garbage += 1
                     continue
                 self._numbers[role] = sample.sequence
@@ -108,7 +108,7 @@ class RecorderNode(ObservingNode):
         return self._drain_direct() or busy
 
     def _drain_direct(self) -> bool:
-        """Takes what observers said. It carries no simulated stamp, so it is dated by the clock that came before it."""
+        """Receive messages of observers. They have no simulated stamp and get that of the clock before them."""
         busy = False
         for topic, subscription in self._direct:
             while (sample := subscription.get(0)) is not None:

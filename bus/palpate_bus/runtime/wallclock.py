@@ -1,11 +1,11 @@
-"""Wall clock: one service a process, each on its own timer, freshest sample wins: for hardware, real or simulated in real time.
+"""Wall-clock mode: one service per process, each on its own timer, newest sample wins; for hardware, real or simulated.
 
-A service still sees whole ticks: `t` counts periods since the common start, with absolute deadlines, so that no drift builds up.
-A late step is counted as an overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick
-by tick, unless it is later than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command
-helps nobody and stamps must stay on the common clock. No service waits for another; expiry protects the readers of a late sample.
+`t` counts periods since the common start, with absolute deadlines, so that no drift builds up. A late step is counted as an
+overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick by tick, unless it is later
+than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps must stay
+on the common clock. No service waits for another; expiry protects the readers of a late sample.
 
-On a machine that cannot keep up, the common clock may go slower than the wall's (PALPATE_RATE); never with hardware.
+On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
 """
 
 from __future__ import annotations
@@ -19,37 +19,78 @@ from palpate_bus.contract import MS, Edge, Topic, Visibility
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
-from palpate_bus.runtime.latency import LatencyHistogram
 from palpate_bus.runtime.lockstep import NEVER, Packet, Sent, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
-from palpate_bus.runtime.priority import by_period, give_way
-from palpate_bus.runtime.process_state import whereabouts
+from palpate_bus.runtime.process import lower_priority, niceness_of_period, process_identity
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
+
+BIN_NS = 20_000
+BINS = 5_000
+"""Bins cover 0 to 0.1 s; a longer latency counts in the last bin and in `worst`."""
+
+
+class LatencyHistogram:
+    """Histogram of the latencies of one topic [ns], from sending to reception; its memory is constant."""
+
+    __slots__ = ("_bins", "count", "total", "worst")
+
+    def __init__(self) -> None:
+        self._bins = [0] * BINS
+        self.count = 0
+        self.total = 0
+        self.worst = 0
+
+    def add(self, latency: int) -> None:
+        """Count a latency [ns]. A negative one, from clocks of two machines, counts as zero."""
+        self._bins[min(max(latency, 0) // BIN_NS, BINS - 1)] += 1
+        self.count += 1
+        self.total += latency
+        self.worst = max(self.worst, latency)
+
+    def quantile(self, fraction: float) -> int:
+        """Return the latency [ns] that this fraction of the messages does not exceed, to within a bin; 0 without messages."""
+        left = fraction * self.count
+        for index, number in enumerate(self._bins):
+            left -= number
+            if left <= 0 and number:
+                return min((index + 1) * BIN_NS, max(self.worst, 0))
+        return 0
+
+    def as_ms(self) -> dict[str, float]:
+        """Return mean, median, 99th percentile and largest latency [ms]."""
+        figures = {
+            "mean": self.total / self.count if self.count else 0.0,
+            "p50": self.quantile(0.5),
+            "p99": self.quantile(0.99),
+            "max": self.worst,
+        }
+        return {name: round(value / 1e6, 3) for name, value in figures.items()}
+
 
 log = logging.getLogger(__name__)
 
 CATCH_UP = 200 * MS
-"""Lag [ns] beyond which a critical role gives up catching up."""
+"""Lag [ns] beyond which a critical role skips to the present tick."""
 HANDSHAKE_POLL_S = 0.02
 WITHOUT_CONDUCTOR_S = 4.0
-"""For how long services go on without a conductor: planning lifts the arm in this time, and it comes clear of the patient."""
+"""Time for which services continue without a conductor, so that planning lifts the arm clear of the patient."""
 PHYSICS_STAYS_S = 0.5
-"""A critical role goes on for so much longer: a driver whose commander has left holds before it leaves itself."""
+"""Additional time for critical roles, so that a driver enters safe hold after its commander has left."""
 READ_NS = 100_000
-"""Two clocks read within this time [ns] were read at once."""
+"""Two clocks read within this time [ns] count as read at once."""
 
 
 def _awaited(edge: Edge, topic: Topic) -> bool:
-    """Whether the first step needs a message of a topic."""
+    """True if the first step needs a message of the topic."""
     return edge is Edge.LATCHED or (edge is Edge.SAME_TICK and topic.periodic and topic.visibility is Visibility.PUBLIC)
 
 
 def _on_monotonic_clock(wall: int, now: Callable[[], int]) -> int:
-    """A wall time [ns] on this process's monotonic clock [ns]; `now` reads the wall clock.
+    """Convert a wall time [ns] to this process's monotonic clock [ns]; `now` reads the wall clock.
 
-    Read again when the process was set aside between the readings: that would put this service ahead of the others for good.
+    Reads both clocks again if the process was preempted in between, which would shift this service against the others.
     """
     while True:
         before, read, after = monotonic_ns(), now(), monotonic_ns()
@@ -79,28 +120,30 @@ class WallClockNode(Node):
         self._end: int | None = None
         self._rate = Settings.read().rate or 1.0
         self._epoch = 0
-        """The common start of the run on this process's monotonic clock [ns]."""
+        """Common start of the run on this process's monotonic clock [ns]."""
 
     def _join(self) -> None:
-        give_way(by_period(self._stepper.role.period))
+        lower_priority(niceness_of_period(self._stepper.role.period))
         self._epoch = self._await_start()
 
     def _await_start(self) -> int:
-        """Answers hellos until the conductor gives the common start, which it returns on this process's monotonic clock [ns].
+        """Answer hellos until the conductor sends the common start; return it on this process's monotonic clock [ns].
 
-        The conductor repeats the start, so that a service that takes over a role in the middle of a run hears it too.
+        The conductor repeats the start for services that replace another during the run.
         """
         while True:
             message = self._link.poll(HANDSHAKE_POLL_S)
-            self._receive(0)  # a quicker service may have sent its latched topics already
+            self._receive(0)  # a faster service may have sent its latched topics already
             if message is None:
                 continue
             if message.command == RunControl.HELLO:
                 self._seat.output.hello()
                 missing = [
-                    name for name, buffer in self._stepper.buffers.items() if buffer.edge.blocking and not self._data[name].heard
+                    name
+                    for name, buffer in self._stepper.buffers.items()
+                    if buffer.edge.blocking and not self._data[name].hello_received
                 ]
-                self._seat.reports.say(ServiceReport.READY, NEVER, detail={"missing": missing, **whereabouts()})
+                self._seat.reports.send(ServiceReport.READY, NEVER, detail={"missing": missing, **process_identity()})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
             elif message.command == RunControl.GRANT:
@@ -111,7 +154,7 @@ class WallClockNode(Node):
             log.warning("%s lost: %s", message.role, message.reason)
             self._stepper.inbox.lost_roles.add(message.role)
         elif message.command == RunControl.HANDOVER:
-            log.warning("%s changes hands: %s", message.role, message.reason)
+            log.warning("%s is replaced: %s", message.role, message.reason)
             for name, buffer in self._stepper.buffers.items():
                 if buffer.topic.producer == message.role:
                     self._data[name].hand_over()
@@ -148,21 +191,21 @@ class WallClockNode(Node):
             t += period
 
     def _note_lost_conductor(self) -> None:
-        """Tells the service once that the conductor is lost, and the conductor, in case that it comes back."""
+        """Mark the conductor lost for the service, and report that in case the conductor returns."""
         lost = self._stepper.inbox.lost_roles
         if self._link.lost and CONDUCTOR not in lost:
             lost.add(CONDUCTOR)
-            self._seat.reports.miss_conductor(self._seat.tick, self._link.lost)
+            self._seat.reports.conductor_lost(self._seat.tick, self._link.lost)
 
     def _passed(self) -> int:
-        """The time of the run [ns]: the wall's since the common start, or less of it."""
+        """Return the time of the run [ns]: wall time since the common start, times the rate."""
         passed = monotonic_ns() - self._epoch
         return passed if self._rate == 1.0 else int(passed * self._rate)
 
     def _await_inputs(self) -> int:
-        """Waits until every input that the first step needs has come once; returns the tick [ns] at which it may step.
+        """Wait for a first message on every input that the first step needs; return the tick [ns] at which it may step.
 
-        Not for events, which may never come, nor for what only a simulation sends, which hardware in this role never hears.
+        Events are not awaited, nor topics that only a simulation sends, since there may be none.
         """
         needed = [b for b in self._stepper.buffers.values() if _awaited(b.edge, b.topic)]
         while True:
@@ -171,7 +214,7 @@ class WallClockNode(Node):
             if not missing:
                 break
             self._seat.progress(missing)
-            if self._end is not None:  # what is missing does not come any more
+            if self._end is not None:  # the missing input will not be sent
                 return self._end + 1
             message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
             if message is not None:
@@ -184,7 +227,7 @@ class WallClockNode(Node):
         for name, buffer in self._stepper.buffers.items():
             data = self._data[name]
             while (sample := data.get(0)) is not None:
-                if data.replaced:  # what came before was a stranger's
+                if data.replaced:  # earlier messages were of another sender
                     data.replaced = False
                     self._sequences[name] = 0
                     buffer.pending.clear()
@@ -196,12 +239,12 @@ class WallClockNode(Node):
                 self._sequences[name] = sample.sequence
                 self._ages[name].add(now - sample.sent)
                 try:
-                    # Now, not when the service looks: broken bytes must not end a driver whose arm is in contact.
+                    # decoded here, not in the service: invalid bytes must not end a driver whose arm is in contact
                     message = buffer.decode(sample.payload)
                 except CodecError as error:
                     self.undecodable += 1
                     if self.undecodable == 1:
-                        log.error("%s: %s; it and its like are dropped and counted", name, error)
+                        log.error("%s: %s; such messages are dropped and counted", name, error)
                     continue
                 buffer.deliver(Packet(sample.payload, t - buffer.delay, sample.sequence, message))
 

@@ -1,6 +1,6 @@
-"""The nodes on the bus: liveliness tokens as rmw_zenoh has them, so that `ros2 node list` and `ros2 topic info` see our services.
+"""Liveliness tokens of rmw_zenoh, so that `ros2 node list` and `ros2 topic info` show our services.
 
-A token is a key that exists as long as its process does:
+A token is a key that exists as long as its process:
 
     @ros2_lv/<domain>/<zid>/<node id>/<entity id>/<kind>/<enclave>/<namespace>/<node>[/<topic>/<type>/<hash>/<qos>]
 
@@ -33,7 +33,7 @@ _PARTS_OF_ENDPOINT = 13
 
 
 class EntityKind(StrEnum):
-    """What an entity of the ROS graph is."""
+    """Kind of an entity of the ROS graph."""
 
     NODE = "NN"
     PUBLISHER = "MP"
@@ -44,7 +44,7 @@ class EntityKind(StrEnum):
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """What a publisher, subscription, service or client is declared with. `type` is the ROS name."""
+    """Declaration of a publisher, subscription, service or client. `type` is the ROS name."""
 
     topic: str
     type: str
@@ -54,7 +54,7 @@ class Endpoint:
 
 @dataclass(frozen=True, slots=True)
 class Entity:
-    """An entity of the ROS graph, with what its token says."""
+    """An entity of the ROS graph, as in its token."""
 
     domain: int
     zid: str
@@ -68,7 +68,7 @@ class Entity:
 
     @property
     def token(self) -> str:
-        """The key of the token."""
+        """Key of the token."""
         parts = [str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind.value]
         parts += [_mangle(self.enclave), _mangle(self.namespace), _mangle(self.node)]
         if self.endpoint is not None:
@@ -78,7 +78,7 @@ class Entity:
 
     @property
     def gid(self) -> bytes:
-        """The GID, 16 bytes."""
+        """GID, 16 bytes."""
         return gid(self.token)
 
 
@@ -91,12 +91,12 @@ def _demangle(name: str) -> str:
 
 
 def gid(token: str) -> bytes:
-    """The GID that rmw_zenoh gives to the entity of a token."""
+    """Return the GID of the entity of a token."""
     return xxhash.xxh3_128_intdigest(token.encode()).to_bytes(GID_SIZE, "little")
 
 
 def qos_token(qos: Qos) -> str:
-    """A QoS class as rmw_zenoh writes it into a token: what is rmw_zenoh's default stays empty.
+    """Return a QoS class as in a token of rmw_zenoh, whose defaults stay empty.
 
     `<reliability>:<durability>:<history>,<depth>:<deadline>:<lifespan>:<liveliness>`; the last three are always defaults here.
     """
@@ -107,10 +107,10 @@ def qos_token(qos: Qos) -> str:
 
 
 def parse_token(key: str) -> Entity:
-    """The entity of a token's key. Raises WireError if the key is no such token."""
+    """Return the entity of a token's key. Raises WireError if the key is not a token."""
     parts = key.split("/")
     if len(parts) < _PARTS_OF_NODE or parts[0] != ADMIN_SPACE or not all(parts):
-        raise WireError(f"no liveliness token: {key!r}")
+        raise WireError(f"not a liveliness token: {key!r}")
     _, domain, zid, node_id, entity_id, kind, enclave, namespace, node, *endpoint = parts
     try:
         entity_kind = EntityKind(kind)
@@ -129,13 +129,13 @@ def parse_token(key: str) -> Entity:
 
 
 class NodeTokens:
-    """The tokens of one role: of its node at once, of its publishers and subscriptions as they are added.
+    """The tokens of one role: of its node, and of its publishers and subscriptions as they are added.
 
-    Keep it as long as the role lives. `undeclare` withdraws all of them; the process's end does so too.
+    They exist until `undeclare` or until the process ends.
     """
 
     def __init__(self, session: zenoh.Session, role: str, domain: int, ids: Iterator[int] | None = None) -> None:
-        """`ids` number the entities of the session, where it has more nodes than this one."""
+        """`ids` gives ids to the entities, if the session has several nodes."""
         self._liveliness = session.liveliness()
         self._ids = count() if ids is None else ids
         number = next(self._ids)
@@ -143,11 +143,11 @@ class NodeTokens:
         self._tokens: list[Any] = [self._liveliness.declare_token(self.node.token)]
 
     def publisher(self, topic: Topic, qos: Qos) -> bytes:
-        """Declares a publisher of a topic and returns its GID, for the attachments."""
+        """Declare a publisher of a topic and return its GID, for the attachments."""
         return self._declare(EntityKind.PUBLISHER, topic, qos)
 
     def subscription(self, topic: Topic, qos: Qos) -> bytes:
-        """Declares a subscription to a topic and returns its GID."""
+        """Declare a subscription to a topic and return its GID."""
         return self._declare(EntityKind.SUBSCRIPTION, topic, qos)
 
     def _declare(self, kind: EntityKind, topic: Topic, qos: Qos) -> bytes:
@@ -158,15 +158,15 @@ class NodeTokens:
         return entity.gid
 
     def undeclare(self) -> None:
-        """Withdraws the tokens."""
+        """Withdraw the tokens."""
         while self._tokens:
             self._tokens.pop().undeclare()
 
 
 class GraphWatch:
-    """Watches the tokens of a domain: those there already, those that come and those that go.
+    """Watches the tokens of a domain: present ones, and changes.
 
-    Nothing happens in zenoh's callback but a put into a queue; call `changes` to catch up.
+    zenoh's callback only puts samples into a queue; call `changes` to process them.
     """
 
     def __init__(self, session: zenoh.Session, domain: int) -> None:
@@ -177,13 +177,13 @@ class GraphWatch:
         self.alive: dict[str, Entity] = {}
         """Entities by token."""
         self.garbage = 0
-        """Tokens that are not rmw_zenoh's."""
+        """Number of invalid tokens."""
         self._seen: set[str] = set()
 
     def changes(self, timeout: float = 0.0) -> list[tuple[Entity, bool]]:
-        """What changed since last time, oldest first: (entity, whether it appeared or else vanished).
+        """Return the changes since the last call, oldest first: (entity, True if it appeared, False if it vanished).
 
-        Waits for the first change for `timeout` [s].
+        Waits up to `timeout` [s] for the first change.
         """
         found: list[tuple[Entity, bool]] = []
         wait = timeout
@@ -201,7 +201,7 @@ class GraphWatch:
                 self.garbage += 1
                 continue
             if appeared == (token in self.alive):
-                continue  # told twice, over two links
+                continue  # received twice, over two links
             if appeared:
                 self.alive[token] = entity
                 self._seen.add(entity.node)
@@ -210,20 +210,20 @@ class GraphWatch:
             found.append((entity, appeared))
 
     def roles(self) -> frozenset[str]:
-        """Names of the nodes that live, as of the last `changes`."""
+        """Return the names of the present nodes, as of the last `changes`."""
         return frozenset(entity.node for entity in self.alive.values() if entity.kind is EntityKind.NODE)
 
     def gone(self) -> frozenset[str]:
-        """Names of the nodes that lived and are gone, as of the last `changes`."""
+        """Return the names of the nodes that have left, as of the last `changes`."""
         return frozenset(self._seen) - self.roles()
 
     def close(self) -> None:
-        """Stops watching."""
+        """Stop watching."""
         self._subscriber.undeclare()
 
 
 def mismatches(entities: Iterable[Entity]) -> list[str]:
-    """One sentence for each publisher and subscription of one topic that cannot meet, because type or hash differ."""
+    """Return a text for each publisher and subscription of a topic that do not connect because type or hash differ."""
     endpoints = [(entity, entity.endpoint) for entity in entities if entity.endpoint is not None]
     found = set()
     for publisher, sent in endpoints:
@@ -239,7 +239,7 @@ def mismatches(entities: Iterable[Entity]) -> list[str]:
 
 
 def entities(session: zenoh.Session, domain: int, timeout: float = 1.0) -> list[Entity]:
-    """The entities that live now, by token; waits `timeout` [s] at most for the answers."""
+    """Return the present entities, sorted by token; waits up to `timeout` [s] for the answers."""
     found = {}
     for reply in session.liveliness().get(f"{ADMIN_SPACE}/{domain}/**", timeout=timeout):
         if reply.ok is not None:

@@ -2,18 +2,18 @@
 
 A topic's key is `<domain>/<topic>/<DDS type>/<RIHS01 hash>`, for example
 `0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all
-four agree; `any_type_key` is for noticing peers that differ in nothing but the type or its hash.
+four agree; `any_type_key` finds peers that differ only in type or hash.
 
 The attachment is 33 bytes, or 41 with a tag, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4
 (Jazzy):
 
 | offset | size | field |
 |---|---|---|
-| 0 | 8 | sequence number, little-endian, from 1 a publisher |
+| 0 | 8 | sequence number, little-endian, from 1 per publisher |
 | 8 | 8 | source time stamp [ns] |
 | 16 | 1 | length of the GID, 16 |
 | 17 | 16 | GID of the publisher (see `liveliness.gid`) |
-| 33 | 8 | our own: the tag, where a run has a key and the contract wants one (see `tags`); ROS 2 reads no further than the GID |
+| 33 | 8 | not of rmw_zenoh: the tag, if the run has a key and the contract requires one (see `tags`); ROS 2 ignores it |
 
 Sources: ros2/rmw_zenoh, `docs/design.md` and, in `rmw_zenoh_cpp/src/detail/`, `attachment_helpers.cpp`,
 `liveliness_utils.cpp` and `type_support_common.cpp`.
@@ -29,26 +29,23 @@ from functools import lru_cache
 from palpate_bus.contract import Topic
 from palpate_bus.messages.codec import type_hash
 from palpate_bus.wire.tags import TAG_SIZE
+from palpate_errors import UserError
 
-GID_SIZE = 16
-"""Bytes in a GID (RMW_GID_STORAGE_SIZE)."""
-
+GID_SIZE = 16  # RMW_GID_STORAGE_SIZE
 ATTACHMENT_SIZE = 8 + 8 + 1 + GID_SIZE
-"""Bytes in an attachment."""
-
 HELLO_SPACE = "palpate/hello"
-"""Begin of the keys on which edges are tested before the first tick."""
+"""Prefix of the keys on which edges are tested before the first tick."""
 
 _ATTACHMENT = struct.Struct(f"<qqB{GID_SIZE}s")
 _TYPE = re.compile(r"([a-z][a-z0-9_]*)::(msg|srv|action)::dds_::([A-Za-z][A-Za-z0-9_]*)_")
 _HASH = re.compile(r"RIHS01_[0-9a-f]{64}")
 _DOMAIN = re.compile(r"[0-9]{1,5}")
-# Chunks of a ROS topic name; the internal topics carry a role name, which may hold a dash.
+# chunks of a ROS topic name; internal topics have a role name, which may have a dash
 _CHUNK = re.compile(r"[A-Za-z0-9_~.{}-]+")
 
 
-class WireError(ValueError):
-    """A key, token or attachment that is not rmw_zenoh's."""
+class WireError(UserError):
+    """A key, token or attachment is not one of rmw_zenoh."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,9 +62,9 @@ class TopicKey:
 
 
 def dds_type(name: str) -> str:
-    """The DDS name of a ROS type: `sensor_msgs/msg/JointState` becomes `sensor_msgs::msg::dds_::JointState_`.
+    """Return the DDS name of a ROS type: `sensor_msgs/msg/JointState` becomes `sensor_msgs::msg::dds_::JointState_`.
 
-    Raises WireError if `name` is no ROS type name.
+    Raises WireError if `name` is not a ROS type name.
     """
     package, slash, rest = name.partition("/")
     kind, slash_2, base = rest.partition("/")
@@ -78,7 +75,7 @@ def dds_type(name: str) -> str:
 
 
 def ros_type(dds: str) -> str:
-    """The ROS name of a DDS type: the inverse of `dds_type`. Raises WireError if `dds` is none."""
+    """Return the ROS name of a DDS type, the inverse of `dds_type`. Raises WireError."""
     match = _TYPE.fullmatch(dds)
     if match is None:
         raise WireError(f"not a DDS type name: {dds!r}; expected <package>::msg::dds_::<Name>_")
@@ -86,41 +83,41 @@ def ros_type(dds: str) -> str:
 
 
 def message_key(topic: str, type_name: str, domain: int) -> str:
-    """The key of any topic of a known message type; slashes around `topic` are dropped, as in rmw_zenoh."""
+    """Return the key of a topic of a known message type; slashes around `topic` are dropped, as in rmw_zenoh."""
     if not 0 <= domain <= 65535:
         raise WireError(f"domain {domain} is outside 0..65535")
     return str(TopicKey(domain, topic.strip("/"), type_name, type_hash(type_name)))
 
 
 def topic_key(topic: Topic, domain: int) -> str:
-    """The key expression of a topic of the contract in a ROS domain."""
+    """Return the key expression of a topic of the contract in a ROS domain."""
     return message_key(topic.name, topic.type, domain)
 
 
 @lru_cache(maxsize=256)
 def parse_key(key: str) -> TopicKey:
-    """The parts of a key expression. Raises WireError if it is not of rmw_zenoh's form."""
+    """Return the parts of a key expression. Raises WireError if it does not have rmw_zenoh's form."""
     chunks = key.split("/")
     if len(chunks) < 4:
         raise WireError(f"key {key!r} has {len(chunks)} parts; expected <domain>/<topic>/<type>/<hash>")
     domain, *topic, dds, digest = chunks
     if not _DOMAIN.fullmatch(domain) or int(domain) > 65535:
-        raise WireError(f"key {key!r}: {domain!r} is no ROS domain")
+        raise WireError(f"key {key!r}: {domain!r} is not a ROS domain")
     if not all(_CHUNK.fullmatch(chunk) for chunk in topic):
-        raise WireError(f"key {key!r}: {'/'.join(topic)!r} is no topic name")
+        raise WireError(f"key {key!r}: {'/'.join(topic)!r} is not a topic name")
     if not _HASH.fullmatch(digest):
-        raise WireError(f"key {key!r}: {digest!r} is no RIHS01 hash")
+        raise WireError(f"key {key!r}: {digest!r} is not a RIHS01 hash")
     return TopicKey(int(domain), "/".join(topic), ros_type(dds), digest)
 
 
 def hello_key(key: str) -> str:
-    """Where the producer of a key says hello to its readers: a key of our own, since an empty message is none of ROS's."""
+    """Return the key on which the producer of a key sends hellos; they are not ROS messages, so they have a key of their own."""
     domain, _, rest = key.partition("/")
     return f"{domain}/{HELLO_SPACE}/{rest}"
 
 
 def any_type_key(topic: str, domain: int) -> str:
-    """A key expression that matches a topic whatever its type and hash: to notice peers whose definition differs."""
+    """Return a key expression that matches a topic with any type and hash, to find peers whose definition differs."""
     return f"{domain}/{topic.strip('/')}/*/*"
 
 
@@ -135,12 +132,12 @@ class AttachmentWriter:
         self._gid = bytes(gid)
 
     def pack(self, sequence: int, source_timestamp_ns: int) -> bytes:
-        """The attachment of a message. Both numbers are signed 64-bit; `struct.error` says when one is not."""
+        """Return the attachment of a message. Both numbers are signed 64-bit; raises struct.error if one is not."""
         return _ATTACHMENT.pack(sequence, source_timestamp_ns, GID_SIZE, self._gid)
 
 
 def unpack(attachment: bytes | bytearray | memoryview) -> tuple[int, int, bytes]:
-    """(sequence, source time stamp [ns], GID) of an attachment. Raises WireError if it is none."""
+    """Return (sequence, source time stamp [ns], GID) of an attachment. Raises WireError if it is invalid."""
     if len(attachment) not in (ATTACHMENT_SIZE, ATTACHMENT_SIZE + TAG_SIZE):
         raise WireError(f"an attachment has {ATTACHMENT_SIZE} bytes, not {len(attachment)}")
     sequence, stamp, length, gid = _ATTACHMENT.unpack_from(attachment)

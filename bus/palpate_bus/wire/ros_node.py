@@ -1,6 +1,6 @@
 """A ROS 2 node without ROS: topics over zenoh with rmw_zenoh's keys, attachments and liveliness tokens.
 
-It shows in `ros2 node list` and `ros2 topic info` on the ROS side.
+`ros2 node list` and `ros2 topic info` show it.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from palpate_bus.wire.transport import Publisher
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
 RING = 16
-"""Messages kept a topic: latest wins, and a few in between are of use."""
+"""Messages kept per topic."""
 QOS = Qos(
     name="ros",
     priority="REAL_TIME",
@@ -36,12 +36,11 @@ class RosPublisher:
     def __init__(self, publisher: Publisher, type_name: str, gid: bytes) -> None:
         self._publisher = publisher
         self.gid = gid
-        """By which subscribers know it."""
         self._encode = codec.encoder(type_name)
         self._sequence = 0
 
     def publish(self, message: Any) -> None:
-        """Sends a message."""
+        """Send a message."""
         self._sequence += 1
         self._publisher.put(self._encode(message), self._sequence)
 
@@ -60,10 +59,10 @@ class RosSubscription:
             self._subscriber = session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
         self.garbage = 0
-        """Messages that could not be read."""
+        """Messages that could not be decoded."""
 
-    def heard(self) -> list[tuple[bytes, Any]]:
-        """What came since last time with its publisher's GID, oldest first; at most `RING`."""
+    def received(self) -> list[tuple[bytes, Any]]:
+        """Return new messages with the GID of their publisher, oldest first; at most `RING`."""
         pairs = []
         while (sample := self._try()) is not None:
             try:
@@ -75,46 +74,46 @@ class RosSubscription:
         return pairs
 
     def take(self) -> list[Any]:
-        """The messages of `heard`."""
-        return [message for _, message in self.heard()]
+        """Return the messages of `received`."""
+        return [message for _, message in self.received()]
 
     def others(self, own: bytes) -> list[bytes]:
-        """GIDs of the publishers of `heard`, without `own`."""
-        return [sender for sender, _ in self.heard() if sender != own]
+        """Return the publishers' GIDs of `received`, without `own`."""
+        return [sender for sender, _ in self.received() if sender != own]
 
     def newest(self) -> Any | None:
-        """The newest message since last time, None without one."""
+        """Return the newest message since the last call, or None."""
         messages = self.take()
         return messages[-1] if messages else None
 
 
 class RosNode:
-    """A node of a name; topics are absolute, without the leading slash."""
+    """A named node; topics are absolute, without the leading slash."""
 
     def __init__(self, name: str, domain: int, options: BusOptions) -> None:
-        """Joins. Raises BusConfigError if a session cannot be opened."""
+        """Raises BusConfigError if a session cannot be opened."""
         self._session = open_session(options)
         self._domain = domain
         self._tokens = NodeTokens(self._session, name, domain)
 
     def publisher(self, topic: str, type_name: str, *, latched: bool = False) -> RosPublisher:
-        """Declares a publisher; `latched` (transient local) serves late subscribers, too."""
+        """Declare a publisher; `latched` (transient local) also serves late subscribers."""
         row = _row(topic, type_name)
         qos = LATCHED if latched else QOS
         gid = self._tokens.publisher(row, qos)
         return RosPublisher(Publisher(self._session, topic_key(row, self._domain), qos, gid), type_name, gid)
 
     def subscription(self, topic: str, type_name: str, *, latched: bool = False) -> RosSubscription:
-        """Declares a subscription; `latched` (transient local) gets what was sent before, too."""
+        """Declare a subscription; `latched` (transient local) also delivers earlier messages."""
         row = _row(topic, type_name)
         self._tokens.subscription(row, QOS)
         return RosSubscription(self._session, topic_key(row, self._domain), type_name, latched=latched)
 
     def close(self) -> None:
-        """Leaves."""
+        """Leave the bus."""
         self._tokens.undeclare()
         close_session(self._session)
 
 
 def _row(topic: str, type_name: str) -> Topic:
-    return Topic(name=topic, type=type_name, producer="robot", readers={}, qos=QOS.name, doc="of the ROS side")
+    return Topic(name=topic, type=type_name, producer="robot", readers={}, qos=QOS.name, doc="a ROS topic")

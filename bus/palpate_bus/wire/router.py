@@ -1,6 +1,6 @@
 """A zenoh router in Python, for runs over a network: `palpate router [ENDPOINT...]` or `python -m palpate_bus.wire.router`.
 
-Peers find each other through it and then talk directly; clients talk through it. `zenohd` does the same, faster for clients.
+Peers find each other through it and then connect directly; clients send through it. `zenohd` does the same, faster for clients.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from typing import Any
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, session
 
 DEFAULT_ENDPOINT = "tcp/[::]:7447"
-"""Where a router listens, as zenohd and rmw_zenohd do."""
+"""As of zenohd and rmw_zenohd."""
 
 log = logging.getLogger(__name__)
 
@@ -27,10 +27,15 @@ def serve(
     tls: Path | None = None,
     access: Mapping[str, Any] | None = None,
 ) -> None:
-    """Routes until SIGINT or SIGTERM; call it from the main thread.
+    """Route until SIGINT or SIGTERM; call it from the main thread.
 
-    `ready` is told, once, where it listens. `tls` is the router's folder of certificates, `access` its access control. Raises
-    BusConfigError when it cannot listen there.
+    Args:
+        listen: endpoints
+        ready: called once it listens, with a text
+        tls: folder of the router's certificates
+        access: access control, see `security.access`
+
+    Raises BusConfigError if it cannot listen there.
     """
     stop = threading.Event()
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -45,7 +50,7 @@ def serve(
 
 
 def main(arguments: Sequence[str]) -> int:
-    """Runs a router on the given endpoints; returns the exit status."""
+    """Run a router on the given endpoints; return the exit status."""
     if any(argument.startswith("-") for argument in arguments):
         print("usage: python -m palpate_bus.wire.router [ENDPOINT...], e.g. tcp/0.0.0.0:7447", file=sys.stderr)
         return 0 if "--help" in arguments or "-h" in arguments else 2

@@ -1,8 +1,8 @@
-"""Keyed tags: who has the key of a run can say that a message is its own, and nobody else can.
+"""Authentication tags: only processes with the key of a run can send messages with a valid tag.
 
 A tag is BLAKE2s (RFC 7693) with the run's key, 8 bytes, over the key expression, the attachment and the payload. It follows
-rmw_zenoh's fields in the attachment, where ROS 2's readers do not look. The key is a file that only its owner can read
-(PALPATE_KEY); `palpate run` makes one a run. Which messages carry a tag, the contract says (`tagged`).
+rmw_zenoh's fields in the attachment, which ROS 2 ignores. The key is a file that only its owner can read (PALPATE_KEY);
+`palpate run` makes one per run. The contract decides which messages carry a tag (`tagged`).
 """
 
 from __future__ import annotations
@@ -16,13 +16,12 @@ from pathlib import Path
 from palpate_bus.settings import BusConfigError
 
 TAG_SIZE = 8
-"""Bytes in a tag: one guess in 1.8e19 is right."""
+"""Bytes; one guess in 1.8e19 is right."""
 KEY_SIZE = 32
-"""Bytes in a key."""
 
 
 class Tagger:
-    """Makes and checks the tags of the messages on one key expression."""
+    """Makes and checks the tags of messages on one key expression."""
 
     __slots__ = ("_begin",)
 
@@ -30,26 +29,26 @@ class Tagger:
         self._begin = blake2s(expression.encode(), key=key, digest_size=TAG_SIZE)
 
     def tag(self, attachment: bytes, payload: bytes) -> bytes:
-        """The tag of a message; `attachment` is rmw_zenoh's alone."""
+        """Return the tag of a message; `attachment` has rmw_zenoh's fields only."""
         mac = self._begin.copy()
         mac.update(attachment)
         mac.update(payload)
         return mac.digest()
 
     def holds(self, attachment: bytes, payload: bytes) -> bool:
-        """Whether an attachment ends with the tag of its message."""
+        """True if an attachment ends with the tag of its message."""
         return compare_digest(attachment[-TAG_SIZE:], self.tag(attachment[:-TAG_SIZE], payload))
 
 
 def make_key(file: Path) -> Path:
-    """Writes a new key that only its owner can read, from the first byte on. Raises OSError."""
+    """Write a new key to a file that is never readable to others. Raises OSError."""
     with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
         opened.write(secrets.token_bytes(KEY_SIZE))
     return file
 
 
 def read_key(file: Path | None) -> bytes | None:
-    """The key in a file; None without a file. Raises BusConfigError for one that is none, or that others may read."""
+    """Return the key in a file; None without a file. Raises BusConfigError if it is invalid or readable to others."""
     if file is None:
         return None
     try:

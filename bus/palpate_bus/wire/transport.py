@@ -1,6 +1,6 @@
-"""zenoh publishers and subscriptions with rmw_zenoh's attachment, garbage counted and set aside.
+"""zenoh publishers and subscriptions with rmw_zenoh's attachment; garbage is counted and dropped.
 
-No callback computes: a received sample goes into a queue of its own, which the service's thread empties.
+Callbacks only put samples into the subscription's queue, which the service's thread empties.
 """
 
 from __future__ import annotations
@@ -24,25 +24,25 @@ HELLO = 0
 
 
 class ReceivedSample(NamedTuple):
-    """What came in on a subscription."""
+    """A message received on a subscription."""
 
     sequence: int
     sent: int
-    """Wall time [ns] at which the sender handed it over."""
+    """Source time [ns], wall clock."""
     payload: bytes
 
 
 class Sender(Protocol):
-    """The sending end of a topic."""
+    """Sends on a topic."""
 
     def put(self, payload: bytes, sequence: int) -> None:
-        """Sends a message."""
+        """Send a message."""
 
     def hello(self) -> None:
-        """Sends the empty message that tests the edge."""
+        """Send the empty message that tests the edge."""
 
     def close(self) -> None:
-        """Undeclares it."""
+        """Undeclare it."""
 
 
 class Publisher:
@@ -57,7 +57,7 @@ class Publisher:
         now: Callable[[], int] = time_ns,
         tagger: Tagger | None = None,
     ) -> None:
-        """`now` gives the wall time [ns] that each message carries; with a `tagger` it carries a tag, too."""
+        """`now` returns the source time [ns] of a message; with a `tagger` messages are tagged."""
         self.key = key
         self._session = session
         self._now = now
@@ -77,11 +77,11 @@ class Publisher:
         self._tagger = tagger
 
     def put(self, payload: bytes, sequence: int) -> None:
-        """Sends a message."""
+        """Send a message."""
         self._publisher.put(payload, attachment=self._attachment(sequence, payload))
 
     def hello(self) -> None:
-        """Sends the empty message that tests the edge."""
+        """Send the empty message that tests the edge."""
         self._session.put(hello_key(self.key), b"", attachment=self._attachment(HELLO, b""))
 
     def _attachment(self, sequence: int, payload: bytes) -> bytes:
@@ -89,16 +89,16 @@ class Publisher:
         return attachment if self._tagger is None else attachment + self._tagger.tag(attachment, payload)
 
     def close(self) -> None:
-        """Undeclares the publisher."""
+        """Undeclare the publisher."""
         self._publisher.undeclare()
 
 
 class Subscription:
     """Receives on one key.
 
-    Only the messages of the sender that says hello first count, and before any has, those of the first. Bytes without a valid
-    attachment are counted in `garbage`, those of another sender in `foreign`, and where messages carry tags, those without the
-    right one in `forged`. A topic that is open to all takes every sender's messages, if they can be decoded.
+    Only messages of the sender of the first hello are accepted; before a hello, those of the first sender. Dropped messages are
+    counted: without a valid attachment in `garbage`, of another sender in `foreign`, and where messages carry tags, without a
+    valid one in `forged`. An open topic accepts messages of every sender that can be decoded.
     """
 
     def __init__(
@@ -109,10 +109,10 @@ class Subscription:
         decode: Callable[[bytes], object] | None = None,
         tagger: Tagger | None = None,
     ) -> None:
-        """Subscribes.
+        """Subscribe.
 
-        With `history`, what a latched topic sent before is delivered too; `decode` opens the topic to all; with a `tagger` only
-        tagged messages count.
+        `history` also delivers earlier messages of a latched topic; `decode` opens the topic to all senders; with a `tagger` only
+        tagged messages are accepted.
         """
         self.key = key
         self._decode = decode
@@ -120,9 +120,9 @@ class Subscription:
         self.foreign = 0
         self.forged = 0
         self._tagger = tagger
-        self.heard = False
+        self.hello_received = False
         self.replaced = False
-        """Whether a hello has told that what came before was another's; who reads sets it back."""
+        """Set when a hello reveals a new sender; cleared by the reader."""
         self._gid: bytes | None = None
         self._retired: bytes | None = None
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
@@ -133,28 +133,28 @@ class Subscription:
             )
         else:
             self._subscriber = session.declare_subscriber(key, handler)
-        # Declared after the data's: a producer whose hello arrives here knows of both.
+        # declared last: a producer whose hello arrives here has discovered both
         self._hellos: Any = session.declare_subscriber(hello_key(key), handler)
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
-        """The next message; None when `timeout` [s] passes without one. A timeout of 0 does not wait."""
+        """Return the next message, or None after `timeout` [s]; a timeout of 0 does not wait."""
         end = monotonic() + timeout if timeout else 0.0
         while True:
-            left = end - monotonic() if timeout else 0.0  # what is set aside wins no time
-            if left <= 0 and self._queue.empty():  # nobody else takes from it; far cheaper than the exception
+            left = end - monotonic() if timeout else 0.0  # dropped messages do not extend the timeout
+            if left <= 0 and self._queue.empty():  # this is the only reader; far cheaper than the exception
                 return None
             try:
                 raw = self._queue.get(timeout=left) if left > 0 else self._queue.get_nowait()
             except Empty:
                 return None
-            sample = self._taken(raw)
+            sample = self._accept(raw)
             if sample is not None:
                 return sample
 
-    def _taken(self, raw: zenoh.Sample) -> ReceivedSample | None:
-        """What came in, or None for what is set aside."""
+    def _accept(self, raw: zenoh.Sample) -> ReceivedSample | None:
+        """Return the message of a sample, or None if it is dropped."""
         try:
-            attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # none is an AttributeError
+            attachment: bytes = raw.attachment.to_bytes()  # type: ignore[union-attr]  # a missing one is an AttributeError
             sequence, sent, gid = unpack(attachment)
         except (WireError, AttributeError):
             self.garbage += 1
@@ -164,16 +164,16 @@ class Subscription:
             self.forged += 1
             return None
         if gid != self._gid:
-            greets = sequence == HELLO and not payload and not self.heard  # only a sender of this run says hello
-            if self._decode is None and (gid == self._retired or (self._gid is not None and not greets)):
+            is_hello = sequence == HELLO and not payload and not self.hello_received  # only senders of this run send a hello
+            if self._decode is None and (gid == self._retired or (self._gid is not None and not is_hello)):
                 self.foreign += 1
                 return None
             self.replaced = self._gid is not None and self._decode is None
             self._gid = gid
         if not payload:
-            self.heard = self.heard or sequence == HELLO
+            self.hello_received = self.hello_received or sequence == HELLO
             return None
-        # Some clients of rmw_zenoh's wire number their messages from 0.
+        # some clients of rmw_zenoh number their messages from 0
         if sequence == HELLO if self._decode is None else decoded(self._decode, payload) is None:
             self.garbage += 1
             return None
@@ -181,62 +181,62 @@ class Subscription:
 
     @property
     def suspicion(self) -> str:
-        """What is wrong with who sends here, empty while nothing is."""
+        """A text if there are messages of a wrong sender; else empty."""
         if self.forged:
-            return "messages with a wrong tag come and are set aside: somebody forges them, or does not have the run's key"
+            return "dropping messages with an invalid authentication tag: forged, or the sender lacks the run key"
         if self.foreign and self._retired is None:
-            return "messages of a second sender come and are set aside"
+            return "dropping messages of a second sender"
         return ""
 
     def hand_over(self) -> None:
-        """Forgets the sender: the next one that is another counts from now on, and nothing that still comes from this one."""
+        """Accept the next new sender in place of this one, whose further messages are dropped."""
         if self._gid is not None:
             self._retired, self._gid = self._gid, None
 
     def close(self) -> None:
-        """Undeclares the subscribers."""
+        """Undeclare the subscribers."""
         self._hellos.undeclare()
         self._subscriber.undeclare()
 
 
 class Transport:
-    """The members' way onto the bus by one session: their publishers, their subscriptions and their wall clock.
+    """Publishers, subscriptions and wall clock of the members of one session.
 
-    The runtimes are given theirs, so that a test can hand them one that loses, changes or delays messages.
+    It is passed to the runtimes, so that a test can use one that drops, changes or delays messages.
     """
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
         self._key = read_key(Settings.read().key)
         self.ids = count()
-        """Numbers of the entities that members declare."""
+        """Ids of the entities that members declare."""
 
     def now(self) -> int:
-        """The wall time [ns]."""
+        """Return the wall time [ns]."""
         return time_ns()
 
     def publisher(self, topic: str, key: str, qos: Qos, gid: bytes) -> Sender:
-        """The sending end of a topic; `key` is its key on the bus.
+        """Return a sender for a topic; `key` is its key on the bus.
 
-        By the wall clock no sender waits for a reader that does not keep up: a frozen recorder would stop physics and planning.
-        Only what is sent once waits.
+        In wall-clock mode a sender drops messages for a slow reader, since a frozen recorder would block physics and planning.
+        Only latched topics wait.
         """
         if Settings.read().runtime == "wallclock" and not qos.transient_local:
             qos = qos.model_copy(update={"congestion": "DROP"})
         return Publisher(self.session, key, qos, gid, self.now, self.tagger(key))
 
     def subscription(self, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None) -> Subscription:
-        """The receiving end of a key, see `Subscription`."""
+        """Return a subscription to a key."""
         return Subscription(self.session, key, history, decode, self.tagger(key))
 
     def tagger(self, key: str) -> Tagger | None:
-        """What tags and checks the messages of a key; None where they carry no tags."""
-        wanted = self._key is not None and contract().tagged(parse_key(key).topic)
-        return Tagger(self._key, key) if self._key is not None and wanted else None
+        """Return the tagger for the messages of a key; None if they carry no tags."""
+        tagged = self._key is not None and contract().tagged(parse_key(key).topic)
+        return Tagger(self._key, key) if self._key is not None and tagged else None
 
 
 def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
-    """The message, or None where the bytes are none: used where anyone may send, so that no stranger can end a service."""
+    """Return the message, or None if it cannot be decoded, so that a foreign sender cannot end a service."""
     try:
         return decode(payload)
     except CodecError:

@@ -1,7 +1,7 @@
-"""How processes find each other on the bus: zenoh's configuration from the settings, or from arguments.
+"""zenoh's configuration, from the settings or from arguments.
 
-Nothing is ever found by multicast: a run must not meet another run's peers on the same network. zenoh itself reads one variable,
-`ZENOH_RUNTIME`, for its thread pools, see below.
+Multicast discovery is off, so that a run does not connect to another run's peers on the same network. zenoh itself reads one
+variable, `ZENOH_RUNTIME`, for its thread pools, see below.
 
 **Low-latency transport.** zenoh's usual transport hands every message to a transmission task; the low-latency one writes it
 to the socket in the caller's thread. It has no priorities, no fragments (so a message over 64 KiB needs shared memory) and no
@@ -9,9 +9,9 @@ time-out of its own: a frozen reader blocks its writers as soon as the socket's 
 one host, where the barrier bounds what is in flight, and only between blocking roles; a pair of which either side does not offer
 it gets the usual transport.
 
-**Thread pools.** By default zenoh watches the sockets in one pool of threads and reads them in another, so that each message
-that comes in wakes two threads before it wakes the service. Here one pool of two threads does both (`POOLS`): the barrier of
-three services makes 3,400 ticks a second instead of 3,000 (medians of six alternating runs of 4,000), a short examination without
+**Thread pools.** By default zenoh watches the sockets in one pool of threads and reads them in another, so that each received
+message wakes two threads before the service. Here one pool of two threads does both (`POOLS`): the barrier of three services
+makes 3,400 ticks per second instead of 3,000 (medians of six alternating runs of 4,000), a short examination without
 recorder and viewer 1.38 times real time instead of 1.21 (medians of three).
 
 **A reader that does not keep up.** Where a publisher drops on congestion, a put waits for room before it drops. In lockstep that
@@ -33,6 +33,7 @@ Round trip of 300 bytes between two Python processes (SimpleQueue receivers, fiv
 from __future__ import annotations
 
 import atexit
+import errno
 import json
 import os
 import re
@@ -48,30 +49,28 @@ import zenoh
 from palpate_bus.settings import BusConfigError as BusConfigError  # noqa: PLC0414  # others import it from here, too
 from palpate_bus.settings import Settings, variable
 
-UNIX_PATH_MAX = 107
-"""Longest path of a unix socket [bytes] on Linux (sun_path less its NUL)."""
+UNIX_PATH_MAX_BYTES = 107  # sun_path without its NUL on Linux
 
 _PRIORITIES = (
     "control", "real_time", "interactive_high", "interactive_low", "data_high", "data", "data_low", "background",
 )  # fmt: skip
 TLS_FILES = ("ca.pem", "cert.pem", "key.pem")
-"""The files in the folder that `tls` names."""
+"""Files in the folder of `BusOptions.tls`."""
 POOLS = "(rx: (handover: net), acc: (handover: net), net: (worker_threads: 2))"
-"""`ZENOH_RUNTIME` where the environment has none: sockets are read by the threads that watch them."""
+"""Default of `ZENOH_RUNTIME`: sockets are read by the threads that watch them."""
 LOCKSTEP_DROP_WAIT_US = 1_000_000
 WALL_CLOCK_DROP_WAIT_US = 1_000
 
-
 _OPEN: set[zenoh.Session] = set()
-"""Sessions that are not closed yet; one that is must not be kept: it has 18 MB of shared memory."""
+"""Open sessions. A closed one must not be kept, since it holds 18 MB of shared memory."""
 
 _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
-"""Where in its own source zenoh met an error."""
+"""Position in zenoh's source in its error messages."""
 
 
 @dataclass(frozen=True)
 class BusOptions:
-    """How a process joins the bus. `BusOptions.from_settings` takes them from the settings."""
+    """How a process joins the bus."""
 
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""
@@ -82,13 +81,13 @@ class BusOptions:
     mode: str = "peer"
     """`peer`, `client` or `router`."""
     lowlatency: bool = False
-    """Whether to offer the low-latency transport."""
+    """Offer the low-latency transport."""
     shared_memory: bool = True
-    """Whether large messages go through shared memory where both ends are on one host."""
+    """Send large messages through shared memory if both ends are on one host."""
     tls: Path | None = None
     """Folder with `ca.pem`, `cert.pem` and `key.pem`: links are encrypted, and both ends show a certificate of that authority."""
     drop_wait_us: int = LOCKSTEP_DROP_WAIT_US
-    """How long a put waits for room before it drops a message [us]."""
+    """Time for which a put waits for room before it drops a message [us]."""
     file: Path | None = None
     """A zenoh configuration file that is used as it is."""
 
@@ -109,7 +108,7 @@ class BusOptions:
 
     @classmethod
     def from_settings(cls, settings: Settings) -> BusOptions:
-        """The options that the settings ask for. Raises BusConfigError that names the variable."""
+        """Return the options of the settings. Raises BusConfigError with the variable's name."""
         wallclock = settings.runtime == "wallclock"
         return cls(
             listen=settings.listen,
@@ -124,7 +123,7 @@ class BusOptions:
         )
 
     def settings(self) -> dict[str, Any]:
-        """These options as fields for `Settings.replaced`. `drop_wait_us` is none of them: it follows from the runtime."""
+        """Return these options as fields for `Settings.replaced`, without `drop_wait_us`, which follows from the runtime."""
         return {
             "listen": self.listen,
             "connect": self.connect,
@@ -137,7 +136,7 @@ class BusOptions:
         }
 
     def to_env(self) -> dict[str, str]:
-        """The variables that make another process join like this; empty ones undo inherited ones."""
+        """Return the environment variables for another process with these options; empty ones override inherited ones."""
         fields = self.settings()
         environment = Settings.read({}).replaced(**fields).to_env()
         return {variable(name): environment[variable(name)] for name in fields}
@@ -147,14 +146,14 @@ def _check_endpoint(endpoint: str) -> None:
     protocol, slash, address = endpoint.partition("/")
     if not (protocol and slash and address):
         raise BusConfigError(f"endpoint {endpoint!r} is not <protocol>/<address>, like tcp/127.0.0.1:7447")
-    if protocol == "unixsock-stream" and len(os.fsencode(address)) > UNIX_PATH_MAX:
+    if protocol == "unixsock-stream" and len(os.fsencode(address)) > UNIX_PATH_MAX_BYTES:
         raise BusConfigError(
-            f"endpoint {endpoint!r}: the path of a unix socket has at most {UNIX_PATH_MAX} bytes; choose a shorter folder"
+            f"endpoint {endpoint!r}: the path of a unix socket has at most {UNIX_PATH_MAX_BYTES} bytes; choose a shorter folder"
         )
 
 
 def zenoh_config(options: BusOptions) -> zenoh.Config:
-    """The configuration of zenoh for these options. Raises BusConfigError if the configuration file cannot be used."""
+    """Return zenoh's configuration for these options. Raises BusConfigError if the configuration file cannot be used."""
     if options.file is not None:
         try:
             return zenoh.Config.from_file(options.file)
@@ -170,11 +169,11 @@ def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
     connect = [*options.connect, *([options.router] if options.router else [])]
     listen = list(options.listen)
     if not listen and options.mode == "peer" and options.router:
-        listen = ["tcp/[::]:0"]  # a peer behind a router is told to others by gossip, so it must be reachable
+        listen = ["tcp/[::]:0"]  # gossip announces a peer behind a router to others, so it must be reachable
     settings: dict[str, Any] = {
         "mode": options.mode,
         "scouting/multicast/enabled": False,
-        # Without a router the launcher names every peer, and gossip would only build a second set of links.
+        # Without a router the launcher lists every peer, and gossip would build a second set of links.
         "scouting/gossip/enabled": options.router is not None or options.mode == "router",
         "connect/endpoints": connect,
         # Peers start in any order. The default first retry comes after one second, which would be most of a start.
@@ -183,7 +182,7 @@ def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
         "open/return_conditions/connect_scouted": options.router is not None,
         # Late joiners of latched topics are served by time stamp, as in rmw_zenoh.
         "timestamping/enabled": True,
-        # Room for a reader that was not scheduled for a moment (the default is 2 batches).
+        # Room while a reader is not scheduled (the default is 2 batches).
         "transport/link/tx/queue/size": dict.fromkeys(_PRIORITIES, 16),
         "transport/link/tx/queue/congestion_control/drop/wait_before_drop": options.drop_wait_us,
         "transport/shared_memory/enabled": options.shared_memory,
@@ -199,7 +198,7 @@ def _zenoh_settings(options: BusOptions) -> dict[str, Any]:
 
 
 def _tls_settings(folder: Path) -> dict[str, Any]:
-    """Mutual TLS with the certificate in `folder`, whichever side opens a link. Shared memory would go past the encryption."""
+    """Return settings for mutual TLS with the certificate in `folder`. Shared memory would bypass the encryption."""
     ca, certificate, key = (str(folder / name) for name in TLS_FILES)
     return {
         "transport/link/tls/root_ca_certificate": ca,
@@ -214,7 +213,7 @@ def _tls_settings(folder: Path) -> dict[str, Any]:
 
 
 def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) -> dict[str, BusOptions]:
-    """Options by role for a full mesh of peers over unix sockets in `folder`, which must exist.
+    """Return options by role for a full mesh of peers over unix sockets in `folder`, which must exist.
 
     Each role listens on `<folder>/<role>.sock` and connects to the roles before it, so that every pair has one link.
     `lowlatency` names the roles that offer the low-latency transport.
@@ -231,10 +230,10 @@ def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) 
 
 
 def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> zenoh.Session:
-    """A zenoh session; by default as the settings say. Close it with `close_session`, or use `session`.
+    """Open a zenoh session, by default with the options of the settings. Close it with `close_session`, or use `session`.
 
     `access` is the access control of a router, see `security.access`. Raises BusConfigError if a session cannot be opened, for
-    instance because an endpoint is in use.
+    example because an endpoint is in use.
     """
     options = options or BusOptions.from_settings(Settings.read())
     os.environ.setdefault("ZENOH_RUNTIME", POOLS)  # zenoh reads it once, when the first session of a process opens
@@ -244,13 +243,13 @@ def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | 
     try:
         opened = zenoh.open(config)
     except zenoh.ZError as error:
-        raise BusConfigError(f"cannot open a zenoh session {_in_words(options)}: {_reason(error)}") from error
+        raise BusConfigError(f"cannot open a zenoh session {_description(options)}: {_reason(error)}") from error
     _OPEN.add(opened)
     return opened
 
 
-def _in_words(options: BusOptions) -> str:
-    """Where a session listens and connects."""
+def _description(options: BusOptions) -> str:
+    """Return a text with the endpoints of a session."""
     listens = f"that listens at {', '.join(options.listen)}" if options.listen else "that listens nowhere"
     asked = [*options.connect, *([options.router] if options.router else [])]
     keys = f" with the keys in {options.tls}" if options.tls is not None else ""
@@ -258,18 +257,17 @@ def _in_words(options: BusOptions) -> str:
 
 
 def _reason(error: zenoh.ZError) -> str:
-    """What zenoh says, without the lines of its source; a port in use is said in a sentence."""
-    if "os error 98" in str(error):
-        return "that address is in use; end the process that listens there, or name another address"
+    """Return zenoh's message without positions in its source; a port in use has a text of its own."""
+    if f"os error {errno.EADDRINUSE}" in str(error):  # zenoh has no error codes
+        return "that address is in use; end the process that listens there, or use another address"
     return _SOURCE_LINE.sub("", str(error)).rstrip(". ")
 
 
 def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
-    """Undeclares what is passed, closes the session and returns whether it closed in order; never raises.
+    """Undeclare `declared` and close the session; return True if it closed in order. Never raises.
 
-    A session that is still open when the interpreter ends makes it hang for ten seconds and then print a panic ("close
-    operation timed out"), because its close waits for callbacks that need the interpreter. So what `open_session` has opened is
-    closed then.
+    A session that is open when the interpreter ends makes it hang for ten seconds and then print a panic ("close operation timed
+    out"), because its close waits for callbacks that need the interpreter. So sessions of `open_session` are closed at exit.
     """
     _OPEN.discard(zenoh_session)
     for item in declared:
@@ -277,7 +275,7 @@ def close_session(zenoh_session: zenoh.Session, *declared: Any) -> bool:
             item.undeclare()
     try:
         zenoh_session.close()  # type: ignore[no-untyped-call]
-    except Exception:  # the session is lost either way; zenoh's errors share no base with PyO3's panics
+    except Exception:  # zenoh's errors share no base class with PyO3's panics
         return False
     return True
 
@@ -290,7 +288,7 @@ def _close_all() -> None:
 
 @contextmanager
 def session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> Iterator[zenoh.Session]:
-    """A zenoh session for a `with` block, as `open_session` opens it."""
+    """Open a zenoh session for a `with` block, as `open_session`."""
     opened = open_session(options, access)
     try:
         yield opened
@@ -299,7 +297,7 @@ def session(options: BusOptions | None = None, access: Mapping[str, Any] | None 
 
 
 def free_port() -> int:
-    """A TCP port of this machine on which nobody listens now."""
+    """Return a free TCP port of this machine."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         return int(probe.getsockname()[1])

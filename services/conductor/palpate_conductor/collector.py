@@ -1,4 +1,4 @@
-"""The conductor as a service: it gathers what the report needs. The same in every runtime."""
+"""The conductor's service: collects what the report needs; publishes clock, diagnostics and frames. The same in every runtime."""
 
 from __future__ import annotations
 
@@ -6,20 +6,51 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
+import numpy as np
+
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import Clock, DiagnosticArray, codec
+from palpate_bus.messages import Clock, DiagnosticArray, Quaternion, TFMessage, Transform, TransformStamped, codec
+from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_conductor.tree import FrameTree
+from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import link_transforms
+from palpate_models.scenario.schema import ExamInput
 
-HEALTH_PERIOD = NS
-"""Simulated time between two messages on `diagnostics`."""
-TREE_PERIOD = 50 * MS
-"""Simulated time between two messages on `tf`."""
+_AXES = np.array(lbr.JOINT_AXIS)
+_FIRST_JOINT = 1
+"""Index of the first joint's frame, after the base. All other frames are constant."""
+
+
+class FrameTree:
+    """Makes `tf` messages from measured joints: world, lbr_link_0 to 7, lbr_link_ee, ft_sensor, indenter; and world, abdomen."""
+
+    def __init__(self, exam: ExamInput) -> None:
+        frames = [*link_transforms(np.zeros(7), exam.robot), ("world", "abdomen", np.array(exam.X_WA))]
+        self._names = [(parent, child) for parent, child, _ in frames]
+        self._transforms = [transform_message(X) for _, _, X in frames]
+
+    def message(self, t: int, q: Iterable[float]) -> TFMessage:
+        """Return the tree at joint positions `q` [rad], shape (7,), stamped `t` [ns]."""
+        half = 0.5 * np.array(q, np.float64)[:, None]
+        rotations = np.hstack((np.sin(half) * _AXES, np.cos(half)))  # unit quaternions (x, y, z, w), shape (7, 4)
+        transforms = self._transforms.copy()
+        for i, rotation in enumerate(rotations.tolist(), _FIRST_JOINT):
+            transforms[i] = Transform(transforms[i].translation, Quaternion(*rotation))
+        return TFMessage(
+            [
+                TransformStamped(header(t, parent), child, transform)
+                for (parent, child), transform in zip(self._names, transforms, strict=True)
+            ]
+        )
+
+
+DIAGNOSTICS_PERIOD_NS = NS
+TF_PERIOD_NS = 50 * MS
 
 
 class KeptMessages(Sequence[Any]):
-    """All messages of a topic, as bytes: decoded, a state of the examination takes ten times as much memory."""
+    """All messages of a topic, kept as bytes: a decoded exam state takes ten times as much memory."""
 
     def __init__(self, topic: str) -> None:
         kind = contract().topics[topic].type
@@ -28,7 +59,7 @@ class KeptMessages(Sequence[Any]):
         self._newest: Any | None = None
 
     def extend(self, messages: Iterable[Any]) -> None:
-        """Keeps further messages."""
+        """Append messages."""
         for message in messages:
             self._kept.append(self._encode(message))
             self._newest = message
@@ -40,7 +71,7 @@ class KeptMessages(Sequence[Any]):
         return map(self._decode, self._kept)
 
     def __getitem__(self, at: Any) -> Any:
-        if at == -1 and self._kept:  # asked for at every tick
+        if at == -1 and self._kept:  # read at every tick
             return self._newest
         kept = self._kept[at]
         return self._decode(kept) if isinstance(kept, bytes) else [*map(self._decode, kept)]
@@ -48,34 +79,33 @@ class KeptMessages(Sequence[Any]):
 
 @dataclass
 class Collected:
-    """Messages of a run, oldest first, or the newest where only that counts."""
+    """Messages of a run: all, oldest first, or the newest only."""
 
     exam_states: Sequence[Any] = ()
     indentation: Sequence[Any] = ()
     motions: Sequence[Any] = ()
-    """How perception saw the wall move."""
+    """`perception/motion`"""
     exam_time: int = -1
-    """Simulated time [ns] of the newest exam state, -1 before the first: by its number: no clock can spoil that."""
+    """Simulated time [ns] of the newest exam state, from its sequence number; -1 before the first."""
     samples: list[Any] = field(default_factory=list)
     status_changes: list[Any] = field(default_factory=list)
     supervisor: Any | None = None
-    """Its newest state."""
     phantom: Any | None = None
     surface: Any | None = None
     correction: Any | None = None
-    """Where the skin lay relative to the surface, as all of the examination tells."""
+    """Final correction of the perceived surface, from all touches and images."""
     targets: Any | None = None
     stiffness_map: Any | None = None
     findings: Any | None = None
 
     @property
     def exam(self) -> Any | None:
-        """The newest exam state."""
+        """Newest exam state."""
         return self.exam_states[-1] if self.exam_states else None
 
     @property
     def end_tick(self) -> int | None:
-        """The simulated time [ns] at which the run ends, None while planning has not decided it."""
+        """Simulated time [ns] at which the run ends; None until planning announces it."""
         exam = self.exam
         return None if exam is None or exam.end_tick < 0 else int(exam.end_tick)
 
@@ -86,20 +116,20 @@ class Collector(Service):
     role = "conductor"
 
     def __init__(self, diagnose: Callable[[], Sequence[Any]] | None = None, tree: FrameTree | None = None) -> None:
-        """`diagnose` gives the statuses for `diagnostics`; `tree` makes `tf` of the measured joints."""
+        """`diagnose` returns the statuses for `diagnostics`; without `tree` no `tf` is published."""
         self._exam_states, self._indentation, self._motions = map(
             KeptMessages, ("exam/state", "truth/indentation", "perception/motion")
         )
         self.collected = Collected(self._exam_states, self._indentation, self._motions)
         self.diagnose = diagnose
         self._tree = tree
-        self._felt = False
-        """Whether there are samples of this run: those of a run that it goes on with are of before its start."""
-        self._said = -HEALTH_PERIOD
-        self._drawn = -TREE_PERIOD
+        self._sampled = False
+        """True once there are samples of this run; those of a resumed one have negative stamps."""
+        self._diagnostics_at = -DIAGNOSTICS_PERIOD_NS
+        self._tf_at = -TF_PERIOD_NS
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Takes everything new and publishes the clock."""
+        """Collect new messages; publish the clock, and diagnostics and frames at their periods."""
         c = self.collected
         self._exam_states.extend(inbox.new("exam/state"))
         seen = inbox.stamp("exam/state")
@@ -108,29 +138,29 @@ class Collector(Service):
         self._motions.extend(inbox.new("perception/motion"))
         samples = inbox.new("assessment/samples")
         c.samples.extend(samples)
-        self._felt = self._felt or any(sample.header.stamp.sec >= 0 for sample in samples)
+        self._sampled = self._sampled or any(sample.header.stamp.sec >= 0 for sample in samples)
         for status in inbox.new("robot/status"):
             last = c.status_changes[-1] if c.status_changes else None
             if last is None or (last.mode, last.cause) != (status.mode, status.cause):
                 c.status_changes.append(status)
         c.supervisor = inbox.latest("supervisor/state")
         c.phantom = inbox.latest("truth/phantom")
-        if not self._felt:  # later looks are at a patient who has moved: what is felt is told where the first look saw it
+        if not self._sampled:  # the frame of the samples is the first scan; later scans are of a patient who has moved
             c.surface = inbox.latest("perception/surface")
             c.targets = inbox.latest("perception/targets")
         c.correction = inbox.latest("exam/correction")
         c.stiffness_map = inbox.latest("assessment/map")
         c.findings = inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}
-        if self.diagnose is not None and t - self._said >= HEALTH_PERIOD:
-            self._said = t
+        if self.diagnose is not None and t - self._diagnostics_at >= DIAGNOSTICS_PERIOD_NS:
+            self._diagnostics_at = t
             out["diagnostics"] = DiagnosticArray(header(t), list(self.diagnose()))
         status = inbox.latest("robot/status")
-        if self._tree is not None and status is not None and t - self._drawn >= TREE_PERIOD:
-            self._drawn = t
+        if self._tree is not None and status is not None and t - self._tf_at >= TF_PERIOD_NS:
+            self._tf_at = t
             out["tf"] = self._tree.message(nanoseconds(status.header.stamp), status.position)
         return out
 
     def finish(self) -> Mapping[str, Any]:
-        """Nothing to close."""
+        """Return the numbers of exam states and samples."""
         return {"exam_states": len(self.collected.exam_states), "samples": len(self.collected.samples)}

@@ -1,7 +1,7 @@
-"""Places that are kept: in a wall-clock run a service may be stopped and another process may take its place.
+"""Slots: in a wall-clock run another process may replace that of a service.
 
-Only roles without which nothing dangerous happens, and whose work another process can go on with: what moves the arm, feels the
-tissue or watches over both ends the run, and a perception that has not seen the first look does not know the wall.
+Only for roles whose absence is safe and whose work another process can continue. A run ends without the roles that move the arm,
+measure or supervise, and a perception that did not process the first scan has no surface to continue with.
 """
 
 from __future__ import annotations
@@ -14,37 +14,37 @@ ROLES: Final = frozenset({"camera", "assessment"})
 
 
 @dataclass
-class Places:
-    """Which places are empty, since when, and which are played by a second process."""
+class Slots:
+    """Roles whose process left, and roles that a replacement has."""
 
     patience_s: float = 0.0
-    """How long a place is kept; 0 keeps none."""
+    """Time for which a slot is kept; 0 keeps none."""
     empty: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """When [s] each was left, and how."""
-    taken: set[str] = field(default_factory=set)
-    """Roles that another process plays than the one that began: what became of that one does not count any more."""
+    """Roles without a process: time [s] at which it left, and how."""
+    replaced: set[str] = field(default_factory=set)
+    """Roles of a replacement. The end of their first process is ignored."""
 
     def keeps(self, role: str) -> bool:
-        """Whether the role's place is kept when its process goes."""
+        """True if the slot of `role` is kept when its process leaves."""
         return self.patience_s > 0 and role in ROLES
 
     def leave(self, role: str, how: str) -> bool:
-        """Notes that a process is gone; whether that is news."""
+        """Mark a slot empty; return False if it was empty."""
         if role in self.empty:
             return False
         self.empty[role] = (monotonic(), how)
         return True
 
-    def take(self, role: str) -> bool:
-        """Notes that a process speaks for the role; whether the place was empty."""
+    def fill(self, role: str) -> bool:
+        """Mark a slot filled after a report of `role`; return False if it was not empty."""
         if role not in self.empty:
             return False
         del self.empty[role]
-        self.taken.add(role)
+        self.replaced.add(role)
         return True
 
     def expired(self) -> dict[str, str]:
-        """The places that nobody took in time, each once, with how they were left."""
+        """Remove and return the slots that were not filled in time, with how each process left."""
         now = monotonic()
         late = {role: how for role, (since, how) in self.empty.items() if now - since > self.patience_s}
         for role in late:

@@ -1,7 +1,7 @@
-"""The conductor's heartbeat: it tells the services that somebody still watches over the run and would pass on an operator's stop.
+"""The conductor's heartbeat, by which the services detect that it is lost.
 
-A thread of its own sends it, so that no figure that is drawn and no message that is decoded keeps it back. It beats only as long
-as the conductor's own loop turns: a conductor that hangs is no better than none.
+A thread sends it, so that drawing a figure or decoding a message does not delay it. It stops while the conductor's loop hangs,
+since a conductor that hangs does not pass on an operator's stop.
 """
 
 from __future__ import annotations
@@ -16,63 +16,63 @@ from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT, longest_silence_s
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.process_state import home
+from palpate_bus.runtime.process import pid_space
 
 HUNG_S: Final = 2.0
-"""A loop that has not turned for so long hangs."""
+"""Time after which a loop that has not turned counts as hanging."""
 RECENT_S: Final = 2.0
-"""What happens within so long after a standstill may have come of it."""
+"""Time after a standstill within which a loss may be its consequence."""
 QOS: Final = "control"
-"""A late beat is worse than a lost one, and a frozen reader must not keep beats from the others."""
+"""A late beat is worse than a lost one, and a frozen reader must not delay the others' beats."""
 
 
 class Heartbeat:
-    """Beats from `start` to `stop`."""
+    """Sends beats from `start` to `stop`."""
 
     def __init__(self, member: Member, rules: Contract, wallclock: bool) -> None:
         self._period_s = rules.internal[HEARTBEAT].period / NS
         self._deadline_s = longest_silence_s(rules, wallclock)
         self._publisher = member.internal_publisher(HEARTBEAT, CONTROL_TYPE, QOS)
-        self._beat = codec.encoder(CONTROL_TYPE)(RunControl(RunControl.HEARTBEAT, os.getpid(), False, "", home()))
-        self._turned = self._beaten = monotonic()
-        self._missed_at = 0.0
-        """When the heart beat again after it had missed beats for longer than services wait."""
-        self._over = Event()
+        self._message = codec.encoder(CONTROL_TYPE)(RunControl(RunControl.HEARTBEAT, os.getpid(), False, "", pid_space()))
+        self._turned_at = self._sent_at = monotonic()
+        self._late_at = 0.0
+        """When a beat was sent that came later than the services' deadline."""
+        self._stop = Event()
         self._thread = Thread(target=self._run, name="heartbeat", daemon=True)
         self._stood_still_s = 0.0
-        self._moved_on = 0.0
+        self._resumed_at = 0.0
 
     def start(self) -> None:
-        """Begins to beat."""
-        self._turned = self._beaten = monotonic()
+        """Start the thread."""
+        self._turned_at = self._sent_at = monotonic()
         self._thread.start()
 
-    def turn(self) -> None:
-        """Says that the conductor's loop turns."""
+    def loop_turned(self) -> None:
+        """Record that the conductor's loop makes progress."""
         now = monotonic()
-        stood_still_s = now - self._turned
-        missed = now - self._beaten > self._deadline_s or now - self._missed_at < stood_still_s
-        if stood_still_s > self._deadline_s and missed:
-            self._stood_still_s, self._moved_on = stood_still_s, now
-        self._turned = now
+        stood_still_s = now - self._turned_at
+        late = now - self._sent_at > self._deadline_s or now - self._late_at < stood_still_s
+        if stood_still_s > self._deadline_s and late:
+            self._stood_still_s, self._resumed_at = stood_still_s, now
+        self._turned_at = now
 
     @property
     def stood_still_s(self) -> float:
-        """How long [s] the conductor has just stood still, its heart for longer than its services wait; 0 when it has not."""
-        return self._stood_still_s if monotonic() - self._moved_on < RECENT_S else 0.0
+        """Duration [s] of a recent standstill of loop and heartbeat beyond the services' deadline; 0 without one."""
+        return self._stood_still_s if monotonic() - self._resumed_at < RECENT_S else 0.0
 
     def stop(self) -> None:
-        """Ends; a heart that never began has nothing to end."""
-        self._over.set()
+        """Stop the thread, if it was started."""
+        self._stop.set()
         if self._thread.is_alive():
             self._thread.join()
 
     def _run(self) -> None:
         sequence = 0
-        while not self._over.wait(self._period_s):
+        while not self._stop.wait(self._period_s):
             now = monotonic()
-            if now - self._turned <= HUNG_S:
-                self._missed_at = now if now - self._beaten > self._deadline_s else self._missed_at
-                self._beaten = now
+            if now - self._turned_at <= HUNG_S:
+                self._late_at = now if now - self._sent_at > self._deadline_s else self._late_at
+                self._sent_at = now
                 sequence += 1
-                self._publisher.put(self._beat, sequence)
+                self._publisher.put(self._message, sequence)

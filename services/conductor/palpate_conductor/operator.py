@@ -1,6 +1,6 @@
-"""Where an operator's word reaches a run: a queryable of the conductor (`palpate_bus.runs.operator_requests` asks it).
+"""Operator interface: a zenoh queryable that forwards requests to `operator/request`, see `palpate_bus.runs.operator_requests`.
 
-The conductor passes the word on as `operator/request` and answers once the supervisor confirms it, so that the operator knows.
+It answers once the supervisor confirms or refuses the request.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import zenoh
 
 from palpate_bus.messages import SupervisorState
 from palpate_bus.runs.operator_requests import CONFIRM_S, TIME_REQUESTS, WORDS, request_key
+from palpate_errors import UserError
 
 
 @dataclass
@@ -28,14 +29,14 @@ class _Pending:
 
 
 class OperatorRequestServer:
-    """The conductor's side. `attend` it often."""
+    """The conductor's side. Call `poll` often."""
 
     def __init__(
         self, session: zenoh.Session, domain: int, send: Callable[[int, str], None], pace: Callable[[str, int], str]
     ) -> None:
-        """`send(request, reason)` passes a request on, see `palpation_msgs/OperatorRequest`.
+        """`send(request, reason)` publishes a request, see `palpation_msgs/OperatorRequest`.
 
-        `pace(word, ms)` carries out one of `TIME_REQUESTS` and says what came of it, or raises ValueError with why not.
+        `pace(word, ms)` carries out one of `TIME_REQUESTS` and returns the answer, or raises UserError.
         """
         self._pace = pace
         self._key = request_key(domain)
@@ -44,8 +45,8 @@ class OperatorRequestServer:
         self._pending: list[_Pending] = []
         self._queryable = session.declare_queryable(self._key, zenoh.handlers.Callback(self._asked.put, indirect=False))
 
-    def attend(self, supervisor: Any | None) -> None:
-        """Passes on what was asked, and answers what the supervisor's newest state confirms or refuses."""
+    def poll(self, supervisor: Any | None) -> None:
+        """Forward new requests, and answer those that the newest supervisor state confirms or refuses."""
         while True:
             try:
                 query = self._asked.get_nowait()
@@ -61,43 +62,43 @@ class OperatorRequestServer:
     def _take(self, query: Any, supervisor: Any | None) -> None:
         try:
             asked = json.loads(query.payload.to_bytes())
-            reason = str(asked["reason"]).encode(errors="replace").decode()  # a terminal's odd bytes keep no stop back
+            reason = str(asked["reason"]).encode(errors="replace").decode()  # invalid bytes of a terminal must not prevent a stop
             word, ms = asked["word"], int(asked.get("ms", 0))
             request = None if word in TIME_REQUESTS else WORDS[word]
         except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
-            self._reply(query, False, f"no request: want a word out of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
+            self._reply(query, False, f"not a request: want one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
             return
         if request is None:
             try:
                 self._reply(query, True, self._pace(word, ms), 0.0)
-            except ValueError as error:
+            except UserError as error:
                 self._reply(query, False, str(error), 0.0)
             return
         self._send(request, reason)
         before = (0, 0) if supervisor is None else (int(supervisor.releases), int(supervisor.refusals))
         self._pending.append(_Pending(query, word, monotonic(), *before))
 
-    def _reply(self, query: Any, done: bool, words: str, after_s: float) -> None:
-        query.reply(self._key, json.dumps({"done": done, "words": words, "after_ms": round(after_s * 1e3, 1)}))
+    def _reply(self, query: Any, done: bool, text: str, after_s: float) -> None:
+        query.reply(self._key, json.dumps({"done": done, "words": text, "after_ms": round(after_s * 1e3, 1)}))
         query.drop()
 
     def close(self) -> None:
-        """Answers nobody any more."""
+        """Undeclare the queryable."""
         self._queryable.undeclare()  # type: ignore[no-untyped-call]
 
 
 def _answer(pending: _Pending, supervisor: Any | None) -> tuple[bool, str] | None:
-    """(Whether it is done, in words), None while nothing is known."""
+    """Return (True if it is done, text for the operator); None while it is neither confirmed nor refused."""
     if supervisor is not None:
         if pending.word == "stop" and supervisor.level == SupervisorState.LEVEL_EMERGENCY:
             return True, f"the driver holds: {supervisor.reason}"
         if pending.word == "soft-stop" and supervisor.level != SupervisorState.LEVEL_OK:
-            return True, f"the arm retreats and waits: {supervisor.reason}"
-        lifts = pending.word in ("release", "end")
-        if lifts and supervisor.releases > pending.releases:
+            return True, f"the arm retreats, then waits: {supervisor.reason}"
+        releases = pending.word in ("release", "end")
+        if releases and supervisor.releases > pending.releases:
             return True, "released"
-        if lifts and supervisor.refusals > pending.refusals:
+        if releases and supervisor.refusals > pending.refusals:
             return False, supervisor.reason
     if monotonic() - pending.since > CONFIRM_S:
-        return False, f"passed on, but the supervisor did not confirm it within {CONFIRM_S:g} s"
+        return False, f"sent, but the supervisor did not confirm it within {CONFIRM_S:g} s"
     return None

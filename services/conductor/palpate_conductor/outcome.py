@@ -1,39 +1,71 @@
-"""How long a conductor waits, and what came of a run."""
+"""Settings and results of a run: how time passes, how long the conductor waits, how the run ended."""
 
 from __future__ import annotations
 
 import logging
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
+from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import NEVER, run_hash
+from palpate_conductor.collector import Collected
 from palpate_errors import RunError
 
 log = logging.getLogger(__name__)
 
+SIM_LIMIT = 3600 * NS
+"""Simulated time [ns] after which a run is ended in any case."""
+
+
+@dataclass(frozen=True)
+class Timing:
+    """How time passes in a run; by default in lockstep, as fast as possible."""
+
+    wallclock: bool = False
+    """Every service runs on its own timer; only the common start and the end are granted."""
+    realtime: float | None = None
+    """Lockstep: upper limit of simulated seconds per wall second."""
+    rate: float = 1.0
+    """Wall-clock mode: simulated seconds per wall second."""
+    limit: int = SIM_LIMIT
+    """Simulated time [ns] at which the run ends at the latest."""
+    handover_s: float = 0.0
+    """Wall-clock mode: time for which the slot of a service that left is kept [s], see `handover`; 0 keeps none."""
+
+    @property
+    def wallclock_rate(self) -> float | None:
+        """The rate in wall-clock mode; None in lockstep."""
+        return self.rate if self.wallclock else None
+
+    @property
+    def runtime(self) -> str:
+        """The value of PALPATE_RUNTIME for the services."""
+        return "wallclock" if self.wallclock else "lockstep"
+
 
 @dataclass(frozen=True)
 class Patience:
-    """How long the conductor waits [s], by wall clock."""
+    """Time limits of the conductor [s], wall clock."""
 
     start: float = 300.0
-    """For every service to answer on every edge. The first run after an installation compiles; who dies is named at once."""
+    """Until every service answers on every edge; the first run after an installation compiles."""
     quiet_start: float = 15.0
-    """Before it says, once, who has not answered yet."""
+    """Until the services that have not answered yet are listed, once."""
     soft: float = 5.0
-    """Without a finished tick before it says who blocks."""
+    """Without a finished tick: a warning names the blocking service."""
     hard: float = 120.0
-    """Without a finished tick before it ends the run."""
+    """Without a finished tick: the run ends."""
     frozen: float = 2.5
-    """How long somebody may have stopped a process before its service counts as lost ..."""
+    """Until the service of a stopped process counts as lost."""
     asleep: float = 15.0
-    """... and of one that sleeps and uses no processor time: longer than zenoh lets a sender wait for a reader that is gone."""
+    """The same for a process that sleeps and uses no processor time; longer than zenoh blocks a sender on a reader that left."""
     absent: tuple[str, ...] = ()
-    """Roles that somebody else starts ..."""
+    """Roles that the user starts."""
     join: float = 300.0
-    """... and how long after all others have answered."""
+    """Until these answer, after all others have."""
 
 
 @dataclass
@@ -46,13 +78,13 @@ class RunOutcome:
     wall_time_s: float = 0.0
     last_tick: int = NEVER
     trouble: list[str] = field(default_factory=list)
-    """A sentence for each loss."""
+    """Messages for the user about lost services and the like."""
     lost: dict[str, int] = field(default_factory=dict)
-    """Tick [ns] at which each lost service fell silent."""
-    failure: str | None = None
-    """Service and cause, None when the run completed."""
+    """Last reported tick [ns] of each lost service."""
+    failure: Failure | None = None
+    """None for a completed run."""
     interrupted: bool = False
-    """Whether it was ended by Ctrl-C or SIGTERM."""
+    """True if Ctrl-C or SIGTERM ended it."""
 
     @property
     def run_hash(self) -> str | None:
@@ -60,15 +92,73 @@ class RunOutcome:
         return None if self.failure else run_hash(self.digests)
 
 
+@dataclass
+class RunResult:
+    """What a run left, in memory."""
+
+    runtime: str
+    collected: Collected
+    run_hash: str | None
+    digests: dict[str, str]
+    """SHA-256 over the messages of each hashed topic; shows the topic in which two runs differ."""
+    sim_time_s: float
+    wall_time_s: float
+    start_time_s: float
+    """From the command to the first tick."""
+    blame: dict[str, Any]
+    counters: dict[str, Any]
+    failure: Failure | None
+    """None for a completed examination."""
+    lost: dict[str, int]
+    earlier: tuple[Collected, ...] = ()
+    """Messages of the interrupted examinations that this one resumed, oldest first; its samples include theirs."""
+    interrupted: bool = False
+    """True if Ctrl-C or SIGTERM ended it."""
+
+    @property
+    def unbegun(self) -> bool:
+        """True if it was interrupted before the examination began."""
+        return self.interrupted and self.collected.exam is None
+
+
+@dataclass(frozen=True)
+class RunProgress:
+    """The state of a run for its user."""
+
+    t: int
+    """Simulated time [ns]."""
+    real_time_factor: float
+    collected: Collected
+    trouble: tuple[str, ...] = ()
+    """Messages for the user so far, see `RunOutcome`."""
+    request: Callable[[int, str], None] | None = None
+    """Sends an operator's request with its reason; None where there is no bus."""
+
+
+Tell = Callable[[RunProgress], None]
+"""Called often during a run."""
+
+
 class RunFailed(RunError):
-    """The run ended early. Names the service and the cause."""
+    """The run ended early."""
+
+    def __init__(self, code: FailureCode, text: str, *roles: str, topics: tuple[str, ...] = ()) -> None:
+        super().__init__(text)
+        self.failure = Failure(code, text, roles, topics)
 
 
-def in_words(failure: BaseException, t: int) -> str:
-    """Why a run ended at `t` [ns]. What nobody expected goes to the log with its traceback."""
-    if isinstance(failure, KeyboardInterrupt):
-        return f"interrupted at {max(t, 0) / NS:.3f} s"
-    if isinstance(failure, RunFailed):
-        return str(failure)
-    log.error("the conductor failed", exc_info=failure)
-    return f"the conductor failed: {type(failure).__name__}: {failure}"
+def failure_of(error: BaseException, t: int) -> Failure:
+    """Return why a run ended at `t` [ns]. Logs the traceback of an unexpected error."""
+    if isinstance(error, KeyboardInterrupt):
+        return Failure(FailureCode.INTERRUPTED, f"interrupted at {max(t, 0) / NS:.3f} s")
+    if isinstance(error, RunFailed):
+        return error.failure
+    log.error("the conductor failed", exc_info=error)
+    return Failure(FailureCode.INTERNAL, f"the conductor failed: {type(error).__name__}: {error}", ("conductor",))
+
+
+def gave_up(collected: Collected) -> Failure | None:
+    """Return why planning aborted the examination; None if it did not."""
+    exam = collected.exam
+    aborted = exam is not None and exam.phase == ExamState.PHASE_ABORTED
+    return Failure(FailureCode.GAVE_UP, str(exam.message)) if exam is not None and aborted else None

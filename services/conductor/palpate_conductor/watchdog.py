@@ -1,18 +1,74 @@
-"""Who blocks whom: from what every service last said of itself."""
+"""Progress of the services: which one blocks the others, and which process is frozen.
+
+Frozen processes are found only where the conductor can inspect them: on the same machine, in the same namespace of process ids.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
-from time import monotonic
+from time import monotonic, sleep
+from typing import Any, Final
 
-INTERRUPTED_S = 0.5
-"""When all services are silent for so long, it is their way to the conductor that is interrupted; they report every 0.2 s."""
+import psutil
+
+from palpate_bus.runtime.process import Activity, is_running, pid_space
+from palpate_conductor.outcome import Patience
+
+CHECK_PERIOD_S: Final = 0.25
+EXIT_S: Final = 0.05
+"""A process that exits closes its connections this long before it is gone."""
+INTERRUPTED_S: Final = 0.5
+"""If all services are silent for longer, the connection to the conductor is interrupted; they report every 0.2 s."""
+
+
+class FreezeWatch:
+    """Inspects the services' processes. A slow process uses processor time or waits for a core; a frozen one does neither."""
+
+    def __init__(self, patience: Patience) -> None:
+        self._patience = patience
+        self._activity: dict[str, Activity] = {}
+        self._checked_at = 0.0
+
+    def add(self, role: str, detail: Mapping[str, Any]) -> None:
+        """Start to watch the process that a service names in its READY report."""
+        if role not in self._activity and detail.get("home") == pid_space() != "":
+            with suppress(psutil.Error):
+                self._activity[role] = Activity(int(detail["pid"]))
+
+    def connection_lost(self, role: str) -> str:
+        """Return a text for the closed connection of `role`, with the state of its process if that still runs."""
+        activity = self._activity.get(role)
+        if activity is None or not is_running(activity.pid):
+            return "its connection closed"
+        sleep(EXIT_S)
+        if not is_running(activity.pid):
+            return "its connection closed"
+        return f"its connection closed, but its process {activity.pid} runs: the connection broke, or the machine is overloaded"
+
+    def frozen(self) -> dict[str, str]:
+        """Return the roles of frozen processes with a text each: stopped ones, or if there is none, ones that sleep for long.
+
+        A stopped process blocks others that send to it; these sleep without being at fault.
+        """
+        now = monotonic()
+        if now - self._checked_at < CHECK_PERIOD_S:
+            return {}
+        self._checked_at = now
+        states = {role: activity.check() for role, activity in self._activity.items()}
+        stopped = {role: state for role, state in states.items() if state.stopped}
+        limit = self._patience.frozen if stopped else self._patience.asleep
+        return {
+            role: f"frozen: its process {state.pid} is {state.status} and has used no processor time for {state.seconds:.1f} s"
+            for role, state in (stopped or states).items()
+            if state.seconds >= limit
+        }
 
 
 @dataclass
 class RoleProgress:
-    """What one service last reported."""
+    """The last report of a service."""
 
     tick: int = -1
     """Last finished tick [ns]."""
@@ -20,11 +76,11 @@ class RoleProgress:
     """Topic it waits for, `grant`, or empty."""
     reported: float = field(default_factory=monotonic)
     moved: float = field(default_factory=monotonic)
-    """When it last finished a tick, by the monotonic clock [s]."""
+    """When it last reported a new tick, by the monotonic clock [s]."""
 
 
 class RunWatchdog:
-    """Keeps the progress of every service and names the one that holds the others up."""
+    """Keeps the progress of every service and finds the one that blocks the others."""
 
     def __init__(self, roles: tuple[str, ...], producers: dict[str, str]) -> None:
         """`producers` gives the producing role of each topic."""
@@ -33,7 +89,7 @@ class RunWatchdog:
         self._longest_silence = 0.0
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:
-        """Takes a report. A role that the run does not have is ignored."""
+        """Take a report. A role that the run does not have is ignored."""
         progress = self.progress.get(role)
         if progress is None:
             return
@@ -45,39 +101,39 @@ class RunWatchdog:
             progress.moved = now
 
     def silent_for(self) -> float:
-        """Seconds since any service was heard of, whatever it said: they report while they wait, too."""
+        """Return the time [s] since the last report of any service; services that wait report, too."""
         return monotonic() - max(progress.reported for progress in self.progress.values())
 
     def note_silence(self) -> None:
-        """Remembers how long nothing has been heard of any service."""
+        """Update the longest silence of all services."""
         self._longest_silence = max(self._longest_silence, self.silent_for())
 
     @property
     def interruption(self) -> str:
-        """That the transport was interrupted for a while, as it seems here; empty if it was not."""
+        """A text if all services were silent for longer than they ever should be; else empty."""
         silent = self._longest_silence
         if silent < INTERRUPTED_S:
             return ""
-        return f"for {silent:.1f} s nothing was heard of any service: the transport or the whole machine stood still"
+        return f"no report of any service for {silent:.1f} s: the transport or the whole machine stood still"
 
     def stalled_for(self) -> float:
-        """Seconds since any service finished a tick."""
+        """Return the time [s] since any service finished a tick."""
         return monotonic() - max(progress.moved for progress in self.progress.values())
 
     def longest_stall(self, roles: Collection[str]) -> float:
-        """Seconds since that one of `roles` which is furthest behind its own clock finished a tick (wall-clock runs)."""
+        """Return the longest time [s] since one of `roles` finished a tick (wall-clock runs)."""
         return monotonic() - min((self.progress[role].moved for role in roles), default=monotonic())
 
-    def forgive(self) -> None:
-        """Starts the stall anew: while the run is paused nobody is to blame."""
+    def restart(self) -> None:
+        """Start to measure stalls from now, at the first grant and while the run is paused."""
         now = monotonic()
         for progress in self.progress.values():
             progress.moved = now
 
     def culprit(self, roles: Collection[str]) -> tuple[str, str]:
-        """The one of `roles` that blocks, and a sentence that says whom.
+        """Return the one of `roles` that blocks the others, and a text.
 
-        Follows who-waits-for-whom from the slowest waiting service to one that waits for nobody; a circle is named as one.
+        Follows who-waits-for-whom from the slowest waiting service to one that does not wait, or around a cycle.
         """
         waiting = {
             role: self._producers[p.waiting_for]
@@ -85,23 +141,18 @@ class RunWatchdog:
             if role in roles and self._producers.get(p.waiting_for) in roles
         }
         if all(self.progress[role].waiting_for == "grant" for role in roles):
-            return "conductor", "everyone waits for the conductor to grant time: planning or the recorder has fallen behind"
+            return "conductor", "all services wait for a grant of the conductor: planning or the recorder is behind"
         if not waiting:
             role = min(roles, key=lambda name: self.progress[name].moved)
-            return (
-                role,
-                f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; nobody waits for it",
-            )
+            return role, f"{role} has not finished a tick since {self.progress[role].tick / 1e9:.3f} s; no service waits for it"
         role = min(waiting, key=lambda name: self.progress[name].tick)
         path = [role]
         while path[-1] in waiting:
             follower = waiting[path[-1]]
             if follower in path:
-                return follower, f"circle of waiting: {' -> '.join([*path[path.index(follower) :], follower])}"
+                return follower, f"cycle of waiting services: {' -> '.join([*path[path.index(follower) :], follower])}"
             path.append(follower)
         culprit = path[-1]
-        blocked = sorted(name for name in waiting if name != culprit)
-        return culprit, (
-            f"{culprit} is at {self.progress[culprit].tick / 1e9:.3f} s and waits for nobody; "
-            f"{', '.join(f'{name} (for {self.progress[name].waiting_for})' for name in blocked)} wait"
-        )
+        blocked = ", ".join(f"{name} (for {self.progress[name].waiting_for})" for name in sorted(set(waiting) - {culprit}))
+        tick_s = self.progress[culprit].tick / 1e9
+        return culprit, f"{culprit} is at {tick_s:.3f} s and does not wait; blocked: {blocked}"

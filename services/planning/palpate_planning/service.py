@@ -15,7 +15,7 @@ from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, Se
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.messages.stamps import header
-from palpate_bus.runtime import priority
+from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array
@@ -55,7 +55,7 @@ class PlanningService(Service):
         roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
-        _let_the_worker_give_way()
+        _lower_worker_priority()
         self._exam = ExamSequence(known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep)
         self._supervisor_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
@@ -239,8 +239,8 @@ def _end(requests: tuple[Message, ...]) -> str:
 
 
 @cache
-def _let_the_worker_give_way() -> None:
-    WORKER.submit(priority.give_way, priority.WORKER)
+def _lower_worker_priority() -> None:
+    WORKER.submit(lower_priority, WORKER_NICENESS)
 
 
 def create(scenario: Scenario) -> PlanningService:

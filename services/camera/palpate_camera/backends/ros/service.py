@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
 from palpate_bus.messages.geometry import depth_in_metres
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera import messages
@@ -191,7 +191,7 @@ def _pinhole(info: Any, *, rectified: bool) -> Pinhole:
 
 def create(scenario: Scenario) -> RosCameraService:
     """The camera that the scenario's `camera.ros` names. Raises CameraError."""
-    if runtime() != "wallclock":
+    if Settings.read().runtime != "wallclock":
         raise CameraError("services.camera = ros takes a real camera, which does not wait: run with --wallclock")
     ros = scenario.camera.ros
     return RosCameraService(ZenohCamera(ros), ros.frame.strip("/"), ros.world.strip("/"))

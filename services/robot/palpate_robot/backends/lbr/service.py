@@ -22,8 +22,8 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
-from palpate_bus.run import runtime
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.gravity import GRAVITY
@@ -270,7 +270,7 @@ def _wrench(values: Array) -> Message:
 
 def create(scenario: Scenario) -> LbrService:
     """The driver of a scenario, of which it may know the exam input; it joins the ROS side that `robot.lbr` names."""
-    if runtime() != "wallclock":
+    if Settings.read().runtime != "wallclock":
         raise BusConfigError("services.robot = lbr drives hardware, which does not wait for simulated time: run with --wallclock")
     exam = exam_input(scenario)
     inner = InnerLoop(load_control(scenario)) if exam.robot.lbr.level == "setpoint" else None

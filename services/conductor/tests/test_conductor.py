@@ -1,0 +1,254 @@
+"""The parts of the conductor, without services."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+import tracemalloc
+from collections.abc import Callable
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import IndentationTruth, Point, SupervisorState, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.failure import FailureCode
+from palpate_bus.runtime.member import Member
+from palpate_bus.runtime.process import pid_space
+from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
+from palpate_conductor import heartbeat
+from palpate_conductor.collector import KeptMessages
+from palpate_conductor.heartbeat import Heartbeat
+from palpate_conductor.operator import OperatorRequestServer
+from palpate_conductor.outcome import Patience, failure_of
+from palpate_conductor.watchdog import FreezeWatch, RunWatchdog
+from palpate_errors import UserError
+
+TOPIC = "truth/indentation"
+
+
+def contact(k: int) -> IndentationTruth:
+    return IndentationTruth(header(k * 10_000_000, "world"), 0.01 * k, 1 / (k + 1), 0.5, 2.5, 20, Point(0.1 * k, 0.2, 0.7), 6.8e5)
+
+
+def test_kept_messages_equal_the_originals() -> None:
+    messages, kept = [contact(k) for k in range(5)], KeptMessages(TOPIC)
+    with pytest.raises(IndexError):
+        kept[-1]
+    kept.extend(messages[:3])
+    kept.extend(messages[3:])
+    assert len(kept) == 5
+    assert list(kept) == list(kept) == messages
+    assert (kept[1], kept[-1], kept[::2]) == (messages[1], messages[-1], messages[::2])
+
+
+def test_kept_messages_take_less_than_a_quarter_of_the_memory() -> None:
+    kind = contract().topics[TOPIC].type
+    payloads = [codec.encode(contact(k), kind) for k in range(1000)]
+
+    def taken(keep: Callable[[Any], None]) -> int:
+        tracemalloc.start()
+        try:
+            for payload in payloads:
+                keep([codec.decode(payload, kind)])
+            return tracemalloc.get_traced_memory()[0]
+        finally:
+            tracemalloc.stop()
+
+    decoded: list[Any] = []
+    assert taken(KeptMessages(TOPIC).extend) < taken(decoded.extend) / 4
+
+
+# -- heartbeat and frozen processes
+
+
+def test_a_process_without_a_connection_is_told_from_one_that_exited() -> None:
+    child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
+    watch = FreezeWatch(Patience())
+    watch.add("planning", {"pid": child.pid, "home": pid_space()})
+    assert f"its process {child.pid} runs" in watch.connection_lost("planning")
+    exited = watch.connection_lost("camera")
+    child.kill()
+    child.wait()
+    assert watch.connection_lost("planning") == exited
+
+
+@pytest.mark.parametrize(("wallclock", "beats", "stood_still_s"), [(True, False, 0.4), (False, False, 0.0), (True, True, 0.0)])
+def test_a_standstill_is_longer_than_the_services_wait_and_stops_the_heartbeat(
+    monkeypatch: pytest.MonkeyPatch, wallclock: bool, beats: bool, stood_still_s: float
+) -> None:
+    session = open_session(BusOptions())
+    now = 100.0
+    monkeypatch.setattr(heartbeat, "monotonic", lambda: now)
+    try:
+        beat = Heartbeat(Member(session, "conductor", contract(), 0), contract(), wallclock)
+        beat.loop_turned()
+        now += 0.4
+        if beats:
+            beat._sent_at = now - 0.1
+        beat.loop_turned()
+        assert beat.stood_still_s == pytest.approx(stood_still_s)
+    finally:
+        close_session(session)
+
+
+# -- the operator
+
+
+class Query:
+    """A query of an operator."""
+
+    def __init__(self, word: str, ms: int = 0) -> None:
+        text = json.dumps({"word": word, "reason": "test", "ms": ms})
+        self.payload = SimpleNamespace(to_bytes=text.encode)
+        self.answer: dict[str, Any] | None = None
+
+    def reply(self, key: str, text: str) -> None:
+        self.answer = json.loads(text)
+
+    def drop(self) -> None:
+        """Does nothing."""
+
+
+class Session:
+    """A session without a bus."""
+
+    def declare_queryable(self, key: str, handler: Any) -> Any:
+        return SimpleNamespace(undeclare=lambda: None)
+
+
+def state(level: int, reason: str, releases: int = 0, refusals: int = 0) -> Any:
+    return SupervisorState(header(0), level, 1, reason, releases, 0.0, -1.0, 0.0, refusals)
+
+
+def never(word: str, ms: int) -> str:
+    raise UserError("wall-clock run")
+
+
+def asked(word: str, before: Any, after: Any) -> tuple[bool, str]:
+    sent: list[int] = []
+    server = OperatorRequestServer(Session(), 0, lambda request, reason: sent.append(request), never)  # type: ignore[arg-type]
+    query = Query(word)
+    server._asked.put(query)
+    server.poll(before)
+    assert sent
+    assert query.answer is None, "an earlier state confirms nothing"
+    server.poll(after)
+    assert query.answer is not None
+    return query.answer["done"], query.answer["words"]
+
+
+def test_a_release_is_not_answered_with_an_earlier_refusal() -> None:
+    refused = state(2, "release refused: 45 N", refusals=1)
+    assert asked("release", refused, state(0, "", releases=1, refusals=1)) == (True, "released")
+
+
+def test_a_refusal_gives_the_reason() -> None:
+    assert asked("release", state(2, "45 N"), state(2, "release refused: 45 N", refusals=1)) == (False, "release refused: 45 N")
+
+
+def test_the_conductor_answers_requests_about_time() -> None:
+    for pace, answer in ((lambda word, ms: f"{word} {ms}", (True, "step 3")), (never, (False, "wall-clock run"))):
+        server = OperatorRequestServer(Session(), 0, lambda request, reason: None, pace)  # type: ignore[arg-type]
+        query = Query("step", 3)
+        server._asked.put(query)
+        server.poll(None)
+        assert query.answer is not None
+        assert (query.answer["done"], query.answer["words"]) == answer
+
+
+# -- the watchdog
+
+
+PRODUCERS = {"joint_states": "robot", "control/joint_torque": "control", "sim/contact_wrench": "tissue", "exam/state": "planning"}
+ROLES = ("robot", "control", "tissue", "planning", "assessment")
+
+
+def watchdog() -> RunWatchdog:
+    return RunWatchdog((*ROLES, "dashboard"), PRODUCERS)
+
+
+def test_the_service_that_does_not_wait_is_the_culprit() -> None:
+    w = watchdog()
+    w.report("control", 5_000_000, "joint_states")
+    w.report("robot", 5_000_000, "sim/contact_wrench")
+    w.report("tissue", 4_000_000, "")
+    role, text = w.culprit(ROLES)
+    assert role == "tissue"
+    assert "control (for joint_states)" in text
+    assert "robot (for sim/contact_wrench)" in text
+
+
+def test_a_cycle_is_named_as_one() -> None:
+    w = watchdog()
+    w.report("control", 1, "joint_states")
+    w.report("robot", 1, "control/joint_torque")
+    role, text = w.culprit(ROLES)
+    assert role in ("control", "robot")
+    assert "cycle" in text
+
+
+def test_one_service_that_waits_for_a_grant_does_not_make_the_conductor_the_culprit() -> None:
+    w = watchdog()
+    w.report("robot", 1, "grant")
+    assert w.culprit(ROLES)[0] != "conductor"
+
+
+def test_only_a_finished_tick_counts_as_movement() -> None:
+    w = watchdog()
+    w.report("robot", 1_000_000, "")
+    before = w.progress["robot"].moved
+    w.report("robot", 1_000_000, "control/joint_torque")
+    assert w.progress["robot"].moved == before
+    w.report("unknown", 5, "")
+
+
+def test_only_the_given_roles_can_be_the_culprit() -> None:
+    w = watchdog()
+    for progress in w.progress.values():
+        progress.moved -= 100.0
+    for role in ROLES:
+        w.report(role, 1_000_000, "")
+    assert w.longest_stall((*ROLES, "dashboard")) > 99.0
+    assert w.longest_stall(ROLES) < 50.0
+    assert w.longest_stall(()) < 1.0
+    assert w.culprit(ROLES)[0] != "dashboard"
+
+
+def test_if_all_wait_for_a_grant_the_conductor_blocks() -> None:
+    w = watchdog()
+    for role in ROLES:
+        w.report(role, 1_000_000, "grant")
+    assert w.culprit(ROLES)[0] == "conductor"
+
+
+def test_silence_is_that_of_all_services() -> None:
+    w = watchdog()
+    for progress in w.progress.values():
+        progress.reported -= 100.0
+    assert w.silent_for() > 99.0
+    w.report("robot", 1_000_000, "")
+    assert w.silent_for() < 50.0
+
+
+def test_an_interruption_is_a_silence_of_all_services() -> None:
+    w = watchdog()
+    w.progress["robot"].reported -= 2.0
+    w.note_silence()
+    assert w.interruption == "", "one role was silent, the others reported"
+    for progress in w.progress.values():
+        progress.reported -= 2.0
+    w.note_silence()
+    w.report("robot", 1_000_000, "")
+    assert "2.0 s" in w.interruption
+
+
+def test_every_error_has_a_failure_code() -> None:
+    unexpected = failure_of(ValueError("odd"), 0)
+    assert (unexpected.code, unexpected.roles) == (FailureCode.INTERNAL, ("conductor",))
+    assert "ValueError: odd" in unexpected.text
+    interrupted = failure_of(KeyboardInterrupt(), 2_500_000_000)
+    assert (interrupted.code, interrupted.text) == (FailureCode.INTERRUPTED, "interrupted at 2.500 s")

@@ -1,7 +1,0 @@
-"""`python -m palpate_perception [NAME_OR_FILE]`: the perception as a process of its own."""
-
-from palpate_bus.run import main
-from palpate_models.scenario.load import load_scenario
-
-if __name__ == "__main__":
-    main("perception", load_scenario)

@@ -1,7 +1,0 @@
-"""`python -m palpate_supervisor [NAME_OR_FILE]`: the supervisor as a process of its own."""
-
-from palpate_bus.run import main
-from palpate_models.scenario.load import load_scenario
-
-if __name__ == "__main__":
-    main("supervisor", load_scenario)
