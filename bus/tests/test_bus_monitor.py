@@ -134,7 +134,7 @@ FAULTS = [
     ("joint_states", degrees, Kind.UNIT, "-3.2..3.2 [rad]", "57, plausible if it is in deg"),
     ("ft/wrench", far, Kind.RANGE, "-200..200 [N]", "10000"),
     ("ft/wrench", other_frame, Kind.FRAME, "'ft_sensor'", "'world'"),
-    ("ft/wrench", backwards, Kind.STAMP, "at least 1999000000 ns", "5 ns: it goes backwards"),
+    ("ft/wrench", backwards, Kind.STAMP, "at least 1999000000 ns", "5 ns: backwards"),
 ]
 
 
