@@ -126,7 +126,7 @@ def _after(run: BrokenOff, earlier: Checkpoint | None) -> Checkpoint:
     motions = deque(c.motions)
     for state in c.exam_states:
         while motions and nanoseconds(motions[0].header.stamp) <= nanoseconds(state.header.stamp):
-            assessment.hear(motions.popleft())
+            assessment.add_motion(motions.popleft())
         assessment.take(state)
     X_AW = inverse(np.array(known.X_WA))
     if c.surface is None or c.targets is None:  # it had not looked yet

@@ -25,7 +25,7 @@ _MOST_CONTRADICTED = 0.3
 
 
 class Reason(IntEnum):
-    """Why a place is not assessed, if it is not; numbered as StiffnessMap.msg does."""
+    """Reason why a place is not assessed; numbers of StiffnessMap.msg."""
 
     ASSESSED = 0
     NOT_REACHED = 1
@@ -74,9 +74,9 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
 
 
 def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate], NDArray[np.int_]] | None:
-    """The regression of what can be believed, the lumps that are weighed, and of each sample the `Reason` why it is left out.
+    """Return the regression of consistent samples, the candidate lumps, and the `Reason` of each sample that is left out.
 
-    None while too few samples tell anything.
+    None with too few samples.
     """
     reasons = np.where(o.yielded, Reason.YIELDED, Reason.ASSESSED)
     telling = np.flatnonzero(~o.yielded)

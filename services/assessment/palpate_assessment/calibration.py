@@ -1,4 +1,4 @@
-"""What was learned from tuning patients: `calibration.yaml`, made by `python -m research.assessment_calibration`."""
+"""Parameters fitted to tuning patients: `calibration.yaml`, made by `python -m research.assessment_calibration`."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ class Calibration(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     exponent: float
-    """n of F ~ depth^n about the examination's depth ..."""
+    """n of F ~ depth^n around the examination's depth."""
     exponent_sd: float
-    """... and how it differs between people."""
+    """Its SD between people."""
     conversion: float
-    """log of the force while sliding at the press's depth over the press's own force ..."""
+    """Log of the ratio of sliding force at the depth of the press to the force of the press."""
     conversion_sd: float
-    """... how it differs between people, tiers and in what all depths have in common."""
+    """Its SD between people and tissues, and by the common depth error."""
     lead_s: float
     """A sliding indenter feels this much of its travel ahead [s]."""
     probability: tuple[float, ...]
     """Weights of a candidate's features (`detection.FEATURES`) in the logit of its probability, the constant first."""
     guarding: tuple[float, float, float]
-    """Weights of the signs of a tensed muscle (`guarding.Signs`) in the logarithm of how much more probable it is than anything
-    else that is no lump, the constant first."""
+    """Weights of the signs of a tensed muscle (`guarding.Signs`) in its log odds against everything except a lump, the constant
+    first."""
     tail: tuple[float, float]
     """Location and scale of a healthy examination's greatest logit: P(greatest > s) = exp(-(s - location) / scale)."""
 

@@ -1,8 +1,7 @@
-"""Whether the model can say what the samples say: each piece of a stroke against what all the others predict of it.
+"""Posterior predictive check: each piece of a stroke against its prediction from all others.
 
 With the covariance K of all observations and P = K^-1, the piece k held out has the residual e = (P_kk)^-1 (P y)_k with
-covariance (P_kk)^-1 (Rasmussen and Williams 2006, sec. 5.4.2), so e' P_kk e is chi-squared if the model holds: a posterior
-predictive check.
+covariance (P_kk)^-1 (Rasmussen and Williams 2006, sec. 5.4.2), so e' P_kk e is chi-squared if the model holds.
 """
 
 from __future__ import annotations
@@ -22,7 +21,7 @@ examinations where the model holds."""
 
 
 def contradicted(regression: Regression) -> NDArray[np.bool_]:
-    """Which samples are in a piece of a stroke that the others contradict, shape (m,)."""
+    """Return the mask of samples in a piece of a stroke that the others contradict, shape (m,)."""
     o = regression.observations
     precision = inverse(regression.triangle)
     pull = precision @ (o.y - regression.level)

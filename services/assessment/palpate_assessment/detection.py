@@ -1,12 +1,12 @@
-"""Lumps by matched filter: how much of a bump's shape the samples hold that natural variation and errors do not explain.
+"""Detection of lumps by matched filter, against natural variation and errors.
 
 With the covariance S of everything but the bump, its log-contrast by generalised least squares, and in units of its error, is
 
     e = b' S^-1 y / b' S^-1 b,      t = b' S^-1 y / sqrt(b' S^-1 b)
 
-which is the best linear test for a known shape (Kay 1998, "Detection theory", ch. 4). Bumps are sought one after the other: the
-strongest becomes part of the model, whose amplitudes are found anew, so that a lump is not taken for a rough background, and a
-rough background not for a lump.
+which is the best linear test for a known shape (Kay 1998, "Detection theory", ch. 4). Bumps are sought one after another: the
+strongest joins the model, whose amplitudes are estimated again, so that a lump is not mistaken for natural variation, nor the
+reverse.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRIES = 120
 EDGES_M = (EDGE_M, 0.016)
 """A lump is felt with the edge of the indenter's footprint, or with a wider one where tissue between spreads the pressure."""
 MOST = 4
-"""So many lumps are sought."""
+"""Largest number of lumps."""
 WEAKEST = 3.0
 """Weakest t with which one is weighed."""
 _TOO_NEAR = 0.7
@@ -42,15 +42,14 @@ _BORDER_M = 0.010
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
 FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", "bone")
-"""What a candidate's probability depends on: how surely it is there, how surely its contrast is FELT or more, its size and how
-far that is from the usual one, its sign, and how much of its strength is bone's under it, which is felt as a lump is: where
-bone may just lie, a lump is the likelier one."""
+"""Features of a candidate's probability: strength, confidence that its contrast is FELT or more, size and its difference from
+the usual one, sign, and the share of its strength that may be bone."""
 SOFTER = FEATURES.index("softer")
 ALIKE, HALF = 1.5, 0.5
-"""Where two strokes over a lump say the same, the second takes t from 1 to the root of 2; and a stroke crosses a lump where the
-bump is more than this part of the highest that any sample has: its centre may lie beyond the samples."""
+"""Limit of t over t without the most influential stroke (two equal strokes: the root of 2); and the share of the highest bump
+value of any sample above which a stroke crosses a lump, whose centre may be outside the samples."""
 SURE = 4.0
-"""So many standard deviations below FELT a contrast is surely none: 0 of 35 such candidates of tuning patients were lumps."""
+"""Standard deviations below FELT from which a candidate is rejected: 0 of 35 such candidates of tuning patients were lumps."""
 
 
 @dataclass(frozen=True)
@@ -63,7 +62,7 @@ class Candidate:
     t: float
     """E over its standard deviation, as far as more than one stroke says it (`agreed`)."""
     signs: Signs
-    """What of a tensed muscle is seen about it."""
+    """Signs of a tensed muscle around it."""
 
     @property
     def features(self) -> Array:
@@ -87,7 +86,7 @@ def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array
 
 
 def detect(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate]]:
-    """The regression with the lumps that stand out, and these, each weighed beside the others."""
+    """Return the regression with the detected lumps, and these lumps, each evaluated with the others in the model."""
     lumps: tuple[Bump, ...] = ()
     regression = Regression(o, calibration, lumps, amplitudes(o, calibration, lumps))
     for _ in range(MOST):
@@ -159,6 +158,6 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
 
 
 def _free(bump: Bump, lumps: Sequence[Bump]) -> bool:
-    """Whether a bump lies beside those found before."""
+    """True if a bump does not overlap those found before."""
     apart = [np.hypot(bump.x - one.x, bump.y - one.y) / (bump.radius + one.radius) for one in lumps]
     return all(a >= _TOO_NEAR for a in apart)

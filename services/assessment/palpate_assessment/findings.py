@@ -21,7 +21,7 @@ Mask = NDArray[np.bool_]
 Z90 = 1.6449
 """Two-sided 90 % quantile of the normal distribution."""
 WEIGHED = 0.01
-"""Probability from which an area is told as a candidate."""
+"""Probability from which an area is reported as a candidate."""
 HALF = 0.5
 """The outline is where the log-contrast is this part of its peak."""
 
@@ -31,7 +31,7 @@ class Area:
     """An area that is stiffer or softer than its surroundings, in the abdomen frame."""
 
     nodes: Mask
-    """Which of the grid's nodes belong to it, shape (n,)."""
+    """Mask of its grid nodes, shape (n,)."""
     centroid: Array
     """Centroid of the area [m], shape (3,)."""
     area: float

@@ -1,4 +1,4 @@
-"""What other roles' messages tell the assessment."""
+"""Conversion of messages from other roles."""
 
 from __future__ import annotations
 

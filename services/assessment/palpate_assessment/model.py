@@ -35,27 +35,27 @@ BONE_M = 0.022
 ARCH_M, ARCH_SLOPE, ARCH_WIDTH_M = 0.18, 0.7, 0.025
 """The costal arch above the umbilicus on the midline, its descent a metre off it, and how unsure both are."""
 ILIAC_M, ILIAC_WIDTH_M = (0.135, -0.12), 0.04
-"""The iliac spines beside and below the umbilicus, and how far about them bone may be felt."""
+"""Iliac spines, lateral to and below the umbilicus, and the width of the bone around them."""
 NATURAL_SD, BONE_SD = 0.08, 0.5
 """Prior medians of the amplitudes: each field's share of 0.2 in the logarithm over all lengths; of bone."""
 LEVEL_SD = 3.0
 """Standard deviation of the patient's own level about the median of his samples."""
 BREATHING_S = 1.0
-"""How long what following leaves of breathing stays alike."""
+"""Correlation time of residual breathing."""
 LEAST_DEPTH_ERROR_M = 0.0001
 """Prior median of the depth's errors for strokes that claim to have none."""
 SURFACE_M, SURFACE_SHARE = 0.015, 0.8
-"""Length of the error that strokes share, what an offset and a tilt leave of the camera's, and its part of the depth's
-uncertainty: a scan cannot tell it from stiffness, ..."""
+"""Correlation length of the surface error that strokes share (without offset and tilt), and its share of the depth
+uncertainty. A scan cannot separate it from stiffness."""
 WIDE_M, WIDE_SHARE = 0.15, 0.7
-"""... nor what touches leave of offset and tilt."""
+"""The same of the offset and tilt that remain after touches."""
 SLIDE_SD = 0.015
-"""How much a slide may feel of a place otherwise than a press does, beside what it does everywhere, in the logarithm."""
+"""SD of the log difference of slide and press from place to place, besides the common one."""
 UNLIKE = 0.1
-"""How much a press may feel of a lump otherwise than a slide does, of its log-contrast."""
+"""SD of the difference of press and slide over a lump, as a share of its log-contrast."""
 ONSET_M = 0.00015
-"""What all touches err by alike: 0.11 mm with typical equipment, RMS over twelve examinations, 0.29 mm with poor, over ten
-(tuning seeds) [C]. The law by which the skin is found is not that of every wall, and skin that was pressed before lies deeper."""
+"""Error common to all touches: 0.11 mm with typical equipment, RMS over twelve examinations, 0.29 mm with poor, over ten
+(tuning seeds) [C]. The contact model does not fit every wall exactly, and skin that was pressed before is lower."""
 TARE_N = 0.06
 """Prior median of the zero of a stroke's force: 0.06 N with typical equipment, 0.12 N with poor (tuning seeds 0 to 9) [C]. What
 all strokes share, by gain, cross-talk and the tool's weight, is expected to be as large: with poor equipment 0.08 N there [C]."""
@@ -64,7 +64,7 @@ WHITE_SD = 0.01
 _SURE, _UNSURE = 0.7, 1.2
 """Standard deviations of the logarithms of amplitudes about their medians: of stiffness, of errors."""
 _FITTED, _FIRST_STEPS, _STEPS = 250, 20, 6
-"""So many samples are enough for the amplitudes, and so many steps from their medians, and from those before."""
+"""Number of samples for the estimation of amplitudes, and of steps from their medians and from earlier values."""
 EDGE_M = 0.007
 """Standard deviation of the edge with which a lump at the skin is felt: the indenter's footprint."""
 LUMP_SD, LUMP_FREE_SD, LUMP_FREE_M = 1.0, 0.25, 0.012
@@ -117,10 +117,10 @@ def natural(a: Array, b: Array) -> list[Array]:
 
 
 def bone(xy: Array) -> Array:
-    """How well ribs or iliac crests may lie under places of the abdomen [m], shape (k, 2) -> (k,)."""
-    beside, up = np.abs(xy[:, 0]), xy[:, 1]
-    ribs = expit((up - ARCH_M + ARCH_SLOPE * beside) / ARCH_WIDTH_M)
-    spine = np.exp(-0.5 * ((beside - ILIAC_M[0]) ** 2 + (up - ILIAC_M[1]) ** 2) / ILIAC_WIDTH_M**2)
+    """Return the prior of ribs or iliac crests under places of the abdomen [m], shape (k, 2) -> (k,)."""
+    lateral, up = np.abs(xy[:, 0]), xy[:, 1]
+    ribs = expit((up - ARCH_M + ARCH_SLOPE * lateral) / ARCH_WIDTH_M)
+    spine = np.exp(-0.5 * ((lateral - ILIAC_M[0]) ** 2 + (up - ILIAC_M[1]) ** 2) / ILIAC_WIDTH_M**2)
     return np.asarray(np.maximum(ribs, spine))
 
 
@@ -132,7 +132,7 @@ def errors(o: Observations) -> list[Array]:
 
 
 def fixed(o: Observations, calibration: Calibration) -> Array:
-    """Covariance of what a scan cannot tell about itself: level, exponent, surface, sensor; shape (m, m)."""
+    """Return the covariance of level, exponent, surface and sensor, which a scan cannot estimate; shape (m, m)."""
     lever = np.outer(o.per_metre, o.per_metre)
     surface = SURFACE_SHARE**2 * _smooth(o.xy, o.xy, SURFACE_M) + WIDE_SHARE**2 * _smooth(o.xy, o.xy, WIDE_M)
     surface = (surface * np.outer(o.depth_uncertainty, o.depth_uncertainty) + ONSET_M**2) * lever

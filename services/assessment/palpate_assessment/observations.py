@@ -15,12 +15,12 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 
 SHALLOWEST_M, WEAKEST_N = 0.002, 0.1
-"""Depth and force from which a sample tells stiffness."""
-TELLING_PART = 0.6
-"""Where depth yielded to the force limit a sample counts from this part of the press's depth on: the exponent, by which it is
-converted, adds 6 % to its error at 6 of 10 mm. Chosen on `clean`, seeds 1000 to 1019; what yields earlier is mostly bone."""
+"""Least depth and force of a usable sample."""
+USABLE_SHARE = 0.6
+"""Least depth of a force-limited sample, as a share of the depth of the press: at 6 of 10 mm the exponent of the conversion
+adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
 FEWEST = 10
-"""So many samples are needed to say anything."""
+"""Least number of samples."""
 
 
 @dataclass(frozen=True)
@@ -28,7 +28,7 @@ class Observations:
     """y = z(x) + errors at m samples, z being the logarithm of apparent stiffness [N]."""
 
     xy: Array
-    """Where each sample is felt [m], shape (m, 2), in A: ahead of the indenter's middle by `lead_s` of its travel."""
+    """Place of each sample [m], shape (m, 2), in A: ahead of the indenter's middle by `lead_s` of its travel."""
     time: Array
     """[s]"""
     stroke: NDArray[np.intp]
@@ -46,13 +46,13 @@ class Observations:
     noise: Array
     """Standard deviation of the force's white noise, over the force [1]."""
     depth_uncertainty: Array
-    """One sigma of the depth, as the examination tells it [m], shape (m,)."""
+    """SD of the depth, as reported [m], shape (m,)."""
     yielded: NDArray[np.bool_]
-    """Whether depth yielded to the force limit so far that the force of a press to full depth is not told by it."""
+    """True if the force limit was met at a depth too small to estimate the force of a full press."""
 
     @cached_property
     def same_stroke(self) -> NDArray[np.bool_]:
-        """Whether two samples are of one stroke, shape (m, m)."""
+        """True where two samples are of one stroke, shape (m, m)."""
         return np.asarray(self.stroke[:, None] == self.stroke)
 
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
@@ -61,7 +61,7 @@ class Observations:
 
 
 def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
-    """The samples that tell stiffness; None if they are too few to say anything."""
+    """Return the usable samples; None if they are too few."""
     good = [s for s in samples if s.depth >= SHALLOWEST_M and s.force >= WEAKEST_N]
     if len(good) < FEWEST:
         return None
@@ -80,5 +80,5 @@ def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observa
         per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),
         noise=np.array([s.force_noise for s in good]) / force,
         depth_uncertainty=np.array([s.depth_uncertainty for s in good]),
-        yielded=np.array([s.force_limited for s in good]) & (depth < TELLING_PART * press.DEPTH_M),
+        yielded=np.array([s.force_limited for s in good]) & (depth < USABLE_SHARE * press.DEPTH_M),
     )

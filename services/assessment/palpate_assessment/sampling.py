@@ -21,7 +21,7 @@ _FEWEST = 3
 
 @dataclass(frozen=True)
 class ContactState:
-    """What the examination measures at one instant, in the abdomen frame A."""
+    """Measurement of the examination at one instant, in the abdomen frame A."""
 
     time: float
     """[s]"""
@@ -35,14 +35,14 @@ class ContactState:
     """Tared normal force [N], positive when the wall is pressed."""
     in_contact: bool
     counts: bool
-    """Whether it belongs into a sample: in contact, at depth, outside transitions."""
+    """True if it belongs to a sample: in contact, at depth, outside transitions."""
     force_limited: bool = False
     stroke: int = 0
     """Number of the latest descent."""
     depth_uncertainty: float = 0.0
     """One sigma of the depth [m]."""
     followed: float = 0.0
-    """How far the set-point, and the depth with it, followed the skin by the breath [m]."""
+    """Displacement by which set-point and depth followed the breathing skin [m]."""
 
 
 @dataclass(frozen=True)

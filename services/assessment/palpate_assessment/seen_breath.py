@@ -1,12 +1,11 @@
-"""Depth by the breath that was seen.
+"""Depth corrected by the measured breathing.
 
-Planning counts depth from where it expects the wall, displaced by f = m(x) w'(t), with the shape m of the breathing motion and
-perception's forecast w', for the images of now come a tenth of a second later. The assessment can wait for them: they show
-w(t), and
+Planning counts depth from the forecast wall, displaced by f = m(x) w'(t), with the shape m of the breathing motion and the
+forecast w' of perception, because images arrive a tenth of a second late. The assessment waits for them: they measure w(t), and
 
     d = d' + m(x) w(t) - f
 
-is the depth d' as it would have been told had it been known then.
+is the depth d' corrected accordingly.
 """
 
 from __future__ import annotations
@@ -23,16 +22,16 @@ from palpate_assessment.sampling import ContactState
 from palpate_models.numerics.frames import Array
 
 LONGEST_S: Final = 0.5
-"""Images further apart tell nothing of the time between them, and a state waits no longer for the next."""
+"""Largest gap between images for interpolation [s], and longest wait of a state for the next image."""
 IMAGES: Final = 40
-"""So many images are remembered, 4 s of them."""
+"""Number of images kept, 4 s."""
 
 
 def depth_seen(time: Array, depth: Array, followed: Array, share: Array, images: tuple[Array, Array]) -> Array:
-    """Depths [m] at times [s] by the displacements that images show, shape (n,) each; as they were told where none are near.
+    """Return depths [m] at times [s] corrected by images, shape (n,) each; unchanged where no image is near.
 
-    `followed`: how far the set-point followed the wall there [m]; `share`: m there; `images`: times of exposure [s], ascending,
-    and displacements of the wall where it moves most [m], shape (k,) each.
+    `followed`: displacement that the set-point followed there [m]; `share`: m there; `images`: times of exposure [s], ascending,
+    and the largest displacement of the wall [m], shape (k,) each.
     """
     exposed, displacement = images
     if len(exposed) < 2:
@@ -43,7 +42,7 @@ def depth_seen(time: Array, depth: Array, followed: Array, share: Array, images:
 
 
 class BreathingShares:
-    """How far breathing moves each place of the perceived surface, 1 where it moves the wall most."""
+    """Breathing amplitude of each place of the perceived surface, 1 at its largest."""
 
     def __init__(self, vertices: Array, breathing: Array) -> None:
         """Vertices [m], shape (n, 3), and their share of the motion, (n,); empty where the wall is not known to move."""
@@ -69,7 +68,7 @@ class SeenBreath:
         """Takes the perceived surface, in A: vertices and their shares as `BreathingShares` has them."""
         self._shares = BreathingShares(vertices, breathing)
 
-    def hear(self, exposed: float, displacement: float) -> None:
+    def add_image(self, exposed: float, displacement: float) -> None:
         """An image exposed at a time [s] shows the wall displaced so far where it moves most [m]."""
         self._exposed.append(exposed)
         self._displacement.append(displacement)
@@ -79,7 +78,7 @@ class SeenBreath:
         self._waiting.append(state)
 
     def forget(self) -> None:
-        """What waits is of no use any more."""
+        """Discard waiting states."""
         self._waiting.clear()
 
     def settled(self, at_once: bool = False) -> list[ContactState]:
@@ -94,7 +93,7 @@ class SeenBreath:
         return self._seen(ready)
 
     def _follows(self, t: float) -> bool:
-        """Whether images can be expected to tell more."""
+        """True if a later image is expected."""
         return self._shares is not None and bool(self._exposed) and t - self._exposed[-1] <= LONGEST_S
 
     def _seen(self, states: Sequence[ContactState]) -> list[ContactState]:

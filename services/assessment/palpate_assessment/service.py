@@ -40,8 +40,8 @@ GROWING_SAMPLES = 200
 GROWING_EVERY = 6 * NS
 GROWING_FIRST = 40
 """Samples before the first growing map."""
-TOLD_AT_ONCE = 50
-"""Samples of an earlier examination that are told in a step."""
+RESENT_PER_STEP = 50
+"""Samples of an earlier examination that are published in one step."""
 NOTICED_S = 1.0
 """A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
@@ -54,7 +54,7 @@ class AssessmentService(Service):
     role: ClassVar[str] = "assessment"
 
     def __init__(self, exam: ExamInput, before: Checkpoint | None = None) -> None:
-        """`before`: where the examination stood that this one goes on with."""
+        """`before`: checkpoint of an examination that this one continues."""
         self._exam = exam.exam
         self._X_AW = inverse(np.array(exam.X_WA))
         self._R_AW, self._p_AW = self._X_AW[:3, :3], self._X_AW[:3, 3]
@@ -62,15 +62,15 @@ class AssessmentService(Service):
         self._sampler = Sampler()
         self._breath = SeenBreath()
         self.samples: list[ForceSample] = [] if before is None else samples_of(before.felt)
-        """What was felt so far."""
-        self._untold = list(self.samples)
-        """Samples of the examination before, which this one's listeners have not heard of."""
+        """All samples."""
+        self._unpublished = list(self.samples)
+        """Samples of the earlier examination that this one has not published yet."""
         self._moved_at: float | None = None
         """When the patient was seen to have moved [s]."""
         self._surface: Array | None = None
         self._perceived: Message | None = None
         self._skin: KnownSkin | None = None
-        """Where the skin was, as all of the examination tells."""
+        """Final surface."""
         self._coarse: MapGrid | None = None
         self._last_map = 0
         self._mapped = 0
@@ -80,7 +80,7 @@ class AssessmentService(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Samples as they come, a map every few seconds, and once the scan is over the final map and the findings."""
         phase = None
-        new, self._untold = self._untold[:TOLD_AT_ONCE], self._untold[TOLD_AT_ONCE:]
+        new, self._unpublished = self._unpublished[:RESENT_PER_STEP], self._unpublished[RESENT_PER_STEP:]
         others = self._others(inbox)
         for state in inbox.new("exam/state"):
             while others and others[0][0] <= nanoseconds(state.header.stamp):
@@ -101,19 +101,19 @@ class AssessmentService(Service):
         return outbox
 
     def _others(self, inbox: Inbox) -> deque[tuple[int, Callable[[Message], None], Message]]:
-        """What came beside the states, by its stamp [ns], with what takes it. One step may bring a whole recording."""
+        """Return messages other than states with their handlers, by stamp [ns]. One step may contain a whole recording."""
         takers: dict[str, Callable[[Message], None]] = {
             "perception/surface": self.perceive,
-            "perception/motion": self.hear,
+            "perception/motion": self.add_motion,
             "exam/correction": self.correct,
         }
         came = [(nanoseconds(m.header.stamp), take, m) for topic, take in takers.items() for m in inbox.new(topic)]
         return deque(sorted(came, key=lambda one: one[0]))
 
-    def hear(self, motion: Message) -> None:
+    def add_motion(self, motion: Message) -> None:
         """Takes the next `perception/motion`."""
         if motion.state in SEEN and self._exam.breathing is not Following.IGNORE:
-            self._breath.hear(nanoseconds(motion.header.stamp) / NS, float(motion.displacement))
+            self._breath.add_image(nanoseconds(motion.header.stamp) / NS, float(motion.displacement))
 
     def correct(self, message: Message) -> None:
         """Takes the `exam/correction`."""
@@ -133,7 +133,7 @@ class AssessmentService(Service):
         return new
 
     def finish(self) -> Mapping[str, Any]:
-        """How much was assessed."""
+        """Return the number of samples and findings."""
         final = self._final
         return {
             "samples": len(self.samples),
@@ -149,7 +149,7 @@ class AssessmentService(Service):
         self._perceived, self._skin = message, None
         p_A = apply(self._X_AW, np.asarray(message.vertices, dtype=np.float64).reshape(-1, 3))
         if self._surface is not None and self.samples:
-            return  # a look at a patient who has moved: all is told where the first look saw it, and so breathing's shares hold
+            return  # a scan after the patient moved: samples refer to the first scan, so its shares stay valid
         self._surface = p_A
         self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
         self._coarse = self._grid(GROWING_PITCH)
@@ -254,9 +254,9 @@ def map_message(t: int, result: AssessedMap, common_depth: float) -> Message:
 
 
 def findings_message(t: int, findings: Sequence[Area], candidates: Sequence[Area]) -> Message:
-    """`palpation_msgs/Findings`, the final ones, and the areas that were weighed and not reported."""
-    told, weighed = ([finding_message(area) for area in some] for some in (findings, candidates))
-    return Findings(header=header(t, FRAME), findings=told, candidates=weighed, final=True)
+    """`palpation_msgs/Findings`, the final ones, and the candidates."""
+    reported, weighed = ([finding_message(area) for area in some] for some in (findings, candidates))
+    return Findings(header=header(t, FRAME), findings=reported, candidates=weighed, final=True)
 
 
 def finding_message(area: Area) -> Message:

@@ -27,9 +27,9 @@ class KnownSkin:
         self._since = since
 
     def deeper(self, time: Array, position: Array, normal: Array) -> tuple[Array, Array]:
-        """How much deeper [m] than was told, and the standard deviation of depth [m]; shape (k,) each, NaN where not known.
+        """Return the correction of the reported depth [m] and its standard deviation [m]; shape (k,) each, NaN where unknown.
 
-        For times [s], points of the skin from which depth was counted [m] and outward normals, shapes (k,), (k, 3), (k, 3).
+        For times [s], points of the skin from which depth is counted [m] and outward normals, shapes (k,), (k, 3), (k, 3).
         """
         height, sigma = self._known(position[:, :2]).T
         there = time >= self._since

@@ -30,7 +30,7 @@ def followed_for(breath: SeenBreath, seconds: float, delay: float = 0.15) -> lis
     for k in range(round(seconds * 100)):
         t = 0.01 * k
         if k % 10 == round(delay * 100) % 10 and t >= delay:
-            breath.hear(t - delay, true_breath(t - delay))
+            breath.add_image(t - delay, true_breath(t - delay))
         breath.take(state(t, 0.05))
         settled += [(t, one) for one in breath.settled()]
     return settled
