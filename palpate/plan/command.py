@@ -49,6 +49,6 @@ def plan(
         refuse(error)
     console = Console()
     console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
-    for why, count in sorted(Counter(planned.skipped.values()).items()):
+    for why, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
         console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)
     console.print(f"drawn in {out}", highlight=False, soft_wrap=True)

@@ -19,6 +19,7 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import Scan
 from palpate_models.scenario.schema import Exam, Mode, Scenario
 from palpate_planning.motion.planner import NoPathError
+from palpate_planning.reasons import Cause
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 from palpate_planning.wall.surface import PerceivedSurface
 
@@ -35,7 +36,7 @@ class Prospect:
     """Where the indenter slides at depth or presses, xy in A [m], each (n, 2), in order."""
     touches: Array
     """Where the skin is touched before the scan, shape (k, 2)."""
-    skipped: dict[int, str]
+    skipped: dict[int, Cause]
     """Targets that are left out, and why."""
     duration_s: float
     """About how long it takes, in simulated time."""

@@ -35,7 +35,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.errors import Level, draw_errors, levels
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
-from palpate_planning.descent import TARE_S
+from palpate_planning.stroke import TOUCH
 from palpate_robot.sensors import FtSensor
 
 LOOP_SECTIONS: Final = ("camera", "hand_eye", "registration", "arm")
@@ -291,7 +291,7 @@ class _TaredSensor:
     def tare(self, k: int) -> None:
         self._read(self._begin + k)
         now = self._begin + k
-        self._tare = float(np.mean(self._normal[max(now - round(TARE_S / PERIOD_S), 0) : now]))
+        self._tare = float(np.mean(self._normal[max(now - round(TOUCH.tare_s / PERIOD_S), 0) : now]))
 
     def tared(self, k: int) -> float:
         self._read(self._begin + k)

@@ -1,13 +1,14 @@
-"""The strokes of an examination, carried out on a patient without an arm.
+"""The strokes of an examination on a patient without an arm.
 
-What is done is planning's: its coverage, its curves and speeds, its regulation of depth against force. What the arm and the eye
-get wrong is drawn as whole examinations have it (`palpate.quick.errors`). What comes out is what planning and tissue would have
-sent: exam/state, perception/surface and truth/indentation.
+Planning's own code moves the indenter: coverage, path, the stroke with its touch, regulation of depth against force. The errors of
+arm, camera and force sensor are drawn from those of whole examinations (`palpate.quick.errors`). `palpate.quick.messages` makes
+exam/state, perception/surface and truth/indentation from the rows.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
@@ -21,46 +22,46 @@ from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import scan_of
-from palpate_models.scenario.schema import Following, Mode, Scenario
+from palpate_models.scenario.schema import Following, Scenario
 from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
-from palpate_planning.descent import ALLOWANCE_M, DESCEND_MPS, PROBE_MPS, REST_S, SIGMAS, TARE_S
-from palpate_planning.palpation import (
-    HOLD_S,
-    HOP_M,
-    LIFT_MPS,
-    SETTLE_MAX_S,
-    SETTLED_M,
-    SETTLED_S,
-    STEADY_FRACTION,
-    STOPPED,
+from palpate_planning.interruptions import WALL
+from palpate_planning.stroke import (
+    PUSHING,
+    STROKE,
+    Descent,
+    Moment,
+    Stages,
+    StrokeStage,
+    is_limited,
+    is_steady,
+    lift,
+    press,
+    travel,
 )
-from palpate_planning.stages import AT_DEPTH, PUSHING, StrokeStage
-from palpate_planning.stroke_motion import DEPTH_ACCELERATION, StrokeMotion
+from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.coverage import strokes, transfer
 from palpate_planning.strokes.path import Ints, SurfacePath, lay
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
 from palpate_planning.wall.surface import Foot, PerceivedSurface
-from palpate_planning.wall.touch import FELT_N
 from palpate_planning.wall.wall import Wall, WallPlace
-from palpate_planning.wall_watch import GATE_M
 
 _DENSE_M: Final = 0.0003
-"""Along a stroke, places are known so far apart: what the indenter travels in a period."""
+"""Spacing of the places of a path: about the travel of the indenter in a period."""
 _DOWN: Final = np.diag((1.0, -1.0, -1.0))
-"""The tool's orientation, with its z axis into the body."""
+"""Orientation of the tool, with its z axis into the body."""
 _NO_ARM: Final = np.zeros(7)
 _NOWHERE: Final = np.zeros(3)
 _FOOT: Final = Foot(_NOWHERE, _NOWHERE, 0.0, _NOWHERE[:2])
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
-    """A path on the skin as it is believed to be and as it is: g places, about _DENSE_M apart."""
+class SkinPath:
+    """A path on the perceived and on the true skin: g places, about _DENSE_M apart."""
 
     segment: Segment
     per_m: float
-    """Places a metre of the path."""
+    """Places per metre of the path."""
     believed_W: list[list[float]]
     """Points of the perceived surface [m], g of three, in world."""
     outward_W: list[list[float]]
@@ -71,12 +72,12 @@ class Way:
     """True outward unit normals there, shape (g, 3)."""
     breathing: list[float]
     """Share of the breathing excursion there, g of them."""
-    wrong_m: list[float]
-    """How much too far outward the perceived surface is there [m], g of them."""
+    error_m: list[float]
+    """Height of the perceived above the true surface there [m], g of them."""
     target: list[int]
-    """Index of the target reached last, g of them."""
+    """Index of the latest target, g of them."""
     gains: Array
-    """Rows that take a force in that frame to the normal force that is read of it, shape (g, 3)."""
+    """Rows that map a force in that frame to the measured normal force, shape (g, 3)."""
 
 
 @dataclass
@@ -84,9 +85,9 @@ class PeriodRow:
     """One period of an examination."""
 
     time: float
-    way: Way
+    path: SkinPath
     at: int
-    """Index of the place in its way."""
+    """Index of the place on its path."""
     stage: StrokeStage
     depth: float
     """Measured [m]."""
@@ -95,28 +96,46 @@ class PeriodRow:
     force: float
     """Measured [N]."""
     followed: float
-    """How far the set-point has followed the skin by the breath [m]."""
+    """Displacement of the skin by the breath that the set-point follows [m]."""
     stroke: int
     """Number of the latest descent."""
     true_depth: float
-    """Against the skin as it breathes [m]."""
+    """Below the breathing skin [m]."""
     true_force: Array
-    """On the sphere [N], shape (3,), in the frame in which the patient truly lies."""
+    """On the sphere [N], shape (3,), in the true frame of the patient."""
     touching: bool
     steady: bool
     limited: bool
+
+
+class _Descent(Descent):
+    """A descent whose touch corrects no wall: the error of its zero is drawn when the sensor is tared."""
+
+    def __init__(self, motion: StrokeMotion, depth: float, on_tared: Callable[[int], None]) -> None:
+        """`on_tared` is called with the number of the stroke."""
+        super().__init__(motion, depth)
+        self._on_tared = on_tared
+
+    def rest(self, height: float) -> bool:
+        tared = super().rest(height)
+        if tared:
+            self._on_tared(self.stroke)
+        return tared
+
+    def learn(self, now: Moment) -> None:
+        """Leave the wall as it is."""
 
 
 class QuickExamination:
     """One examination of one patient."""
 
     def __init__(self, scenario: Scenario, loop: Loop) -> None:
-        """`loop`: what arm, eye and force sensor of this examination get wrong."""
+        """`loop`: errors of arm, camera and force sensor in this examination."""
         self._scenario, self._loop = scenario, loop
         self._exam = scenario.exam
         self._X_WA = np.array(exam_input(scenario).X_WA)
         self.patient = Patient(scenario, time=loop.begin_s)
-        """Who is examined."""
+        """The patient."""
         self._R_AtW = self.patient.X_WA[:3, :3].T
         model = self.patient.tissue.model
         X_AAt = inverse(self._X_WA) @ self.patient.X_WA
@@ -129,30 +148,47 @@ class QuickExamination:
         self._believed = PerceivedSurface.from_mesh(*self.perceived, self._X_WA)
         wall = Wall(self._believed, Breath())
         self._motion = StrokeMotion(self._exam, scenario.limits, self.patient.radius, PERIOD_S, wall)
-        self._unsure_m = SIGMAS * loop.uncertainty_m
+        self._descent = _Descent(self._motion, self._exam.depth_m, self._tare)
         self._gated = self._exam.breathing is Following.GATE
         self._open = True
+        self._path: SkinPath
         self._zero_m = 0.0
         self._force, self._load, self._touching = 0.0, 0.0, False
-        self._depth = -HOP_M
-        self._count = self._stroke_number = 0
+        self._depth = -STROKE.hop_height_m
+        self._count = 0
 
     def run(self) -> list[PeriodRow]:
-        """Carries it out: what was measured, and what was true."""
-        scan = scan_of(self._exam, self._believed.in_A)
-        xy = scan.targets
+        """Carry out the examination; return measurements and truth of every period."""
         rows: list[PeriodRow] = []
+        stages = self._strokes()
+        next(stages)
+        with suppress(StopIteration):
+            while True:
+                contact = self._measured()
+                stage = stages.send(Moment(self._count, contact, open=self._open))
+                rows.append(self._period(stage, contact))
+        return rows
+
+    def _strokes(self) -> Stages[None]:
+        """Planning's strokes over all targets, with paths between them."""
+        scan, exam, motion = scan_of(self._exam, self._believed.in_A), self._exam, self._motion
+        xy = scan.targets
         usable = np.ones(len(xy), dtype=bool)
-        exam = self._exam
         before: Array | None = None
         for stroke in strokes(xy, scan.line_of_target, usable, scan.joined, exam.mode, exam.spacing_m):
             if before is not None:
-                rows += self._travel(self._way(transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
-            rows += self._stroke(self._way(stroke.xy, stroke.targets, stroke.visits))
+                self._start(self._lay(transfer(before, stroke.xy[0]), stroke.targets[:1], contact=False))
+                yield from travel(motion, motion.segment.path.length)
+            self._start(self._lay(stroke.xy, stroke.targets, stroke.visits))
+            yield from press(motion, self._descent)
+            yield from lift(motion, lambda t: STROKE.hop_height_m)
             before = stroke.xy[-1]
-        return rows
 
-    # --- where the skin is, truly and as it is believed to be ----------------------------------------------------------
+    def _start(self, path: SkinPath) -> None:
+        self._path = path
+        self._motion.start(path.segment)
+
+    # --- the true and the perceived skin ------------------------------------------------------------------------------
 
     @cached_property
     def perceived(self) -> tuple[Array, Array]:
@@ -165,15 +201,15 @@ class QuickExamination:
 
     @property
     def shares(self) -> Array:
-        """Share of the breathing excursion at each of these points, as it truly is, shape (n,)."""
+        """True share of the breathing excursion at each of these points, shape (n,)."""
         return np.asarray(self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2]))
 
     @property
     def uncertainty_m(self) -> float:
-        """Standard deviation of depth that the examination states [m]."""
+        """Standard deviation of depth that the examination reports [m]."""
         return self._loop.uncertainty_m
 
-    def _way(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> Way:
+    def _lay(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> SkinPath:
         s, p, n, R = lay(self._believed, xy, _DOWN)
         visited: Ints = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
         path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
@@ -182,7 +218,7 @@ class QuickExamination:
         dense = np.column_stack([np.interp(at, s, xy[:, k]) for k in (0, 1)])
         believed, outward = self._believed.at(dense)
         place, normal = self._skin.points(dense + self._loop.aside_m)
-        return Way(
+        return SkinPath(
             segment=Segment(path, contact=contact),
             per_m=count / path.length if path.length else 0.0,
             believed_W=believed.tolist(),
@@ -190,94 +226,55 @@ class QuickExamination:
             place=apply(self._X_AtA, place),
             normal=normal @ self._X_AtA[:3, :3].T,
             breathing=self._breathing(dense + self._loop.aside_m).tolist(),
-            wrong_m=self._loop.wrong(dense).tolist(),
+            error_m=self._loop.wrong(dense).tolist(),
             target=targets[np.maximum(np.searchsorted(path.visits, at, side="right") - 1, 0)].tolist(),
             gains=self._loop.gains(outward @ self._R_AtW.T),
         )
 
-    # --- the sequence of a stroke, as `palpate_planning.palpation` has it ------------------------------------------------
+    # --- one period ---------------------------------------------------------------------------------------------------
 
-    def _stroke(self, way: Way) -> Iterator[PeriodRow]:
-        motion, exam = self._motion, self._exam
-        motion.start(way.segment)
-        for _ in range(round((REST_S + TARE_S) / PERIOD_S)):
-            motion.depth.step(-HOP_M, LIFT_MPS)
-            yield self._period(way, StrokeStage.REST)
+    def _tare(self, stroke: int) -> None:
+        """Tare the force sensor, and draw the error of the stroke's zero."""
         self._loop.tare(self._count)
-        self._stroke_number += 1
-        self._zero_m = self._loop.zero(self._stroke_number)
-        while self._force < FELT_N and motion.depth.position < exam.depth_m:
-            braking = motion.depth.velocity**2 / DEPTH_ACCELERATION
-            near = motion.depth.position > -self._unsure_m - ALLOWANCE_M - braking
-            motion.depth.step(self._unsure_m + exam.depth_m, PROBE_MPS if near else DESCEND_MPS)
-            yield self._period(way, StrokeStage.DESCEND)
-        there, stopped = False, 0.0
-        while not there and stopped <= SETTLED_S:
-            there = motion.deepen()
-            stopped = stopped + PERIOD_S if motion.slowdown(0.7, 1.0, 0.0) < STOPPED else 0.0
-            yield self._period(way, StrokeStage.DESCEND)
-        settled = waited = 0.0
-        while settled < SETTLED_S and waited < SETTLE_MAX_S:
-            motion.deepen()
-            near = abs(motion.regulation.reference - self._depth) < SETTLED_M
-            settled, waited = settled + PERIOD_S if near else 0.0, waited + PERIOD_S
-            yield self._period(way, StrokeStage.SETTLE)
-        if exam.mode is Mode.POINT or not way.segment.path.length:
-            held = 0
-            while held < round(HOLD_S / PERIOD_S):
-                held += self._open
-                yield self._period(way, StrokeStage.HOLD)
-        else:
-            while not (self._open and motion.slide()):
-                motion.deepen()
-                if not self._open:
-                    motion.brake()
-                yield self._period(way, StrokeStage.SLIDE)
-        while not motion.depth.step(-HOP_M, LIFT_MPS):
-            motion.brake()
-            yield self._period(way, StrokeStage.LIFT)
+        self._zero_m = self._loop.zero(stroke)
 
-    def _travel(self, way: Way) -> Iterator[PeriodRow]:
-        self._motion.start(way.segment)
-        while not self._motion.travel(way.segment.path.length):
-            yield self._period(way, StrokeStage.TRANSFER)
-
-    def _period(self, way: Way, stage: StrokeStage) -> PeriodRow:
-        """The indenter follows the motion for a period, with this examination's errors."""
-        motion, loop, patient, k = self._motion, self._loop, self.patient, self._count
-        self._count += 1
+    def _measured(self) -> ContactMeasurement:
+        """Return the contact as measured at the end of the latest period."""
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
-        contact = ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, loop.uncertainty_m), *measured)
+        return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, self.uncertainty_m), *measured)
+
+    def _period(self, stage: StrokeStage, contact: ContactMeasurement) -> PeriodRow:
+        """Move the indenter for a period, with the errors of this examination."""
+        motion, loop, patient, path, k = self._motion, self._loop, self.patient, self._path, self._count
+        self._count += 1
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT, pushing=stage in PUSHING)
-        at = int(motion.along.position * way.per_m + 0.5)
+        at = int(motion.along.position * path.per_m + 0.5)
         self._depth = motion.regulation.reference + loop.regulation(k)
-        share = way.breathing[at]
+        share = path.breathing[at]
         excursion = patient.tissue.excursion(patient.time + PERIOD_S)
         unseen = (1.0 - loop.followed) * share * (excursion - self._mean_excursion)
-        depth = self._depth - way.wrong_m[at] - self._zero_m - loop.wander(k) + unseen
+        depth = self._depth - path.error_m[at] - self._zero_m - loop.wander(k) + unseen
         height = patient.radius - depth + share * excursion
-        force = patient.move(way.place[at] + height * way.normal[at])
-        self._force = float(way.gains[at] @ force) + loop.tared(k)
-        along = float(way.normal[at] @ force)
+        force = patient.move(path.place[at] + height * path.normal[at])
+        self._force = float(path.gains[at] @ force) + loop.tared(k)
+        along = float(path.normal[at] @ force)
         self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
         self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
-        self._open = not self._gated or abs(loop.followed * excursion) < GATE_M
-        limited = motion.regulation.limited or (motion.short_of_depth and stage in AT_DEPTH)
-        fast = motion.along.velocity >= STEADY_FRACTION * self._exam.speed_mps or limited
-        steady = self._touching and self._open and (stage is StrokeStage.HOLD or (stage is StrokeStage.SLIDE and fast))
+        self._open = not self._gated or abs(loop.followed * excursion) < WALL.gate_m
+        limited = is_limited(stage, motion)
         return PeriodRow(
             time=patient.time,
-            way=way,
+            path=path,
             at=at,
             stage=stage,
             depth=self._depth,
             setpoint=motion.regulation.reference,
             force=self._force,
             followed=loop.followed * share * excursion,
-            stroke=self._stroke_number,
+            stroke=self._descent.stroke,
             true_depth=depth,
             true_force=force,
             touching=self._touching,
-            steady=steady,
+            steady=self._touching and self._open and is_steady(stage, motion, limited=limited),
             limited=limited,
         )

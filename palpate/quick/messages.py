@@ -51,9 +51,9 @@ def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
     return exam_state(
         round(time * NS),
         phase,
-        row.way.believed_W[row.at],
-        row.way.outward_W[row.at],
-        target_index=row.way.target[row.at],
+        row.path.believed_W[row.at],
+        row.path.outward_W[row.at],
+        target_index=row.path.target[row.at],
         in_contact=row.touching and not over,
         steady=row.steady and not over,
         force_limited=row.limited,
@@ -68,8 +68,8 @@ def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
 
 def _indentations(patient: Patient, rows: list[PeriodRow]) -> list[Any]:
     """`truth/indentation` of every period."""
-    place = np.array([row.way.place[row.at] for row in rows])
-    outward = np.array([row.way.normal[row.at] for row in rows])
+    place = np.array([row.path.place[row.at] for row in rows])
+    outward = np.array([row.path.normal[row.at] for row in rows])
     F = np.array([row.true_force for row in rows])
     normal, size = (F * outward).sum(axis=1), np.linalg.norm(F, axis=1)
     columns = (

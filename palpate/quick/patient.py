@@ -30,7 +30,7 @@ from palpate_models.scenario.load import seen, true_pose, whole_scenario
 from palpate_models.scenario.patterns import stations
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
-from palpate_planning.wall_watch import GATE_M
+from palpate_planning.interruptions import WALL
 
 PERIOD_S: Final = 0.010
 """Between two readings of the force, as of an examination's states."""
@@ -226,7 +226,7 @@ class Patient:
         self._p = None
         there = np.arange(len(depths)) >= descent
         if self.scenario.exam.breathing is Following.GATE:
-            there &= np.abs(lifted) < GATE_M
+            there &= np.abs(lifted) < WALL.gate_m
         return Touch(times, places, normals, depths, force, there, self.seen)
 
 

@@ -15,7 +15,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam
-from palpate_planning.stages import StrokeStage
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.status import PHASE_OF, Phase
 
 EXAM = Exam(region_m=(0.10, 0.06))

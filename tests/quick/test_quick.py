@@ -63,8 +63,8 @@ def test_depth_is_wrong_by_what_was_drawn() -> None:
     rows = [row for row in QuickExamination(chosen, loop).run() if row.steady]
     wrong = np.array([row.depth - row.true_depth for row in rows])
     curve = Patient(chosen).tissue.breathing
-    unseen = np.array([(curve.excursion(row.time) - curve.mean_m) * row.way.breathing[row.at] for row in rows])
-    drawn = np.array([row.way.wrong_m[row.at] + loop.zero(row.stroke) for row in rows])
+    unseen = np.array([(curve.excursion(row.time) - curve.mean_m) * row.path.breathing[row.at] for row in rows])
+    drawn = np.array([row.path.error_m[row.at] + loop.zero(row.stroke) for row in rows])
     assert np.abs(wrong - drawn + (1 - loop.followed) * unseen).max() < 6 * errors.wander_m + 1e-9
     assert wrong.std() > 1e-4
 

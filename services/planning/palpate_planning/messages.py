@@ -1,4 +1,4 @@
-"""Messages of the examination's status and path from arrays, and the wall's motion from its message."""
+"""Messages of the examination from arrays, and arrays from the messages of perception."""
 
 from __future__ import annotations
 
@@ -6,17 +6,22 @@ import numpy as np
 
 from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_message
+from palpate_bus.messages.geometry import pose_message, vector
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.status import ExamStatus
+from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import HIDDEN_M, BreathObservation
+from palpate_planning.wall.surface import PerceivedSurface
 from palpate_planning.wall.wall import TouchedSkin
+
+COINCIDENT_M = 1e-4
+"""Consecutive targets closer than this have no path between them."""
 
 
 def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None) -> Message:
-    """`palpation_msgs/ExamState`; without a contact (the robot has not been heard of) nothing is measured."""
+    """Return `palpation_msgs/ExamState`; without a contact (before the first reading of the robot) nothing is measured."""
     p, n = np.zeros(3), np.array((0.0, 0.0, 1.0))
     if contact is not None:
         p, n = contact.skin
@@ -46,7 +51,7 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
 
 
 def touch_message(t: int, touched: TouchedSkin) -> Message:
-    """`palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
+    """Return `palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
     point = Point(*touched.p_W.tolist())
     return SkinTouch(
         header(t, "world"), point, touched.stroke, touched.height, touched.sigma, touched.expected, touched.expected_sigma
@@ -54,17 +59,38 @@ def touch_message(t: int, touched: TouchedSkin) -> Message:
 
 
 def correction_message(t: int, outward: Array, sigma: Array) -> Message:
-    """`palpation_msgs/SurfaceCorrection` at `t` [ns], of the vertices of the perceived surface [m], shape (n,) each."""
+    """Return `palpation_msgs/SurfaceCorrection` at `t` [ns] of the vertices of the perceived surface [m], shape (n,) each."""
     return SurfaceCorrection(header(t, "abdomen"), outward.astype(np.float32), sigma.astype(np.float32))
 
 
 def path_message(t: int, poses_WI: Array) -> Message:
-    """`nav_msgs/Path` of indenter poses, shape (n, 4, 4)."""
+    """Return `nav_msgs/Path` of indenter poses, shape (n, 4, 4)."""
     return Path(header(t, "world"), [PoseStamped(header(t, "world"), pose_message(X[:3, :3], X[:3, 3])) for X in poses_WI])
 
 
+def abdomen_of(mesh: Message, targets: Message, X_WA: Array) -> PerceivedAbdomen:
+    """Return the targets on the perceived surface. Raises ValueError if the messages cannot be used."""
+    count, lines = len(targets.positions), np.asarray(targets.lines, dtype=np.int64)
+    if len(lines) != count:
+        raise ValueError(f"perception/targets: {len(lines)} lines for {count} positions")
+    positions = np.array([vector(p) for p in targets.positions])
+    coincident = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) < COINCIDENT_M)
+    if len(coincident):
+        raise ValueError(f"perception/targets: {coincident[0]} and {coincident[0] + 1} coincide")
+    try:
+        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
+        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
+        triangles = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)
+        if triangles.max(initial=-1) >= len(vertices):
+            raise ValueError(f"triangles of vertex {triangles.max()}, it has {len(vertices)}")
+        surface = PerceivedSurface.from_mesh(vertices, normals, X_WA, np.asarray(mesh.breathing))
+    except ValueError as error:
+        raise ValueError(f"perception/surface: {error}") from error
+    return PerceivedAbdomen(positions, lines, vertices, triangles, surface)
+
+
 def motion_of(message: Message) -> BreathObservation:
-    """The motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast goes on, as long as it is good."""
+    """Return the motion in a `palpation_msgs/SurfaceMotion`. While the wall is hidden the forecast is used if it is certain."""
     seen = bool(message.state != SurfaceMotion.LOST)
     calm = message.state == SurfaceMotion.QUIET or (not seen and message.uncertainty < HIDDEN_M)
     moved = bool(message.state == SurfaceMotion.MOVED)

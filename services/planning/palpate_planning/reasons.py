@@ -48,9 +48,5 @@ class Cause(NamedTuple):
     def __bool__(self) -> bool:
         return self.reason is not Reason.NONE
 
-    def within(self, text: str) -> Cause:
-        """Return this reason with a longer text; `{}` in `text` stands for the present one."""
-        return Cause(self.reason, text.format(self.text))
-
 
 NO_CAUSE: Final = Cause()

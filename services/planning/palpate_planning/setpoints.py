@@ -30,8 +30,8 @@ NO_STIFFNESS: Final = _fixed([0.0] * 7)
 """Asks nothing of the arm [N m/rad]; the set-point only keeps the chain of commands alive."""
 _NO_TWIST: Final = _fixed([0.0] * 6)
 _NO_WRENCH: Final = _fixed([0.0] * 6)
-_JOINTS_AT_REST: Final = _fixed([0.0] * 7)
-_AT_REST: Final = Setpoint(
+_JOINTSAT_REST: Final = _fixed([0.0] * 7)
+AT_REST: Final = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,
     R_WD=np.eye(3),
@@ -40,19 +40,19 @@ _AT_REST: Final = Setpoint(
     F_W=_NO_WRENCH,
     stiffness=CARTESIAN_STIFFNESS,
     damping_ratio=DAMPING_RATIO,
-    q=_JOINTS_AT_REST,
-    qd=_JOINTS_AT_REST,
+    q=_JOINTSAT_REST,
+    qd=_JOINTSAT_REST,
     joint_stiffness=JOINT_STIFFNESS,
 )
 """What both kinds have in common."""
 
 
-def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
+def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTSAT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
     """Set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
 
     X_WI, shape (4, 4), tells readers of the message where the indenter is; the controller does not use it.
     """
-    return replace(_AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
+    return replace(AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
 
 
 def cartesian_setpoint(
@@ -62,11 +62,11 @@ def cartesian_setpoint(
     q: Array,
     V_WD: Array = _NO_TWIST,
     F_W: Array = _NO_WRENCH,
-    qd: Array = _JOINTS_AT_REST,
+    qd: Array = _JOINTSAT_REST,
 ) -> Setpoint:
     """Set-point of contact at `t` [ns]: pose, twist and feed-forward wrench of the indenter, posture q [rad] in the null space.
 
     Shapes and units as in `Setpoint`.
     """
     motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": qd}
-    return replace(_AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=POSTURE_STIFFNESS, **motion)
+    return replace(AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=POSTURE_STIFFNESS, **motion)

@@ -1,4 +1,4 @@
-"""What goes into a step of the examination and what comes out of it."""
+"""Inputs and outputs of a step of the examination, and its phases."""
 
 from __future__ import annotations
 
@@ -9,8 +9,9 @@ from typing import Final, NamedTuple
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
-from palpate_planning.reasons import Reason
-from palpate_planning.stages import StrokeStage
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.setpoints import AT_REST
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation
@@ -52,43 +53,42 @@ OVER: Final = frozenset({Phase.DONE, Phase.ABORTED})
 """Phases that end the examination."""
 
 
-@dataclass(frozen=True, slots=True)
-class PerceptionFailure:
-    """Perception's answer when it could not give targets."""
+class PerceptionFailure(NamedTuple):
+    """Answer of a perception that has no targets."""
 
-    message: str
+    cause: Cause
 
 
 class Observation(NamedTuple):
-    """All that planning knows at a step."""
+    """Inputs of one step. What arrived is given at one step only."""
 
     t: int
     """[ns]"""
     reading: SensorReading | None
     """None before the first joint states."""
     perceived: PerceivedAbdomen | PerceptionFailure | None = None
-    """Perception's answer, at the step at which it came."""
+    """Perception's answer, if it arrived."""
     motion: BreathObservation | None = None
-    """Perception's newest word about the breath, at the step at which it came."""
+    """The newest motion of the wall, if it arrived."""
     findings_final: bool = False
-    """Whether the assessment has sent its final findings."""
-    stop: str = ""
-    """Why the arm must rest; empty when all is well."""
+    """True if the final findings of the assessment arrived."""
+    stop: Cause = NO_CAUSE
+    """Why the arm must rest."""
     soft: bool = False
-    """Whether the stop leaves the arm to planning, which is to retreat along the normal; else the driver holds."""
-    end: str = ""
-    """Why the exam is to go home and end; given at one step only."""
+    """True if the stop leaves the arm to planning, which retreats along the normal; else the driver holds."""
+    end: Cause = NO_CAUSE
+    """Why the examination is to go home and end, if that was just requested."""
     lost: tuple[str, ...] = ()
-    """Roles whose services are gone."""
+    """Disconnected roles."""
     request: PressRequest | None = None
-    """What the search asks for, at the step at which it came."""
+    """The request of the search, if it arrived."""
     averaged: Array | None = None
-    """How far outward of the surface's vertices the mean of the images since shows the wall [m], at the step at which it came."""
+    """Height of the wall above the surface's vertices in the mean of later images [m], if it arrived."""
 
 
 @dataclass(slots=True)
 class ExamStatus:
-    """What exam/state says beside the measured contact."""
+    """Fields of exam/state other than the measured contact."""
 
     phase: Phase = Phase.HOME
     message: str = "waiting for the robot"
@@ -102,20 +102,20 @@ class ExamStatus:
     depth_setpoint: float = 0.0
     """[m]"""
     end_tick: int = -1
-    """When the run is to end [ns]; -1 until that is known."""
+    """When the run is to end [ns]; -1 while undecided."""
     stroke: int = 0
     """Number of the latest descent, 0 before the first."""
     patient_moved: bool = False
-    """Whether the patient has moved since the surface was perceived."""
+    """True if the patient has moved since the surface was perceived."""
 
 
 @dataclass(slots=True)
 class ExamStep:
-    """What a step asks for."""
+    """Outputs of one step."""
 
-    setpoint: Setpoint
     contact: ContactMeasurement | None
-    """None before the robot has been heard of."""
+    """None before the first reading of the robot."""
+    setpoint: Setpoint = AT_REST
     trigger: bool = False
     """Ask the camera for a burst now."""
     path: Array | None = None
@@ -123,4 +123,4 @@ class ExamStep:
     touched: TouchedSkin | None = None
     """The touch of this step, if there was one."""
     correction: tuple[Array, Array] | None = None
-    """Of the perceived surface's vertices, as `Wall.corrected` has it, once: when the strokes are over."""
+    """Of the perceived surface's vertices, as by `Wall.corrected`, once: when the strokes are over."""

@@ -1,88 +1,141 @@
-"""Stop, hold and resume: what happens to an examination that is stopped, and how it goes on or ends."""
+"""Stop, hold and resume: how an examination that is stopped continues or ends."""
 
 from __future__ import annotations
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_planning.course import ExamCourse
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.free_motion import FreeMotion
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import SECOND
-from palpate_planning.status import OVER, PALPATING, Observation, Phase
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.status import OVER, PALPATING, ExamStatus, Observation, Phase
+from palpate_planning.strokes.plan import ExamPlan, PerceivedAbdomen
+
+END_AFTER = SECOND
+"""The run continues for this time after the examination has ended [ns]."""
+
+
+class Course:
+    """State that the phases of an examination and its stops share."""
+
+    def __init__(self, arm: FreeMotion, strokes: int) -> None:
+        """`strokes`: descents made before."""
+        self.arm = arm
+        self.status = ExamStatus(stroke=strokes)
+        self.since = 0
+        """When the phase was entered, or the arm came to rest in it [ns]."""
+        self.interrupted = Phase.HOME
+        """The phase in which the examination was held last."""
+        self.contact: ContactMeasurement
+        """Measured at this step."""
+        self.rate = 1.0
+        """Samples of a trajectory to advance by at this step; see `RestartRamp`."""
+        self.perceived: PerceivedAbdomen | None = None
+        self.plan: ExamPlan | None = None
+        self.palpation: Palpation | None = None
+        self.failure = NO_CAUSE
+        """Why the examination is aborted once the arm is home."""
+
+    @property
+    def phase(self) -> Phase:
+        """The present phase."""
+        return self.status.phase
+
+    def enter(self, phase: Phase, t: int, message: str, reason: Reason = Reason.NONE) -> None:
+        """Enter a phase at `t` [ns]."""
+        status = self.status
+        status.phase, status.message, status.reason, self.since = phase, message, reason, t
+        if phase in OVER:
+            status.end_tick = t + END_AFTER
+
+    def abort(self, now: Observation, cause: Cause) -> None:
+        """End the examination where the arm is; it holds still."""
+        assert now.reading is not None
+        self.arm.hold(now.reading.q)
+        phase = self.interrupted if self.phase is Phase.HELD else self.phase
+        self.enter(Phase.ABORTED, now.t, f"aborted in phase {phase.name}: {cause.text}", cause.reason)
+
+    def go_home(self, now: Observation, cause: Cause = NO_CAUSE) -> None:
+        """Return home from where the arm is; the examination is then aborted if there is a cause."""
+        assert now.reading is not None
+        self.failure = cause
+        self.arm.hold(now.reading.q)
+        self.enter(Phase.RETURN, now.t, f"returning home: {cause.text}" if cause else "returning home", cause.reason)
 
 
 class Stops:
-    """Holds the examination while it is stopped, and takes it back to what was interrupted when the stop is released.
+    """Holds the examination while it is stopped, and returns it to the interrupted phase after the release.
 
     After a soft stop in contact the arm retreats along the normal and waits. After any other stop the driver holds the arm, and
-    planning asks for the posture in which it is: nothing is to pull when the driver lets go.
+    planning's set-point follows the measured posture, so that nothing pulls when the driver releases it.
     """
 
-    def __init__(self, course: ExamCourse, patience_s: float) -> None:
+    def __init__(self, course: Course, patience_s: float) -> None:
         """A stop that is not released within `patience_s` ends the examination."""
         self._course = course
         self._patience_s = patience_s
         self._soft = False
-        """Whether the arm was left to planning all the time."""
+        """True if planning has moved the arm since the stop began."""
         self._resuming = False
-        """Whether the stop was released and the arm is on its way back."""
+        """True if the stop was released and the arm returns to where it was."""
 
     def watch(self, now: Observation) -> None:
-        """Holds the exam when it is stopped, ends it when a service that it needs is gone or an operator wants it to end."""
-        if self._course.phase in OVER:
+        """Hold the examination when it is stopped; end it when a needed service is lost or an operator ends it."""
+        course = self._course
+        if course.phase in OVER:
             return
-        if now.stop and self._course.phase is not Phase.HELD:
-            self._course.interrupted = self._course.phase
+        if now.stop and course.phase is not Phase.HELD:
+            course.interrupted = course.phase
             self._hold(now)
         if now.lost:
-            self._end_for_loss(now, f"lost {', '.join(now.lost)}")
+            self._end_after_loss(now, Cause(Reason.SERVICE_LOST, f"lost {', '.join(now.lost)}"))
         elif now.end:
             self._end_at_home(now, now.end)
 
     def step(self, now: Observation) -> Setpoint | None:
-        """One step of a held examination; None where the arm's own free motion or rest gives the set-point."""
+        """Advance a held examination; return None where the arm's free motion or rest gives the set-point."""
+        course = self._course
         if not now.stop:
             self._resume(now)
             return None
         if self._resuming:
             self._hold(now)
         self._soft = self._soft and now.soft
-        if now.t - self._course.since > self._patience_s * SECOND:
-            self._course.abort(now, f"nobody released it within {self._patience_s:g} s: {now.stop}")
+        if now.t - course.since > self._patience_s * SECOND:
+            text = f"the stop was not released within {self._patience_s:g} s: {now.stop.text}"
+            course.abort(now, Cause(Reason.NOT_RELEASED, text))
         elif not self._soft:
             assert now.reading is not None
-            self._course.arm.hold(now.reading.q)
-        elif (palpation := self._interrupted_palpation) is not None and palpation.free_goal is None:
-            return palpation.step(now.t, self._course.contact, self._course.rate).setpoint
+            course.arm.hold(now.reading.q)
+        elif (palpation := self._palpation) is not None and palpation.free_goal is None:
+            return palpation.step(now.t, course.contact, course.rate).setpoint
         return None
 
-    @property
-    def _interrupted_palpation(self) -> Palpation | None:
-        """The palpation, if it is what was interrupted."""
-        return self._course.palpation if self._course.interrupted in PALPATING else None
-
     def _hold(self, now: Observation) -> None:
-        """Lets the examination retreat, or leaves the arm to the driver."""
+        """Let the strokes retreat, or leave the arm to the driver."""
         assert now.reading is not None
+        course = self._course
         self._soft, self._resuming = now.soft, False
-        self._course.arm.hold(now.reading.q)
-        if (palpation := self._interrupted_palpation) is not None:
+        course.arm.hold(now.reading.q)
+        course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop.reason)
+        if (palpation := self._palpation) is not None:
             palpation.pause()
-        self._course.enter(Phase.HELD, now.t, f"held in phase {self._course.interrupted.name}: {now.stop}")
 
     def _resume(self, now: Observation) -> None:
-        """Goes back to what was interrupted, by a new motion where that was a free motion."""
-        course, palpation = self._course, self._interrupted_palpation
+        """Return to the interrupted phase; a free motion is planned again."""
+        course, palpation = self._course, self._palpation
         self._resuming = True
-        goal = self._free_goal
+        goal = self._free_goal(palpation)
         if goal is not None:
             try:
                 if not course.arm.move_to(now.t, goal, course.perceived):
                     return
             except NoPathError as error:
-                course.abort(now, f"no way back to where it was held: {error}")
+                course.abort(now, Cause(Reason.NO_PATH, f"no path back to where it was held: {error}"))
                 return
-        course.enter(course.interrupted, now.t, "released, going on")
+        course.enter(course.interrupted, now.t, "released, continuing")
         if palpation is None:
             return
         if goal is None:
@@ -90,45 +143,42 @@ class Stops:
         else:
             palpation.skip_free_motion()
 
-    @property
-    def _free_goal(self) -> Array | None:
-        """Where the interrupted free motion of the plan was to end [rad], shape (7,); None if it was none."""
-        palpation, plan = self._interrupted_palpation, self._course.plan
+    def _free_goal(self, palpation: Palpation | None) -> Array | None:
+        """Return the goal of the interrupted free motion of the plan [rad], shape (7,); None if there was none."""
         if palpation is not None:
             return palpation.free_goal
+        plan = self._course.plan
         if self._course.interrupted is Phase.APPROACH and plan is not None:
             goal: Array = plan.approach.q[-1]
             return goal
         return None
 
-    def _end_for_loss(self, now: Observation, why: str) -> None:
-        """Ends the exam: in contact by lifting off and going home, if planning has the arm, else where the arm is."""
-        course, held = self._course, self._course.phase is Phase.HELD
-        palpation = self._palpation_under_way
+    def _end_after_loss(self, now: Observation, cause: Cause) -> None:
+        """End the examination: in contact by lifting off and going home, if planning moves the arm, else where the arm is."""
+        course, held, palpation = self._course, self._course.phase is Phase.HELD, self._palpation
         if palpation is None:
-            course.abort(now, why)
+            course.abort(now, cause)
             return
-        palpation.abandon(why)
+        palpation.abandon(cause)
         if held and self._soft:
-            course.enter(course.interrupted, now.t, why)
+            course.enter(course.interrupted, now.t, cause.text, cause.reason)
         elif held:
-            course.abort(now, why)
+            course.abort(now, cause)
 
-    def _end_at_home(self, now: Observation, why: str) -> None:
-        """Ends the exam at home; a held one as soon as it is released, but one in contact that was left to planning at once."""
-        course, held = self._course, self._course.phase is Phase.HELD
-        palpation = self._palpation_under_way
+    def _end_at_home(self, now: Observation, cause: Cause) -> None:
+        """End the examination at home: a held one after the release, but strokes that planning lifts at once."""
+        course, held, palpation = self._course, self._course.phase is Phase.HELD, self._palpation
         if palpation is not None:
-            palpation.abandon(why)
+            palpation.abandon(cause)
             if held and self._soft:
-                course.enter(course.interrupted, now.t, why)
+                course.enter(course.interrupted, now.t, cause.text, cause.reason)
         elif held:
-            course.failure, course.interrupted = why, Phase.RETURN
+            course.failure, course.interrupted = cause, Phase.RETURN
         else:
-            course.go_home(now, why)
+            course.go_home(now, cause)
 
     @property
-    def _palpation_under_way(self) -> Palpation | None:
-        """The palpation, if it is under way or was interrupted."""
+    def _palpation(self) -> Palpation | None:
+        """The strokes, if they are under way or were interrupted."""
         phase = self._course.interrupted if self._course.phase is Phase.HELD else self._course.phase
         return self._course.palpation if phase in PALPATING else None

@@ -1,6 +1,9 @@
-"""The set-points of a stroke: where along the path, how deep below the surface and with what force the indenter is to be."""
+"""Motion of the commanded indenter in a stroke: position along the path, depth below the surface, feed-forward force."""
 
 from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -17,28 +20,35 @@ from palpate_planning.strokes.path import ACCELERATION, PathPoint
 from palpate_planning.strokes.segments import HOVER_M, Segment
 from palpate_planning.wall.wall import Wall
 
-DEPTH_ACCELERATION = 0.5
-"""[m/s^2]"""
-PLUNGE_MPS = 0.015
-"""Speed of the descent near the surface and below it."""
-TRANSFER_MPS = 0.15
-"""Speed of the ways between strokes."""
-TRANSFER_ACCELERATION = 0.8
-"""[m/s^2]"""
-CREEP_MPS = 1e-3
-"""Least speed along a path: it is to arrive."""
-ENDED_M = 1e-4
-"""So near to its end a path is at its end."""
-BRAKING = 0.75
-"""Part of the acceleration with which the motion along a path brakes."""
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """Speeds and accelerations of the commanded indenter."""
+
+    depth_acceleration_mps2: float = 0.5
+    plunge_mps: float = 0.015
+    """Speed of the descent in tissue."""
+    transfer_mps: float = 0.15
+    """Speed between strokes."""
+    transfer_acceleration_mps2: float = 0.8
+    creep_mps: float = 1e-3
+    """Least speed along a path."""
+    end_tolerance_m: float = 1e-4
+    braking_fraction: float = 0.75
+    """Fraction of the acceleration with which the motion along a path brakes."""
+    stopped_speed_fraction: float = 0.1
+    """Below this fraction of its speed the descent counts as stopped by force."""
+
+
+MOTION: Final = MotionTuning()
 
 
 def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sinking: float, push: float) -> Setpoint:
-    """The set-point at `t` [ns] of a sphere that is at a point of a path.
+    """Return the set-point of a sphere at a point of a path.
 
     Args:
         t: time [ns].
-        point: where the path is now.
+        point: present point of the path.
         rate: speed along the path ds/dt [m/s].
         distance: of the sphere's centre from the surface along the outward normal [m].
         sinking: rate at which `distance` decreases [m/s].
@@ -53,54 +63,63 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
 
 
 class StrokeMotion:
-    """Moves the commanded indenter along one segment after the other, and up and down, within speed and acceleration."""
+    """Moves the commanded indenter along segments and up and down, within limits of speed and acceleration."""
 
     def __init__(self, exam: Exam, limits: Limits, radius: float, period_s: float, wall: Wall) -> None:
-        """`radius` of the sphere [m]; depth is counted from the `wall` where it is at the moment."""
-        self._exam, self._limits, self._radius, self._period_s = exam, limits, radius, period_s
-        self.wall = wall
+        """`radius` of the sphere [m]; depth is measured from the present `wall`."""
+        self._exam, self._limits, self._radius = exam, limits, radius
+        self.period_s, self.speed_mps, self.wall = period_s, exam.speed_mps, wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self.regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
         self.depth = self._depth_axis(-HOVER_M)
         """Target depth [m], negative above the surface."""
+        self.joined = False
+        """True if the commanded depth continues that of the arm; after a free motion it has to be measured first."""
 
     def _depth_axis(self, depth: float) -> JerkLimitedAxis:
         self._regulator.reset(depth)
-        return JerkLimitedAxis(depth, DEPTH_ACCELERATION, DEPTH_ACCELERATION / 0.05, self._period_s)
+        return JerkLimitedAxis(depth, MOTION.depth_acceleration_mps2, MOTION.depth_acceleration_mps2 / 0.05, self.period_s)
 
     def _path_axis(self, position: float) -> JerkLimitedAxis:
-        return JerkLimitedAxis(position, self._acceleration, 10 * self._acceleration, self._period_s)
+        return JerkLimitedAxis(position, self._acceleration, 10 * self._acceleration, self.period_s)
 
-    # --- where on which segment ---------------------------------------------------------------------------------------
+    # --- position on the segment --------------------------------------------------------------------------------------
 
     def start(self, segment: Segment) -> None:
-        """At rest at the start of a segment."""
+        """Begin a segment, at rest."""
         self.segment = segment
-        speed = self._exam.speed_mps if segment.contact else TRANSFER_MPS
+        self.joined = self.joined and segment.free is None
+        speed = self.speed_mps if segment.contact else MOTION.transfer_mps
         self._speed_limit = segment.path.speed_limit(speed, self._limits)
-        self._acceleration = ACCELERATION if segment.contact else TRANSFER_ACCELERATION
+        self._acceleration = ACCELERATION if segment.contact else MOTION.transfer_acceleration_mps2
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
-        self._going = True
-        """Whether the free motion goes on."""
-        self._aside: Array | None = None
-        """Where the arm was at the start of a free motion, less where that begins [rad], shape (7,); None before it is known."""
+        self._following = True
+        """False while a free motion pauses."""
+        self._q_offset: Array | None = None
+        """Measured less planned joint positions at the start of a free motion [rad], shape (7,); None until then."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
 
+    def join(self, contact: ContactMeasurement) -> None:
+        """Begin at the depth of the arm, unless the commanded depth continues it already."""
+        if not self.joined:
+            self.restart(contact)
+            self.joined = True
+
     def restart(self, contact: ContactMeasurement) -> None:
-        """At rest where the segment was left, at the depth at which the arm is now."""
+        """Continue the segment from rest where it was left, at the present depth of the arm."""
         self.depth = self._depth_axis(contact.depth)
         self.along = self._path_axis(self.along.position)
 
     def shift(self, outward: float) -> None:
-        """The wall is found to be `outward` [m] of where it was counted from: the commanded position stays where it is."""
+        """Count depth from a wall that is `outward` [m] of the previous estimate; the commanded position stays."""
         self.depth.shift(outward)
         self._regulator.shift(outward)
 
     @property
     def point(self) -> PathPoint:
-        """Where the path is now."""
+        """Present point of the path."""
         return self.segment.path.at(self.along.position)
 
     @property
@@ -109,107 +128,115 @@ class StrokeMotion:
         return self.segment.path.target(self.along.position + 1e-6)
 
     def centre_height(self, t: int) -> float:
-        """Distance of the sphere's centre from the perceived surface at zero depth, at `t` [ns]; in metres."""
+        """Return the distance [m] of the sphere's centre from the perceived surface at zero depth, at `t` [ns]."""
         return self._radius + self.wall.outward(self.point.p, t)
 
     def free_height(self, t: int) -> float:
-        """Height [m] above the skin at `t` [ns] for free motions, which keep clear of where the skin was seen, too."""
+        """Return the height [m] above the skin at `t` [ns] for free motions, which keep clear of the perceived surface, too."""
         return HOVER_M + max(0.0, -self.wall.outward(self.point.p, t))
 
     @property
     def ended(self) -> bool:
-        """Whether the path has been followed to its end."""
-        return self.along.position > self.segment.path.length - ENDED_M
+        """True if the path has been followed to its end."""
+        return self.along.position > self.segment.path.length - MOTION.end_tolerance_m
 
     @property
     def stopping_distance(self) -> float:
         """Path length needed to come to rest [m]."""
-        return self.along.velocity**2 / (2 * BRAKING * self._acceleration)
+        return self.along.velocity**2 / (2 * MOTION.braking_fraction * self._acceleration)
 
     def bend_needed(self, q: Array) -> float:
-        """How far the plan must bend the elbow [rad] for it not to become too straight, with the arm at joint positions q [rad].
+        """Return the bend [rad] that a plan needs for the elbow not to become too straight, at measured joint positions q [rad].
 
-        The square of the bend falls in proportion to how far the arm reaches. Where the skin lies deeper, or further off, than it
-        was seen, it is less than planned, and will be by as much on what is ahead.
+        The square of the bend falls in proportion to the arm's reach. Where the skin is deeper or more lateral than perceived,
+        the elbow bends less than planned, and will do so by as much on the rest of the plan.
         """
         lost = self.point.q[ELBOW] ** 2 - q[ELBOW] ** 2
         return float(np.sqrt(max(TOO_STRAIGHT_RAD**2 + lost, 0.0)))
 
     @property
     def bend_ahead(self) -> float:
-        """How far the plan bends the elbow where the motion along the path can come to rest [rad]."""
+        """Planned bend of the elbow where the motion along the path can come to rest [rad]."""
         return float(abs(self.segment.path.at(self.along.position + self.stopping_distance).q[ELBOW]))
 
     # --- one period of motion -----------------------------------------------------------------------------------------
 
-    def slowdown(self, full: float, none: float, floor: float) -> float:
-        """Part of the speed that the expected force leaves: 1 below `full` of the force limit, none at `none`, yet `floor`."""
+    def _slowdown(self, full: float, none: float, floor: float) -> float:
+        """Return the fraction of speed that the force allows: 1 below `full` of its limit, 0 at `none`, but at least `floor`."""
         force = self.regulation.expected_force / self._regulator.force_max
         return min(max((none - force) / (none - full), floor), 1.0)
 
+    @property
+    def stopped_by_force(self) -> bool:
+        """True if the force leaves the descent almost no speed."""
+        return self._slowdown(0.7, 1.0, 0.0) < MOTION.stopped_speed_fraction
+
     def deepen(self) -> bool:
-        """Sinks towards full depth, the slower the nearer the force is to its limit; returns whether it is there."""
-        return self.depth.step(self._deepest, PLUNGE_MPS * self.slowdown(0.7, 1.0, 0.01))
+        """Sink towards full depth, slower near the force limit; return True if it is reached."""
+        return self.depth.step(self._deepest, MOTION.plunge_mps * self._slowdown(0.7, 1.0, 0.01))
 
     def slide(self) -> bool:
-        """Follows the path in contact, slower where force rises; returns whether it is at its end."""
-        allowed = self._speed_limit.at(self.along.position + self.along.velocity * self._period_s)
-        return self.along.step(self.segment.path.length, max(allowed * self.slowdown(1.0, 1.1, 0.3), CREEP_MPS))
+        """Follow the path in contact, slower above the force limit; return True at its end."""
+        allowed = self._speed_limit.at(self.along.position + self.along.velocity * self.period_s)
+        speed = max(allowed * self._slowdown(1.0, 1.1, 0.3), MOTION.creep_mps)
+        return self.along.step(self.segment.path.length, speed)
 
     def travel(self, goal: float) -> bool:
-        """Follows the path above the surface to path length `goal` [m]; returns whether it is there."""
-        return self.along.step(goal, max(self._speed_limit.at(self.along.position), CREEP_MPS))
+        """Follow the path above the surface to path length `goal` [m]; return True once there."""
+        return self.along.step(goal, max(self._speed_limit.at(self.along.position), MOTION.creep_mps))
 
     def brake(self) -> None:
-        """Comes to rest along the path; a free motion stays where it is."""
-        self._going = False
+        """Come to rest along the path; pause a free motion."""
+        self._following = False
         if self.along.velocity > 1e-4:
-            self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, CREEP_MPS))
-
-    def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
-        """A free motion that begins where the arm is, and fades to the planned one: s(x) = 1 - x^2 (3 - 2 x) of the difference.
-
-        It was planned from where the wall was believed to be, before touches. A centimetre off, the elbow of a stretched arm is
-        0.1 rad from there, and a step of the set-point would drive it faster than its limit.
-        """
-        free = self.segment.free
-        assert free is not None
-        last = len(free) - 1
-        q, qd = free.at(self._sample)
-        if self._aside is None:
-            self._aside = contact.q - free.q[0]
-        x = self._sample / last if last else 1.0
-        left, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self._period_s)
-        return joint_setpoint(t, contact.X_WI, q + left * self._aside, rate * (qd + fading * self._aside))
+            self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, MOTION.creep_mps))
 
     def follow_free_motion(self, rate: float) -> bool:
-        """Goes on by `rate` samples of the segment's free motion; returns whether it is at its end."""
+        """Advance the segment's free motion by `rate` samples; return True at its end."""
         assert self.segment.free is not None
         last = len(self.segment.free) - 1.0
-        self._going = True
+        self._following = True
         self._sample = min(self._sample + rate, last)
         return self._sample >= last
 
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
-        """Regulates the measured depth towards the target depth.
+        """Regulate the measured depth towards the target depth.
 
-        `in_contact` lets errors be integrated, `pushing` the force be fed forward: on the way above the skin nothing that comes
-        against the tool is pushed back.
+        `in_contact` enables the integral of the error, `pushing` the feed-forward of force: above the skin the tool does not
+        push back.
         """
         force = contact.force if pushing else 0.0
         self.regulation = self._regulator.update(self.depth.position, contact.depth, force, contact.load, in_contact)
 
     @property
     def short_of_depth(self) -> bool:
-        """Whether the target depth has not reached the depth of the examination."""
+        """True if the target depth has not reached the depth of the examination."""
         return self.depth.position < self._deepest - LIMITED_M
 
+    # --- the set-point ------------------------------------------------------------------------------------------------
+
     def setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
-        """The set-point at `t` [ns]; a free motion goes on by `rate` samples a period."""
+        """Return the set-point at `t` [ns]; a free motion advances by `rate` samples a period."""
         if self.segment.free is not None:
-            return self._free_setpoint(t, contact, rate if self._going else 0.0)
-        regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self._period_s
+            return self._free_setpoint(t, contact, rate if self._following else 0.0)
+        regulation, point, speed, dt = self.regulation, self.point, self.along.velocity, self.period_s
         outward = self.wall.outward(point.p, t)
         rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt
         distance = self._radius + outward - regulation.depth
         return stroke_setpoint(t, point, speed, distance, regulation.rate - rising, regulation.force)
+
+    def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
+        """Return a free motion that starts where the arm is and fades to the planned one: s(x) = 1 - x^2 (3 - 2 x) of the gap.
+
+        It was planned from the wall as estimated before the touches. A centimetre off, the elbow of a stretched arm is 0.1 rad
+        from there, and a step of the set-point would drive it faster than its limit.
+        """
+        free = self.segment.free
+        assert free is not None
+        last = len(free) - 1
+        q, qd = free.at(self._sample)
+        if self._q_offset is None:
+            self._q_offset = contact.q - free.q[0]
+        x = self._sample / last if last else 1.0
+        share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
+        return joint_setpoint(t, contact.X_WI, q + share * self._q_offset, rate * (qd + fading * self._q_offset))

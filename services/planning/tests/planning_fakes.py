@@ -15,9 +15,10 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_planning.contact import SensorReading, ToolWeight
-from palpate_planning.exam_sequence import ExamSequence
+from palpate_planning.examination import Examination
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.reasons import NO_CAUSE
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
 from palpate_planning.status import ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
@@ -96,7 +97,7 @@ class World:
         self.misled = 0.0
         """Forecasts err by so much [m], one outward and the next inward."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = ExamSequence(settings, PERIODS)
+        self.exam = Examination(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1])
@@ -107,7 +108,7 @@ class World:
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
-        self.stop, self.soft, self.end, self.lost = "", False, "", ()
+        self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, ()
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None
@@ -156,7 +157,7 @@ class World:
         reading = SensorReading(self.q.copy(), wrench, qd)
         motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
         outcome = self.exam.step(Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.end, self.lost))
-        self.end = ""
+        self.end = NO_CAUSE
         if outcome.trigger:
             self._answer_at, self.moved = self.t + 300 * MS, False
         status = self.exam.status

@@ -11,12 +11,12 @@ from planning_fakes import World, known
 from palpate_bus.messages import SurfaceMotion
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Following
+from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
-from palpate_planning.recovery import REPEATS_MAX
+from palpate_planning.reasons import Cause, Reason
 from palpate_planning.status import PerceptionFailure, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
-from palpate_planning.wall_watch import CALM_S, HIDDEN_MAX_S, LOST_MAX, LOST_S, WallWatch
 
 DT = 0.01
 
@@ -63,25 +63,25 @@ def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
     breath = Breath()
     watch = WallWatch(breath, Following.FOLLOW, DT)
     breath.hear(motion(0, 0.0, calm=False), 0)
-    watch.step(0, adrift=False)
+    watch.step(0, contact_lost=False)
     assert watch.spoiled and not watch.calm
     steps = 0
     while not watch.calm:
         breath.hear(motion(0, 0.0), 0)
-        watch.step(0, adrift=False)
+        watch.step(0, contact_lost=False)
         steps += 1
-    assert steps * DT == pytest.approx(CALM_S, abs=0.02)
+    assert steps * DT == pytest.approx(WALL.calm_s, abs=0.02)
 
 
 def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
     watch = WallWatch(Breath(), Following.FOLLOW, DT)
     losses = steps = 0
     while not watch.ended:
-        watch.step(0, adrift=True)
+        watch.step(0, contact_lost=True)
         losses += watch.spoiled
         steps += 1
-    assert losses == LOST_MAX
-    assert steps * DT == pytest.approx(LOST_MAX * LOST_S, rel=0.05)
+    assert losses == WALL.contact_losses_max
+    assert steps * DT == pytest.approx(WALL.contact_losses_max * WALL.contact_lost_s, rel=0.05)
 
 
 def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> None:
@@ -89,8 +89,8 @@ def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> N
     watch = WallWatch(breath, Following.FOLLOW, DT)
     breath.hear(motion(0, 0.0, calm=False)._replace(seen=False), 0)
     for leaving, hidden in ((True, False), (False, True), (True, False)):
-        for _ in range(round(1.1 * HIDDEN_MAX_S / DT)):
-            watch.step(0, adrift=False, leaving=leaving)
+        for _ in range(round(1.1 * WALL.hidden_timeout_s / DT)):
+            watch.step(0, contact_lost=False, on_free_motion=leaving)
         assert watch.hidden is hidden
 
 
@@ -99,7 +99,7 @@ def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
     watch = WallWatch(breath, Following.GATE, DT)
     for displacement, open_ in ((0.0, True), (0.006, False)):
         breath.hear(motion(0, displacement), 0)
-        watch.step(SECOND, adrift=False)
+        watch.step(SECOND, contact_lost=False)
         assert watch.open is open_
 
 
@@ -135,7 +135,7 @@ def test_what_a_cough_spoils_is_repeated() -> None:
 def test_the_rest_of_a_stroke_that_is_given_up_is_passed_above_the_skin() -> None:
     """The next way begins at the stroke's end: the set-point is not to jump there."""
     world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
-    for _ in range(REPEATS_MAX + 1):
+    for _ in range(RECOVERY.repeats_max + 1):
         world.run(lambda: world.exam.status.phase is Phase.SCAN)
         for _ in range(10):
             world.step()
@@ -184,13 +184,12 @@ def test_a_patient_who_moves_is_looked_at_again_and_the_rest_is_felt() -> None:
 
 
 def test_a_patient_who_moved_and_is_not_seen_again_is_assessed_as_far_as_he_was_felt() -> None:
-    world = moved_in_the_second_stroke(PerceptionFailure("a curtain"))
+    world = moved_in_the_second_stroke(PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "a curtain")))
     world.run()
     status = world.exam.status
     assert status.phase is Phase.DONE
     assert 0 < status.targets_skipped < status.target_count
-    assert world.exam.skipped.popitem()[1] == "the patient has moved: gave up after 3 looks: a curtain"
-    assert status.message.endswith("the rest was left: gave up after 3 looks: a curtain")
+    assert world.exam.skipped.popitem()[1].reason is Reason.PATIENT_MOVED
 
 
 def test_what_was_seen_is_told_for_the_past_alone() -> None:

@@ -24,8 +24,8 @@ from palpate_planning.motion.timing import (
 )
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
-from palpate_planning.stages import StrokeStage
 from palpate_planning.status import Phase
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.surface import Foot

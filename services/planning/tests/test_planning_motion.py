@@ -10,13 +10,12 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
-from palpate_planning.look import look_postures
 from palpate_planning.motion.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene, with_skirt
 from palpate_planning.motion.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 from palpate_planning.strokes.path import centre, least_twist, pose
-from palpate_planning.strokes.plan import ExamPlanner
+from palpate_planning.strokes.plan import ExamPlanner, look_postures
 from palpate_planning.strokes.segments import REACH, STRETCHED
 
 LIMITS = Limits()

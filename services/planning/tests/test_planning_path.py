@@ -5,7 +5,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
-from palpate_planning.recovery import Displacement
+from palpate_planning.interruptions import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
 from palpate_planning.strokes.path import SurfacePath, centre, lay
 from palpate_planning.wall.surface import PerceivedSurface

@@ -8,13 +8,14 @@ import numpy as np
 from planning_fakes import World, known
 
 from palpate_models.scenario.schema import Following
+from palpate_planning.interruptions import WALL, WallWatch
 from palpate_planning.motion.timing import JointTrajectory
-from palpate_planning.palpation import WAIT_MAX_S
-from palpate_planning.stages import StrokeStage
+from palpate_planning.palpation import REQUEST_TIMEOUT_S
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.status import Phase
+from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import Breath, BreathObservation
-from palpate_planning.wall_watch import CALM_PATIENCE_S, CALM_S, SHUT_MAX_S, WallWatch
 
 SMALL = {"region_m": (0.025, 0.0125)}
 
@@ -46,11 +47,11 @@ def test_a_push_where_no_skin_can_be_is_no_touch() -> None:
 def test_a_soft_stop_above_the_skin_lifts_the_arm() -> None:
     world = World(known(**SMALL))
     reached(world, StrokeStage.REST, stroke=1)
-    world.stop, world.soft = "force 26 N", True
+    world.stop, world.soft = Cause(Reason.SOFT_STOP, "force 26 N"), True
     for _ in range(100):
         world.step()
     assert world.depth < -0.02
-    world.stop = ""
+    world.stop = NO_CAUSE
     world.run()
     assert world.exam.status.phase is Phase.DONE
     assert world.exam.status.targets_skipped == 0
@@ -67,10 +68,10 @@ def test_above_the_skin_nothing_is_pushed_back() -> None:
 def test_a_wall_that_is_calm_for_less_than_is_asked_for_ends_the_strokes_too() -> None:
     breath, watch = Breath(), None
     watch = WallWatch(breath, Following.FOLLOW, 0.1)
-    for k in range(round(1.2 * CALM_PATIENCE_S / 0.1)):
+    for k in range(round(1.2 * WALL.calm_timeout_s / 0.1)):
         calm = k % 14 < 7  # 0.7 s each
         breath.hear(BreathObservation(k * 100_000_000, np.zeros(11), 1e-4, calm), k * 100_000_000)
-        watch.step(k * 100_000_000, adrift=False)
+        watch.step(k * 100_000_000, contact_lost=False)
     assert watch.ended
 
 
@@ -79,7 +80,7 @@ def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
     reached(world, StrokeStage.DESCEND, stroke=2)  # the first only touches
     palpation = world.exam._course.palpation
     assert palpation is not None
-    palpation.leave("for another reason")
+    palpation.leave(Cause(Reason.WALL_NOT_TRACKED, "another reason"))
     assert sorted(palpation.ahead) == list(range(world.exam.status.target_count))
 
 
@@ -94,17 +95,17 @@ def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> N
     breath = Breath()
     watch = WallWatch(breath, Following.GATE, 0.1)
     inspired = BreathObservation(0, np.full(11, 0.006), 1e-4, calm=True)
-    for k in range(round((SHUT_MAX_S + CALM_PATIENCE_S + 1) / 0.1)):
+    for k in range(round((WALL.gate_closed_max_s + WALL.calm_timeout_s + 1) / 0.1)):
         t = k * 100_000_000
         breath.hear(inspired._replace(stamp=t), t)
-        watch.step(t, adrift=False)
-        assert watch.spoiled == (k * 0.1 > SHUT_MAX_S - 0.05)
+        watch.step(t, contact_lost=False)
+        assert watch.spoiled == (k * 0.1 > WALL.gate_closed_max_s - 0.05)
         assert not watch.leaps
     assert watch.ended
-    for _ in range(round(1.5 * CALM_S / 0.1)):
+    for _ in range(round(1.5 * WALL.calm_s / 0.1)):
         t += 100_000_000
         breath.hear(inspired._replace(stamp=t, forecast=np.zeros(11)), t)
-        watch.step(t, adrift=False)
+        watch.step(t, contact_lost=False)
     assert watch.calm
 
 
@@ -115,8 +116,8 @@ def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
     held_from = world.t / 1e9
     world.run(seconds=200.0)
     pressed = [depth > 0.002 for *_, depth, _ in world.rows]
-    assert sum(pressed) * 0.01 < 2 * SHUT_MAX_S
-    assert "could not be followed" in world.exam.status.message or world.exam.status.phase is Phase.DONE
+    assert sum(pressed) * 0.01 < 2 * WALL.gate_closed_max_s
+    assert world.exam.status.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
 
 
 def test_a_push_while_the_skin_is_only_touched_skips_no_target() -> None:
@@ -141,12 +142,12 @@ def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> No
     palpation._motion.segment = replace(palpation._motion.segment, free=posture)
     for _ in range(5):
         world.step()
-    world.stop = "the driver holds safely"
+    world.stop = Cause(Reason.ROBOT_HOLD, "")
     world.step()
     world.q = world.q + 0.1
-    world.end = "ended by the operator: enough"
+    world.end = Cause(Reason.OPERATOR_END, "enough")
     world.step()
-    world.stop = ""
+    world.stop = NO_CAUSE
     for _ in range(10):
         before = world.q.copy()
         assert np.abs(world.step().setpoint.q - before).max() < 0.01
@@ -158,6 +159,6 @@ def test_a_search_that_asks_for_nothing_is_not_waited_for() -> None:
     world = World(known(pattern="search", **SMALL))
     world.run(lambda: world.exam.status.message == StrokeStage.WAIT.value)
     began = world.t
-    world.run(seconds=2 * WAIT_MAX_S + 60.0)
+    world.run(seconds=2 * REQUEST_TIMEOUT_S + 60.0)
     assert world.exam.status.phase is Phase.DONE, world.exam.status.message
-    assert (world.t - began) / 1e9 < WAIT_MAX_S + 15.0
+    assert (world.t - began) / 1e9 < REQUEST_TIMEOUT_S + 15.0

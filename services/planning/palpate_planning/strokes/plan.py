@@ -9,20 +9,27 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot import lbr
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
 from palpate_planning.motion.planner import NoPathError, timed_motion
-from palpate_planning.motion.scene import CollisionScene
+from palpate_planning.motion.scene import CollisionScene, ViewPyramid, region_corners
 from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.placement.redundancy import plan_redundancy, prepare
+from palpate_planning.reasons import Cause
 from palpate_planning.strokes.coverage import strokes, touches
 from palpate_planning.strokes.path import centre, pose
 from palpate_planning.strokes.requests import PressPlanner
-from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner
+from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner, collision
 from palpate_planning.wall.surface import PerceivedSurface
 
 Ints = NDArray[np.int64]
+
+VIEW_MARGIN_M = 0.03
+"""Margin about the region that the view includes: perception needs the surface there."""
+TURNS_RAD = (0.0, 1.2, -1.2, 2.2, -2.2)
+"""Turns of the whole arm away from the table."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -48,8 +55,8 @@ class ExamPlan:
     """From where the arm was to above the first target."""
     segments: tuple[Segment, ...]
     """Alternating: contact, way, contact, ..."""
-    skipped: dict[int, str]
-    """Reason by target."""
+    skipped: dict[int, Cause]
+    """Cause by target."""
     presses: PressPlanner | None = None
     """Plans the presses that a search asks for; None where there is no search."""
 
@@ -63,9 +70,9 @@ class ExamPlan:
                 out += [pose(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
         return np.array(out)
 
-    def skipped_in_words(self) -> str:
-        """Empty, or how many targets are skipped and why."""
-        counts = Counter(self.skipped.values())
+    def skipped_text(self) -> str:
+        """Return how many targets are skipped and why; empty if none are."""
+        counts = Counter(cause.text for cause in self.skipped.values())
         return "; ".join(f"{count} targets skipped: {reason}" for reason, count in sorted(counts.items()))
 
 
@@ -121,7 +128,7 @@ class ExamPlanner:
             breaks |= layout.breaks
             skipped |= layout.dropped
         if not pieces:
-            reasons = "; ".join(sorted(set(skipped.values()))) or "there are none"
+            reasons = "; ".join(sorted({cause.text for cause in skipped.values()})) or "there are none"
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
         start = segments.hover(pieces[0], 0)
         assert start is not None, "a stroke that cannot be hovered over is trouble"
@@ -135,7 +142,7 @@ class ExamPlanner:
 
     def _reachable(
         self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene, bend: float
-    ) -> tuple[Array, dict[int, str]]:
+    ) -> tuple[Array, dict[int, Cause]]:
         """A posture for each target, shape (n, 7), and the targets that none reaches, with the reason."""
         p, n = perceived.surface.at(xy)
         robot, limits = self._known.robot, self._known.limits
@@ -147,12 +154,31 @@ class ExamPlanner:
             joint_margin_rad=limits.joint_margin_rad,
             force_n=limits.force_working_n,
         )
-        skipped: dict[int, str] = {}
+        skipped: dict[int, Cause] = {}
         for i, q in enumerate(chosen.q):
             if not chosen.reachable[i]:
                 skipped[i] = REACH
             elif stretched(q, bend):
                 skipped[i] = STRETCHED
             elif not scene.free(q):
-                skipped[i] = f"the arm would collide: {', '.join(scene.collisions(q))}"
+                skipped[i] = collision(scene, q)
         return chosen.q, skipped
+
+
+def look_postures(known: ExamInput) -> list[Array]:
+    """Return collision-free postures to look from [rad], shape (7,) each: those that leave the view free first, by their turn.
+
+    They are the home posture, turned about the vertical.
+    """
+    kinematics = ArmKinematics(known.robot, known.limits)
+    size = (known.exam.region_m[0] + 2 * VIEW_MARGIN_M, known.exam.region_m[1] + 2 * VIEW_MARGIN_M)
+    corners = region_corners(np.array(known.X_WA), known.exam.centre_m, size)
+    view = ViewPyramid(kinematics, known.robot, np.array(known.camera.position_m), corners)
+    scene = CollisionScene(kinematics, known.robot)
+    postures = []
+    for turn in TURNS_RAD:
+        q = np.array(lbr.HOME)
+        q[0] += turn
+        if scene.free(q):
+            postures.append(q)
+    return sorted(postures, key=lambda q: not view.clear(q))

@@ -13,6 +13,7 @@ from palpate_planning.motion.kinematics import ArmKinematics, stretched
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.strokes.coverage import Stroke, transfer
 from palpate_planning.strokes.path import SurfacePath, centre, lay, least_twist, pose
 from palpate_planning.wall.surface import PerceivedSurface
@@ -22,12 +23,12 @@ HOVER_M = 0.025
 usually wrong by (`surface_correction`)."""
 POSTURE_EVERY = 4
 """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
-REACH = "out of the arm's reach"
-STRETCHED = "within reach of a stretched arm only"
+REACH = Cause(Reason.OUT_OF_REACH, "out of the arm's reach")
+STRETCHED = Cause(Reason.ARM_STRETCHED, "within reach of a stretched arm only")
 
 Place = tuple[float, float]
-Troubles = list[tuple[int, str]]
-"""Samples of a path that the arm cannot take, and why."""
+Troubles = list[tuple[int, Cause]]
+"""Samples of a path that the arm cannot take, with the cause."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -53,8 +54,8 @@ class Layout:
     segments: list[Segment] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)
     """Targets after which a stroke has to end: the way to the next is out of reach or collides."""
-    dropped: dict[int, str] = field(default_factory=dict)
-    """Targets to skip, and why."""
+    dropped: dict[int, Cause] = field(default_factory=dict)
+    """Targets to skip, with the cause."""
 
     @property
     def troubled(self) -> bool:
@@ -84,7 +85,7 @@ class SegmentPlanner:
         self._postures, self._radius, self._depth, self._bend, self._free_motion = postures, radius, depth, bend, free_motion
         self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
         self._hovers: dict[Place, Array | None] = {}
-        self._ways: dict[tuple[Place, Place], tuple[Segment | None, str]] = {}
+        self._paths: dict[tuple[Place, Place], tuple[Segment | None, Cause]] = {}
         self._R_ref = np.eye(3)
 
     def lay(self, pieces: list[Stroke]) -> Layout:
@@ -103,11 +104,11 @@ class SegmentPlanner:
                     layout.breaks.add(target)
             for end in (0, -1):
                 if self.hover(piece, end) is None:
-                    layout.dropped[int(piece.targets[end])] = f"the posture above it is {REACH}"
+                    layout.dropped[int(piece.targets[end])] = REACH._replace(text=f"the posture above it is {REACH.text}")
             if k and not layout.troubled:
-                segment, why = self._way(pieces[k - 1], piece)
+                segment, why = self._path_to_next(pieces[k - 1], piece)
                 if segment is None:
-                    layout.dropped[int(piece.targets[0])] = f"no way to it: {why}"
+                    layout.dropped[int(piece.targets[0])] = why._replace(text=f"no path to it: {why.text}")
                 else:
                     layout.segments.append(segment)
             layout.segments.append(Segment(path, contact=True, touch=piece.touch))
@@ -115,10 +116,10 @@ class SegmentPlanner:
 
     def after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
         """A press to `depth` [m], and the way there from above the end of the stroke before; empty where the arm cannot do it."""
-        path, troubles = self._path(press, depth)
+        path, troubles = self._path_of(press, depth)
         if troubles or self.hover(press, 0) is None:
             return ()
-        way, _ = self._way(before, press)
+        way, _ = self._path_to_next(before, press)
         return () if way is None else (way, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
@@ -136,28 +137,28 @@ class SegmentPlanner:
     def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Troubles]:
         key = tuple(int(i) for i in piece.targets)
         if key not in self._strokes:
-            self._strokes[key] = self._path(piece, self._depth)
+            self._strokes[key] = self._path_of(piece, self._depth)
         return self._strokes[key]
 
-    def _way(self, before: Stroke, after: Stroke) -> tuple[Segment | None, str]:
+    def _path_to_next(self, before: Stroke, after: Stroke) -> tuple[Segment | None, Cause]:
         """From above the end of one stroke to above the start of the next: straight, else by a free motion."""
         key = (_place(before, -1), _place(after, 0))
-        if key not in self._ways:
+        if key not in self._paths:
             xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
-            path, troubles = self._path(Stroke(xy, targets, np.array([0, len(xy) - 1])), -HOVER_M)
+            path, troubles = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -HOVER_M)
             start, goal = self.hover(before, -1), self.hover(after, 0)
             if not troubles:
-                self._ways[key] = (Segment(path, contact=False), "")
+                self._paths[key] = (Segment(path, contact=False), NO_CAUSE)
             elif start is None or goal is None:
-                self._ways[key] = (None, troubles[0][1])
+                self._paths[key] = (None, troubles[0][1])
             else:
                 try:
-                    self._ways[key] = (Segment(path, contact=False, free=self._free_motion(start, goal)), "")
+                    self._paths[key] = (Segment(path, contact=False, free=self._free_motion(start, goal)), NO_CAUSE)
                 except NoPathError as error:
-                    self._ways[key] = (None, str(error))
-        return self._ways[key]
+                    self._paths[key] = (None, Cause(Reason.NO_PATH, str(error)))
+        return self._paths[key]
 
-    def _path(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
+    def _path_of(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
         """A stroke with postures at `depth`, near those of its targets; and samples that the arm cannot take."""
         s, p, n, R = lay(self._surface, stroke.xy, self._R_ref)
         centres = centre(p, n, self._radius, depth)
@@ -174,9 +175,14 @@ class SegmentPlanner:
             elif stretched(solution.q, self._bend):
                 troubles.append((int(i), STRETCHED))
             elif not self._scene.free(solution.q):
-                troubles.append((int(i), f"the arm would collide: {', '.join(self._scene.collisions(solution.q))}"))
+                troubles.append((int(i), collision(self._scene, solution.q)))
         between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
         return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), troubles
+
+
+def collision(scene: CollisionScene, q: Array) -> Cause:
+    """Return what the arm collides with at q [rad], shape (7,)."""
+    return Cause(Reason.COLLISION, f"the arm would collide: {', '.join(scene.collisions(q))}")
 
 
 def _place(piece: Stroke, end: int) -> Place:

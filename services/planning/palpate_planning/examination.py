@@ -1,0 +1,425 @@
+"""The sequence of the examination: home, look, plan, approach, indent, scan, retract, return, assess, done."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate_bus.setpoint import Setpoint
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot import lbr
+from palpate_models.scenario.checkpoint import Checkpoint
+from palpate_models.scenario.schema import ExamInput
+from palpate_planning.contact import ContactSensing, ToolWeight
+from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, TrajectoryFollower
+from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics
+from palpate_planning.motion.planner import NoPathError
+from palpate_planning.motion.timing import RestartRamp
+from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
+from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.reasons import Cause, Reason
+from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
+from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.stops import Course, Stops
+from palpate_planning.stroke import StrokeStage
+from palpate_planning.strokes.path import compile_ahead
+from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
+from palpate_planning.strokes.requests import PLANNING_TIME, PressPlanner, PressRequest
+from palpate_planning.strokes.segments import Segment
+from palpate_planning.wall.wall import Wall, plane
+
+
+@dataclass(frozen=True)
+class ExamTuning:
+    """How often phases are repeated and how long they may take."""
+
+    looks_max: int = 3
+    moves_max: int = 2
+    """A patient who moves more often is not viewed again."""
+    replans_max: int = 3
+    """The rest is not planned again more often because the arm would stretch or hides the wall."""
+    resume_distance_m: float = 0.015
+    """Resume is refused if the wall moved by more than this."""
+    rest_ns: int = 200 * MS
+    """Time at rest before an image: the arm's oscillations fade."""
+    perception_timeout_ns: int = 12 * SECOND
+    """Time that perception may take beyond the burst: it watches about two breaths."""
+    planning_ns: int = 2 * SECOND
+    """Simulated time that planning the examination takes."""
+    findings_timeout_ns: int = 120 * SECOND
+
+
+EXAM = ExamTuning()
+
+
+class Views:
+    """The views of the abdomen: postures, tried in turn, and the bursts of the camera."""
+
+    def __init__(self, postures: list[Array]) -> None:
+        """`postures` [rad], shape (7,) each."""
+        self.postures = postures
+        self.failed = 0
+        """Number of views that failed."""
+        self.asked: int | None = None
+        """When the camera was asked for the burst that perception is to answer [ns]."""
+
+    @property
+    def posture(self) -> Array:
+        """The posture to look from [rad], shape (7,)."""
+        return self.postures[self.failed]
+
+    def fail(self) -> bool:
+        """Turn to the next posture; return True if none is left."""
+        self.asked = None
+        self.failed += 1
+        return self.failed >= min(EXAM.looks_max, len(self.postures))
+
+    def restart(self) -> None:
+        """Begin with the first posture again."""
+        self.asked, self.failed = None, 0
+
+
+@dataclass
+class Rest:
+    """The part of the examination that is planned, and planned again after an interruption."""
+
+    wanted: frozenset[int] | None = None
+    """Targets to examine; None: all."""
+    bend: float | None = None
+    """Least bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
+    moves: int = 0
+    """How often the patient was viewed again after a motion."""
+    replans: int = 0
+    unplanned: str = ""
+    """Why the rest could not be planned; empty if it could."""
+
+    @property
+    def begun(self) -> bool:
+        """True if strokes were carried out before."""
+        return self.moves + self.replans > 0
+
+
+class RequestedPresses:
+    """The presses that a search requests, planned one at a time on the worker thread."""
+
+    def __init__(self, *, lockstep: bool) -> None:
+        self._lockstep = lockstep
+        self._request: PressRequest | None = None
+        self._planning: BackgroundTask[tuple[Segment, ...]] | None = None
+        self._number = 0
+        self.done = 0
+        """Number of the latest request that was carried out."""
+
+    def receive(self, request: PressRequest | None) -> None:
+        """Keep a request until the arm can carry it out: the search asks once."""
+        self._request = request or self._request
+
+    def drop_plan(self) -> None:
+        """Drop a press that is being planned on an outdated surface."""
+        self._planning = None
+
+    def step(self, t: int, presses: PressPlanner, palpation: Palpation, shift_A: Array) -> None:
+        """Plan the next press at `t` [ns], or append it to the strokes."""
+        if self._request is not None:
+            request, self._request = self._request.moved(shift_A), None
+            if request.xy is None:
+                palpation.close()
+            else:
+                self._planning = BackgroundTask(t, PLANNING_TIME, lambda: presses.press(request), lockstep=self._lockstep)
+                self._number = request.number
+        elif self._planning is not None and self._planning.due(t):
+            palpation.extend(self._planning.result())
+            self._planning = None
+        elif self._planning is None and palpation.waiting:
+            self.done = self._number
+
+
+class Examination:
+    """Runs one examination. `step` each planning period; `status` is what exam/state reports."""
+
+    def __init__(self, known: ExamInput, periods: Periods, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
+        """Start at home.
+
+        Args:
+            known: the exam input.
+            periods: periods of the contract.
+            before: state of the interrupted examination that this one resumes.
+            lockstep: True if heavy planning takes exactly its simulated time; else it takes at least that.
+        """
+        self._known, self._periods, self._lockstep = known, periods, lockstep
+        self._before = before
+        self._kinematics = ArmKinematics(known.robot, known.limits)
+        compile_ahead()
+        wall, radius = plane(np.array(known.X_WA)), known.robot.indenter_radius_m
+        self._sense = ContactSensing(self._kinematics, ToolWeight.of(known.robot), wall, radius, periods.step_s)
+        self._planner = ExamPlanner(known, periods.step_s)
+        WORKER.submit(self._planner.prepare)
+        follower = TrajectoryFollower(self._kinematics, np.array(lbr.HOME))
+        arm = FreeMotion(follower, self._planner, lockstep=lockstep)
+        self._course = Course(arm, 0 if before is None else before.strokes)
+        self._stops = Stops(self._course, known.limits.release_patience_s)
+        self._restart = RestartRamp()
+        self._views = Views(look_postures(known))
+        self._rest = Rest()
+        self._requested = RequestedPresses(lockstep=lockstep)
+        self._planning: BackgroundTask[ExamPlan] | None = None
+        self._skipped: dict[int, Cause] = {}
+        self._started = False
+        self._averaged: Array | None = None
+        """Height of the wall above the surface's vertices in the mean of the images since the view [m]."""
+        self._phases: dict[Phase, Callable[[Observation, ExamStep], Setpoint | None]] = {
+            Phase.HOME: self._home,
+            Phase.LOOK: self._look,
+            Phase.PLAN: self._plan,
+            Phase.APPROACH: self._approach,
+            **dict.fromkeys(PALPATING, self._palpate),
+            Phase.RETURN: self._return,
+            Phase.ASSESS: self._assess,
+            Phase.HELD: self._held,
+        }
+
+    @property
+    def status(self) -> ExamStatus:
+        """State of the examination."""
+        return self._course.status
+
+    @property
+    def skipped(self) -> dict[int, Cause]:
+        """Skipped targets with the cause."""
+        return dict(self._skipped)
+
+    def step(self, now: Observation) -> ExamStep:
+        """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
+        course, status = self._course, self.status
+        course.rate = self._restart.step(now.t)
+        if now.reading is None:
+            q = np.array(lbr.HOME)
+            return ExamStep(None, setpoint=joint_setpoint(now.t, self._kinematics.pose(q), q, stiffness=NO_STIFFNESS))
+        if not self._started:
+            self._started = True
+            course.arm.hold(now.reading.q)
+            course.enter(Phase.HOME, now.t, "going home")
+        if now.averaged is not None:
+            self._averaged = now.averaged
+        self._requested.receive(now.request)
+        if now.motion is not None:
+            self._sense.wall.breath.hear(now.motion, now.t)
+        course.contact = self._sense.sense(now.reading, now.t)
+        status.steady = status.force_limited = False
+        status.depth_setpoint = course.contact.depth
+        self._stops.watch(now)
+        step = ExamStep(course.contact)
+        phase = self._phases.get(status.phase, _stay)
+        step.setpoint = phase(now, step) or course.arm.step(now.t, course.rate)
+        return step
+
+    # --- before contact -----------------------------------------------------------------------------------------------
+
+    def _home(self, now: Observation, out: ExamStep) -> None:
+        course = self._course
+        try:
+            at_home = course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived)
+        except NoPathError as error:
+            course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))
+            return
+        if at_home and now.t - course.since >= EXAM.rest_ns:
+            course.enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
+
+    def _look(self, now: Observation, out: ExamStep) -> None:
+        course, views, frames = self._course, self._views, self._known.camera.frames
+        if not views.postures:
+            text = "every look posture collides: check robot.base_xy_m, base_yaw_rad and base_height_m"
+            course.abort(now, Cause(Reason.VIEW_UNREACHABLE, text))
+        elif views.asked is None:
+            try:
+                if not course.arm.move_to(now.t, views.posture, course.perceived):
+                    course.since = now.t
+                elif now.t - course.since >= EXAM.rest_ns:
+                    out.trigger, views.asked = True, now.t
+                    self.status.reason, self.status.message = Reason.NONE, f"looking: {frames} frames"
+            except NoPathError as error:
+                self._look_again(now, out, Cause(Reason.VIEW_UNREACHABLE, f"look posture cannot be reached: {error}"))
+        elif isinstance(now.perceived, PerceivedAbdomen):
+            self._accept_view(now, now.perceived)
+        elif isinstance(now.perceived, PerceptionFailure):
+            self._look_again(now, out, now.perceived.cause)
+        elif now.t - views.asked > frames * self._periods.frame + EXAM.perception_timeout_ns:
+            text = f"no answer from perception {EXAM.perception_timeout_ns / SECOND:.0f} s after the burst"
+            self._look_again(now, out, Cause(Reason.VIEW_TIMEOUT, text))
+
+    def _accept_view(self, now: Observation, perceived: PerceivedAbdomen) -> None:
+        """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
+        course, rest, sense, before = self._course, self._rest, self._sense, self._before
+        course.perceived, self._averaged = perceived, None
+        sense.wall = sense.wall.seen_again(perceived.surface) if rest.moves else Wall(perceived.surface, sense.wall.breath)
+        count = self.status.target_count = len(perceived.positions)
+        self.status.view_blocked = False
+        text = f"planning over {count} targets"
+        if before is not None and not rest.moves:
+            X_WA = np.array(self._known.X_WA)
+            if (away := perceived.surface.away_from(apply(X_WA, before.surface))) > EXAM.resume_distance_m:
+                limit = f"limit {EXAM.resume_distance_m * 1e3:.0f} mm"
+                text = f"cannot resume: abdominal wall moved {away * 1e3:.0f} mm ({limit}); start a new run"
+                course.abort(now, Cause(Reason.OTHER_PATIENT, text))
+                return
+            if not self._known.exam.searched:
+                targets = apply(inverse(X_WA), perceived.positions)[:, :2]
+                rest.wanted = before.wanted(targets, self._known.exam.spacing_m)
+                text = f"planning over {len(rest.wanted)} of {count} targets that are left"
+        course.enter(Phase.PLAN, now.t, text)
+
+    def _look_again(self, now: Observation, out: ExamStep, cause: Cause) -> None:
+        status, exhausted = self.status, self._views.fail()
+        status.reason, status.message = cause
+        status.view_blocked = cause.reason is Reason.VIEW_BLOCKED
+        if exhausted:
+            self._give_up(now, out, cause._replace(text=f"gave up after {self._views.failed} looks: {cause.text}"))
+
+    def _give_up(self, now: Observation, out: ExamStep, cause: Cause) -> None:
+        """End an examination that cannot be planned; measurements made before are assessed."""
+        rest, skipped = self._rest, self._skipped
+        if not rest.begun:
+            self._course.abort(now, cause)
+            return
+        rest.unplanned = cause.text
+        for i in (rest.wanted or frozenset()) & skipped.keys():
+            skipped[i] = skipped[i]._replace(text=f"{skipped[i].text}: {cause.text}")
+        self._correct(out)
+        self._course.go_home(now)
+
+    def _plan(self, now: Observation, out: ExamStep) -> None:
+        course, rest = self._course, self._rest
+        if self._planning is None:
+            perceived, start = course.perceived, course.arm.q.copy()
+            assert perceived is not None
+            self._planning = BackgroundTask(
+                now.t,
+                EXAM.planning_ns,
+                lambda: self._planner.examination(perceived, start, rest.wanted, rest.bend),
+                lockstep=self._lockstep,
+            )
+        elif self._planning.due(now.t):
+            task, self._planning = self._planning, None
+            try:
+                plan = course.plan = task.result()
+            except NoPathError as error:
+                self._give_up(now, out, Cause(Reason.NO_PATH, str(error)))
+                return
+            planned_again = rest.wanted or frozenset()
+            self._skipped = {i: cause for i, cause in self._skipped.items() if i not in planned_again} | plan.skipped
+            self._sense.wall.shift_A = self._sense.wall.breath.shift_A
+            out.path = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m)
+            course.arm.start(plan.approach)
+            self.status.targets_skipped = len(self._skipped)
+            course.enter(Phase.APPROACH, now.t, plan.skipped_text() or "approaching the first target")
+
+    def _approach(self, now: Observation, out: ExamStep) -> Setpoint | None:
+        course, known = self._course, self._known
+        if not course.arm.arrived:
+            course.since = now.t
+        elif now.t - course.since >= EXAM.rest_ns:
+            assert course.plan is not None
+            course.palpation = Palpation(
+                course.plan.segments,
+                known.exam,
+                known.limits,
+                known.robot.indenter_radius_m,
+                self._periods.step_s,
+                self._sense.wall,
+                strokes=self.status.stroke,
+                more=course.plan.presses is not None,
+            )
+            return self._palpate(now, out)
+        return None
+
+    # --- in contact ---------------------------------------------------------------------------------------------------
+
+    def _palpate(self, now: Observation, out: ExamStep) -> Setpoint | None:
+        course, sense = self._course, self._sense
+        palpation, plan = course.palpation, course.plan
+        assert palpation is not None and plan is not None and now.reading is not None
+        if plan.presses is not None:
+            self._requested.step(now.t, plan.presses, palpation, sense.wall.shift_A)
+        step = palpation.step(now.t, course.contact, course.rate)
+        self._report(step, palpation, now.t)
+        out.touched = step.touched
+        if step.taring:
+            sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
+        else:
+            sense.weight.start_tare()
+        if step.stage is StrokeStage.DONE:
+            self._end_strokes(now, out, palpation)
+            if palpation.failed:
+                return None  # it rests where it is, which may be off the planned path
+        return step.setpoint
+
+    def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
+        status = self.status
+        self._skipped |= palpation.skipped
+        status.stroke, status.patient_moved = palpation.stroke, self._sense.wall.breath.moved
+        status.steady, status.force_limited, status.depth_setpoint = step.steady, step.limited, step.depth_setpoint
+        status.target_index = self._requested.done if self._known.exam.searched else step.target
+        status.targets_skipped = len(self._skipped)
+        cause = palpation.failed or palpation.left
+        self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause.reason)
+
+    def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
+        """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
+        assert now.reading is not None
+        course, rest, cause = self._course, self._rest, palpation.left
+        course.arm.hold(now.reading.q)
+        self._requested.drop_plan()
+        more = palpation.open_ended or bool(palpation.ahead)
+        wanted = None if palpation.open_ended else palpation.ahead
+        if more and palpation.moved and rest.moves < EXAM.moves_max:
+            rest.moves, rest.wanted, rest.bend = rest.moves + 1, wanted, None
+            self._views.restart()
+            course.enter(Phase.LOOK, now.t, "the patient has moved: looking again", Reason.PATIENT_MOVED)
+        elif more and cause.reason in REPLANNED and rest.replans < EXAM.replans_max:
+            rest.replans, rest.wanted = rest.replans + 1, wanted
+            rest.bend = max(rest.bend or STRAIGHT_RAD, palpation.bend_needed)
+            course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause.reason)
+        else:
+            self._correct(out)
+            course.go_home(now, palpation.failed)
+
+    def _correct(self, out: ExamStep) -> None:
+        """Publish the final surface correction, unless the patient moved."""
+        perceived, wall = self._course.perceived, self._sense.wall
+        if perceived is not None and not self._rest.moves and not wall.breath.moved:
+            out.correction = wall.corrected(perceived.vertices, self._averaged)
+
+    def _held(self, now: Observation, out: ExamStep) -> Setpoint | None:
+        setpoint = self._stops.step(now)
+        self._views.asked = None  # a burst that was requested before the stop is requested again
+        return self._palpate(now, out) if self.status.phase in PALPATING else setpoint
+
+    # --- after contact ------------------------------------------------------------------------------------------------
+
+    def _return(self, now: Observation, out: ExamStep) -> None:
+        course = self._course
+        try:
+            if not course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived):
+                return
+        except NoPathError as error:
+            course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))
+            return
+        if course.failure:
+            course.abort(now, course.failure)
+        else:
+            course.enter(Phase.ASSESS, now.t, "waiting for the findings")
+
+    def _assess(self, now: Observation, out: ExamStep) -> None:
+        if now.findings_final:
+            skipped = f", {len(self._skipped)} of {self.status.target_count} targets skipped" if self._skipped else ""
+            unplanned = f"; the rest was left: {self._rest.unplanned}" if self._rest.unplanned else ""
+            self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}{unplanned}")
+        elif now.t - self._course.since > EXAM.findings_timeout_ns:
+            text = f"no final findings after {EXAM.findings_timeout_ns / SECOND:.0f} s"
+            self._course.abort(now, Cause(Reason.NO_FINDINGS, text))
+
+
+def _stay(now: Observation, out: ExamStep) -> None:
+    """The phase of an examination that is over."""

@@ -1,0 +1,232 @@
+"""What interrupts the strokes: a wall that cannot be tracked, too much force, a pause; and from where they are taken up again."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+
+from palpate_bus.setpoint import Setpoint
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Exam, Following, Limits
+from palpate_planning.contact import ContactMeasurement
+from palpate_planning.motion.timing import JerkLimitedAxis
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.stroke import Duration
+from palpate_planning.stroke_motion import MOTION
+from palpate_planning.strokes.coverage import Bools
+from palpate_planning.strokes.path import PathPoint, centre
+from palpate_planning.strokes.segments import Segment
+from palpate_planning.wall.breath import Breath
+
+
+@dataclass(frozen=True)
+class WallTuning:
+    """When the wall may be touched, and when the strokes end."""
+
+    calm_s: float = 1.0
+    """After a cough or a deep breath the skin is left alone until the wall has been tracked for this time."""
+    calm_timeout_s: float = 60.0
+    """The strokes end if the wall cannot be tracked for this time."""
+    hidden_timeout_s: float = 5.0
+    """The arm leaves if it hides the wall for this time; a deep breath or a cough, which also hides it, is shorter."""
+    contact_lost_s: float = 0.3
+    """Without contact at depth for this time the wall is touched again."""
+    contact_losses_max: int = 5
+    gate_closed_max_s: float = 15.0
+    """With gated breathing the arm lifts if the end of expiration is not reached for this time."""
+    gate_m: float = 0.001
+    """With gated breathing, samples count up to this distance from the end of expiration, where the wall moves most."""
+
+
+@dataclass(frozen=True)
+class RecoveryTuning:
+    """How often and from where strokes are taken up again."""
+
+    soft_stops_max: int = 3
+    repeats_max: int = 3
+    """A stroke that is interrupted at one place more often is skipped from there on."""
+    one_place_m: float = 0.010
+    """Two interruptions of a stroke that are closer than this are at one place."""
+    displaced_max_m: float = 0.02
+    """An arm that was pushed aside further while it was held does not continue."""
+    clear_height_m: float = 0.003
+    """Above this height an arm that was pushed aside may move laterally."""
+    on_path_m: float = 1e-6
+    return_mps: float = 0.15
+    return_acceleration_mps2: float = 0.8
+
+
+WALL: Final = WallTuning()
+RECOVERY: Final = RecoveryTuning()
+
+
+class WallWatch:
+    """Checks that the wall is tracked and touched; one `step` each planning period."""
+
+    def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
+        self._breath, self._gated = breath, following is Following.GATE
+        self._tracked = Duration(period_s, WALL.calm_s)
+        self._not_calm, self._contact_lost = Duration(period_s), Duration(period_s)
+        self._occluded, self._gate_closed = Duration(period_s), Duration(period_s)
+        self._losses = 0
+        self.spoiled = False
+        """True if present samples are invalid: the indenter has to lift off."""
+        self.leaps = False
+        """True if the wall moves against its forecast."""
+        self.open = True
+        """True if samples may be taken at this moment of the breath."""
+        self.moved = False
+        """True if the patient has moved."""
+        self.ended = NO_CAUSE
+        """Why the strokes have to end."""
+
+    @property
+    def calm(self) -> bool:
+        """True if the wall has been tracked for long enough to be touched."""
+        return self._tracked.s >= WALL.calm_s
+
+    @property
+    def hidden(self) -> bool:
+        """True if the arm has hidden the wall for too long to wait there."""
+        return self._occluded.s > WALL.hidden_timeout_s
+
+    def step(self, t: int, *, contact_lost: bool, on_free_motion: bool = False) -> None:
+        """Check the moment `t` [ns]; `contact_lost`: at depth without contact."""
+        breath = self._breath
+        self.open = not self._gated or abs(breath.displacement(t)) < WALL.gate_m
+        tracked = breath.calm(t)
+        calm = self._gate_closed.update(not self.open) <= WALL.gate_closed_max_s and tracked
+        self._tracked.update(calm)
+        self._not_calm.update(not self.calm)
+        self._occluded.update(breath.hidden and not tracked and not on_free_motion)
+        lost = self._contact_lost.update(contact_lost) > WALL.contact_lost_s
+        if lost:
+            self._losses += 1
+            self._contact_lost.update(False)
+        self.spoiled = lost or not calm
+        self.leaps = not (tracked or breath.hidden)
+        self.moved = self.moved or breath.moved
+        if self.moved:
+            self.ended = Cause(Reason.PATIENT_MOVED, "the patient has moved")
+        elif self._not_calm.s > WALL.calm_timeout_s:
+            self.ended = Cause(Reason.WALL_NOT_TRACKED, f"the wall could not be tracked for {WALL.calm_timeout_s:g} s")
+        elif self._losses >= WALL.contact_losses_max:
+            self.ended = Cause(Reason.CONTACT_LOST, f"contact was lost {self._losses} times")
+
+
+class Displacement:
+    """Gap between an arm that was pushed aside and its path, while the arm returns."""
+
+    def __init__(self, gap: Array, period_s: float) -> None:
+        """`gap` [m], world axes, shape (3,): measured less planned centre of the sphere; not zero."""
+        length = float(np.linalg.norm(gap))
+        self._direction = gap / length
+        acceleration = RECOVERY.return_acceleration_mps2
+        self._length = JerkLimitedAxis(length, acceleration, 10 * acceleration, period_s)
+
+    def move(self, setpoint: Setpoint) -> Setpoint:
+        """Return the set-point, displaced by the remaining gap."""
+        V_WD = setpoint.V_WD.copy()
+        V_WD[:3] += self._direction * self._length.velocity
+        return replace(setpoint, p_WD=setpoint.p_WD + self._direction * self._length.position, V_WD=V_WD)
+
+    def shrink(self) -> bool:
+        """Return to the path for one period; True once there."""
+        return self._length.step(0.0, RECOVERY.return_mps)
+
+    def stay(self) -> None:
+        """Stop the return."""
+        self._length.stand()
+
+
+class Recovery:
+    """How interrupted strokes continue: from where, without which targets, or not at all."""
+
+    def __init__(self, exam: Exam, limits: Limits, period_s: float) -> None:
+        self._exam, self._limits, self._period_s = exam, limits, period_s
+        self._soft_stops = 0
+        self._spoiled_at, self._repeats = 0.0, 0
+        self.paused = False
+        """True if the arm has to wait above the surface."""
+        self.resume_at: float | None = None
+        """Path length [m] at which the stroke is taken up again after the lift; None: the next segment follows."""
+        self.displacement: Displacement | None = None
+        self.skipped: dict[int, Cause] = {}
+        """Cause by target."""
+        self.failed = NO_CAUSE
+        """Why the strokes were abandoned."""
+        self.left = NO_CAUSE
+        """Why the strokes end early without failure."""
+
+    @property
+    def ending(self) -> bool:
+        """True if the arm lifts and the strokes end."""
+        return bool(self.failed or self.left)
+
+    def give_up(self, cause: Cause) -> None:
+        """Abandon the strokes."""
+        self.failed = self.failed or cause
+        self.paused = False
+
+    def soft_stop(self, force: float, segment: Segment, s: float) -> None:
+        """Skip the targets near path length s; abandon the strokes at the last allowed soft stop."""
+        path = segment.path
+        self._soft_stops += 1
+        cause = Cause(Reason.FORCE, f"soft stop at {force:.1f} N, limit {self._limits.force_soft_stop_n:g} N")
+        self._skip(segment, (path.visits > s - 1e-6) & (path.visits < s + self._exam.spacing_m), cause)
+        ahead = path.visits[path.visits >= s + self._exam.spacing_m]
+        self.resume_at = float(ahead[0]) if len(ahead) else None
+        if self._soft_stops >= RECOVERY.soft_stops_max:
+            self.failed = cause._replace(text=f"{cause.text}, {self._soft_stops} times")
+
+    def repeat(self, segment: Segment, s: float, back: float, cause: Cause) -> None:
+        """Take the stroke up again `back` [m] before path length s; skip its rest after too many repeats at one place."""
+        again = self._repeats > 0 and s < self._spoiled_at + RECOVERY.one_place_m
+        self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
+        self.resume_at = max(s - back, 0.0)
+        if self._repeats > RECOVERY.repeats_max:
+            self._skip(segment, segment.path.visits > s - 1e-6, cause)
+            self.resume_at, self._repeats = None, 0
+
+    def _skip(self, segment: Segment, visits: Bools, cause: Cause) -> None:
+        """Skip targets, unless the skin is only touched there: they are pressed later."""
+        if not segment.touch:
+            self.skipped |= dict.fromkeys((int(i) for i in segment.path.targets[visits]), cause)
+
+    def leave(self, cause: Cause, segment: Segment, unfelt_from: float, later: list[int]) -> frozenset[int]:
+        """End the strokes early; skip and return the targets of the segment beyond a path length [m], and the `later` ones."""
+        ahead = list(later)
+        if segment.contact and not segment.touch:
+            ahead += [int(i) for i in segment.path.targets[segment.path.visits > unfelt_from]]
+        self.left = cause
+        self.skipped |= dict.fromkeys(ahead, cause)
+        return frozenset(ahead)
+
+    def reached(self, position: float, *, slid: bool) -> float:
+        """Return the path length up to which the present stroke has been measured [m]; before its first target if it has not."""
+        if self.resume_at is not None:
+            return self.resume_at - MOTION.end_tolerance_m
+        return position - (0.0 if slid else MOTION.end_tolerance_m)
+
+    def measure_displacement(self, contact: ContactMeasurement, point: PathPoint, radius: float) -> float:
+        """Return the lateral distance [m] of the arm from its path point; the return to the path begins there.
+
+        `radius` [m]: distance of the sphere's centre from the perceived surface at zero depth.
+        """
+        p_WI = contact.X_WI[:3, 3]
+        gap = p_WI - centre(point.p, point.n, radius, contact.depth)
+        pushed = float(np.linalg.norm(gap)) > RECOVERY.on_path_m
+        self.displacement = Displacement(gap, self._period_s) if pushed else None
+        gap = p_WI - point.p
+        return float(np.linalg.norm(gap - (gap @ point.n) * point.n))
+
+    def return_to_path(self, contact: ContactMeasurement) -> None:
+        """Return to the path for one period: only clear of the skin, and not while the arm waits or gives up."""
+        if self.displacement is None:
+            return
+        if self.failed or self.paused or contact.depth > -RECOVERY.clear_height_m:
+            self.displacement.stay()
+        elif self.displacement.shrink():
+            self.displacement = None
