@@ -31,20 +31,6 @@ WHY: Final = {
     ExamState.PHASE_PLAN: ": ways on which the arm meets nothing else",
 }
 """What a phase is for, where its message does not say so."""
-USUAL: Final = frozenset(
-    {
-        "resting above the skin",
-        "descending",
-        "settling at depth",
-        "sliding at depth",
-        "holding at depth",
-        "lifting",
-        "moving to the next stroke",
-        "waiting for the next stroke",
-        "done",
-    }
-)
-"""Messages of our planning within a stroke that says nothing new; any other message is told."""
 
 
 class Narration:
@@ -81,7 +67,7 @@ class Narration:
         name = self.part(state).partition(" ")[0]
         if state.phase not in STROKE:
             sentence = str(state.message) + ("" if self._told[0] == name else WHY.get(state.phase, ""))
-        elif state.message not in USUAL:
+        elif state.reason != ExamState.REASON_NONE:
             sentence = str(state.message)
         elif self._told[0] == name or not (self._touching(state) or self._scanning):
             return None  # the first descent after the touches ends them; the scan begins at depth

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 from typing import Any
 
-import pytest
 from rich.console import Console
 
 from palpate.exam_state import exam_state
 from palpate.run.outlook import Outlook
-from palpate.run.progress import PHASES, USUAL, Narration, RunDisplay
+from palpate.run.progress import PHASES, Narration, RunDisplay
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam
-from palpate_planning.stroke import StrokeStage
+from palpate_planning.reasons import Reason
 from palpate_planning.status import PHASE_OF, Phase
+from palpate_planning.stroke import StrokeStage
 
 EXAM = Exam(region_m=(0.10, 0.06))
 TOUCHES = Outlook.of(EXAM).touches
 LINES = Outlook.of(EXAM).lines
 
 
-def state(phase: int, message: str, stroke: int) -> Any:
-    return exam_state(0, phase, message=message, stroke=stroke, target_count=45)
+def state(phase: int, message: str, stroke: int, reason: int = ExamState.REASON_NONE) -> Any:
+    return exam_state(0, phase, message=message, stroke=stroke, target_count=45, reason=reason)
 
 
 def stroke(number: int, *, pressed: bool) -> list[Any]:
@@ -77,13 +77,13 @@ def test_a_patient_who_moved_is_touched_again() -> None:
 def test_what_happens_within_a_stroke_is_told_word_for_word_and_once() -> None:
     narration = Narration(EXAM)
     told(examination(), narration)
-    lifts = [state(Phase.RETRACT, "the skin was not felt", TOUCHES + LINES)] * 3
-    assert told(lifts, narration) == [("scan", "the skin was not felt")]
+    lifts = [state(Phase.RETRACT, "no tissue felt", TOUCHES + LINES, ExamState.REASON_NO_TISSUE)] * 3
+    assert told(lifts, narration) == [("scan", "no tissue felt")]
 
 
-@pytest.mark.parametrize("stage", StrokeStage)
-def test_the_usual_messages_of_planning_are_known(stage: StrokeStage) -> None:
-    assert stage.value in USUAL
+def test_every_reason_has_its_code() -> None:
+    codes = {name.removeprefix("REASON_"): getattr(ExamState, name) for name in vars(ExamState) if name.startswith("REASON_")}
+    assert codes == {reason.name: int(reason) for reason in Reason}
 
 
 def test_every_phase_has_a_name() -> None:
