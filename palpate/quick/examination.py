@@ -1,8 +1,8 @@
 """The strokes of an examination on a patient without an arm.
 
-Planning's own code moves the indenter: coverage, path, the stroke with its touch, regulation of depth against force. The errors of
-arm, camera and force sensor are drawn from those of whole examinations (`palpate.quick.errors`). `palpate.quick.messages` makes
-exam/state, perception/surface and truth/indentation from the rows.
+Planning's own code moves the indenter: coverage, path, the stroke with its touch, regulation of depth against force. The errors
+of arm, camera and force sensor are drawn from those of whole examinations (`palpate.quick.errors`). `palpate.quick.messages`
+makes exam/state, perception/surface and truth/indentation from the rows.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Contact force from the force/torque sensor: bias by taring in free air, weight of the tool by its orientation.
+"""Contact force from the force/torque sensor: bias by taring in free air, weight of the tool from its orientation.
 
 The sensor S reads, in its own axes, F_S = R_SW (F_contact + m (g - a)) + bias. With the mass known, the bias is the mean of
 F_S - R_SW m g at rest while nothing is touched, in whatever orientations. Torques are not used.
@@ -28,37 +28,37 @@ class ToolWeight:
         self.weight_W: Array = np.array((0.0, 0.0, -mass * GRAVITY))
         """[N], world axes, shape (3,)."""
         self.bias = np.zeros(3)
-        """Force [N] that the sensor reads where there is none, in its axes, shape (3,)."""
+        """Reading of the sensor without force [N], in its axes, shape (3,)."""
         self.tared = False
-        """Whether the bias has been measured at all."""
+        """True once the bias has been measured."""
         self._sum = np.zeros(3)
         self._count = 0
 
     @staticmethod
     def of(robot: Robot) -> ToolWeight:
-        """From the robot's tables: stand-off and sphere."""
+        """Return the tool of a robot: stand-off and sphere."""
         inertia = lbr.inertias(robot)
         return ToolWeight(inertia["ft_sensor"].mass + inertia["indenter"].mass)
 
     def force(self, R_WS: Array) -> Array:
-        """The weight as the sensor sees it [N], in its axes, shape (3,)."""
+        """Return the weight in the sensor's axes [N], shape (3,)."""
         return np.asarray(R_WS.T @ self.weight_W)
 
     def start_tare(self) -> None:
-        """Forgets earlier readings; the bias stays as it is until the first reading."""
+        """Drop earlier readings; the bias is kept until the first new one."""
         self._sum, self._count = np.zeros(3), 0
 
     def tare(self, R_WS: Array, wrench_S: Array) -> None:
-        """Takes a reading in free air, force and torque, shape (6,), into the bias."""
+        """Include a reading in free air, force and torque, shape (6,), in the bias."""
         self._sum += wrench_S[:3] - self.force(R_WS)
         self._count += 1
         self.tared = True
         self.bias = self._sum / self._count
 
     def contact(self, R_WS: Array, wrench_S: Array, a_W: Array) -> Array:
-        """Force [N] that the environment exerts on the tool, world axes, shape (3,).
+        """Return the force of the environment on the tool [N], world axes, shape (3,).
 
-        `a_W`: acceleration of the tool [m/s^2], shape (3,): 0.5 m/s^2 of 0.35 kg would pass for a touch.
+        `a_W`: acceleration of the tool [m/s^2], shape (3,): 0.5 m/s^2 at 0.35 kg would look like a touch.
         """
         return np.asarray(R_WS @ (wrench_S[:3] - self.bias) - self.weight_W + self.mass * a_W)
 
@@ -92,21 +92,21 @@ class ContactMeasurement(NamedTuple):
     foot: Foot
     """The point of the perceived surface under the indenter."""
     wall: WallPlace
-    """Where the skin is outward of it; its standard deviation is that of the depth."""
+    """Height of the skin above it; its standard deviation is that of the depth."""
     depth: float
-    """Radius less the signed distance of the sphere's centre from the unpressed skin, where it is now [m]; negative: gap."""
+    """Radius less the signed distance of the sphere's centre from the present unpressed skin [m]; negative: gap."""
     force: float
     """Normal force [N], positive when the tissue is pressed."""
     load: float
-    """Size of the whole force, normal and sideways [N]."""
+    """Magnitude of the whole force, normal and lateral [N]."""
     skin: tuple[Array, Array]
-    """The point of the skin under the indenter and its outward normal, where the first look saw them (`Wall.skin`)."""
+    """Point of the skin under the indenter and its outward normal, in the frame of the first view (`Wall.skin`)."""
     touching: bool
-    """Whether the tissue is felt; before the first tare the sensor's bias would pass for it, and nothing is."""
+    """True in contact; False before the first tare, when the sensor's bias would look like contact."""
 
 
 class ContactSensing:
-    """Turns sensor readings into contact with the wall as it is believed to be."""
+    """Computes the contact with the estimated wall from sensor readings."""
 
     def __init__(self, kinematics: ArmKinematics, weight: ToolWeight, wall: Wall, radius: float, period_s: float) -> None:
         """`radius` of the sphere [m]; a reading comes every `period_s`."""
@@ -115,10 +115,10 @@ class ContactSensing:
         self._kinematics, self._radius, self._period_s = kinematics, radius, period_s
         self._touching = False
         self._velocity: Array | None = None
-        """Velocity of the sphere's centre at the reading before [m/s], world axes, shape (3,)."""
+        """Previous velocity of the sphere's centre [m/s], world axes, shape (3,)."""
 
     def sense(self, reading: SensorReading, t: int) -> ContactMeasurement:
-        """The contact at the reading of time `t` [ns]."""
+        """Return the contact at the reading of time `t` [ns]."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
         wall, foot = self.wall, self.wall.perceived.nearest(X_WI[:3, 3])
         place = wall.at(foot.xy_A, t)

@@ -1,4 +1,4 @@
-"""Depth regulation: the sphere's true depth at its set-point, on soft and stiff tissue, within a limit of force.
+"""Depth regulation on soft and stiff tissue, within a limit of force.
 
 Depth d is measured: radius minus the signed distance of the sphere's centre (forward kinematics) from the perceived rest
 surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F - F_ff)/K_z. So
@@ -8,67 +8,76 @@ surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F 
     d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45)
     g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard surface, a wrong exponent
 
-with F the normal force, L the size of the whole force (sliding onto a hard edge pushes sideways, too), and F_p = L + tau dL/dt
-the size that is expected when the command takes effect.
+with F the normal force, L the magnitude of the whole force (a hard edge pushes laterally, too), and F_p = L + tau dL/dt the
+magnitude expected when the command takes effect.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
-EXPONENT = 1.45
-"""Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
-FORCE_FRACTION = 0.83
-"""Part of the working force limit at which depth yields: force rises until the arm has yielded, and the sensor's gain errs."""
-FEED_FORWARD = 0.9
-"""a, below one so that the force cannot build up by itself even on a rigid surface."""
-FORCE_LAG_S = 0.02
-"""Low-pass of the measured force."""
-RATE_LAG_S = 0.03
-"""Low-pass of its derivative."""
-LEAD_S = 0.08
-"""tau: delay of the command (20 ms) and rise of the impedance (about 60 ms)."""
-INTEGRAL_PER_S = 4.0
-"""k_i: well below the impedance's bandwidth of about 5 Hz."""
-INTEGRAL_MAX_M = 0.004
-INTEGRAL_FADE_S = 0.1
-"""Out of contact the integral fades."""
-GUARD_PER_S = 10.0
-"""w, the rate of the guard [1/s]: its depth follows the excess force over K_z."""
-GUARD_MAX_M = 0.02
-YIELD_LAG_S = 0.03
-"""Smoothing of d_r."""
-YIELD_MPS = 0.08
-"""Fastest d_r towards the surface."""
-RETURN_MPS = 0.02
-"""Fastest d_r back into the tissue after yielding."""
-MODEL_DEPTH_M = 0.003
-"""Shallower than this the power law is not trusted: the force is taken for that of this depth."""
-RATE_MAX_MPS = 0.2
-"""Greatest rate of the commanded depth that is passed on for control to extrapolate by."""
-LIMITED_M = 0.0002
-"""Yielding by more than this is reported."""
+
+@dataclass(frozen=True)
+class DepthTuning:
+    """Constants of the law above."""
+
+    exponent: float = 1.45
+    """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
+    force_fraction: float = 0.83
+    """Fraction of the working force limit at which depth yields: force rises until the arm has yielded, and its gain errs."""
+    feed_forward: float = 0.9
+    """a, below one so that the force cannot build up by itself even on a rigid surface."""
+    force_lag_s: float = 0.02
+    """Low-pass of the measured force."""
+    rate_lag_s: float = 0.03
+    """Low-pass of its derivative."""
+    lead_s: float = 0.08
+    """tau: delay of the command (20 ms) and rise of the impedance (about 60 ms)."""
+    integral_per_s: float = 4.0
+    """k_i: well below the impedance's bandwidth of about 5 Hz."""
+    integral_max_m: float = 0.004
+    integral_fade_s: float = 0.1
+    """Time constant with which the integral fades out of contact."""
+    guard_per_s: float = 10.0
+    """w: the depth of the guard follows the excess force over K_z."""
+    guard_max_m: float = 0.02
+    yield_lag_s: float = 0.03
+    """Smoothing of d_r."""
+    yield_mps: float = 0.08
+    """Fastest d_r towards the surface."""
+    return_mps: float = 0.02
+    """Fastest d_r back into the tissue after yielding."""
+    model_depth_m: float = 0.003
+    """Below this depth the power law is replaced by the force at this depth."""
+    rate_max_mps: float = 0.2
+    """Greatest rate of the commanded depth that control may extrapolate by."""
+    limited_m: float = 0.0002
+    """Yielding by more than this is reported."""
+
+
+DEPTH: Final = DepthTuning()
 
 
 class Regulation(NamedTuple):
-    """What the regulator asks for at one step."""
+    """Output of the regulator at one step."""
 
     depth: float
     """Depth to command [m]."""
     rate: float
     """Its rate [m/s]."""
     reference: float
-    """The depth aimed at [m]: the target, or less where force limits it."""
+    """Depth aimed at [m]: the target, or less where force limits it."""
     force: float
     """Normal feed-forward force [N], positive into the tissue."""
     limited: bool
-    """Whether depth yields to the force limit."""
+    """True if depth yields to the force limit."""
     expected_force: float
     """F_p [N]."""
 
 
 class DepthRegulator:
-    """Regulates one stroke; `reset` before the next. One call a planning period."""
+    """Regulates one stroke; one `update` per planning period, `reset` before the next stroke."""
 
     def __init__(self, period: float, stiffness: float, force_working: float, depth_max: float) -> None:
         """`stiffness` K_z [N/m] along the normal, `force_working` the working force limit [N].
@@ -76,46 +85,54 @@ class DepthRegulator:
         No deeper than `depth_max` [m] is commanded, unless the target itself is.
         """
         self._dt, self._stiffness, self._depth_max = period, stiffness, depth_max
-        self.force_max = FORCE_FRACTION * force_working
+        self.force_max = DEPTH.force_fraction * force_working
         self.reset(0.0)
 
     def reset(self, depth: float) -> None:
-        """Starts at rest at a commanded depth [m], negative above the surface."""
+        """Start at rest at a commanded depth [m], negative above the surface."""
         self._force = self._load = self._raw_load = self._slope = 0.0
         self._integral = self._guard = self._yield = 0.0
         self._command = depth
 
     def shift(self, change: float) -> None:
-        """Moves the zero of all depths: every depth reads `change` [m] more."""
+        """Move the zero of all depths: every depth reads `change` [m] more."""
         self._command += change
 
     def update(self, target: float, depth: float, force: float, load: float, in_contact: bool) -> Regulation:
-        """One step: target and measured depth [m], normal force and size of the whole [N], whether the tissue is touched."""
-        dt = self._dt
-        self._slope += dt / (RATE_LAG_S + dt) * ((load - self._raw_load) / dt - self._slope)
-        self._raw_load = load
-        self._force += dt / (FORCE_LAG_S + dt) * (force - self._force)
-        self._load += dt / (FORCE_LAG_S + dt) * (load - self._load)
-        expected = self._load + LEAD_S * max(self._slope, 0.0)
+        """Advance one period.
 
-        self._guard += dt * GUARD_PER_S * (expected - self.force_max) / self._stiffness
-        self._guard = min(max(self._guard, 0.0), GUARD_MAX_M)
+        Args:
+            target: depth [m].
+            depth: measured [m].
+            force: normal force [N].
+            load: magnitude of the whole force [N].
+            in_contact: True if the tissue is touched.
+        """
+        dt = self._dt
+        self._slope += dt / (DEPTH.rate_lag_s + dt) * ((load - self._raw_load) / dt - self._slope)
+        self._raw_load = load
+        self._force += dt / (DEPTH.force_lag_s + dt) * (force - self._force)
+        self._load += dt / (DEPTH.force_lag_s + dt) * (load - self._load)
+        expected = self._load + DEPTH.lead_s * max(self._slope, 0.0)
+
+        self._guard += dt * DEPTH.guard_per_s * (expected - self.force_max) / self._stiffness
+        self._guard = min(max(self._guard, 0.0), DEPTH.guard_max_m)
         allowed = target
         if expected > 0.5 * self.force_max:
-            allowed = min(target, max(depth, MODEL_DEPTH_M) * (self.force_max / expected) ** (1.0 / EXPONENT))
-        step = (target - allowed - self._yield) * dt / (YIELD_LAG_S + dt)
-        self._yield = max(0.0, self._yield + min(max(step, -RETURN_MPS * dt), YIELD_MPS * dt))
+            allowed = min(target, max(depth, DEPTH.model_depth_m) * (self.force_max / expected) ** (1.0 / DEPTH.exponent))
+        step = (target - allowed - self._yield) * dt / (DEPTH.yield_lag_s + dt)
+        self._yield = max(0.0, self._yield + min(max(step, -DEPTH.return_mps * dt), DEPTH.yield_mps * dt))
         reference = target - self._yield
 
         error = reference - depth
-        if in_contact and abs(error) < INTEGRAL_MAX_M:
-            self._integral += dt * INTEGRAL_PER_S * error
-            self._integral = min(max(self._integral, -INTEGRAL_MAX_M), INTEGRAL_MAX_M)
+        if in_contact and abs(error) < DEPTH.integral_max_m:
+            self._integral += dt * DEPTH.integral_per_s * error
+            self._integral = min(max(self._integral, -DEPTH.integral_max_m), DEPTH.integral_max_m)
         elif not in_contact:
-            self._integral -= dt / INTEGRAL_FADE_S * self._integral
+            self._integral -= dt / DEPTH.integral_fade_s * self._integral
         command = min(reference + self._integral - self._guard, max(target, self._depth_max))
         rate = (command - self._command) / dt
         self._command = command
-        feed = FEED_FORWARD * min(max(self._force, 0.0), self.force_max)
-        limited = self._yield + self._guard > LIMITED_M
-        return Regulation(command, min(max(rate, -RATE_MAX_MPS), RATE_MAX_MPS), reference, feed, limited, expected)
+        feed = DEPTH.feed_forward * min(max(self._force, 0.0), self.force_max)
+        limited = self._yield + self._guard > DEPTH.limited_m
+        return Regulation(command, min(max(rate, -DEPTH.rate_max_mps), DEPTH.rate_max_mps), reference, feed, limited, expected)

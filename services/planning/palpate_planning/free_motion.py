@@ -1,9 +1,8 @@
-"""A background worker for planning that takes longer than a step.
+"""Free motions of the arm, and the background worker that plans them.
 
-A motion planner may need seconds, while set-points are due at every step and expire. So heavy planning runs on a worker thread
-while the steps go on, and its result is used a fixed simulated time later. In lockstep the step that uses the result waits for
-it, so what a step returns never depends on how fast the machine is. On a wall clock nothing waits: the result is used when it
-is there, but not before its time.
+A motion planner may need seconds, while set-points are due at every step and expire. Heavy planning runs on a worker thread, and
+its result is used a fixed simulated time later. In lockstep the step that uses the result waits for it, so the output does not
+depend on the speed of the machine. In wall-clock mode the result is used when it is available, but not before its time.
 """
 
 from __future__ import annotations
@@ -25,12 +24,11 @@ from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 T = TypeVar("T")
 
 WORKER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
-"""The one worker of the process, since CasADi and OMPL are not safe in two threads at once. A task whose result is no longer
-wanted runs to its end."""
+"""The only worker of the process: CasADi and OMPL are not thread-safe. A dropped task runs to its end."""
 
 
 class BackgroundTask(Generic[T]):
-    """One task on the worker: started at `t` [ns], result used at `t + duration`. `work` must share no state with the steps."""
+    """A task on the worker: started at `t` [ns], used at `t + duration`. `work` must share no state with the steps."""
 
     def __init__(self, t: int, duration: int, work: Callable[[], T], *, lockstep: bool = True) -> None:
         self._due = t + duration
@@ -38,56 +36,56 @@ class BackgroundTask(Generic[T]):
         self._future: Future[T] = WORKER.submit(work)
 
     def due(self, t: int) -> bool:
-        """Whether the result is to be used at `t` [ns]."""
+        """Return True if the result is to be used at `t` [ns]."""
         return t >= self._due and (self._lockstep or self._future.done())
 
     def result(self) -> T:
-        """The result; waits for it, and raises again what the work raised."""
+        """Return the result, or raise the exception of the work; waits for it."""
         return self._future.result()
 
 
 PLANNING_TIME = 200 * MS
 """Simulated time that planning one free motion takes [ns]."""
-THERE_RAD = 0.01
-"""An arm whose joints are all nearer to a posture than this is there."""
+AT_POSTURE_RAD = 0.01
+"""The arm is at a posture if all joints are closer than this."""
 
 
 class TrajectoryFollower:
     """Holds a posture, or follows a trajectory to its end and holds there."""
 
     def __init__(self, kinematics: ArmKinematics, q: Array) -> None:
-        """At rest at q [rad], shape (7,)."""
+        """Start at rest at q [rad], shape (7,)."""
         self._kinematics = kinematics
         self.hold(q)
 
     def hold(self, q: Array) -> None:
-        """Stays at q [rad], shape (7,)."""
+        """Stay at q [rad], shape (7,)."""
         self._trajectory = JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, 7)))
         self._sample = 0.0
 
     def start(self, trajectory: JointTrajectory) -> None:
-        """Follows a trajectory from the next step on."""
+        """Follow a trajectory from the next step on."""
         self._trajectory, self._sample = trajectory, 0.0
 
     @property
     def arrived(self) -> bool:
-        """Whether the last set-point was the trajectory's end."""
+        """True if the last set-point was the end of the trajectory."""
         return self._sample >= len(self._trajectory) - 1
 
     @property
     def q(self) -> Array:
-        """The posture of the last set-point [rad], shape (7,)."""
+        """Posture of the last set-point [rad], shape (7,)."""
         return self._trajectory.at(self._sample)[0]
 
     def step(self, t: int, rate: float = 1.0) -> Setpoint:
-        """The set-point at `t` [ns], `rate` samples further on; see `RestartRamp`."""
+        """Return the set-point at `t` [ns], `rate` samples further; see `RestartRamp`."""
         self._sample = min(self._sample + rate, len(self._trajectory) - 1.0)
         q, qd = self._trajectory.at(self._sample)
         return joint_setpoint(t, self._kinematics.pose(q), q, rate * qd)
 
 
 class FreeMotion:
-    """Takes the arm from posture to posture without contact."""
+    """Moves the arm between postures without contact."""
 
     def __init__(self, follower: TrajectoryFollower, planner: ExamPlanner, *, lockstep: bool) -> None:
         """`lockstep` as in `BackgroundTask`."""
@@ -96,30 +94,30 @@ class FreeMotion:
 
     @property
     def arrived(self) -> bool:
-        """Whether the arm has been asked to be where it is to go."""
+        """True if the last set-point was the goal."""
         return self._follower.arrived
 
     @property
     def q(self) -> Array:
-        """The posture of the last set-point [rad], shape (7,)."""
+        """Posture of the last set-point [rad], shape (7,)."""
         return self._follower.q
 
     def hold(self, q: Array) -> None:
-        """Stays at q [rad], shape (7,); a motion that is being planned is dropped."""
+        """Stay at q [rad], shape (7,); drop a motion that is being planned."""
         self._task = None
         self._follower.hold(q)
 
     def start(self, trajectory: JointTrajectory) -> None:
-        """Follows a trajectory that is already planned."""
+        """Follow a planned trajectory."""
         self._follower.start(trajectory)
 
     def move_to(self, t: int, goal: Array, perceived: PerceivedAbdomen | None) -> bool:
-        """Plans a motion to a posture [rad], shape (7,), then follows it; returns whether it is there. Raises NoPathError."""
+        """Plan a motion to a posture [rad], shape (7,), then follow it; return True once there. Raises NoPathError."""
         if not self._follower.arrived:
             return False
         if self._task is None:
             start = self._follower.q.copy()
-            if float(np.abs(start - goal).max()) < THERE_RAD:
+            if float(np.abs(start - goal).max()) < AT_POSTURE_RAD:
                 return True
             self._task = BackgroundTask(
                 t, PLANNING_TIME, lambda: self._planner.motion(start, goal, perceived), lockstep=self._lockstep
@@ -130,5 +128,5 @@ class FreeMotion:
         return False
 
     def step(self, t: int, rate: float) -> Setpoint:
-        """The set-point at `t` [ns]; see `TrajectoryFollower.step`."""
+        """Return the set-point at `t` [ns]; see `TrajectoryFollower.step`."""
         return self._follower.step(t, rate)

@@ -1,13 +1,11 @@
-"""Periods by which planning works. `service` takes them from the contract and hands them to the algorithms."""
+"""Periods of planning, which `service` reads from the contract."""
 
 from __future__ import annotations
 
 from typing import Final, NamedTuple
 
 MS: Final = 1_000_000
-"""Nanoseconds in a millisecond."""
 SECOND: Final = 1_000 * MS
-"""Nanoseconds in a second."""
 
 
 class Periods(NamedTuple):

@@ -1,4 +1,4 @@
-"""The two kinds of set-point that planning sends, with the stiffness of each."""
+"""The two kinds of set-point of planning, with the stiffness of each."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ def _fixed(values: list[float]) -> Array:
 
 
 NORMAL_STIFFNESS: Final = 5000.0
-"""K_z [N/m] along the tool: with it depth errs by 0.4 to 1.5 mm even before regulation."""
+"""K_z [N/m] along the tool: the depth error is 0.4 to 1.5 mm even before regulation."""
 CARTESIAN_STIFFNESS: Final = _fixed([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
-"""[N/m, N m/rad] in axes of the indenter: firm along the tool, yielding across it, softest in the spin that does not matter."""
+"""[N/m, N m/rad] in axes of the indenter: stiff along the tool, softer across it, softest in spin."""
 DAMPING_RATIO: Final = _fixed([0.8] * 6)
 JOINT_STIFFNESS: Final = _fixed([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
 """Free motion [N m/rad]."""
 POSTURE_STIFFNESS: Final = _fixed([20.0] * 7)
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
 NO_STIFFNESS: Final = _fixed([0.0] * 7)
-"""Asks nothing of the arm [N m/rad]; the set-point only keeps the chain of commands alive."""
+"""No torque [N m/rad]; the set-point only keeps the chain of commands alive."""
 _NO_TWIST: Final = _fixed([0.0] * 6)
 _NO_WRENCH: Final = _fixed([0.0] * 6)
 _JOINTSAT_REST: Final = _fixed([0.0] * 7)
@@ -44,13 +44,13 @@ AT_REST: Final = Setpoint(
     qd=_JOINTSAT_REST,
     joint_stiffness=JOINT_STIFFNESS,
 )
-"""What both kinds have in common."""
+"""Common fields of both kinds."""
 
 
 def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTSAT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
-    """Set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
+    """Return the set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
 
-    X_WI, shape (4, 4), tells readers of the message where the indenter is; the controller does not use it.
+    X_WI, shape (4, 4): pose of the indenter, for other readers of the message; the controller does not use it.
     """
     return replace(AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
 
@@ -64,7 +64,7 @@ def cartesian_setpoint(
     F_W: Array = _NO_WRENCH,
     qd: Array = _JOINTSAT_REST,
 ) -> Setpoint:
-    """Set-point of contact at `t` [ns]: pose, twist and feed-forward wrench of the indenter, posture q [rad] in the null space.
+    """Return the set-point of contact at `t` [ns]: pose, twist, feed-forward wrench, posture q [rad] in the null space.
 
     Shapes and units as in `Setpoint`.
     """

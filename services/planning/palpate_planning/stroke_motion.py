@@ -11,7 +11,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.depth import LIMITED_M, DepthRegulator, Regulation
+from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
 from palpate_planning.motion.kinematics import ELBOW, TOO_STRAIGHT_RAD
 from palpate_planning.motion.timing import JerkLimitedAxis
 from palpate_planning.periods import SECOND
@@ -211,7 +211,7 @@ class StrokeMotion:
     @property
     def short_of_depth(self) -> bool:
         """True if the target depth has not reached the depth of the examination."""
-        return self.depth.position < self._deepest - LIMITED_M
+        return self.depth.position < self._deepest - DEPTH.limited_m
 
     # --- the set-point ------------------------------------------------------------------------------------------------
 

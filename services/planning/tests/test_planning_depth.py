@@ -7,7 +7,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from palpate_planning.depth import FEED_FORWARD, FORCE_FRACTION, DepthRegulator, Regulation
+from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
 from palpate_planning.setpoints import NORMAL_STIFFNESS
 
 LIMIT_N = 15.0
@@ -74,7 +74,7 @@ def test_sliding_into_a_lesion_keeps_depth_or_yields_below_the_limit(contrast: f
     end = rows[-1]
     if contrast == 10.0:
         assert end[4]
-        assert end[3] == pytest.approx(FORCE_FRACTION * LIMIT_N, abs=0.3)
+        assert end[3] == pytest.approx(DEPTH.force_fraction * LIMIT_N, abs=0.3)
         assert end[2] < 0.008
     else:
         assert end[2] == pytest.approx(0.010, abs=1e-4)
@@ -84,7 +84,7 @@ def test_sliding_into_a_lesion_keeps_depth_or_yields_below_the_limit(contrast: f
 def test_a_wrong_exponent_still_ends_at_the_limit(exponent: float) -> None:
     rows = indent(lambda depth, t: 24.0 * (max(depth, 0.0) / 0.01) ** exponent)
     assert rows[-1, 3] <= LIMIT_N
-    assert rows[-1, 3] > 0.6 * FORCE_FRACTION * LIMIT_N
+    assert rows[-1, 3] > 0.6 * DEPTH.force_fraction * LIMIT_N
 
 
 def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> None:
@@ -100,7 +100,7 @@ def test_sideways_force_makes_depth_yield_as_normal_force_does() -> None:
         regulation = regulator.update(0.01, 0.01, 11.0, 16.0, True)
     assert regulation.limited
     assert regulation.reference < 0.0085
-    assert regulation.force == pytest.approx(FEED_FORWARD * 11.0)
+    assert regulation.force == pytest.approx(DEPTH.feed_forward * 11.0)
 
 
 def test_where_little_depth_gives_much_force_depth_does_not_return_to_its_target() -> None:

@@ -1,8 +1,8 @@
 """Coverage: from the lines of a scan pattern to strokes, each a smooth curve in the abdomen's xy plane.
 
-A stroke is a line; where the pattern joins its lines, they are one stroke with arcs in between. Mode point: a stroke a target. A
-skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the way between two targets that
-are in reach may itself be out of reach.
+A stroke is a line; where the pattern joins its lines, they are one stroke with arcs in between. In mode point each target is a
+stroke. A skipped target ends a stroke: the arm must not slide over what it cannot reach. So does a break: the path between two
+reachable targets may be out of reach.
 """
 
 from __future__ import annotations
@@ -39,11 +39,11 @@ class Stroke:
     visits: Ints
     """Sample at which each of them is reached, shape (m,)."""
     touch: bool = False
-    """Whether the skin is only touched, not pressed."""
+    """True if the skin is only touched, not pressed."""
 
 
 def line_through(points: Array) -> tuple[Array, Ints]:
-    """A smooth curve through points, shape (k, 2): samples (n, 2), and the sample of each point. Chord-length spline."""
+    """Return a chord-length spline through points, shape (k, 2): samples (n, 2), and the sample of each point."""
     if len(points) == 1:
         return points.copy(), np.zeros(1, dtype=np.int64)
     chords = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6)
@@ -57,7 +57,7 @@ def line_through(points: Array) -> tuple[Array, Ints]:
 
 
 def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
-    """The curve that joins p0, left along unit t0, to p1, entered along unit t1: inner samples, shape (n, 2).
+    """Return inner samples, shape (n, 2), of the curve from p0, left along unit t0, to p1, entered along unit t1.
 
     A cubic Bezier with handles of 2/3 of the gap: for two opposite tangents across the gap it is a semicircle to 2 %.
     """
@@ -69,7 +69,7 @@ def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
 
 
 def _runs(lines: Ints, usable: Bools, breaks: Set[int], *, pointwise: bool) -> list[Ints]:
-    """Unbroken runs of usable targets within one line, in order."""
+    """Return unbroken runs of usable targets within one line, in order."""
     runs: list[list[int]] = []
     for i in np.flatnonzero(usable):
         joined = runs and not pointwise and runs[-1][-1] == i - 1 and lines[i - 1] == lines[i]
@@ -93,14 +93,14 @@ def strokes(
     spacing: float,
     breaks: Set[int] = frozenset(),
 ) -> list[Stroke]:
-    """Strokes that visit all usable targets in their order.
+    """Return strokes that visit all usable targets in their order.
 
     Args:
         xy: targets in frame A [m], shape (n, 2), in coverage order.
         lines: index of each target's scan line, shape (n,).
-        usable: whether it may be visited, shape (n,).
-        joined: whether line ends are joined in contact.
-        mode: continuous, or a stroke a target.
+        usable: which targets may be visited, shape (n,).
+        joined: True if line ends are joined in contact.
+        mode: continuous, or one stroke per target.
         spacing: distance of the lines [m].
         breaks: targets after which the stroke ends.
     """
@@ -130,7 +130,7 @@ def strokes(
 
 
 def touches(xy: Array, usable: Bools) -> list[Stroke]:
-    """Touches at usable targets, spread over all of them: near the centres of equal cells, the last one near the first target."""
+    """Return touches at usable targets near the centres of equal cells, the last one near the first target."""
     candidates = np.flatnonzero(usable)
     if not len(candidates):
         return []
@@ -139,7 +139,7 @@ def touches(xy: Array, usable: Bools) -> list[Stroke]:
 
 
 def transfer(a: Array, b: Array) -> Array:
-    """Samples of the straight way above the surface from a to b in frame A, shape (n, 2)."""
+    """Return samples of the straight path above the surface from a to b in frame A, shape (n, 2)."""
     length = float(np.linalg.norm(b - a))
     if length < 1e-6:
         return a[None].copy()

@@ -1,4 +1,4 @@
-"""From a point and its normal to the pose of the indenter.
+"""Poses of the indenter along a path on the surface.
 
 The indenter's z axis is opposite to the outward normal. The sphere's centre is at p + n (R - depth), so that its deepest
 point lies `depth` below the surface point p along the inward normal. Spin about z is free: the sphere is round.
@@ -22,15 +22,15 @@ from palpate_planning.wall.surface import CubicPieces, PerceivedSurface, cubic_a
 
 
 def centre(p_W: Array, n_W: Array, radius: float, depth: float | Array) -> Array:
-    """Centre of the sphere [m] at `depth` [m] below surface points p_W with outward unit normals n_W, shape (..., 3)."""
+    """Return the centre of the sphere [m] at `depth` [m] below surface points p_W with outward normals n_W, shape (..., 3)."""
     return np.asarray(p_W + n_W * (radius - np.asarray(depth)[..., None]))
 
 
 def least_twist(z_W: Array, R_ref: Array) -> Array:
-    """Rotations, shape (..., 3, 3), whose z axes are unit z_W, shape (..., 3), reached from R_ref by the shortest turn.
+    """Return rotations, shape (..., 3, 3), with unit z axes z_W, shape (..., 3), reached from R_ref by the shortest turn.
 
-    Each turns R_ref about z_ref x z by the angle between them: no spin about z. A function of z alone, it is smooth along
-    any path and comes back to itself round a loop. Opposite to z_ref it is not defined; there it turns about R_ref's x.
+    Each turns R_ref about z_ref x z by the angle between them, without spin about z. As a function of z alone it is smooth along
+    any path and closed around a loop. Opposite to z_ref, where it is not defined, it turns about the x axis of R_ref.
     """
     z = z_W / np.linalg.norm(z_W, axis=-1, keepdims=True)
     x_ref, _, z_ref = R_ref.T
@@ -38,21 +38,21 @@ def least_twist(z_W: Array, R_ref: Array) -> Array:
     flipped = c < -1.0 + 1e-9
     along = (z + z_ref) / np.where(flipped, 1.0, 1.0 + c)[..., None]  # v turned: v - along (z.v), for v across z_ref
     x = np.where(flipped[..., None], x_ref, x_ref - along * (z @ x_ref)[..., None])
-    x = x - z * np.sum(x * z, axis=-1, keepdims=True)  # near the opposite 1 + c has lost digits: across z all the same
+    x = x - z * np.sum(x * z, axis=-1, keepdims=True)  # near the opposite direction 1 + c loses digits; keep x orthogonal to z
     x = x / np.linalg.norm(x, axis=-1, keepdims=True)
     return np.stack((x, np.cross(z, x), z), axis=-1)
 
 
 @compiled
 def frame(z: Array, x_near: Array) -> Array:
-    """The rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as it can be."""
+    """Return the rotation, shape (3, 3), with unit z as its z axis and its x axis as near to x_near as possible."""
     x = x_near - z * (z @ x_near)
     x = x / np.sqrt(x @ x)
     return np.column_stack((x, np.cross(z, x), z))
 
 
 def pose(R: Array, p: Array) -> Array:
-    """Homogeneous matrix, shape (4, 4)."""
+    """Return the homogeneous matrix, shape (4, 4)."""
     X = np.eye(4)
     X[:3, :3] = R
     X[:3, 3] = p
@@ -61,7 +61,7 @@ def pose(R: Array, p: Array) -> Array:
 
 @compiled
 def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
-    """w_W [rad/s] that turns R0 into R1 in dt [s], shape (3,), for turns of less than 90 degrees."""
+    """Return w_W [rad/s], shape (3,), that turns R0 into R1 in dt [s], for turns of less than 90 degrees."""
     turn = R1 @ R0.T
     axis_by_sine = 0.5 * np.array((turn[2, 1] - turn[1, 2], turn[0, 2] - turn[2, 0], turn[1, 0] - turn[0, 1]))
     sine = np.sqrt(axis_by_sine @ axis_by_sine)
@@ -77,7 +77,7 @@ TURN_RATE = 0.6
 ACCELERATION = 0.2
 """Tangential acceleration in contact [m/s^2] [A]."""
 _STEP_M = 1e-4
-"""Path length over which the turn of the orientation is taken."""
+"""Path length of the finite difference of the orientation."""
 
 
 class PathPoint(NamedTuple):
@@ -102,7 +102,7 @@ class PathPoint(NamedTuple):
 
 
 class SurfacePath:
-    """p(s), n(s), R(s), q(s) for s in 0..length, from samples; natural cubic splines in between."""
+    """p(s), n(s), R(s), q(s) for s in 0..length: natural cubic splines through samples."""
 
     def __init__(self, s: Array, p: Array, n: Array, R: Array, q: Array, targets: Ints, visits: Ints) -> None:
         """Samples at path lengths s: points and normals (k, 3), orientations (k, 3, 3), postures (k, 7).
@@ -119,7 +119,7 @@ class SurfacePath:
             self._curve = CubicPieces(curve.x, curve.c)
 
     def at(self, s: float) -> PathPoint:
-        """The path at length s, clipped to its ends."""
+        """Return the path at length s, clipped to its ends."""
         if self._curve is None:
             still = np.zeros(3)
             return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], dp=still, dn=still, w=still, dq=np.zeros(7))
@@ -127,12 +127,12 @@ class SurfacePath:
         return PathPoint(p=y[:3], n=-R[:, 2], R=R, q=y[9:], dp=dy[:3], dn=dy[3:6], w=w, dq=dy[9:])
 
     def target(self, s: float) -> int:
-        """Index of the target reached last at path length s, of the first before that."""
+        """Return the index of the latest target at path length s, of the first target before that."""
         visits, targets = self._order
         return targets[max(bisect_right(visits, s) - 1, 0)]
 
     def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
-        """Speed along the path [m/s]: `speed` [m/s], less in tight curves, where the tool turns or joints would race."""
+        """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast."""
         if self.length == 0.0:
             return SpeedLimit(self.s, np.array([speed]), ACCELERATION)
         dp = np.gradient(self.p, self.s, axis=0)
@@ -151,7 +151,7 @@ class SurfacePath:
 
 
 def compile_ahead() -> None:
-    """Compiles what `SurfacePath.at` calls, so that no deadline waits for it."""
+    """Compile what `SurfacePath.at` calls before the first deadline."""
     R = np.stack((np.eye(3), np.eye(3)))
     first = np.zeros(1, np.int64)
     SurfacePath(np.array((0.0, 1.0)), np.zeros((2, 3)), -R[:, :, 2], R, np.zeros((2, 7)), first, first).at(0.0)
@@ -159,7 +159,7 @@ def compile_ahead() -> None:
 
 @compiled
 def _along(curve: CubicPieces, s: float) -> tuple[Array, Array, Array, Array]:
-    """Interpolated values and their derivatives at path length s, shape (16,); orientation (3, 3) and its turn [rad/m] (3,)."""
+    """Return values and derivatives at path length s, shape (16,), orientation (3, 3) and its turn [rad/m] (3,)."""
     y, dy = cubic_at(curve, s)
     R, R_ahead = _orientation(y), _orientation(y + _STEP_M * dy)
     return y, dy, R, angular_velocity(R, R_ahead, _STEP_M)
@@ -167,13 +167,13 @@ def _along(curve: CubicPieces, s: float) -> tuple[Array, Array, Array, Array]:
 
 @compiled
 def _orientation(y: Array) -> Array:
-    """Orientation from interpolated values of point, normal and x axis: z opposite to the normal, x near the x axis."""
+    """Return the orientation from interpolated point, normal and x axis: z opposite to the normal, x near the x axis."""
     n = y[3:6]
     return frame(-n / np.sqrt(n @ n), y[6:9])
 
 
 def lay(surface: PerceivedSurface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
-    """A curve in A's xy plane laid onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) by least twist."""
+    """Project a curve in A's xy plane onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) by least twist."""
     p, n = surface.at(xy)
     s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
     return s, p, n, least_twist(-n, R_ref)

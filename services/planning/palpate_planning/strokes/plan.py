@@ -1,4 +1,4 @@
-"""From perceived targets to a planned examination: which are reachable, the strokes, their postures, the way there."""
+"""From perceived targets to a planned examination: reachable targets, strokes, their postures, the approach."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ TURNS_RAD = (0.0, 1.2, -1.2, 2.2, -2.2)
 
 @dataclass(frozen=True, slots=True)
 class PerceivedAbdomen:
-    """What perception has found: targets in coverage order and the surface. World frame."""
+    """Result of perception: targets in coverage order and the surface. World frame."""
 
     positions: Array
     """[m], shape (n, 3)."""
@@ -49,19 +49,19 @@ class PerceivedAbdomen:
 
 @dataclass(frozen=True, slots=True)
 class ExamPlan:
-    """All motion of an examination."""
+    """All motions of an examination."""
 
     approach: JointTrajectory
-    """From where the arm was to above the first target."""
+    """To above the first target."""
     segments: tuple[Segment, ...]
-    """Alternating: contact, way, contact, ..."""
+    """Alternating: contact, path above the surface, contact, ..."""
     skipped: dict[int, Cause]
     """Cause by target."""
     presses: PressPlanner | None = None
-    """Plans the presses that a search asks for; None where there is no search."""
+    """Plans the presses requested by a search; None without a search."""
 
     def poses(self, radius: float, depth: float) -> Array:
-        """Poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""
+        """Return poses of the indenter at depth along all strokes, about 5 mm apart, shape (n, 4, 4)."""
         out = []
         for segment in self.segments:
             if segment.contact and not segment.touch:
@@ -77,7 +77,7 @@ class ExamPlan:
 
 
 class ExamPlanner:
-    """Plans for one robot and examination. Shares no state with the steps: it has kinematics and scenes of its own."""
+    """Plans for one robot and examination, with its own kinematics and scenes: it shares no state with the steps."""
 
     def __init__(self, known: ExamInput, period_s: float) -> None:
         """Trajectories are sampled every `period_s`."""
@@ -85,22 +85,21 @@ class ExamPlanner:
         self._kinematics = ArmKinematics(known.robot, known.limits)
 
     def prepare(self) -> None:
-        """Prepares what needs no surface; afterwards an examination is planned in half the time."""
+        """Prepare what needs no surface; this halves the planning time of an examination."""
         prepare(self._known.robot, self._known.limits.force_working_n)
 
     def motion(self, q0: Array, q1: Array, perceived: PerceivedAbdomen | None) -> JointTrajectory:
-        """Collision-free timed motion from q0 to q1. Raises NoPathError."""
+        """Return a collision-free timed motion from q0 to q1. Raises NoPathError."""
         mesh = None if perceived is None else (perceived.vertices, perceived.triangles)
         return self._motion(CollisionScene(self._kinematics, self._known.robot, mesh), q0, q1)
 
     def examination(
         self, perceived: PerceivedAbdomen, q_now: Array, wanted: frozenset[int] | None = None, bend: float | None = None
     ) -> ExamPlan:
-        """The examination of the targets that are `wanted`, of all if None.
+        """Return the examination of the `wanted` targets, of all if None.
 
-        With a `bend` [rad] it goes on: the elbow is bent by at least as much, and the skin is not touched before the strokes.
-
-        Raises NoPathError if none of them can be reached or there is no way to the first.
+        With a `bend` [rad] it continues an examination: the elbow is bent by at least as much, and there are no touches before
+        the strokes. Raises NoPathError if no target can be reached or there is no path to the first.
         """
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
@@ -131,8 +130,8 @@ class ExamPlanner:
             reasons = "; ".join(sorted({cause.text for cause in skipped.values()})) or "there are none"
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
         start = segments.hover(pieces[0], 0)
-        assert start is not None, "a stroke that cannot be hovered over is trouble"
-        missed = {i: why for i, why in skipped.items() if wanted is None or i in wanted}
+        assert start is not None, "strokes without a hover posture were dropped"
+        missed = {i: cause for i, cause in skipped.items() if wanted is None or i in wanted}
         approach = self._motion(free, q_now, start)
         presses = PressPlanner(segments, xy, usable, pieces[-1]) if exam.searched else None
         return ExamPlan(approach, tuple(layout.segments), missed, presses)
@@ -143,7 +142,7 @@ class ExamPlanner:
     def _reachable(
         self, perceived: PerceivedAbdomen, xy: Array, q_now: Array, scene: CollisionScene, bend: float
     ) -> tuple[Array, dict[int, Cause]]:
-        """A posture for each target, shape (n, 7), and the targets that none reaches, with the reason."""
+        """Return a posture for each target, shape (n, 7), and the targets that none reaches, with the cause."""
         p, n = perceived.surface.at(xy)
         robot, limits = self._known.robot, self._known.limits
         chosen = plan_redundancy(

@@ -1,4 +1,4 @@
-"""Strokes as segments of arm motion: postures along them, what is out of reach or would collide, ways between them."""
+"""Strokes as segments of arm motion: postures along them, reach and collisions, paths between them."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ from palpate_planning.strokes.path import SurfacePath, centre, lay, least_twist,
 from palpate_planning.wall.surface import PerceivedSurface
 
 HOVER_M = 0.025
-"""Height of the sphere's deepest point above the surface before, between and after strokes: twice what the perceived surface is
-usually wrong by (`surface_correction`)."""
+"""Height of the sphere's deepest point above the surface before, between and after strokes: twice the usual error of the
+perceived surface (`wall.correction`)."""
 POSTURE_EVERY = 4
 """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
 REACH = Cause(Reason.OUT_OF_REACH, "out of the arm's reach")
@@ -36,35 +36,35 @@ class Segment:
     """A part of the examination."""
 
     path: SurfacePath
-    """On the surface; of a free motion only its ends count."""
+    """On the surface; only its ends count for a free motion."""
     contact: bool
-    """At depth; else above the surface, on the way to the next stroke."""
+    """True at depth; else above the surface, between strokes."""
     touch: bool = False
-    """Whether the skin is only touched, not pressed."""
+    """True if the skin is only touched, not pressed."""
     depth_m: float | None = None
-    """How deep it is pressed; None for the examination's depth."""
+    """Depth of a press [m]; None: the examination's depth."""
     free: JointTrajectory | None = None
-    """A free motion, where the straight way above the surface cannot be taken."""
+    """A free motion, where the arm cannot take the straight path above the surface."""
 
 
 @dataclass(slots=True)
 class Layout:
-    """All strokes and ways, and what stands in the way of it."""
+    """All strokes and paths between them, and what prevents them."""
 
     segments: list[Segment] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)
-    """Targets after which a stroke has to end: the way to the next is out of reach or collides."""
+    """Targets after which a stroke has to end: the path to the next is out of reach or collides."""
     dropped: dict[int, Cause] = field(default_factory=dict)
     """Targets to skip, with the cause."""
 
     @property
     def troubled(self) -> bool:
-        """Whether it cannot be carried out."""
+        """True if it cannot be carried out."""
         return bool(self.breaks or self.dropped)
 
 
 class SegmentPlanner:
-    """Lays strokes over one surface with the postures of their targets, shape (n, 7)."""
+    """Plans strokes on one surface, given the postures of their targets, shape (n, 7)."""
 
     def __init__(
         self,
@@ -77,9 +77,17 @@ class SegmentPlanner:
         bend: float,
         free_motion: Callable[[Array, Array], JointTrajectory],
     ) -> None:
-        """`scene` lets the tool touch the abdomen; the elbow is bent by at least `bend` [rad], but on free motions.
+        """Prepare for one surface.
 
-        `free_motion(q0, q1)` plans without contact, or raises NoPathError.
+        Args:
+            kinematics: of the arm.
+            scene: in which the tool may touch the abdomen.
+            surface: the perceived surface.
+            postures: of the targets [rad], shape (n, 7).
+            radius: of the sphere [m].
+            depth: of the examination [m].
+            bend: least bend of the elbow in strokes and on straight paths [rad].
+            free_motion: plans from q0 to q1 [rad] without contact, or raises NoPathError.
         """
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
         self._postures, self._radius, self._depth, self._bend, self._free_motion = postures, radius, depth, bend, free_motion
@@ -89,7 +97,7 @@ class SegmentPlanner:
         self._R_ref = np.eye(3)
 
     def lay(self, pieces: list[Stroke]) -> Layout:
-        """Paths for strokes and for the ways between them. Repeated calls reuse what has not changed."""
+        """Return strokes and the paths between them. Repeated calls reuse what has not changed."""
         layout = Layout()
         if pieces and not self._strokes:
             self._R_ref = self._kinematics.pose(self._postures[pieces[0].targets[0]])[:3, :3]
@@ -115,7 +123,7 @@ class SegmentPlanner:
         return layout
 
     def after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
-        """A press to `depth` [m], and the way there from above the end of the stroke before; empty where the arm cannot do it."""
+        """Return a press to `depth` [m] and the path to it from the end of the previous stroke; empty if impossible."""
         path, troubles = self._path_of(press, depth)
         if troubles or self.hover(press, 0) is None:
             return ()
@@ -123,7 +131,7 @@ class SegmentPlanner:
         return () if way is None else (way, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
-        """Posture above the stroke's first (0) or last (-1) target [rad], shape (7,); None out of reach or in collision."""
+        """Return the posture above the first (0) or last (-1) target [rad], shape (7,); None if out of reach or in collision."""
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
@@ -141,7 +149,7 @@ class SegmentPlanner:
         return self._strokes[key]
 
     def _path_to_next(self, before: Stroke, after: Stroke) -> tuple[Segment | None, Cause]:
-        """From above the end of one stroke to above the start of the next: straight, else by a free motion."""
+        """Return the path from above the end of one stroke to above the start of the next: straight, else a free motion."""
         key = (_place(before, -1), _place(after, 0))
         if key not in self._paths:
             xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
@@ -159,7 +167,7 @@ class SegmentPlanner:
         return self._paths[key]
 
     def _path_of(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
-        """A stroke with postures at `depth`, near those of its targets; and samples that the arm cannot take."""
+        """Return a stroke with postures at `depth`, near those of its targets; and samples that the arm cannot take."""
         s, p, n, R = lay(self._surface, stroke.xy, self._R_ref)
         centres = centre(p, n, self._radius, depth)
         known = self._postures[stroke.targets]
@@ -186,6 +194,6 @@ def collision(scene: CollisionScene, q: Array) -> Cause:
 
 
 def _place(piece: Stroke, end: int) -> Place:
-    """Where a stroke begins (0) or ends (-1), in the abdomen frame [m]."""
+    """Return the start (0) or end (-1) of a stroke in the abdomen frame [m]."""
     x, y = piece.xy[end]
     return float(x), float(y)
