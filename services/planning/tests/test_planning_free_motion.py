@@ -1,8 +1,9 @@
-"""Planning that was kept from its steps: control has braked meanwhile, so a motion goes on from a stand, where it was."""
+"""Free motions: the background worker, following a trajectory, and what happens after missed steps."""
 
 from __future__ import annotations
 
 from itertools import pairwise
+from threading import Event
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.free_motion import TrajectoryFollower
+from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import (
     BRAKED_NS,
@@ -30,6 +31,34 @@ from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import WallPlace, plane
+
+
+def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() -> None:
+    go = Event()
+    task = BackgroundTask(1000, 50, lambda: go.wait(10) and 7)
+    assert not task.due(1049)
+    assert task.due(1050)
+    go.set()
+    assert task.result() == 7
+
+
+def test_on_a_wall_clock_an_unfinished_task_is_not_due() -> None:
+    go = Event()
+    task = BackgroundTask(1000, 50, lambda: go.wait(10) and 7, lockstep=False)
+    assert not task.due(5000)
+    go.set()
+    assert task.result() == 7
+    assert not task.due(1049)
+    assert task.due(1050)
+
+
+def test_what_the_work_raises_is_raised_again() -> None:
+    def fail() -> int:
+        raise KeyError("why")
+
+    with pytest.raises(KeyError, match="why"):
+        BackgroundTask(0, 0, fail).result()
+
 
 KINEMATICS = ArmKinematics(BASE, Limits())
 START = np.array([0.0, 0.6, 0.0, -1.2, 0.0, 1.0, 0.0])

@@ -1,6 +1,8 @@
-"""A stopped examination: it waits, goes on where it was, or ends."""
+"""Stops, pushes and a wall that moves unexpectedly: the examination waits, continues where it was, or ends."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -8,9 +10,15 @@ from planning_fakes import World, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.robot import lbr
+from palpate_models.scenario.schema import Following
+from palpate_planning.interruptions import WALL, WallWatch
+from palpate_planning.motion.timing import JointTrajectory
+from palpate_planning.palpation import REQUEST_TIMEOUT_S
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
+from palpate_planning.strokes.requests import PressRequest
+from palpate_planning.wall.breath import Breath, BreathObservation
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
 PHASES = [Phase.HOME, Phase.LOOK, Phase.PLAN, Phase.APPROACH, Phase.INDENT, Phase.SCAN, Phase.RETRACT, Phase.RETURN]
@@ -167,3 +175,150 @@ def test_lost_perception_while_held_ends_it() -> None:
     world.lost = ("perception",)
     world.run()
     assert world.exam.status.reason is Reason.SERVICE_LOST
+
+
+SMALL = {"region_m": (0.025, 0.0125)}
+
+
+def reached(world: World, stage: StrokeStage, stroke: int = 1) -> None:
+    status = world.exam.status
+    world.run(lambda: status.stroke >= stroke and status.message == stage.value)
+
+
+def test_a_push_where_no_skin_can_be_is_no_touch() -> None:
+    world = World(known(**SMALL))
+    tissue, pushed = world.force, []
+
+    def force(depth: float) -> float:
+        pushes = world.exam.status.stroke == 2 and depth < -0.007 and len(pushed) < 5
+        if pushes and world.exam.status.message == StrokeStage.DESCEND.value:
+            pushed.append(depth)
+            return 8.0
+        return tissue(depth)
+
+    world.force = force
+    world.run()
+    assert pushed
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
+    assert max(row[4] for row in world.rows) < 0.0115, "no touch was taken from it"
+
+
+def test_a_soft_stop_above_the_skin_lifts_the_arm() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.REST, stroke=1)
+    world.stop, world.soft = Cause(Reason.SOFT_STOP, "force 26 N"), True
+    for _ in range(100):
+        world.step()
+    assert world.depth < -0.02
+    world.stop = NO_CAUSE
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert world.exam.status.targets_skipped == 0
+
+
+def test_above_the_skin_nothing_is_pushed_back() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.REST, stroke=1)
+    world.force = lambda depth: 6.0
+    for _ in range(5):
+        assert np.abs(world.step().setpoint.F_W).max() < 1e-9
+
+
+def test_a_wall_that_is_calm_for_less_than_is_asked_for_ends_the_strokes_too() -> None:
+    breath, watch = Breath(), None
+    watch = WallWatch(breath, Following.FOLLOW, 0.1)
+    for k in range(round(1.2 * WALL.calm_timeout_s / 0.1)):
+        calm = k % 14 < 7  # 0.7 s each
+        breath.hear(BreathObservation(k * 100_000_000, np.zeros(11), 1e-4, calm), k * 100_000_000)
+        watch.step(k * 100_000_000, contact_lost=False)
+    assert watch.ended
+
+
+def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.DESCEND, stroke=2)  # the first only touches
+    palpation = world.exam._course.palpation
+    assert palpation is not None
+    palpation.leave(Cause(Reason.WALL_NOT_TRACKED, "another reason"))
+    assert sorted(palpation.ahead) == list(range(world.exam.status.target_count))
+
+
+def test_a_place_asked_for_moves_with_the_body() -> None:
+    moved = PressRequest(3, np.array((0.01, 0.02))).moved(np.array((0.008, -0.003)))
+    assert moved.xy is not None
+    assert np.allclose(moved.xy, (0.018, 0.017))
+    assert PressRequest(4, None).moved(np.ones(2)).xy is None
+
+
+def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> None:
+    breath = Breath()
+    watch = WallWatch(breath, Following.GATE, 0.1)
+    inspired = BreathObservation(0, np.full(11, 0.006), 1e-4, calm=True)
+    for k in range(round((WALL.gate_closed_max_s + WALL.calm_timeout_s + 1) / 0.1)):
+        t = k * 100_000_000
+        breath.hear(inspired._replace(stamp=t), t)
+        watch.step(t, contact_lost=False)
+        assert watch.spoiled == (k * 0.1 > WALL.gate_closed_max_s - 0.05)
+        assert not watch.leaps
+    assert watch.ended
+    for _ in range(round(1.5 * WALL.calm_s / 0.1)):
+        t += 100_000_000
+        breath.hear(inspired._replace(stamp=t, forecast=np.zeros(11)), t)
+        watch.step(t, contact_lost=False)
+    assert watch.calm
+
+
+def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
+    held_from = 1e9
+    world = World(known(breathing="gate", **SMALL), excursion=lambda t: 0.0 if t < held_from else 0.004)
+    reached(world, StrokeStage.SLIDE, stroke=2)
+    held_from = world.t / 1e9
+    world.run(seconds=200.0)
+    pressed = [depth > 0.002 for *_, depth, _ in world.rows]
+    assert sum(pressed) * 0.01 < 2 * WALL.gate_closed_max_s
+    assert world.exam.status.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
+
+
+def test_a_push_while_the_skin_is_only_touched_skips_no_target() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.DESCEND, stroke=1)
+    tissue = world.force
+    world.force = lambda depth: 40.0
+    world.step()
+    world.step()
+    world.force = tissue
+    world.run()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
+
+
+def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.TRANSFER, stroke=1)
+    palpation = world.exam._course.palpation
+    assert palpation is not None
+    posture = JointTrajectory(np.tile(world.q, (50, 1)), np.zeros((50, 7)))
+    palpation._motion.segment = replace(palpation._motion.segment, free=posture)
+    for _ in range(5):
+        world.step()
+    world.stop = Cause(Reason.ROBOT_HOLD, "")
+    world.step()
+    world.q = world.q + 0.1
+    world.end = Cause(Reason.OPERATOR_END, "enough")
+    world.step()
+    world.stop = NO_CAUSE
+    for _ in range(10):
+        before = world.q.copy()
+        assert np.abs(world.step().setpoint.q - before).max() < 0.01
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+
+
+def test_a_search_that_asks_for_nothing_is_not_waited_for() -> None:
+    world = World(known(pattern="search", **SMALL))
+    world.run(lambda: world.exam.status.message == StrokeStage.WAIT.value)
+    began = world.t
+    world.run(seconds=2 * REQUEST_TIMEOUT_S + 60.0)
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert (world.t - began) / 1e9 < REQUEST_TIMEOUT_S + 15.0

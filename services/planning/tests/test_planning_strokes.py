@@ -1,0 +1,242 @@
+"""Strokes of a scan: coverage, poses of the indenter, set-points along a path."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from scipy.spatial.transform import Rotation
+
+from palpate_bus.setpoint import ControlMode
+from palpate_models.scenario.patterns import TOUCHES_M
+from palpate_models.scenario.schema import Mode
+from palpate_planning.interruptions import Displacement
+from palpate_planning.stroke_motion import stroke_setpoint
+from palpate_planning.strokes.coverage import SAMPLE_M, strokes, touches, transfer
+from palpate_planning.strokes.path import SurfacePath, angular_velocity, centre, frame, lay, least_twist, pose
+from palpate_planning.wall.surface import PerceivedSurface
+
+SPACING = 0.0125
+
+
+def grid(columns: int, rows: int, snake: bool) -> tuple[np.ndarray, np.ndarray]:
+    xy, lines = [], []
+    for j in range(rows):
+        order = range(columns - 1, -1, -1) if snake and j % 2 else range(columns)
+        xy += [(i * SPACING, j * SPACING) for i in order]
+        lines += [j] * columns
+    return np.array(xy), np.array(lines)
+
+
+@given(
+    st.integers(2, 6),
+    st.integers(1, 5),
+    st.booleans(),
+    st.sampled_from(list(Mode)),
+    st.integers(0, 2**30 - 1),
+)
+@settings(deadline=None)
+def test_every_usable_target_is_visited_once_in_order(columns: int, rows: int, joined: bool, mode: Mode, mask: int) -> None:
+    xy, lines = grid(columns, rows, joined)
+    usable = np.array([bool(mask >> i & 1) for i in range(len(xy))])
+    pieces = strokes(xy, lines, usable, joined, mode, SPACING)
+    visited = [int(i) for piece in pieces for i in piece.targets]
+    assert visited == np.flatnonzero(usable).tolist()
+    for piece in pieces:
+        assert piece.xy[piece.visits] == pytest.approx(xy[piece.targets], abs=1e-9)
+
+
+def test_a_snake_is_one_stroke_without_corners() -> None:
+    xy, lines = grid(6, 4, snake=True)
+    (stroke,) = strokes(xy, lines, np.ones(len(xy), dtype=bool), True, Mode.CONTINUOUS, SPACING)
+    steps = np.diff(stroke.xy, axis=0)
+    lengths = np.linalg.norm(steps, axis=1)
+    assert lengths.max() < 1.5 * SAMPLE_M
+    turns = np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1) / (lengths[1:] * lengths[:-1]), -1, 1))
+    assert turns.max() < 0.5, "a semicircle of 6.25 mm in steps of 2 mm turns by 0.32 rad a step"
+    assert stroke.xy[:, 0].max() < 5 * SPACING + 0.6 * SPACING
+
+
+def test_a_skipped_target_breaks_the_stroke() -> None:
+    xy, lines = grid(5, 2, snake=True)
+    usable = np.ones(len(xy), dtype=bool)
+    usable[2] = False
+    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING)
+    assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [3, 4, 5, 6, 7, 8, 9]]
+
+
+def test_a_break_ends_a_stroke_but_keeps_its_targets() -> None:
+    xy, lines = grid(5, 2, snake=True)
+    usable = np.ones(len(xy), dtype=bool)
+    pieces = strokes(xy, lines, usable, True, Mode.CONTINUOUS, SPACING, {1, 4})
+    assert [piece.targets.tolist() for piece in pieces] == [[0, 1], [2, 3, 4], [5, 6, 7, 8, 9]]
+
+
+def test_raster_has_a_stroke_a_line_and_point_mode_one_a_target() -> None:
+    xy, lines = grid(5, 3, snake=False)
+    usable = np.ones(len(xy), dtype=bool)
+    assert len(strokes(xy, lines, usable, False, Mode.CONTINUOUS, SPACING)) == 3
+    points = strokes(xy, lines, usable, False, Mode.POINT, SPACING)
+    assert [len(p.xy) for p in points] == [1] * 15
+
+
+def test_transfer_is_straight_and_may_be_nothing() -> None:
+    way = transfer(np.array((0.0, 0.0)), np.array((0.03, 0.04)))
+    assert way[0].tolist() == [0, 0]
+    assert way[-1] == pytest.approx((0.03, 0.04))
+    assert len(transfer(np.zeros(2), np.zeros(2))) == 1
+
+
+def test_touches_are_spread_over_all_that_is_usable() -> None:
+    xy, _ = grid(17, 17, snake=True)
+    usable = np.ones(len(xy), dtype=bool)
+    usable[:40] = False
+    spread = touches(xy, usable)
+    assert all(piece.touch and len(piece.xy) == 1 and usable[piece.targets[0]] for piece in spread)
+    places = np.array([piece.xy[0] for piece in spread])
+    assert len(places) == 9
+    assert np.linalg.norm(xy[usable][:, None] - places, axis=-1).min(axis=1).max() < TOUCHES_M
+    assert touches(xy, np.zeros(len(xy), dtype=bool)) == []
+
+
+coordinate = st.floats(-1.0, 1.0)
+vectors = st.tuples(coordinate, coordinate, coordinate).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.05)
+units = vectors.map(lambda v: v / np.linalg.norm(v))
+rotations = st.tuples(vectors, st.floats(-3.1, 3.1)).map(
+    lambda a: Rotation.from_rotvec(a[0] / np.linalg.norm(a[0]) * a[1]).as_matrix()
+)
+
+
+@given(units, rotations)
+@settings(deadline=None)
+def test_tool_axis_is_opposite_to_the_normal(normal: np.ndarray, R_near: np.ndarray) -> None:
+    R = least_twist(-normal, R_near)
+    assert R[:, 2] == pytest.approx(-normal, abs=1e-9)
+    assert np.abs(R.T @ R - np.eye(3)).max() < 1e-9
+    assert np.linalg.det(R) == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("tilt", [0.0, 1e-12, 1e-9, 1.2e-7, 1e-6, 4.4e-5, 4.5e-5, 1e-3])
+def test_stays_a_rotation_close_to_the_opposite_of_the_reference(tilt: float) -> None:
+    R = least_twist(np.array((0.0, -tilt, -1.0)), np.eye(3))
+    assert np.abs(R.T @ R - np.eye(3)).max() < 1e-12
+    assert np.linalg.det(R) == pytest.approx(1.0, abs=1e-12)
+
+
+@given(units, rotations)
+@settings(deadline=None)
+def test_no_other_orientation_with_that_axis_is_nearer(normal: np.ndarray, R_near: np.ndarray) -> None:
+    R = least_twist(-normal, R_near)
+    turned = [R @ Rotation.from_rotvec((0, 0, a)).as_matrix() for a in (-0.3, -0.05, 0.05, 0.3)]
+    assert all(np.trace(R_near.T @ R) >= np.trace(R_near.T @ other) - 1e-9 for other in turned)
+
+
+@given(units, units, st.floats(0.005, 0.04), st.floats(-0.03, 0.02))
+@settings(deadline=None)
+def test_deepest_point_lies_at_depth_below_the_surface(p: np.ndarray, n: np.ndarray, radius: float, depth: float) -> None:
+    deepest = centre(p, n, radius, depth) - radius * n
+    assert deepest == pytest.approx(p - depth * n, abs=1e-12)
+
+
+@given(st.lists(units, min_size=2, max_size=8), rotations)
+@settings(deadline=None)
+def test_many_at_once_are_the_same_as_one_by_one(normals: list[np.ndarray], R_ref: np.ndarray) -> None:
+    many = least_twist(-np.array(normals), R_ref)
+    assert many == pytest.approx(np.array([least_twist(-n, R_ref) for n in normals]), abs=1e-12)
+
+
+@given(units, vectors, rotations)
+@settings(deadline=None)
+def test_near_normals_have_near_orientations(normal: np.ndarray, change: np.ndarray, R_ref: np.ndarray) -> None:
+    assume(-normal @ R_ref[:, 2] > -0.5)
+    other = normal + 0.01 * change
+    a, b = least_twist(-normal, R_ref), least_twist(-other, R_ref)
+    assert np.abs(a - b).max() < 0.06
+
+
+@given(rotations, vectors)
+@settings(deadline=None)
+def test_angular_velocity_turns_one_into_the_other(R: np.ndarray, w: np.ndarray) -> None:
+    dt = 0.1
+    turned = Rotation.from_rotvec(w * dt).as_matrix() @ R
+    assert angular_velocity(R, turned, dt) == pytest.approx(w, abs=1e-6)
+
+
+def test_pose_is_homogeneous() -> None:
+    X = pose(np.eye(3), np.array((1.0, 2.0, 3.0)))
+    assert X[3].tolist() == [0, 0, 0, 1]
+    assert X[:3, 3].tolist() == [1, 2, 3]
+
+
+@given(rotations, vectors)
+@settings(deadline=None)
+def test_a_frame_has_the_given_z_axis_and_keeps_its_x_axis_near(R: np.ndarray, x_near: np.ndarray) -> None:
+    z = R[:, 2].copy()
+    assume(np.linalg.norm(np.cross(z, x_near)) > 1e-3)
+    found = frame(z, x_near)
+    assert found[:, 2] == pytest.approx(z, abs=1e-12)
+    assert np.abs(found.T @ found - np.eye(3)).max() < 1e-9
+    assert np.linalg.det(found) == pytest.approx(1.0)
+    assert found[:, 1] @ x_near == pytest.approx(0.0, abs=1e-12)
+    assert found[:, 0] @ x_near > 0.0
+
+
+DOWN = np.diag((1.0, -1.0, -1.0))
+
+
+def dome_path(samples: int) -> SurfacePath:
+    """A path over a dome, reached targets 7, 3 and 5 on it."""
+    xy = np.column_stack((np.linspace(-0.05, 0.05, samples), np.full(samples, 0.01))) if samples > 1 else np.zeros((1, 2))
+    x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-0.1, 0.1, 0.01))
+    vertices = np.column_stack((x.ravel(), y.ravel(), -(x.ravel() ** 2) / 0.5 - y.ravel() ** 2))
+    s, p, n, R = lay(PerceivedSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
+    q = np.outer(1.0 + s, np.arange(1.0, 8.0)) ** 2
+    visits = np.array([0, samples // 2, samples - 1]) if samples > 1 else np.zeros(1, int)
+    return SurfacePath(s, p, n, R, q, np.array([7, 3, 5])[: len(visits)], visits)
+
+
+@pytest.mark.parametrize("samples", [1, 21])
+def test_a_setpoint_is_the_path_point_at_a_distance_from_the_surface(samples: int) -> None:
+    path = dome_path(samples)
+    rate, distance, sinking, push = 0.03, 0.0173, -0.002, 1.7
+    for s in np.linspace(-0.01, path.length + 0.01, 50).tolist():
+        point = path.at(s)
+        setpoint = stroke_setpoint(7, point, rate, distance, sinking, push)
+        assert setpoint.mode is ControlMode.CARTESIAN
+        assert setpoint.stamp == 7
+        assert setpoint.p_WD == pytest.approx(centre(point.p, point.n, distance, 0.0))
+        assert setpoint.R_WD[:, 2] == pytest.approx(-point.n)
+        assert setpoint.F_W.tolist() == [*(-push * point.n), 0.0, 0.0, 0.0]
+        assert np.array_equal(setpoint.q, point.q)
+
+
+def test_the_velocities_of_a_setpoint_are_its_rates_of_change() -> None:
+    path, rate, sinking, dt = dome_path(21), 0.03, -0.002, 1e-4
+    for s in np.linspace(0.01, path.length - 0.01, 20).tolist():
+        before, now, after = (
+            stroke_setpoint(0, path.at(s + k * rate * dt), rate, 0.01 - k * sinking * dt, sinking, 0.0) for k in (-1, 0, 1)
+        )
+        assert now.V_WD[:3] == pytest.approx((after.p_WD - before.p_WD) / (2 * dt), abs=1e-5)
+        assert now.V_WD[3:] == pytest.approx(Rotation.from_matrix(after.R_WD @ before.R_WD.T).as_rotvec() / (2 * dt), abs=1e-3)
+        assert now.qd == pytest.approx((after.q - before.q) / (2 * dt), abs=1e-5)
+
+
+def test_a_displaced_setpoint_leaves_the_path_as_it_is() -> None:
+    path = dome_path(1)
+    point = path.at(0.0)
+    setpoint = stroke_setpoint(0, point, 0.0, 0.01, 0.0, 0.0)
+    gap = np.array((0.0, 0.004, 0.003))
+    displacement = Displacement(gap, 0.01)
+    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD + gap)
+    while not displacement.shrink():
+        pass
+    assert displacement.move(setpoint).p_WD == pytest.approx(setpoint.p_WD)
+    assert np.array_equal(stroke_setpoint(0, path.at(0.0), 0.0, 0.01, 0.0, 0.0).p_WD, setpoint.p_WD)
+
+
+def test_the_target_is_the_one_reached_last() -> None:
+    path = dome_path(21)
+    _, middle, end = path.visits
+    reached = [path.target(s) for s in (-1.0, 0.0, middle - 1e-9, middle, end - 1e-9, end, end + 1.0)]
+    assert reached == [7, 7, 7, 3, 3, 5, 5]
