@@ -1,4 +1,4 @@
-"""One quick case: an examination on a patient, the assessment's own service, and the scores of whole examinations."""
+"""One quick case: an examination without an arm, the assessment service, and the scores of whole examinations."""
 
 from __future__ import annotations
 
@@ -32,21 +32,21 @@ _HASHED: Final = ("assessment/samples", "assessment/map", "assessment/findings")
 
 @dataclass(frozen=True)
 class QuickCase:
-    """What a quick case gave, and the processor time of each of its parts [s]."""
+    """Result of a quick case, and the processor time of its parts [s]."""
 
     report: Report
     """The rows of report.json; its run hash is over samples, map and findings."""
     collected: Collected
-    """The messages that it was made from."""
+    """The messages behind it."""
     simulate_s: float
-    """The patient made and examined."""
+    """Building and examining the patient."""
     assess_s: float
     score_s: float
-    """The patient pressed for the truth (kept for the next time), and compared."""
+    """Computing the truth (cached) and comparing with it."""
 
 
 def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> QuickCase:
-    """Examines the patient of a scenario without arm and bus, with the errors that whole examinations have.
+    """Examine the patient of a scenario without arm and bus, with the errors of whole examinations.
 
     `errors`: distributions of its loop; None for those of loop.yaml. `drawn` as in `Loop`. Raises UnknownLoopError where it has
     none, NoTissueError for a tissue of which there is no copy, PluginError for an assessment that cannot be made.
@@ -76,15 +76,15 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
 
 
 def examined(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> Collected:
-    """What a conductor would have collected of an examination before the assessment. Arguments and errors as of `run_quick`."""
-    with _nothing_collected():
+    """Return what a conductor would have collected before the assessment. Arguments and errors as of `run_quick`."""
+    with _no_garbage_collection():
         examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
         return collected(examination, examination.run())
 
 
 @contextmanager
-def _nothing_collected() -> Iterator[None]:
-    """Python looks for no circles meanwhile: 100,000 new messages hold none, and looking takes longer than making them."""
+def _no_garbage_collection() -> Iterator[None]:
+    """Suspend the search for reference cycles: 100,000 new messages hold none, and the search takes longer than making them."""
     enabled = gc.isenabled()
     gc.disable()
     try:
@@ -95,9 +95,9 @@ def _nothing_collected() -> Iterator[None]:
 
 
 def assess(service: Service, gathered: Collected) -> dict[str, Any]:
-    """Has an assessment service make samples, map and findings of an examination, into what was gathered of it.
+    """Run an assessment service on the messages of an examination, and add its samples, map and findings; return its facts.
 
-    It steps twice: with the surface, and with all states at once, so that it draws no map before the last. Returns its facts.
+    It steps twice: with the surface, and with all states at once, so that it computes one map only.
     """
     states = gathered.exam_states
     first, last = (nanoseconds(state.header.stamp) for state in (states[0], states[-1]))
@@ -109,7 +109,7 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     service.start()
     for t, new in inputs:
         latest |= new
-        outbox = service.step(t, _Given(new, latest))
+        outbox = service.step(t, _Inbox(new, latest))
         samples = outbox.get("assessment/samples", [])
         gathered.samples += samples if isinstance(samples, list) else [samples]
         gathered.stiffness_map = outbox.get("assessment/map", gathered.stiffness_map)
@@ -117,8 +117,8 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     return dict(service.finish())
 
 
-class _Given:
-    """An inbox of messages by topic: those that are new, and those that came so far."""
+class _Inbox:
+    """An inbox of messages by topic: new ones, and all until now."""
 
     def __init__(self, new: dict[str, Sequence[Message]], latest: dict[str, Sequence[Message]]) -> None:
         self._new, self._latest = new, latest
@@ -138,7 +138,7 @@ class _Given:
 
 
 def _digest(topic: str, gathered: Collected) -> str | None:
-    """SHA-256 over the messages of a topic; None where there is none."""
+    """Return the SHA-256 over the messages of a topic; None without messages."""
     sent = {
         "assessment/samples": gathered.samples,
         "assessment/map": [gathered.stiffness_map],

@@ -1,13 +1,12 @@
-"""Errors of arm, camera and force sensor in an examination, with the distributions of whole examinations.
+"""Errors of arm, camera and force sensor in an examination, drawn from the distributions of whole examinations.
 
-`loop.yaml` holds them, a row for each setting of the errors and kind of breathing. A row that was fitted to fewer than
-LEAST_EXAMINATIONS is assumed: studies on it say so. With d the depth that the examination measures and d' the true one, against
-the skin as it breathes,
+`loop.yaml` has a row for each setting of the errors and kind of breathing. A row fitted to fewer than LEAST_EXAMINATIONS counts
+as assumed in studies. With d the measured depth and d' the true one, below the breathing skin,
 
     d - d' = offset + zero(stroke) + tilt . xy + field(xy) + wander(t) - (1 - followed) (excursion(t) - its mean)
 
-and d is the set-point plus the error of regulation. Force is read by the force/torque sensor of `palpate_robot`, tared before
-each stroke. Where the patient lies is what registration got wrong, and needs no distribution.
+and d is the set-point plus the error of regulation. Force is measured by the force/torque sensor of `palpate_robot`, tared before
+each stroke. The error of registration is simulated as it is, without a distribution.
 """
 
 from __future__ import annotations
@@ -39,35 +38,35 @@ from palpate_planning.stroke import TOUCH
 from palpate_robot.sensors import FtSensor
 
 LOOP_SECTIONS: Final = ("camera", "hand_eye", "registration", "arm")
-"""Sections of the errors that reach an examination through its loop; the force sensor's are simulated as they are."""
+"""Sections of the errors that are drawn; those of the force sensor are simulated."""
 _STROKES: Final = 1024
 _GRID_M: Final = 0.004
 _BEYOND_M: Final = 0.06
-"""The field of surface errors reaches this far beyond the examined region."""
+"""Margin of the field of surface errors around the examined region."""
 
 LEAST_EXAMINATIONS: Final = 10
-"""Figures of fewer examinations say nothing about how examinations differ: such a loop counts as assumed."""
+"""Fewer examinations do not give the spread between examinations: such a row counts as assumed."""
 
 Breath = Literal["none", "quiet", "deep", "held"]
 
 
 class UnknownLoopError(UserError):
-    """A scenario for which there is no loop. Names what is asked for and what there is."""
+    """The scenario has no row in loop.yaml. Names its setting and the available ones."""
 
 
 class Normal(Section):
-    """A normal distribution, over examinations."""
+    """A normal distribution over examinations."""
 
     mean: float = 0.0
     sd: NonNegative = 0.0
 
     def draw(self, rng: np.random.Generator) -> float:
-        """One examination's value."""
+        """Return the value of one examination."""
         return self.mean + self.sd * float(rng.standard_normal())
 
 
 class LoopErrors(Section):
-    """What examinations with one setting of errors and kind of breathing get wrong."""
+    """Distributions of the errors in examinations with one setting of errors and kind of breathing."""
 
     camera: Level
     hand_eye: Level
@@ -75,38 +74,38 @@ class LoopErrors(Section):
     arm: Level
     breathing: Breath
     following: Following
-    """What the examination does about breathing."""
+    """Handling of breathing in the examination."""
     examinations: Annotated[int, Field(ge=0)]
-    """From how many whole examinations these figures are."""
+    """Number of whole examinations behind these figures."""
     begin_s: Positive
-    """Mean time at which the first stroke begins."""
+    """Mean start time of the first stroke [s]."""
     aside_m: NonNegative
-    """How far from where it is believed to be the tool is along x, and along y: standard deviation over examinations."""
+    """SD of lateral tool position error per axis, over examinations [m]."""
     offset_m: Normal
-    """How much too far outward the perceived surface is, as it is used: after every correction."""
+    """Height of the corrected surface above the true one [m]."""
     tilt: Normal
-    """The slope of that along x, and along y."""
+    """Slope of this height along x and y."""
     zero_m: NonNegative
-    """What is wrong all over one stroke, since its touch: standard deviation over strokes."""
+    """SD over strokes of the error of a stroke's zero [m]."""
     uncertainty_m: NonNegative
-    """The standard deviation of depth that the examination tells, root mean square."""
+    """Root mean square of the reported standard deviation of depth [m]."""
     field_m: NonNegative
-    """What else is wrong with it, smooth over the skin: standard deviation."""
+    """SD of the remaining error of the surface, smooth over the skin [m]."""
     field_length_m: Positive
-    """Its correlation length: covariance exp(-r^2 / 2 l^2)."""
+    """Its correlation length l [m]: covariance exp(-r^2 / 2 l^2)."""
     followed: Normal
-    """Which part of the breathing excursion the examination follows."""
+    """Fraction of the breathing excursion that the examination follows."""
     wander_m: NonNegative
-    """What else is wrong with the measured depth, smooth in time: standard deviation."""
+    """SD of the remaining error of depth, smooth in time [m]."""
     wander_s: Positive
-    """Its correlation time: covariance (1 + t / T) exp(-t / T)."""
+    """Its correlation time T [s]: covariance (1 + t / T) exp(-t / T)."""
     regulation_m: NonNegative
-    """Measured depth less set-point at depth: standard deviation."""
+    """SD of measured depth less set-point at depth [m]."""
     regulation_s: Positive
-    """Its correlation time, as that of the wander."""
+    """Its correlation time [s], as of the wander."""
 
     def draw(self, rng: np.random.Generator) -> Drawn:
-        """What stays the same all over one examination."""
+        """Draw the constant errors of one examination."""
         aside = self.aside_m * rng.standard_normal(2)
         offset, tilt = self.offset_m.draw(rng), np.array((self.tilt.draw(rng), self.tilt.draw(rng)))
         return Drawn(offset, tilt, self.followed.draw(rng), aside, self.zero_m * rng.standard_normal(_STROKES))
@@ -114,29 +113,29 @@ class LoopErrors(Section):
 
 @dataclass(frozen=True, eq=False)
 class Drawn:
-    """What one examination gets wrong from beginning to end."""
+    """Constant errors of one examination."""
 
     offset_m: float
-    """How much too far outward the perceived surface is at the centre of the region."""
+    """Height of the perceived above the true surface at the centre of the region [m]."""
     tilt: Array
-    """Its slope along x and y, shape (2,)."""
+    """Slope of this height along x and y, shape (2,)."""
     followed: float
-    """Which part of the breathing excursion is followed."""
+    """Fraction of the breathing excursion that is followed."""
     aside_m: Array
-    """Where the tool truly is less where it is believed to be, xy of A, shape (2,)."""
+    """True less estimated position of the tool [m], xy of A, shape (2,)."""
     zeros_m: Array
-    """What is wrong with the depths of one stroke after another; from the first again after the last."""
+    """Errors of the zeros of successive strokes [m]; repeated after the last."""
 
 
 @cache
 def known_loops() -> tuple[LoopErrors, ...]:
-    """The rows of loop.yaml."""
+    """Return the rows of loop.yaml."""
     text = resources.files("palpate.quick").joinpath("loop.yaml").read_text(encoding="utf-8")
     return tuple(TypeAdapter(list[LoopErrors]).validate_python(yaml.safe_load(text)["loops"]))
 
 
 def setting_of(scenario: Scenario) -> dict[str, str | None]:
-    """The level of each section of a scenario's errors that its loop depends on, None where it is none; and the breathing."""
+    """Return the level of each section of errors, None for a user-defined one; and the breathing."""
     sections: dict[str, str | None] = {}
     for name in LOOP_SECTIONS:
         given = getattr(scenario.errors, name)
@@ -147,37 +146,37 @@ def setting_of(scenario: Scenario) -> dict[str, str | None]:
 
 
 def loop_errors(scenario: Scenario) -> LoopErrors:
-    """The distributions for a scenario. Raises UnknownLoopError where loop.yaml has no row for it."""
+    """Return the distributions for a scenario. Raises UnknownLoopError if loop.yaml has no row for it."""
     wanted = setting_of(scenario)
     for row in known_loops():
         if all(getattr(row, name) == value for name, value in wanted.items()):
             return row
     known = "; ".join(", ".join(f"{name} {getattr(row, name)}" for name in wanted) for row in known_loops())
     own = [name for name, level in wanted.items() if level is None]
-    words = ", ".join(f"{name} {value or 'of its own'}" for name, value in wanted.items())
+    setting = ", ".join(f"{name} {value or 'user-defined'}" for name, value in wanted.items())
     raise UnknownLoopError(
-        f"{scenario.name}: there is no loop for examinations with {words}"
-        + (f" (errors.{own[0]} is of no level)" if own else "")
-        + f"; want one of: {known}; or tier: whole"
+        f"{scenario.name}: no fitted error model for {setting}"
+        + (f" (errors.{own[0]} is user-defined)" if own else "")
+        + f"; available: {known}; or use tier: whole"
     )
 
 
 class Loop:
-    """What one examination gets wrong. Equal scenarios have equal loops."""
+    """Errors of one examination. Equal scenarios have equal errors."""
 
     def __init__(self, scenario: Scenario, errors: LoopErrors, drawn: Drawn | None = None) -> None:
-        """Drawn from the scenario's seed; `drawn` takes the place of what stays the same all over the examination."""
+        """Draw from the scenario's seed; `drawn` replaces the constant errors."""
         rng = generator(scenario.seed, "loop")
         mine = errors.draw(rng)
         self._drawn = drawn or mine
         self.begin_s = errors.begin_s
-        """When the first stroke begins [s]."""
+        """Start time of the first stroke [s]."""
         self.aside_m = self._drawn.aside_m
-        """Where the tool truly is less where it is believed to be, xy of A [m], shape (2,)."""
+        """True less estimated position of the tool, xy of A [m], shape (2,)."""
         self.uncertainty_m = errors.uncertainty_m
-        """The standard deviation of depth that the examination states."""
+        """Reported standard deviation of depth [m]."""
         self.followed = self._drawn.followed
-        """Which part of the breathing excursion is followed."""
+        """Fraction of the breathing excursion that is followed."""
         self._centre = np.array(scenario.exam.centre_m)
         self._field = _field(scenario.exam, errors.field_m, errors.field_length_m, rng)
         self._regulation = _Smooth(errors.regulation_m, errors.regulation_s, rng)
@@ -185,38 +184,38 @@ class Loop:
         self._sensor = _TaredSensor(scenario, self.begin_s)
 
     def wrong(self, xy: Array) -> Array:
-        """How much too far outward the perceived surface is at points [m], shape (p, 2) -> (p,)."""
+        """Return the height of the perceived above the true surface at points [m], shape (p, 2) -> (p,)."""
         return np.asarray(self._drawn.offset_m + (xy - self._centre) @ self._drawn.tilt + self._field.ev(xy[:, 0], xy[:, 1]))
 
     def zero(self, stroke: int) -> float:
-        """How much too far outward the skin is believed to be in a stroke, counted from 1 [m]."""
+        """Return the error of the zero of a stroke, counted from 1 [m]."""
         return float(self._drawn.zeros_m[(stroke - 1) % len(self._drawn.zeros_m)])
 
     def regulation(self, k: int) -> float:
-        """Measured depth less set-point in the k-th period [m]."""
+        """Return measured depth less set-point in the k-th period [m]."""
         return self._regulation.at(k)
 
     def wander(self, k: int) -> float:
-        """What else is wrong with the measured depth in the k-th period [m]."""
+        """Return the remaining error of depth in the k-th period [m]."""
         return self._wander.at(k)
 
     def gains(self, outward: Array) -> Array:
-        """Rows that take a force to the normal force that is read of it, for outward normals, both of shape (p, 3)."""
+        """Return rows that map a force to the measured normal force, for outward normals, both of shape (p, 3)."""
         return self._sensor.gains(outward)
 
     def tare(self, k: int) -> None:
-        """Takes what the sensor reads just before the k-th period, in which nothing is touched, for its bias."""
+        """Tare the sensor by its readings in air just before the k-th period."""
         self._sensor.tare(k)
 
     def tared(self, k: int) -> float:
-        """What the sensor reads in the k-th period without a force, along the outward normal [N]."""
+        """Return the reading in the k-th period without a force, along the outward normal [N]."""
         return self._sensor.tared(k)
 
 
 def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> RectBivariateSpline:
-    """A smooth random field over the examined region and about it [m]."""
+    """Return a smooth random field over the examined region and a margin [m]."""
     x, y = (_axis(centre, size) for centre, size in zip(exam.centre_m, exam.region_m, strict=True))
-    width = length / np.sqrt(2) / _GRID_M  # white noise under a Gaussian of this width has the covariance wanted
+    width = length / np.sqrt(2) / _GRID_M  # white noise under a Gaussian of this width has the wanted covariance
     noise = gaussian_filter(rng.standard_normal((len(x), len(y))), width, mode="wrap")
     peak = np.zeros((len(x), len(y)))
     peak[0, 0] = 1.0
@@ -225,13 +224,13 @@ def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> Re
 
 
 def _axis(centre: float, size: float) -> Array:
-    """Coordinates of the field's grid along one axis [m]."""
+    """Return the coordinates of the field's grid along one axis [m]."""
     half = 0.5 * size + _BEYOND_M
     return centre + np.linspace(-half, half, round(2 * half / _GRID_M) + 1)
 
 
 class _Smooth:
-    """A process with the covariance (1 + t / T) exp(-t / T): white noise through two equal lags. A value each PERIOD_S."""
+    """A process with the covariance (1 + t / T) exp(-t / T): white noise through two equal lags; one value per PERIOD_S."""
 
     _BLOCK = 4096
 
@@ -239,7 +238,7 @@ class _Smooth:
         self._rng = np.random.Generator(np.random.PCG64(rng.bit_generator.seed_seq.spawn(1)[0]))  # type: ignore[attr-defined]
         a = exp(-PERIOD_S / time_s)
         self._lags = np.array((1.0, -2 * a, a * a))
-        gain = (1 - a * a) ** 3 / (1 + a * a)  # variance of white noise that gives the process variance one
+        gain = (1 - a * a) ** 3 / (1 + a * a)  # variance of white noise for a process of unit variance
         self._scale = sd * np.sqrt(gain)
         self._memory = np.zeros(2)
         warm = round(20 * time_s / PERIOD_S)
@@ -257,7 +256,7 @@ class _Smooth:
 
 
 class _TaredSensor:
-    """The force sensor of a patient's examination, as it reads normal forces.
+    """The normal force of the force sensor.
 
     Its z axis is along the inward normal, x near that of A; readings are means over PERIOD_S, as `robot/status` has them.
     """
@@ -274,10 +273,10 @@ class _TaredSensor:
         self.tare(0)
         reads, lever = drawn.sensitivity[2], lbr.FT_TO_INDENTER_M
         self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
-        """What z reads of a force at the sphere's centre, in the sensor's axes, shape (3,)."""
+        """Reading of z for a unit force at the sphere's centre along each of the sensor's axes, shape (3,)."""
 
     def _read(self, k: int) -> None:
-        """Has the readings up to the k-th since the sensor was switched on."""
+        """Simulate the readings up to the k-th since the sensor was switched on."""
         while k >= len(self._normal):
             self._normal += (-self._sensor.block()[:, 2]).tolist()
 

@@ -1,7 +1,7 @@
-"""What the standard press feels of a person, without physics in time.
+"""Force of the standard press on a person, without physics in time.
 
-A place's force follows from the wall's stiffness and stiffening there (`force_at_10_mm`) and is averaged over the indenter's
-footprint on a Winkler-Pasternak foundation. It takes half a second a person, so that thousands can be had.
+The force at a place follows from stiffness and stiffening of the wall there (`force_at_10_mm`) and is averaged over the footprint
+of the indenter on a Winkler-Pasternak foundation. It takes half a second per person.
 """
 
 from __future__ import annotations
@@ -23,35 +23,35 @@ from palpate_models.patient.tension import pressed_force
 
 PITCH_M: Final = 0.004
 HALF_M: Final = 0.148
-"""Half the side of the square in which the wall is known."""
+"""Half the side of the square that is computed."""
 CONTACT_M: Final = 0.009
 """Radius of the contact of a sphere of 15 mm at 10 mm depth [C, of the foundation's obstacle problem]."""
 POWER: Final = 0.8
-"""A wall that gives way beside a stiff place makes the mean over the footprint a power mean of this exponent [C, transients]."""
+"""Exponent of the power mean over the footprint: the wall yields next to a stiff place [C, transients]."""
 _TABLE: Final = np.linspace(0.0, 600.0, 25)
 
 
 @dataclass(frozen=True)
 class FeltPatient:
-    """What the standard press feels of a person, by the footprint's mean, on a square grid about the umbilicus; n x n places."""
+    """Force of the standard press on a square grid about the umbilicus, n x n places."""
 
     force: Array
     """[N], shape (n, n), rows along y."""
     healthy: Array
-    """The same without lumps."""
+    """The force without lumps [N], shape (n, n)."""
 
     def force_at(self, xy: Array) -> Array:
-        """Force [N] at places [m], shape (m, 2) -> (m,)."""
+        """Return the force [N] at places [m], shape (m, 2) -> (m,)."""
         return np.asarray(map_coordinates(self.force, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
 
     def excess_at(self, xy: Array) -> Array:
-        """The logarithm of the felt contrast of all lumps at places [m], shape (m, 2) -> (m,)."""
+        """Return the logarithm of the felt contrast of all lumps at places [m], shape (m, 2) -> (m,)."""
         excess = np.log(self.force / self.healthy)
         return np.asarray(map_coordinates(excess, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
 
 
 def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
-    """The person of a seed with the lumps that the phantom draws or has."""
+    """Return the person of a seed with the lumps of the phantom."""
     phantom = drawn(phantom, seed)
     model = build_phantom(phantom, seed)
     axis = np.arange(-HALF_M, HALF_M + 1e-9, PITCH_M)
@@ -71,7 +71,7 @@ def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
 
 
 def _footprint(length: float) -> Array:
-    """Sensitivity of the force to the modulus about the indenter, on the grid, summing to 1.
+    """Return the sensitivity of the force to the modulus about the indenter, on the grid, summing to 1.
 
     By the envelope theorem dF = dk_w (u phi + l^2 grad u . grad phi) with the influence phi = K0(r / l) / K0(a / l)
     beyond the contact.
@@ -89,6 +89,6 @@ def _footprint(length: float) -> Array:
 
 
 def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
-    """Force [N] of a press of 10 mm on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
+    """Return the force [N] of a 10 mm press on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
     unit = [pressed_force(wall.model_copy(update={"stiffening_per_m": beta}), 0.0) for beta in _TABLE.tolist()]
     return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)

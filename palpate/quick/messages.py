@@ -1,4 +1,4 @@
-"""An examination on a patient as the messages that planning, perception and tissue of a whole one would have sent."""
+"""Messages of planning, perception and tissue for an examination without an arm."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from palpate_models.numerics.frames import apply
 from palpate_planning.status import PHASE_OF
 
 LEAVES_S: Final = 1.0
-"""From the last stroke until the assessment is asked for its findings."""
+"""Time from the last stroke to the request for findings."""
 _NO_TRIANGLES: Final = np.empty(0, np.uint32)
 _NO_SHARES: Final = np.empty(0, np.float32)
 
 
 def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected:
-    """What a conductor would have collected of it before the assessment. The last state is in phase ASSESS."""
+    """Return what a conductor would have collected before the assessment. The last state is in phase ASSESS."""
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model
     sigma = examination.uncertainty_m
@@ -46,7 +46,7 @@ def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected
 
 
 def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
-    """`exam/state`."""
+    """Return `exam/state` of a period."""
     over = phase == ExamState.PHASE_ASSESS
     return exam_state(
         round(time * NS),
@@ -67,7 +67,7 @@ def _state(row: PeriodRow, phase: int, time: float, sigma: float) -> Any:
 
 
 def _indentations(patient: Patient, rows: list[PeriodRow]) -> list[Any]:
-    """`truth/indentation` of every period."""
+    """Return `truth/indentation` of every period."""
     place = np.array([row.path.place[row.at] for row in rows])
     outward = np.array([row.path.normal[row.at] for row in rows])
     F = np.array([row.true_force for row in rows])

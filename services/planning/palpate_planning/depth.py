@@ -25,7 +25,7 @@ class DepthTuning:
     exponent: float = 1.45
     """Local exponent of force against depth, 5 to 15 mm, of the tissue's foundation; Hertz has 1.5."""
     force_fraction: float = 0.83
-    """Fraction of the working force limit at which depth yields: force rises until the arm has yielded, and its gain errs."""
+    """Fraction of the working force limit at which depth yields: force rises until the arm has yielded."""
     feed_forward: float = 0.9
     """a, below one so that the force cannot build up by itself even on a rigid surface."""
     force_lag_s: float = 0.02

@@ -33,7 +33,7 @@ from palpate_planning.wall.wall import Wall, plane
 
 @dataclass(frozen=True)
 class ExamTuning:
-    """How often phases are repeated and how long they may take."""
+    """Limits of repetition and time of the phases."""
 
     looks_max: int = 3
     moves_max: int = 2
@@ -90,10 +90,10 @@ class Rest:
     bend: float | None = None
     """Least bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
     moves: int = 0
-    """How often the patient was viewed again after a motion."""
+    """Number of new views after a motion of the patient."""
     replans: int = 0
     unplanned: str = ""
-    """Why the rest could not be planned; empty if it could."""
+    """Text of the failure to plan the rest; empty if there was none."""
 
     @property
     def begun(self) -> bool:

@@ -1,4 +1,4 @@
-"""What interrupts the strokes: a wall that cannot be tracked, too much force, a pause; and from where they are taken up again."""
+"""Interruptions of the strokes: a wall that cannot be tracked, too much force, a pause; and how the strokes continue."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from palpate_planning.wall.breath import Breath
 
 @dataclass(frozen=True)
 class WallTuning:
-    """When the wall may be touched, and when the strokes end."""
+    """Times and limits for a wall that cannot be tracked or touched."""
 
     calm_s: float = 1.0
     """After a cough or a deep breath the skin is left alone until the wall has been tracked for this time."""
@@ -42,7 +42,7 @@ class WallTuning:
 
 @dataclass(frozen=True)
 class RecoveryTuning:
-    """How often and from where strokes are taken up again."""
+    """Limits and speeds for strokes that are taken up again."""
 
     soft_stops_max: int = 3
     repeats_max: int = 3
@@ -80,7 +80,7 @@ class WallWatch:
         self.moved = False
         """True if the patient has moved."""
         self.ended = NO_CAUSE
-        """Why the strokes have to end."""
+        """Cause that ends the strokes, if any."""
 
     @property
     def calm(self) -> bool:
@@ -142,7 +142,7 @@ class Displacement:
 
 
 class Recovery:
-    """How interrupted strokes continue: from where, without which targets, or not at all."""
+    """State of interrupted strokes: where they continue, which targets are skipped, or the cause that ends them."""
 
     def __init__(self, exam: Exam, limits: Limits, period_s: float) -> None:
         self._exam, self._limits, self._period_s = exam, limits, period_s
@@ -156,9 +156,9 @@ class Recovery:
         self.skipped: dict[int, Cause] = {}
         """Cause by target."""
         self.failed = NO_CAUSE
-        """Why the strokes were abandoned."""
+        """Cause of abandoned strokes."""
         self.left = NO_CAUSE
-        """Why the strokes end early without failure."""
+        """Cause of an early end without failure."""
 
     @property
     def ending(self) -> bool:

@@ -1,4 +1,4 @@
-"""The strokes of a plan, one after the other, and what interrupts them."""
+"""The strokes of a plan, one after the other, and their interruptions."""
 
 from __future__ import annotations
 
@@ -122,12 +122,12 @@ class Palpation:
 
     @property
     def failed(self) -> Cause:
-        """Why the strokes were abandoned."""
+        """Cause of abandoned strokes."""
         return self._recovery.failed
 
     @property
     def left(self) -> Cause:
-        """Why the strokes end early without failure."""
+        """Cause of an early end without failure."""
         return self._recovery.left
 
     @property
@@ -162,7 +162,7 @@ class Palpation:
         self._more = False
 
     def abandon(self, cause: Cause) -> None:
-        """Lift off and end. A free motion ends at once: there is no skin to lift off from, and the arm may be off its path."""
+        """Lift off and end. A free motion ends at once: it has no skin to lift off from, and the arm may be off its path."""
         self._recovery.give_up(cause)
         if self._motion.segment.free is not None:
             self._continue_with(_done())

@@ -1,4 +1,4 @@
-"""Why an examination deviates from its plan: a code that programs read, and a text that people read."""
+"""Causes for which an examination deviates from its plan: a code for programs and a text for people."""
 
 from __future__ import annotations
 

@@ -73,11 +73,11 @@ class Observation(NamedTuple):
     findings_final: bool = False
     """True if the final findings of the assessment arrived."""
     stop: Cause = NO_CAUSE
-    """Why the arm must rest."""
+    """Cause for which the arm must rest, if any."""
     soft: bool = False
     """True if the stop leaves the arm to planning, which retreats along the normal; else the driver holds."""
     end: Cause = NO_CAUSE
-    """Why the examination is to go home and end, if that was just requested."""
+    """Cause for which the examination is to go home and end, if that was just requested."""
     lost: tuple[str, ...] = ()
     """Disconnected roles."""
     request: PressRequest | None = None

@@ -36,7 +36,7 @@ class Course:
         self.plan: ExamPlan | None = None
         self.palpation: Palpation | None = None
         self.failure = NO_CAUSE
-        """Why the examination is aborted once the arm is home."""
+        """Cause for which the examination is aborted once the arm is home."""
 
     @property
     def phase(self) -> Phase:

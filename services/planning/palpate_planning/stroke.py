@@ -21,7 +21,7 @@ from palpate_planning.wall.wall import TouchedSkin
 
 @dataclass(frozen=True)
 class StrokeTuning:
-    """How a stroke settles, measures and lifts."""
+    """Tolerances, times and heights of a stroke."""
 
     hop_height_m: float = 0.010
     """Least height between strokes; it is `HOVER_M` on free motions and where the surface is uncertain."""
@@ -38,15 +38,15 @@ class StrokeTuning:
 
 @dataclass(frozen=True)
 class TouchTuning:
-    """How the sensor is tared and the skin is sought."""
+    """Times of taring, speeds and range of the search for the skin."""
 
     descend_mps: float = 0.08
     probe_mps: float = 0.014
     """Speed at which the skin is sought: force rises by about 3 N/s."""
     sigmas: float = 3.0
-    """The skin is sought within this many standard deviations of its estimate ..."""
+    """The skin is sought within this many standard deviations of its estimate."""
     margin_m: float = 0.003
-    """... from this far above: the fit of the onset needs samples in air."""
+    """The search begins at this height above that range: the fit of the onset needs samples in air."""
     rest_s: float = 0.15
     """Time at rest before taring, in which the arm's oscillations fade."""
     tare_s: float = 0.25
@@ -79,7 +79,7 @@ PUSHING: Final = (*PRESSING, StrokeStage.LIFT)
 
 
 class Moment(NamedTuple):
-    """What a stroke is given at each planning period."""
+    """Input of a stroke at one planning period."""
 
     t: int
     """[ns]"""
@@ -258,7 +258,7 @@ class Descent:
         self._onset = Onset()
         self._found = self._revised = False
         self.failed = NO_CAUSE
-        """Why the skin was not found."""
+        """Cause of a failed search, if any."""
 
     def rest(self, height: float) -> bool:
         """Rest `height` [m] above the skin; return True once the sensor is tared."""

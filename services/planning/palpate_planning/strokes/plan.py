@@ -54,7 +54,7 @@ class ExamPlan:
     approach: JointTrajectory
     """To above the first target."""
     segments: tuple[Segment, ...]
-    """Alternating: contact, path above the surface, contact, ..."""
+    """Strokes alternate with paths above the surface."""
     skipped: dict[int, Cause]
     """Cause by target."""
     presses: PressPlanner | None = None
@@ -98,7 +98,7 @@ class ExamPlanner:
     ) -> ExamPlan:
         """Return the examination of the `wanted` targets, of all if None.
 
-        With a `bend` [rad] it continues an examination: the elbow is bent by at least as much, and there are no touches before
+        With a `bend` [rad] it continues an examination: the elbow is bent by at least as much, without touches before
         the strokes. Raises NoPathError if no target can be reached or there is no path to the first.
         """
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)

@@ -27,7 +27,7 @@ class PressRequest:
     """Place to press, in the abdomen frame [m], shape (2,); None when the search is over."""
     depth_m: float = 0.0
     reason: str = ""
-    """Why the search is over."""
+    """Text for the end of the search."""
 
     def moved(self, shift_A: Array) -> PressRequest:
         """Return the same place of a body that has moved by `shift_A` [m], shape (2,), since the first view."""
