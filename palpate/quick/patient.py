@@ -1,13 +1,13 @@
-"""A patient without an arm: the true tissue of a scenario, and an indenter that is moved through it without an arm.
+"""The true tissue of a scenario, pressed by an indenter without an arm.
 
     >>> patient = Patient("person", seed=7)
     >>> touch = patient.press((0.03, -0.02), depth=0.010, speed=0.02, hold=0.5)
     >>> touch.force.shape, bool(touch.force.max() > 1.0)
     ((100,), True)
 
-Everything is in the abdomen frame A: x to the patient's left, y to the head, z outward, from the umbilicus, where the patient
-truly lies. He breathes, guards and moves as the scenario says, and remembers what was pressed before. The indenter follows the
-breath as the scenario's `exam.breathing` says.
+Positions are in the true abdomen frame A: x to the patient's left, y to the head, z outward, from the umbilicus. The patient
+breathes, guards and moves as in the scenario; earlier presses have lasting effects. The indenter follows the breath as
+`exam.breathing` says.
 """
 
 from __future__ import annotations
@@ -33,21 +33,21 @@ from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
 from palpate_planning.interruptions import WALL
 
 PERIOD_S: Final = 0.010
-"""Between two readings of the force, as of an examination's states."""
+"""Period of the force readings, as of exam/state."""
 _LIFT_MPS: Final = 0.12
 _LONGEST_HOLD_S: Final = 60.0
 
 
 class NoTissueError(UserError):
-    """A scenario of whose tissue there is no copy. Names the field and what is allowed."""
+    """The tissue of the scenario has no copy that can be pressed. Names the field and the allowed values."""
 
 
 @dataclass(frozen=True, eq=False)
 class Seen:
-    """What an examiner has of a patient before the first touch, and nothing of the truth within."""
+    """A patient as seen before the first touch, without the truth inside."""
 
     scenario: Scenario
-    """As the examination's own roles are given it: without the patient, his seed and the errors of the equipment."""
+    """As given to the roles of the examination: without the patient, the seed and the errors of the equipment."""
     places: Array
     """Points of the skin at rest over the examined region [m], shape (n, 3), in A."""
     normals: Array
@@ -56,24 +56,23 @@ class Seen:
 
 @dataclass(frozen=True, eq=False)
 class Touch:
-    """What an indenter felt at n instants, PERIOD_S apart."""
+    """Measurements of an indenter at n instants, PERIOD_S apart."""
 
     time: Array
-    """Since the patient was first there [s], shape (n,)."""
+    """Time of the patient [s], shape (n,)."""
     position: Array
     """Points of the skin at rest under the indenter [m], shape (n, 3), in A."""
     normal: Array
     """Outward unit normals there, shape (n, 3)."""
     depth: Array
-    """How far the indenter's lowest point is below the skin where that would be untouched [m], shape (n,): lifted by the breath,
-    or with `exam.breathing: ignore` at the end of expiration, however the patient breathes."""
+    """Depth of the indenter's lowest point below the unpressed skin [m], shape (n,): the breathing skin, or with
+    `exam.breathing: ignore` the skin at the end of expiration."""
     force: Array
     """Along the outward normal [N], shape (n,)."""
     steady: NDArray[np.bool_]
-    """Whether the indenter is held, or slides, at the depth that was asked for, shape (n,); with `exam.breathing: gate` only
-    where the breath lifts the skin there by less than a millimetre."""
+    """True at the requested depth, shape (n,); with `exam.breathing: gate` only within a millimetre of the end of expiration."""
     seen: Seen
-    """Who is touched, as he is seen."""
+    """The patient as seen."""
 
     def __repr__(self) -> str:
         (x, y, _), seconds = self.position[0], PERIOD_S * len(self.time)
@@ -82,13 +81,13 @@ class Touch:
 
 
 class Patient:
-    """A patient and an indenter. Equal scenarios and equal motions give equal forces."""
+    """A patient and an indenter. Equal scenarios and motions give equal forces."""
 
     def __init__(self, scenario: str | Path | Scenario, seed: int | None = None, *, time: float = 0.0) -> None:
-        """The patient of a scenario, given by name, YAML file or as it is, at `time` [s] of his breathing, untouched.
+        """Build the patient of a scenario (name, YAML file or object), untouched, at `time` [s].
 
-        `seed` is that of the scenario unless it is given with a name or file. Raises ScenarioError for a scenario that cannot be
-        used, MeshError for a body that cannot be made, NoTissueError where there is no copy of his tissue.
+        `seed` replaces that of a scenario given by name or file. Raises ScenarioError for an invalid scenario, MeshError for a
+        body that cannot be built, NoTissueError for a tissue without a copy.
         """
         scenario = whole_scenario(scenario, seed)
         tissue = true_tissue(scenario)
@@ -103,9 +102,9 @@ class Patient:
         self.time = time
         """[s]"""
         self.radius = scenario.robot.indenter_radius_m
-        """Of the indenter [m]."""
+        """Radius of the indenter [m]."""
         self.X_WA: Array = matrix(true_pose(scenario))
-        """Where he truly lies, shape (4, 4)."""
+        """True pose, shape (4, 4)."""
         self._motion = BodyMotion(scenario.phantom.motion, scenario.seed)
         self._steps = max(1, round(PERIOD_S / self.tissue.dt))
         self._ticks = round(time / PERIOD_S)
@@ -113,34 +112,33 @@ class Patient:
 
     @cached_property
     def surface(self) -> TrueSurface:
-        """His skin at rest, at the end of expiration."""
+        """The skin at rest, at the end of expiration."""
         model = self.tissue.model
         return TrueSurface(TrueBody(model.vertices, model.triangles, self.X_WA))
 
     @cached_property
     def seen(self) -> Seen:
-        """What an examiner has of him before the first touch: his skin at rest, as it is."""
+        """The patient as seen before the first touch: the true skin at rest."""
         places, normals = self.surface.points(seen_lattice(self.scenario.exam))
         there = np.isfinite(places).all(axis=1)
         return Seen(seen(self.scenario, "exam"), places[there], normals[there])
 
     @cached_property
     def _follows(self) -> Callable[[Array], Array]:
-        """Which part of the breathing excursion the indenter follows at points [m], shape (n, 2) -> (n,)."""
+        """Fraction of the breathing excursion that the indenter follows at points [m], shape (n, 2) -> (n,)."""
         share = self.tissue.model.breathing
         return self.surface.between(np.zeros_like(share) if self.scenario.exam.breathing is Following.IGNORE else share)
 
     def stiffness(self, xy: Array) -> Array:
-        """True foundation modulus k_w [N/m^3] at points [m], shape (p, 2) -> (p,); NaN off the body."""
+        """Return the true foundation modulus k_w [N/m^3] at points [m], shape (p, 2) -> (p,); NaN off the body."""
         return np.asarray(self.surface.between(self.tissue.model.stiffness)(xy))
 
     def press(self, xy: Sequence[float] | Array, depth: float, speed: float, hold: float) -> Touch:
-        """Presses at a place, along the inward normal, to `depth` [m] at `speed` [m/s], holds for `hold` [s], and lets go.
+        """Press at a place, along the inward normal, to `depth` [m] at `speed` [m/s], hold for `hold` [s], and lift.
 
-        Depth is from the skin as the breath lifts it, and speed is against it; with `exam.breathing: ignore` the indenter does
-        not follow, and depth is from the skin at the end of expiration. `xy`: metres from the umbilicus, shape (2,). Returns
-        what was felt from the touch to the end of the hold. Raises ValueError for a place off the body, and for a depth or
-        speed beyond the scenario's `limits`.
+        Depth and speed are relative to the breathing skin; with `exam.breathing: ignore` to the skin at the end of expiration.
+        `xy`: metres from the umbilicus, shape (2,). Returns the measurements from the touch to the end of the hold. Raises
+        ValueError for a place off the body, and for a depth or speed beyond the scenario's `limits`.
         """
         self._within_limits(depth, speed)
         if not 0 <= hold <= _LONGEST_HOLD_S:
@@ -150,10 +148,10 @@ class Patient:
         return self._touch(np.tile(_corners([xy], "xy"), (len(depths), 1)), depths, len(down))
 
     def slide(self, path: Sequence[Sequence[float]] | Array, depth: float, speed: float) -> Touch:
-        """Presses at the start of a path as `press` does, slides along it at `depth` [m], and lets go at its end.
+        """Press at the start of a path as `press` does, slide along it at `depth` [m], and lift at its end.
 
-        `path`: corners [m], shape (k, 2), joined by straight lines, followed at `speed` [m/s] over the xy plane. Returns what
-        was felt from the touch to the end of the path. Raises ValueError as `press` does, and for a path that leaves the body.
+        `path`: corners [m], shape (k, 2), joined by straight lines, followed at `speed` [m/s] over the xy plane. Returns the
+        measurements from the touch to the end of the path. Raises ValueError as `press` does, and if the path leaves the body.
         """
         self._within_limits(depth, speed)
         corners = _corners(path, "path")
@@ -165,7 +163,7 @@ class Patient:
         return self._touch(np.column_stack([np.interp(way, length, corners[:, k]) for k in (0, 1)]), depths, len(down))
 
     def rest(self, duration: float) -> None:
-        """Nobody touches him for `duration` [s]."""
+        """Leave the patient untouched for `duration` [s]."""
         self._p = None
         for _ in range(round(duration / PERIOD_S)):
             self._tick()
@@ -173,9 +171,9 @@ class Patient:
                 self.tissue.idle(self.time - PERIOD_S * (1 - k / self._steps))
 
     def move(self, p: Array) -> Array:
-        """Moves the sphere's centre straight to `p` [m], shape (3,), in A as he lay at first, within PERIOD_S.
+        """Move the sphere's centre straight to `p` [m], shape (3,), in the initial frame A, within PERIOD_S.
 
-        Returns the mean force on the sphere meanwhile [N], shape (3,). After a rest it begins there.
+        Returns the mean force on the sphere during this time [N], shape (3,). After a rest the motion begins at `p`.
         """
         self._tick()
         if self._motion.moves and self.time > self._motion.at_s:
@@ -198,7 +196,7 @@ class Patient:
         self.time = self._ticks * PERIOD_S
 
     def _turned(self, force: Array) -> Array:
-        """A force in the body's axes as it is in those of A."""
+        """Return a force in the body's axes in those of A."""
         moved = self._motion.moves and self.time > self._motion.at_s
         return np.asarray(self._motion.pose(self.time)[:3, :3] @ force) if moved else force
 
@@ -209,7 +207,7 @@ class Patient:
                 raise ValueError(f"{name} = {value} {unit}: want more than 0 and at most {most:g} {unit} (the scenario's limits)")
 
     def _touch(self, xy: Array, depths: Array, descent: int) -> Touch:
-        """`descent`: how many of the instants are on the way down."""
+        """`descent`: number of instants of the descent."""
         places, normals = self.surface.points(xy)
         off = ~np.isfinite(places).all(axis=1)
         if off.any():
@@ -231,7 +229,7 @@ class Patient:
 
 
 def seen_lattice(exam: Exam) -> Array:
-    """Where the skin is seen: points over the region and a margin, as perception lays them [m], shape (n, 2)."""
+    """Return points of the perceived mesh: over the region and a margin [m], shape (n, 2)."""
     x, y = (
         stations(centre, size + 2 * MESH_MARGIN_M, MESH_STEP_M) for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
     )
@@ -239,7 +237,7 @@ def seen_lattice(exam: Exam) -> Array:
 
 
 def _corners(path: Sequence[Sequence[float] | Array] | Array, name: str) -> Array:
-    """Places [m], shape (k, 2), k at least 1."""
+    """Return places [m], shape (k, 2), k at least 1."""
     corners = np.asarray(path, dtype=float)
     if corners.ndim != 2 or corners.shape[1:] != (2,) or not np.isfinite(corners).all() or not len(corners):
         raise ValueError(f"{name} = {path}: want x and y [m] in the abdomen frame for each place")
@@ -247,7 +245,7 @@ def _corners(path: Sequence[Sequence[float] | Array] | Array, name: str) -> Arra
 
 
 def _ramp(begin: float, end: float, speed: float) -> Array:
-    """From `begin`, left out, to `end` at `speed`, a value each PERIOD_S; shape (n,)."""
+    """Return values from `begin` (excluded) to `end` at `speed`, one per PERIOD_S, shape (n,)."""
     count = int(np.ceil(abs(end - begin) / (speed * PERIOD_S) - 1e-9))
     way = np.minimum(np.arange(1, count + 1) * speed * PERIOD_S, abs(end - begin))
     return np.asarray(begin + np.sign(end - begin) * way)

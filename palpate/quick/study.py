@@ -1,8 +1,8 @@
-"""The errors of whole examinations, fitted: `python -m palpate.quick.study RUN...` writes loop.yaml from the folders of runs.
+"""Fits the errors of whole examinations: `python -m palpate.quick.study RUN...` writes loop.yaml from run folders.
 
-`python -m palpate.quick.study --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` makes such runs first: persons, every second
-one with a lump, seeds from 0 on, with typical errors and quiet breathing. What is there already is not made again. Rows of
-loop.yaml whose setting is not among the runs stay as they are.
+`python -m palpate.quick.study --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` first runs examinations: persons, every
+second one with a lump, seeds from 0, with typical errors and quiet breathing. Existing runs are kept, as are rows of loop.yaml
+whose setting is not among the runs.
 """
 
 from __future__ import annotations
@@ -38,46 +38,46 @@ from palpate_models.scenario.load import exam_input, load_scenario, true_pose
 from palpate_models.scenario.schema import Scenario
 
 APART_S: Final = 3.0
-"""Measurements that lie further apart in time share nothing but the surface's own error."""
+"""Measurements further apart in time share only the error of the surface."""
 _LONGEST: Final = 100
-"""Lags of the covariances in time, of PERIOD_S each."""
+"""Number of lags of the covariances in time, of PERIOD_S each."""
 _PAIRS: Final = 400_000
-"""Pairs of measurements of a run from which its covariance in space is taken."""
+"""Number of pairs of measurements per run for the covariance in space."""
 _HALF: Final = 1.678
 """(1 + x) exp(-x) is one half here."""
 _HEADER: Final = """\
-# What whole examinations get wrong, by setting of the errors and kind of breathing: see palpate/quick/errors.py for the fields.
-# Made by `python -m palpate.quick.study` from whole examinations; never edited by hand.
+# Errors of whole examinations, by setting of the errors and kind of breathing; fields: palpate/quick/errors.py.
+# Written by `python -m palpate.quick.study`; do not edit.
 """
 
 
 @dataclass(frozen=True, eq=False)
 class Trace:
-    """One whole examination where it measured at depth; n instants."""
+    """Measurements at depth of one whole examination; n instants."""
 
     scenario: Scenario
     begin_s: float
-    """When the first stroke that presses began [s]."""
+    """Start time of the first stroke that presses [s]."""
     stroke: NDArray[np.int64]
-    """In which stroke, from 0 on, shape (n,)."""
+    """Index of the stroke, shape (n,)."""
     time: Array
     """[s], shape (n,)."""
     place: Array
-    """Where it believed to be, xy of A as registered, from the centre of the region [m], shape (n, 2)."""
+    """Estimated position, xy of A as registered, from the centre of the region [m], shape (n, 2)."""
     aside: Array
-    """Where it was less that [m], xy, shape (n, 2)."""
+    """True less estimated position [m], xy, shape (n, 2)."""
     wrong: Array
-    """Measured less true depth [m], as the assessment has it in the end; shape (n,)."""
+    """Measured depth, as finally corrected, less true depth [m], shape (n,)."""
     uncertainty: Array
-    """Its standard deviation, as the assessment has it [m], shape (n,)."""
+    """Its reported standard deviation [m], shape (n,)."""
     unseen: Array
-    """How far breathing lifted the skin there above its mean [m], shape (n,)."""
+    """Displacement of the skin by breathing, less its mean [m], shape (n,)."""
     regulation: Array
     """Measured depth less set-point [m], shape (n,)."""
 
 
 def runs_in(folders: Sequence[Path]) -> list[Path]:
-    """Folders of runs among these, and of completed runs within those that are none, each once."""
+    """Return the run folders among these, and the completed runs within the others, each once."""
     found: list[Path] = []
     for folder in folders:
         inside = sorted(path.parent for path in folder.glob(f"*/{archive.FILE}"))
@@ -86,7 +86,7 @@ def runs_in(folders: Sequence[Path]) -> list[Path]:
 
 
 def trace_of(folder: Path) -> Trace:
-    """The trace of a run. Raises EvidenceError or ScenarioError for a folder that is none."""
+    """Return the trace of a run. Raises EvidenceError or ScenarioError for any other folder."""
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
     stamps, true_stamps = (np.round(a * NS).astype(np.int64) for a in (evidence.time, evidence.true_time))
     there = evidence.steady & np.isin(stamps, true_stamps)
@@ -118,14 +118,14 @@ def trace_of(folder: Path) -> Trace:
 
 
 def _began(time: Array, phase: NDArray[np.uint8]) -> float:
-    """When the descent began that led to the first state in phase SCAN [s]."""
+    """Return the start time of the descent before the first state in phase SCAN [s]."""
     indents = np.flatnonzero(np.diff(phase == ExamState.PHASE_INDENT, prepend=False) & (phase == ExamState.PHASE_INDENT))
     scans = int(np.argmax(phase == ExamState.PHASE_SCAN))
     return float(time[indents[indents < scans][-1]])
 
 
 def loop_of(traces: Sequence[Trace]) -> LoopErrors:
-    """The distributions behind examinations of one setting."""
+    """Return the distributions of the errors in examinations of one setting."""
     fitted = [_fit(trace) for trace in traces]
     surface = np.array([[found.offset_m, *found.tilt, found.followed] for found, _ in fitted])
     rests = [rest for _, rest in fitted]
@@ -137,7 +137,7 @@ def loop_of(traces: Sequence[Trace]) -> LoopErrors:
     regulated = _in_time([t.time for t in traces], [t.regulation for t in traces])
     breathes = traces[0].scenario.phantom.breathing.kind != "none"
     return LoopErrors(
-        **setting_of(traces[0].scenario),  # type: ignore[arg-type]  # a setting of no level is refused there
+        **setting_of(traces[0].scenario),  # type: ignore[arg-type]  # a user-defined setting is refused there
         examinations=len(traces),
         begin_s=_round(np.mean([trace.begin_s for trace in traces])),
         aside_m=_round(np.sqrt(np.mean([found.aside_m**2 for found, _ in fitted]))),
@@ -156,12 +156,12 @@ def loop_of(traces: Sequence[Trace]) -> LoopErrors:
 
 
 def drawn_of(trace: Trace) -> Drawn:
-    """What stayed the same all over one examination."""
+    """Return the constant errors of one examination."""
     return _fit(trace)[0]
 
 
 def _fit(trace: Trace) -> tuple[Drawn, Array]:
-    """What stayed the same all over an examination, and what its depths get wrong beside it [m], shape (n,)."""
+    """Return the constant errors of an examination, and the remaining errors of its depths [m], shape (n,)."""
     columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.unseen))
     coefficients: Array = np.asarray(np.linalg.lstsq(columns, trace.wrong, rcond=None)[0], dtype=np.float64)
     rest = trace.wrong - columns @ coefficients
@@ -172,7 +172,7 @@ def _fit(trace: Trace) -> tuple[Drawn, Array]:
 
 
 def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, float]:
-    """Standard deviation and correlation length [m] of what measurements share that are near in space but not in time."""
+    """Return SD and correlation length [m] of the error shared by measurements that are close in space but not in time."""
     products, distances = [], []
     for number, (trace, rest) in enumerate(zip(traces, rests, strict=True)):
         rng = np.random.Generator(np.random.PCG64(number))
@@ -200,7 +200,7 @@ def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, floa
 
 
 def _in_time(times: Sequence[Array], values: Sequence[Array]) -> Array:
-    """Mean covariance of neighbours in time by lag, shape (_LONGEST,) [of values squared]."""
+    """Return the mean covariance in time by lag, shape (_LONGEST,)."""
     total, count = np.zeros(_LONGEST), np.zeros(_LONGEST)
     for time, value in zip(times, values, strict=True):
         tick = np.round(time / PERIOD_S).astype(np.int64)
@@ -212,7 +212,7 @@ def _in_time(times: Sequence[Array], values: Sequence[Array]) -> Array:
 
 
 def _time(covariance: Array) -> float:
-    """T of the covariance (1 + t / T) exp(-t / T) that falls to its half where this one does [s]."""
+    """Return T [s] of the covariance (1 + t / T) exp(-t / T) with the same half-value time."""
     below = np.flatnonzero(covariance < 0.5 * covariance[0])
     lag = int(below[0]) if len(below) else len(covariance)
     return _round(max(lag, 1) * PERIOD_S / _HALF)
@@ -223,12 +223,12 @@ def _normal(values: Array) -> Normal:
 
 
 def _round(value: Any) -> float:
-    """To three digits."""
+    """Round to three digits."""
     return float(f"{float(value):.3g}")
 
 
 def examine(number: int, level: str, breathing: str, out: Path, settings: Sequence[str], workers: int) -> list[Path]:
-    """Runs whole examinations of persons, every second one with a lump; returns their folders. Those that are there stay."""
+    """Run whole examinations of persons, every second one with a lump; return their folders. Existing runs are kept."""
 
     def one(seed: int) -> Path:
         folder = out / f"{level}-{breathing}-{seed}"
@@ -246,14 +246,14 @@ def examine(number: int, level: str, breathing: str, out: Path, settings: Sequen
 
 def main(
     runs: Annotated[list[Path] | None, typer.Argument(help="Folders of completed runs, or of many of them.")] = None,
-    examinations: Annotated[int, typer.Option("--examine", min=0, help="Make so many whole examinations first.")] = 0,
+    examinations: Annotated[int, typer.Option("--examine", min=0, help="Number of whole examinations to run first.")] = 0,
     level: Annotated[str, typer.Option(help="With --examine: errors, none, typical or poor.")] = "typical",
     breathing: Annotated[str, typer.Option(help="With --examine: none, quiet, deep or held.")] = "quiet",
     settings: Annotated[list[str] | None, typer.Option("--set", help="With --examine: as of palpate run.")] = None,
-    workers: Annotated[int, typer.Option(min=1, help="With --examine: so many at a time.")] = 1,
-    out: Annotated[Path, typer.Option("-o", "--out", help="With --examine: where the runs go.")] = Path("out/loop"),
+    workers: Annotated[int, typer.Option(min=1, help="With --examine: number of parallel runs.")] = 1,
+    out: Annotated[Path, typer.Option("-o", "--out", help="With --examine: folder of the runs.")] = Path("out/loop"),
 ) -> None:
-    """Fit what whole examinations get wrong, and write it to palpate/quick/loop.yaml."""
+    """Fit the errors of whole examinations, and write them to palpate/quick/loop.yaml."""
     folders = runs_in([*(runs or ()), *examine(examinations, level, breathing, out, settings or (), workers)])
     groups: dict[tuple[Any, ...], list[Trace]] = defaultdict(list)
     for folder in folders:
@@ -270,9 +270,9 @@ def main(
 
 
 def renewed(known: Iterable[LoopErrors], fitted: Iterable[LoopErrors]) -> list[LoopErrors]:
-    """The rows of loop.yaml with those that were fitted, in order.
+    """Return the rows of loop.yaml, updated by the fitted ones, in order.
 
-    Raises ValueError for a row of fewer examinations than the one that it would replace.
+    Raises ValueError for a row from fewer examinations than the one that it would replace.
     """
     rows = {_key(row): row for row in known}
     for row in fitted:
