@@ -184,7 +184,7 @@ def test_a_patient_who_moves_is_looked_at_again_and_the_rest_is_felt() -> None:
 
 
 def test_a_patient_who_moved_and_is_not_seen_again_is_assessed_as_far_as_he_was_felt() -> None:
-    world = moved_in_the_second_stroke(PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "a curtain")))
+    world = moved_in_the_second_stroke(PerceptionFailure(Cause(Reason.VIEW_FAILED, "a curtain")))
     world.run()
     status = world.exam.status
     assert status.phase is Phase.DONE
