@@ -67,7 +67,7 @@ def assert_lifted(struck: Struck) -> None:
 
 
 @pytest.mark.parametrize("blow", [kill, freeze])
-def test_by_the_wall_clock_the_arm_is_lifted_and_the_services_leave(blow: Blow, tmp_path: Path) -> None:
+def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(blow: Blow, tmp_path: Path) -> None:
     struck = strike_conductor(tmp_path, "wallclock", blow)
     assert_lifted(struck)
     if blow is freeze:
@@ -75,7 +75,7 @@ def test_by_the_wall_clock_the_arm_is_lifted_and_the_services_leave(blow: Blow, 
         assert "stood still for" in struck.said["failure"]["text"]
 
 
-def test_without_planning_too_the_driver_holds(tmp_path: Path) -> None:
+def test_without_planning_the_driver_holds(tmp_path: Path) -> None:
     struck = strike_conductor(tmp_path, "wallclock", kill_with_planning)
     statuses = struck.recorded("robot/status")
     assert statuses[-1][1].mode == RobotStatus.MODE_SAFE_HOLD
@@ -85,7 +85,7 @@ def test_without_planning_too_the_driver_holds(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("blow", [kill, freeze])
-def test_in_lockstep_time_stands_and_what_was_measured_is_recovered(blow: Blow, tmp_path: Path) -> None:
+def test_in_lockstep_the_measured_data_are_recovered(blow: Blow, tmp_path: Path) -> None:
     struck = strike_conductor(tmp_path, "lockstep", blow)
     last = struck.forces[-1]
     assert last[1] <= max(force for _, force in struck.forces[:-1]) + MORE_N

@@ -12,7 +12,7 @@ SMALL = ("exam.region_m=[0.03, 0.03]", "exam.centre_m=[-0.055, -0.055]", "camera
 
 
 @pytest.mark.slow
-def test_a_role_that_nobody_starts_is_named_with_what_would_have_joined(tmp_path: Path) -> None:
+def test_a_role_that_does_not_join_is_named_with_the_command_that_joins(tmp_path: Path) -> None:
     finished = palpate_run("clean", tmp_path / "alone", "--record", "none", "--without", "assessment", "--wait", "1")
     assert finished.status == 3
     end = finished.output.split("the run failed")[1]

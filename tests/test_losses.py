@@ -25,7 +25,7 @@ def test_without_the_physics_the_run_ends_at_once(role: str, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize("role", ["dashboard"])
-def test_without_a_viewer_the_run_goes_on(role: str, tmp_path: Path) -> None:
+def test_without_a_viewer_the_run_continues(role: str, tmp_path: Path) -> None:
     killed = kill_in_contact(role, tmp_path)
     assert killed.status == 0, killed.lines
     assert killed.named_after_s < 2.0

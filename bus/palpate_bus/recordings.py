@@ -1,4 +1,4 @@
-"""A recording as it is read: a run's folder, a rosbag2 folder with one or more MCAP files, or a single MCAP file."""
+"""Readers of recordings: a run's folder, a rosbag2 folder with one or more MCAP files, or a single MCAP file."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from palpate_bus.settings import RECORDING
 from palpate_errors import UserError
 
 KEPT_EVERY = "kept_every_ms"
-"""In the metadata of a channel: the time in which one message was kept."""
+"""Metadata of a channel: period [ms] in which one message was kept."""
 SCENARIO = "scenario.yaml"
-"""Name of the attachment that a reference has its scenario in."""
+"""Name of the attachment with the scenario of a reference recording."""
 
 
 class RecordingError(UserError):
@@ -43,28 +43,27 @@ class RecordedMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class Recording:
-    """The files of a recording and what their channels say."""
+    """The files of a recording and their channels."""
 
     path: Path
-    """What was asked for."""
     files: tuple[Path, ...]
     types: dict[str, tuple[str, str]]
     """Message type and RIHS01 hash by topic (without its leading slash)."""
     counts: dict[str, int]
     """Messages by topic."""
     thinned: dict[str, int]
-    """Topics of which not every message was kept, with the time [ms] in which one was."""
+    """Topics of which one message per period [ms] was kept."""
     first: int
     """Earliest stamp [ns]."""
     last: int
     """Latest stamp [ns]."""
     scenario: str | None
-    """Scenario as YAML, when the file carries one."""
+    """Scenario as YAML, if the file has one."""
 
     def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
-        """Messages of `topics` in order of their stamps, from `begin` to `end` [ns], both included.
+        """Yield messages of `topics` in order of their stamps, from `begin` to `end` [ns], both included.
 
-        Raises RecordingError when a file breaks off.
+        Raises RecordingError if a file is truncated.
         """
         names = [f"/{topic}" for topic in topics]
         if not names:
@@ -79,18 +78,18 @@ class Recording:
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
             except (McapError, EOFError, struct.error, ZstdError) as error:
-                raise RecordingError(f"{self.path}: breaks off: {error!r}; {_RECOVER}") from error
+                raise RecordingError(f"{self.path}: truncated: {error!r}; {_RECOVER}") from error
 
     def check(self, rules: Contract, topics: Collection[str], *, whole: bool = True) -> None:
-        """Raises RecordingError when a topic was recorded with another type, or another definition of it, than the contract's.
+        """Raise RecordingError if a topic was recorded with another type or definition than the contract's.
 
-        So it does for a topic that is not there `whole`, unless that does not matter.
+        With `whole`, also if not every message of a topic was kept.
         """
         for name in topics:
             if whole and name in self.thinned:
                 raise RecordingError(
-                    f"{self.path}: of topic {name} one message in {self.thinned[name]} ms was kept, and every one is needed; "
-                    "examine with --record full"
+                    f"{self.path}: only one message of topic {name} per {self.thinned[name]} ms was kept, but all are needed; "
+                    "record with --record full"
                 )
             row, recorded = rules.topics[name], self.types.get(name)
             if recorded is not None and recorded != (row.type, row.type_hash):
@@ -118,7 +117,7 @@ def _files(path: Path) -> tuple[Path, ...]:
 
 
 def open_recording(path: Path) -> Recording:
-    """Reads what a recording says of itself. Raises RecordingError."""
+    """Open a recording and read its metadata. Raises RecordingError."""
     files = _files(path)
     types: dict[str, tuple[str, str]] = {}
     counts: dict[str, int] = {}
@@ -153,10 +152,10 @@ def open_recording(path: Path) -> Recording:
 
 
 BROKEN = (McapError, EOFError, RuntimeError, ValueError, ZstdError, struct.error)
-"""What reading across a break raises: a short record, a chunk that does not decompress, a wrong checksum."""
+"""Errors at the end of a truncated file: a short record, a chunk that does not decompress, a wrong checksum."""
 
 
 def complete_records(path: Path) -> Iterator[object]:
-    """Schemas, channels and messages of an MCAP file, in order, up to its end or to where it breaks. Raises OSError."""
+    """Yield schemas, channels and messages of an MCAP file, up to its end or to where it is truncated. Raises OSError."""
     with path.open("rb") as stream, suppress(*BROKEN):
         yield from StreamReader(stream, validate_crcs=True).records

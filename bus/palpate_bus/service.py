@@ -1,4 +1,4 @@
-"""What a service is: a step function between an inbox and an outbox.
+"""Interface of a service: a step function from an inbox to an outbox.
 
     class Control(Service):
         role = "control"
@@ -8,7 +8,7 @@
             ...
             return {"control/joint_torque": command}
 
-A service never touches a socket, a thread or a wall clock. The contract says which topics it reads and writes and when it steps.
+A service uses no socket, thread or wall clock. The contract defines the topics it reads and writes and its period.
 """
 
 from __future__ import annotations
@@ -20,53 +20,53 @@ from typing import Any, ClassVar, Protocol
 from palpate_bus.messages.codec import Message
 
 Outbox = Mapping[str, "Message | list[Message]"]
-"""Messages by topic: one, or a list for an event topic. They must not be changed after the step: readers in the same
-process may get them as they are."""
+"""Messages by topic: one, or a list for an event topic. They must not be changed after the step, since readers in the same
+process may share them."""
 
 
 class Inbox(Protocol):
-    """What a service receives at a step, ordered by (stamp, topic, sequence). Messages are decoded when first looked at."""
+    """Input of a step, ordered by (stamp, topic, sequence). Messages are decoded at first access."""
 
     def latest(self, topic: str) -> Message | None:
-        """The newest message so far, of this step or of an earlier one; None before the first."""
+        """Return the newest message, of this step or of an earlier one; None before the first."""
 
     def new(self, topic: str) -> Iterable[Message]:
-        """The messages that arrived since the step before, oldest first."""
+        """Return the messages since the step before, oldest first."""
 
     def stamp(self, topic: str) -> int | None:
-        """The time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode."""
+        """Return the time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode."""
 
     def lost(self, role: str) -> bool:
-        """Whether that role's service is known to be gone (its liveliness token vanished)."""
+        """True if the service of that role is lost (its liveliness token vanished)."""
 
 
 class Service(ABC):
-    """Base of every service. `role` names its row in the contract."""
+    """Base class of services. `role` is the name of its row in the contract."""
 
     role: ClassVar[str]
     catches_up: ClassVar[bool] = True
-    """Whether its physics has to keep time: in wall-clock mode a critical service that is late then steps every tick that it
-    missed. A driver of real hardware says False: the arm has moved on by itself, and what was due a while ago is past."""
+    """True for simulated physics: in wall-clock mode a critical service that is late then steps every missed tick. False for a
+    driver of real hardware, which has moved in the meantime."""
 
     def start(self) -> Outbox:
-        """Messages to send before the first tick: the latched ones. Called once."""
+        """Return the latched messages, to be sent before the first tick. Called once."""
         return {}
 
     @abstractmethod
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advances to time `t` [ns] and returns what is to be sent.
+        """Advance to time `t` [ns] and return the messages to send.
 
         A periodic topic of this role needs a message at each of its ticks (t a multiple of the topic's period).
         Nothing here may depend on wall time, thread timing or an unseeded generator.
         """
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """The step in parts, each sent before the next is computed; the runtimes call this.
+        """Yield the outboxes of the step in parts, each sent before the next is computed; the runtimes call this.
 
-        By default one part, `step`'s. A service on the 1 kHz path yields first what others wait for, then the rest.
+        By default there is one part, from `step`. A service of the 1 kHz loop yields first the messages that others wait for.
         """
         yield self.step(t, inbox)
 
     def finish(self) -> Mapping[str, Any]:
-        """Called once at the end; returns JSON-able facts for the report. Write files and close them here."""
+        """Close files; return JSON-serialisable facts for the report. Called once at the end."""
         return {}

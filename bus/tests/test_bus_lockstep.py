@@ -95,7 +95,7 @@ def test_event_topic_is_not_ready_before_its_messages_are_here() -> None:
     assert images.ready(100 * MS)
 
 
-def test_a_lost_producer_holds_nobody_up() -> None:
+def test_a_lost_producer_blocks_no_reader() -> None:
     joints = buffer("joint_states", Edge.SAME_TICK)
     joints.lost = True
     assert joints.ready(5 * MS)

@@ -1,4 +1,4 @@
-"""The recorder's process between its conductor and the services that it records, which a test plays."""
+"""The recorder's process and its chunks."""
 
 from __future__ import annotations
 
@@ -10,15 +10,48 @@ from typing import Any
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.messages import JointState, RunControl, ServiceReport, codec
+from palpate_bus.messages.codec import CodecError
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
-from palpate_bus.runtime.output import ChunkWriter
+from palpate_bus.runtime.output import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
 from palpate_bus.runtime.recording import RecorderNode
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import ReceivedSample
+
+TOPICS = ("joint_states", "ft/wrench")
+messages = st.lists(
+    st.builds(ChunkMessage, st.sampled_from(TOPICS), st.binary(max_size=300), st.integers(0, 2**40), st.integers(0, 2**32 - 1)),
+    max_size=40,
+)
+
+
+@given(messages)
+def test_a_chunk_round_trips(sent: list[ChunkMessage]) -> None:
+    spool = ChunkWriter("robot", TOPICS)
+    for message in sent:
+        spool.add(message.topic, message.payload, message.stamp, message.sequence)
+    tick, received = unpack_chunk(spool.chunk(7))
+    assert tick == 7
+    assert list(received) == sent
+
+
+def test_a_chunk_is_due_once_per_period() -> None:
+    spool = ChunkWriter("robot", TOPICS)
+    assert not spool.due(CHUNK_PERIOD - 1)
+    assert spool.due(CHUNK_PERIOD)
+    spool.chunk(CHUNK_PERIOD)
+    assert not spool.due(CHUNK_PERIOD + 1)
+
+
+def test_garbage_raises_a_codec_error() -> None:
+    with pytest.raises(CodecError):
+        unpack_chunk(b"\x00\x01\x00\x00garbage")
+
 
 PRODUCERS = [name for name, role in contract().roles.items() if not role.observer]
 STATE = codec.encode(JointState(header(0), ["a"], np.zeros(1), np.zeros(1), np.zeros(1)), "sensor_msgs/msg/JointState")
@@ -110,7 +143,7 @@ def said(command: int, role: str = "") -> RunControl:
     return RunControl(command, 0, False, role, "")
 
 
-def test_it_keeps_what_came_and_says_so_at_the_end() -> None:
+def test_received_messages_are_recorded_and_reported() -> None:
     kept = Kept()
     member: Any = Bus(said(RunControl.HELLO), said(RunControl.GRANT), said(RunControl.END))
     RecorderNode(kept, member).run()
@@ -121,14 +154,14 @@ def test_it_keeps_what_came_and_says_so_at_the_end() -> None:
     assert (detail["messages"], detail["garbage"], detail["facts"]) == (1, 0, {"kept": 1})
 
 
-def test_it_waits_no_more_for_a_role_that_is_lost() -> None:
+def test_a_lost_role_is_not_waited_for() -> None:
     lost = [said(RunControl.LOST, role) for role in PRODUCERS if role != "robot"]
     member: Any = Bus(said(RunControl.HELLO), *lost, said(RunControl.END))
     RecorderNode(Kept(), member).run()
     assert member.reports[-1].tick == 50 * MS  # as far as the robot, the only one that is left
 
 
-def test_without_a_conductor_and_services_it_leaves_with_what_it_has() -> None:
+def test_without_conductor_and_services_the_recording_is_completed() -> None:
     kept = Kept()
     member: Any = Bus()
     with pytest.raises(RunAborted, match="token is gone"):
@@ -136,7 +169,7 @@ def test_without_a_conductor_and_services_it_leaves_with_what_it_has() -> None:
     assert kept.messages == [("joint_states", 7 * MS, 8)]
 
 
-def test_told_to_leave_by_a_signal_it_completes_what_it_has() -> None:
+def test_a_signal_completes_the_recording() -> None:
     kept = Kept()
     member: Any = Bus(said(RunControl.HELLO))
     member.alive = lambda roles: signal.raise_signal(signal.SIGTERM)
@@ -152,7 +185,7 @@ def test_told_to_leave_by_a_signal_it_completes_what_it_has() -> None:
 
 
 @pytest.mark.parametrize("command", [RunControl.END, RunControl.ABORT], ids=["end", "abort"])
-def test_what_the_conductors_word_has_overtaken_is_kept(command: int) -> None:
+def test_messages_in_transit_at_the_end_are_recorded(command: int) -> None:
     kept = Kept()
     member: Any = Bus(said(RunControl.HELLO), said(command))
     member.there = deque(["robot", "robot"])
@@ -180,7 +213,7 @@ def test_what_the_conductors_word_has_overtaken_is_kept(command: int) -> None:
     [(1, ("joint_states", 7 * MS, 8)), (2, ("joint_states", -1, 9)), (2, ("planning/setpoint", 8 * MS, 9))],
     ids=["again", "before the start", "another's topic"],
 )
-def test_a_chunk_that_cannot_be_is_garbage(again: tuple[int, tuple[str, int, int]]) -> None:
+def test_an_invalid_chunk_is_garbage(again: tuple[int, tuple[str, int, int]]) -> None:
     kept = Kept()
     member: Any = Bus(said(RunControl.HELLO), said(RunControl.END))
     number, message = again
@@ -190,7 +223,7 @@ def test_a_chunk_that_cannot_be_is_garbage(again: tuple[int, tuple[str, int, int
     assert json.loads(member.reports[-1].detail)["garbage"] == 1
 
 
-def test_whatever_goes_wrong_what_was_kept_is_completed() -> None:
+def test_any_error_completes_the_recording() -> None:
     kept = Kept()
     member: Any = Bus(said(RunControl.HELLO))
 

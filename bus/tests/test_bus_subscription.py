@@ -1,17 +1,77 @@
-"""Whose messages a subscription takes, and for how long it waits for one."""
+"""Subscriptions and authentication tags."""
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
+from pathlib import Path
 from time import sleep
 from typing import Any
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
+from palpate_bus.contract import contract
+from palpate_bus.settings import BusConfigError
+from palpate_bus.wire import rmw
 from palpate_bus.wire.rmw import AttachmentWriter
+from palpate_bus.wire.tags import KEY_SIZE, TAG_SIZE, Tagger, make_key, read_key
 from palpate_bus.wire.transport import HELLO, Subscription
+
+KEY = bytes(range(KEY_SIZE))
+ATTACHMENT = rmw.AttachmentWriter(b"g" * 16).pack(7, 8)
+
+
+@given(payload=st.binary(max_size=300), at=st.integers(0), flip=st.integers(1, 255))
+def test_a_tag_detects_any_changed_byte(payload: bytes, at: int, flip: int) -> None:
+    tagger = Tagger(KEY, "0/a")
+    whole = bytearray(ATTACHMENT + tagger.tag(ATTACHMENT, payload) + payload)
+    size = len(ATTACHMENT) + TAG_SIZE
+    assert tagger.holds(bytes(whole[:size]), payload)
+    whole[at % len(whole)] ^= flip
+    assert not tagger.holds(bytes(whole[:size]), bytes(whole[size:]))
+
+
+def test_a_tag_depends_on_key_and_topic() -> None:
+    tag = Tagger(KEY, "0/a").tag(ATTACHMENT, b"x")
+    assert not Tagger(KEY, "0/b").holds(ATTACHMENT + tag, b"x")
+    assert not Tagger(KEY[::-1], "0/a").holds(ATTACHMENT + tag, b"x")
+    assert not Tagger(KEY, "0/a").holds(ATTACHMENT, b"x")
+
+
+def test_a_tag_leaves_the_fields_that_ros_2_reads_unchanged() -> None:
+    tagged = ATTACHMENT + Tagger(KEY, "0/a").tag(ATTACHMENT, b"x")
+    assert rmw.unpack(tagged) == rmw.unpack(ATTACHMENT)
+
+
+def test_a_key_is_readable_to_its_owner_only(tmp_path: Path) -> None:
+    file = make_key(tmp_path / "run.key")
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert len(read_key(file) or b"") == KEY_SIZE
+    assert read_key(None) is None
+    with pytest.raises(FileExistsError):
+        make_key(file)
+    file.chmod(0o644)
+    with pytest.raises(BusConfigError, match=r"others may read it \(mode 0644\); allowed is 0600"):
+        read_key(file)
+    file.chmod(0o600)
+    file.write_bytes(b"short")
+    with pytest.raises(BusConfigError, match="has 5 bytes"):
+        read_key(file)
+    with pytest.raises(BusConfigError, match="cannot be read"):
+        read_key(tmp_path / "none")
+
+
+def test_messages_that_move_the_arm_or_conduct_are_tagged() -> None:
+    rules = contract()
+    for name in ("control/joint_torque", "planning/setpoint", "supervisor/state", "palpate/control", "palpate/report/robot"):
+        assert rules.tagged(name)
+    assert not rules.tagged("operator/request"), "anyone may ask for a stop, ROS 2 too"
+    assert not rules.tagged("palpate/record/robot")
+    assert not rules.tagged("nothing")
+
 
 OURS, STRANGER = b"o" * 16, b"s" * 16
 
@@ -55,7 +115,7 @@ def wire(monkeypatch: pytest.MonkeyPatch) -> Iterator[Wire]:
     yield Wire(monkeypatch)
 
 
-def test_who_says_hello_is_the_sender_and_not_who_was_there_before(wire: Wire) -> None:
+def test_the_sender_of_the_hello_replaces_an_earlier_one(wire: Wire) -> None:
     wire.bring(STRANGER, 4711)
     assert wire.numbers() == [4711]
     wire.bring(OURS, HELLO, b"")
@@ -76,7 +136,7 @@ def test_a_second_hello_changes_nothing(wire: Wire) -> None:
     assert wire.subscription.foreign == 2
 
 
-def test_where_all_may_speak_nobody_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_on_an_open_topic_no_sender_is_replaced(monkeypatch: pytest.MonkeyPatch) -> None:
     wire = Wire(monkeypatch, open_to_all=True)
     for gid in (OURS, STRANGER, OURS):
         wire.bring(gid, 1)
@@ -84,7 +144,7 @@ def test_where_all_may_speak_nobody_is_replaced(monkeypatch: pytest.MonkeyPatch)
     assert not wire.subscription.replaced
 
 
-def test_what_is_set_aside_wins_no_time(wire: Wire) -> None:
+def test_dropped_messages_do_not_extend_the_timeout(wire: Wire) -> None:
     wire.bring(OURS, HELLO, b"")
 
     def meddle() -> None:

@@ -1,6 +1,11 @@
-"""Keys and attachments: as rmw_zenoh writes them, and any garbage is a WireError."""
+"""rmw_zenoh's wire format: keys, attachments, liveliness tokens."""
+
+from __future__ import annotations
 
 import struct
+import time
+from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import zenoh.ext as ze
@@ -9,6 +14,20 @@ from hypothesis import strategies as st
 
 from palpate_bus.contract import contract
 from palpate_bus.wire import rmw as wire
+from palpate_bus.wire.liveliness import (
+    Endpoint,
+    Entity,
+    EntityKind,
+    GraphWatch,
+    NodeTokens,
+    entities,
+    gid,
+    mismatches,
+    parse_token,
+    qos_token,
+)
+from palpate_bus.wire.rmw import WireError
+from palpate_bus.wire.zenoh_config import mesh, session
 
 INT64 = st.integers(-(2**63), 2**63 - 1)
 
@@ -62,13 +81,13 @@ def test_key_of_design_document() -> None:
 @pytest.mark.parametrize(
     "name", ["", "String", "std_msgs/String", "std_msgs/msg/", "/msg/A", "Std/msg/A", "a/msg/b/c", "a/xyz/B"]
 )
-def test_what_is_no_type_name_is_refused(name: str) -> None:
+def test_an_invalid_type_name_is_refused(name: str) -> None:
     with pytest.raises(wire.WireError, match="not a ROS type name"):
         wire.dds_type(name)
 
 
 @pytest.mark.parametrize("domain", [-1, 65536])
-def test_what_is_no_domain_is_refused(domain: int) -> None:
+def test_an_invalid_domain_is_refused(domain: int) -> None:
     with pytest.raises(wire.WireError, match=r"outside 0\.\.65535"):
         wire.message_key("a", "std_msgs/msg/String", domain)
 
@@ -100,3 +119,92 @@ def test_any_type_key_meets_topics_whose_definition_differs() -> None:
     theirs = "3/ft/wrench/geometry_msgs::msg::dds_::Wrench_/RIHS01_" + "0" * 64
     assert zenoh.KeyExpr(wire.any_type_key("ft/wrench", 3)).intersects(theirs)
     assert not zenoh.KeyExpr(wire.any_type_key("wrench", 3)).intersects(theirs)
+
+
+# From rmw_zenoh's docs/design.md.
+LISTENER = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
+TALKER = (
+    "@ros2_lv/0/8b20917502ee955ac4476e0266340d5c/0/10/MP/%/%/talker/%chatter/std_msgs::msg::dds_::String_/"
+    "RIHS01_df668c740482bbd48fb39d76a70dfd4bd59db1288021743503259e948f6b1a18/::,7:,:,:,,"
+)
+RULES = contract()
+
+
+def test_tokens_of_the_design_document() -> None:
+    listener, talker = parse_token(LISTENER), parse_token(TALKER)
+    assert (listener.token, talker.token) == (LISTENER, TALKER)
+    assert (listener.kind, listener.node, listener.namespace, listener.endpoint) == (EntityKind.NODE, "listener", "/", None)
+    assert (talker.domain, talker.node_id, talker.entity_id, talker.kind) == (0, 0, 10, EntityKind.PUBLISHER)
+    assert talker.endpoint is not None
+    assert (talker.endpoint.topic, talker.endpoint.type) == ("chatter", "std_msgs/msg/String")
+    qos = RULES.qos["control"].model_copy(update={"depth": 7})
+    assert qos_token(qos) == talker.endpoint.qos
+
+
+def test_gid_is_xxh3_of_the_token_low_half_first() -> None:
+    # XXH3-128 of the empty string is 99aa06d3014798d86001c324468d497f (high half first), xxHash's own sanity value.
+    assert gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
+    assert parse_token(TALKER).gid == gid(TALKER) != parse_token(LISTENER).gid
+
+
+@pytest.mark.parametrize("name", sorted(RULES.qos))
+def test_qos_of_our_classes(name: str) -> None:
+    qos = RULES.qos[name]
+    reliability, durability, history, *rest = qos_token(qos).split(":")
+    assert reliability == ("" if qos.reliability == "RELIABLE" else "2")
+    assert durability == ("1" if qos.transient_local else "")
+    assert history == f",{'' if qos.depth == 42 else qos.depth}"
+    assert rest == [",", ",", ",,"]
+
+
+@given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from([*TALKER.split("/"), "", "x", "SS"]), max_size=14).map("/".join)))
+def test_garbage_tokens_raise_wire_error_at_most(key: str) -> None:
+    try:
+        entity = parse_token(key)
+    except WireError:
+        return
+    assert parse_token(entity.token) == entity
+
+
+def test_a_different_definition_is_named_with_both_sides() -> None:
+    def entity(kind: EntityKind, node: str, type_hash: str) -> Entity:
+        return Entity(0, "a", 0, 1, kind, node, endpoint=Endpoint("ft/wrench", "geometry_msgs/msg/WrenchStamped", type_hash, ""))
+
+    same = [entity(EntityKind.PUBLISHER, "robot", "RIHS01_1"), entity(EntityKind.SUBSCRIPTION, "planning", "RIHS01_1")]
+    assert mismatches(same) == []
+    (sentence,) = mismatches([*same, entity(EntityKind.SUBSCRIPTION, "viewer", "RIHS01_2")])
+    for part in ("ft/wrench", "robot", "viewer", "RIHS01_1", "RIHS01_2"):
+        assert part in sentence
+
+
+def _until(condition: Callable[[], bool], seconds: float = 10.0) -> bool:
+    end = time.monotonic() + seconds
+    while not condition():
+        if time.monotonic() > end:
+            return False
+        time.sleep(0.01)
+    return True
+
+
+@pytest.mark.parametrize("lowlatency", [(), ("robot", "control")])
+def test_watch_sees_roles_come_and_go_and_late_joiners_see_all(tmp_path: Path, lowlatency: tuple[str, ...]) -> None:
+    options = mesh(["robot", "control"], tmp_path, lowlatency=lowlatency)
+    topic = RULES.topics["joint_states"]
+    with session(options["control"]) as watching:
+        watch = GraphWatch(watching, domain=5)
+        with session(options["robot"]) as robot:
+            tokens = NodeTokens(robot, "robot", domain=5)
+            publisher_gid = tokens.publisher(topic, RULES.qos[topic.qos])
+            seen = []
+            assert _until(lambda: bool(seen.extend(watch.changes()) or len(watch.alive) == 2))
+            assert all(appeared for _, appeared in seen)
+            assert watch.roles() == {"robot"}
+            assert publisher_gid in {entity.gid for entity in watch.alive.values()}
+            late = GraphWatch(watching, domain=5)
+            assert _until(lambda: bool(late.changes() or late.roles() == {"robot"}))
+            assert [entity.kind for entity in entities(watching, 5)] == [EntityKind.NODE, EntityKind.PUBLISHER]
+            assert entities(watching, 6, timeout=0.2) == []
+            NodeTokens(robot, "elsewhere", domain=6)
+        assert _until(lambda: bool(watch.changes() or watch.gone() == {"robot"}))
+        assert watch.roles() == frozenset()
+        watch.close()

@@ -56,7 +56,7 @@ def test_wall_clock_neither_waits_long_nor_uses_the_low_latency_transport() -> N
         ({"PALPATE_CONNECT": "unixsock-stream/" + "x" * 120}, "at most 107 bytes; choose a shorter folder"),
     ],
 )
-def test_what_cannot_work_is_refused_by_name(environment: dict[str, str], message: str) -> None:
+def test_invalid_options_are_refused_by_name(environment: dict[str, str], message: str) -> None:
     with pytest.raises(BusConfigError, match=message):
         BusOptions.from_settings(Settings.read(environment))
 
@@ -81,7 +81,7 @@ def test_an_endpoint_in_use_is_an_error(tmp_path: Path) -> None:
         open_session(options)
 
 
-def test_a_port_in_use_is_said_in_one_line() -> None:
+def test_a_port_in_use_has_a_message_of_one_line() -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -108,7 +108,7 @@ def test_silence_is_noticed_at_the_contracts_deadline(wallclock: Bus) -> None:
     assert lost < 0.3
 
 
-def test_a_heart_that_beats_is_no_loss(wallclock: Bus) -> None:
+def test_a_conductor_with_a_heartbeat_is_not_lost(wallclock: Bus) -> None:
     link = wallclock.link()
     for _ in range(1000):
         wallclock.say(RunControl.HEARTBEAT)
@@ -131,7 +131,7 @@ def test_a_conductor_whose_token_is_gone_is_lost_at_once(wallclock: Bus) -> None
     assert wallclock.silence(link, 1.0) <= 5 * STEP_S
 
 
-def test_its_services_stay_for_the_grace_and_then_leave(wallclock: Bus) -> None:
+def test_services_leave_after_the_grace_period(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=2.0)
     assert wallclock.silence(link, 1.0) < 1.0
     lost_at = wallclock.now
@@ -142,7 +142,7 @@ def test_its_services_stay_for_the_grace_and_then_leave(wallclock: Bus) -> None:
     assert 2.0 <= wallclock.now - lost_at < 2.1
 
 
-def test_one_that_comes_back_is_not_lost_any_more(wallclock: Bus) -> None:
+def test_a_conductor_that_returns_is_not_lost(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=2.0)
     wallclock.silence(link, 1.0)
     wallclock.say(RunControl.HEARTBEAT)
@@ -150,7 +150,7 @@ def test_one_that_comes_back_is_not_lost_any_more(wallclock: Bus) -> None:
     assert not link.lost
 
 
-def test_in_lockstep_nothing_moves_and_it_has_longer(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_in_lockstep_the_silence_may_be_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = Bus(monkeypatch, "lockstep")
     link = bus.link(grace_s=9.0)
     assert LOCKSTEP_SILENT_S < bus.silence(link, 10.0) < LOCKSTEP_SILENT_S + 0.1
@@ -162,7 +162,7 @@ def test_in_lockstep_a_conductor_without_a_core_is_waited_for_longer(monkeypatch
     assert LOCKSTEP_BUSY_S < bus.silence(bus.link(grace_s=9.0), 60.0) < LOCKSTEP_BUSY_S + 0.1
 
 
-def test_one_without_a_heartbeat_is_given_the_time_that_a_start_takes(wallclock: Bus) -> None:
+def test_a_conductor_without_a_heartbeat_has_the_limit_of_a_start(wallclock: Bus) -> None:
     member: Any = wallclock
     link = ConductorLink(member, 9.0)
     wallclock.say(RunControl.GRANT)
@@ -170,7 +170,7 @@ def test_one_without_a_heartbeat_is_given_the_time_that_a_start_takes(wallclock:
     assert wallclock.silence(link, 9.0) == float("inf")
 
 
-def test_a_heartbeat_that_is_replayed_is_no_sign_of_life(wallclock: Bus) -> None:
+def test_a_replayed_heartbeat_is_ignored(wallclock: Bus) -> None:
     link = wallclock.link(grace_s=9.0)
     begin = wallclock.now
     while not link.lost and wallclock.now - begin < 1.0:
@@ -180,7 +180,7 @@ def test_a_heartbeat_that_is_replayed_is_no_sign_of_life(wallclock: Bus) -> None
     assert wallclock.now - begin < 0.3
 
 
-def test_a_control_message_that_is_replayed_is_not_obeyed(wallclock: Bus) -> None:
+def test_a_replayed_control_message_is_ignored(wallclock: Bus) -> None:
     link = wallclock.link()
     wallclock.queues["palpate/control"].replay()
     assert link.poll() is None

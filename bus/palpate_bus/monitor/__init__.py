@@ -1,1 +1,1 @@
-"""What a live bus does against its contract."""
+"""Checks of a live bus against the contract."""

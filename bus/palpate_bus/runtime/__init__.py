@@ -1,1 +1,1 @@
-"""The runtimes: what drives a service's step, in lockstep or by the wall clock, over zenoh or in one process."""
+"""Runtimes that step services in lockstep or by the wall clock, over zenoh or in one process."""

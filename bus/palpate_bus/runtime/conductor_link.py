@@ -34,7 +34,7 @@ CONDUCTOR_SILENT_S = 10.0
 CONDUCTOR_AWAITED_S = 120.0
 """The same before its first message: containers on a busy machine start tens of seconds apart."""
 LOCKSTEP_SILENT_S = 3.0
-"""The same in lockstep, where nothing moves while nobody grants time."""
+"""The same in lockstep, where time stands without grants."""
 LONGEST_POLL_S = 0.1
 """Longest silence counted between two polls: a node that polls later was itself without a core, and perhaps others were."""
 GONE_S = 0.01
@@ -82,7 +82,7 @@ class ConductorLink:
         self._pid = 0
         """The conductor's process id if we can inspect that process; else 0."""
         self.lost = ""
-        """Why the conductor is lost; empty while it is not."""
+        """Text on why the conductor is lost; empty while it is not."""
         self.ended_by = ""
         """Reason in the control message that ended the run; empty if none did."""
 

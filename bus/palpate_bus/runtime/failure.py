@@ -1,4 +1,4 @@
-"""Why a run or a service failed, as a code for programs and a text for people."""
+"""Failures of runs and services: a code for programs and a text for people."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from palpate_plugins import USER_MODULE
 
 
 class FailureCode(StrEnum):
-    """Why a run ended early."""
+    """Cause of the early end of a run."""
 
     INTERRUPTED = "interrupted"
     """By Ctrl-C or SIGTERM."""
@@ -53,7 +53,7 @@ class FailureCode(StrEnum):
 
 @dataclass(frozen=True)
 class Failure:
-    """Why a run failed. Programs use `code`, `roles` and `topics`; `text` is for people."""
+    """Failure of a run. Programs use `code`, `roles` and `topics`; `text` is for people."""
 
     code: FailureCode
     text: str

@@ -29,7 +29,7 @@ class RawRecorder(Protocol):
     """A service that takes every message as bytes."""
 
     trouble: str
-    """Why recording stopped; empty while it continues."""
+    """Text on why recording stopped; empty while it continues."""
 
     def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
         """Take a message: its row, CDR bytes, simulated stamp [ns] and sequence number."""

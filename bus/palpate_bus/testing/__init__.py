@@ -1,1 +1,1 @@
-"""For tests of services: messages of any type, an inbox filled by hand."""
+"""Tools for tests of services: messages of any type, an inbox filled by hand."""

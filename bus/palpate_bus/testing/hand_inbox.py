@@ -10,20 +10,20 @@ from palpate_bus.messages import codec
 
 
 class HandInbox:
-    """What a step receives: `put` messages into it, or fill its dictionaries by topic."""
+    """The input of a step: `put` messages into it, or fill its dictionaries by topic."""
 
     def __init__(self) -> None:
         self.messages: dict[str, Any] = {}
-        """The newest of each topic, which `latest` gives."""
+        """Newest message of each topic, see `latest`."""
         self.events: dict[str, list[Any]] = {}
-        """New messages, which `new` gives once."""
+        """New messages, returned once by `new`."""
         self.stamps: dict[str, int] = {}
-        """Times [ns] that `stamp` gives."""
+        """Times [ns], see `stamp`."""
         self.gone: set[str] = set()
-        """Roles that are lost."""
+        """Lost roles."""
 
     def put(self, topic: str, message: Any, stamp: int | None = None) -> HandInbox:
-        """A message that has come over the wire: as decoded, newest and new. Raises CodecError if it does not fit its type."""
+        """Add a message, encoded and decoded, as newest and new. Raises CodecError if it does not fit its type."""
         kind = contract().topics[topic].type
         decoded = codec.decode(codec.encode(message, kind), kind)
         self.messages[topic] = decoded
@@ -33,7 +33,7 @@ class HandInbox:
         return self
 
     def receive(self, messages: Mapping[str, Any]) -> HandInbox:
-        """What has come for one step, by topic; what was new before is so no longer. Raises CodecError."""
+        """Replace the new messages by those of one step, by topic. Raises CodecError."""
         self.events.clear()
         for topic, message in messages.items():
             self.put(topic, message)

@@ -12,14 +12,13 @@ from rosbags.interfaces import Nodetype
 from palpate_bus.messages.codec import message_type, store
 from palpate_bus.messages.typestore import array_dtype
 
-LONGEST = 4
-"""Items in a sequence, at most."""
+MAX_ITEMS = 4
 
 _INTEGER = {"byte": "int8", "char": "uint8"}
 
 
 def messages(name: str) -> st.SearchStrategy[Any]:
-    """Valid messages of a type: full ranges of numbers (NaN and infinities too), any text, sequences of up to LONGEST items."""
+    """Return valid messages of a type: full ranges of numbers (NaN and infinities too), any text, short sequences."""
     message_type(name)
     return _message(name)
 
@@ -36,7 +35,7 @@ def _field(description: Any) -> st.SearchStrategy[Any]:
         return _message(detail)
     if kind == Nodetype.BASE:
         return _scalar(detail[0])
-    least, most = (detail[1], detail[1]) if kind == Nodetype.ARRAY else (0, LONGEST)
+    least, most = (detail[1], detail[1]) if kind == Nodetype.ARRAY else (0, MAX_ITEMS)
     item_kind, item = detail[0]
     if item_kind == Nodetype.BASE and item[0] != "string":
         return _array(item[0], least, most)

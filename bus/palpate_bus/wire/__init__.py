@@ -1,1 +1,1 @@
-"""Messages on zenoh as rmw_zenoh has them: keys, attachments, liveliness tokens, transports."""
+"""rmw_zenoh's wire format on zenoh: keys, attachments, liveliness tokens, transports."""

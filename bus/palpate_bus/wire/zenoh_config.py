@@ -70,7 +70,7 @@ _SOURCE_LINE = re.compile(r" at /\S+\.rs:\d+\.?")
 
 @dataclass(frozen=True)
 class BusOptions:
-    """How a process joins the bus."""
+    """Options with which a process joins the bus."""
 
     listen: tuple[str, ...] = ()
     """Endpoints to listen on."""

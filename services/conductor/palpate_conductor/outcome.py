@@ -22,7 +22,7 @@ SIM_LIMIT = 3600 * NS
 
 @dataclass(frozen=True)
 class Timing:
-    """How time passes in a run; by default in lockstep, as fast as possible."""
+    """Progress of time in a run; by default in lockstep, as fast as possible."""
 
     wallclock: bool = False
     """Every service runs on its own timer; only the common start and the end are granted."""
@@ -70,11 +70,11 @@ class Patience:
 
 @dataclass
 class RunOutcome:
-    """How a run went."""
+    """Outcome of a conducted run."""
 
     digests: dict[str, str] = field(default_factory=dict)
     reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
-    """What each service reported at its end: blame, counters, facts."""
+    """Last report of each service: blame, counters, facts."""
     wall_time_s: float = 0.0
     last_tick: int = NEVER
     trouble: list[str] = field(default_factory=list)
@@ -94,7 +94,7 @@ class RunOutcome:
 
 @dataclass
 class RunResult:
-    """What a run left, in memory."""
+    """Result of a run, in memory."""
 
     runtime: str
     collected: Collected

@@ -1,4 +1,4 @@
-"""A rosbag2 folder with MCAP files, written as a stream in bounded memory: bytes in, bytes out, nothing decoded.
+"""Writer of a rosbag2 folder with MCAP files, in bounded memory and without decoding.
 
 Layout: rosbag2's `metadata.yaml` (version 9, ROS 2 Jazzy) next to `<folder>_0.mcap`, `<folder>_1.mcap` and so on, profile `ros2`,
 message encoding `cdr`, schema encoding `ros2msg`; see MCAP's well-known profiles and rosbag2_storage's metadata.
@@ -18,9 +18,9 @@ from palpate_bus.contract import MS
 from palpate_bus.recordings import KEPT_EVERY
 
 CHUNK_BYTES = 4 * 1024 * 1024
-"""A chunk is closed at this size, whatever its age: this bounds the memory."""
+"""Largest size of a chunk, which bounds the memory."""
 FILE_BYTES = 1 << 30
-"""A file that has grown to this is completed and the next one begun: what is in a completed file no crash can touch."""
+"""Size at which a file is completed and the next one begun; a crash does not affect a completed file."""
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 """RMW_DURATION_INFINITE, as rosbag2 writes it."""
@@ -28,10 +28,10 @@ _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 
 @dataclass(frozen=True)
 class Channel:
-    """What a reader must know to decode a topic."""
+    """Description of a topic in the file."""
 
     topic: str
-    """Topic as ROS 2 names it, with its leading slash."""
+    """ROS 2 name, with its leading slash."""
     type: str
     """Message type, e.g. `sensor_msgs/msg/JointState`."""
     schema: str
@@ -41,11 +41,11 @@ class Channel:
     depth: int = 1
     """Depth of the history offered."""
     transient_local: bool = False
-    """Whether late joiners get the last message."""
+    """True for latched topics."""
     kept_every_ms: int = 0
-    """One message in this time is kept; 0: every one."""
+    """Period in which one message is kept; 0 keeps every message."""
     open: bool = False
-    """Whether several send on it, each with numbers of its own."""
+    """True if it has several senders, each with its own sequence numbers."""
 
     @property
     def qos(self) -> list[dict[str, Any]]:
@@ -67,12 +67,12 @@ class Channel:
 
 @dataclass
 class Count:
-    """What was written on one channel."""
+    """Counts of one channel."""
 
     messages: int = 0
     bytes: int = 0
     missing: int = 0
-    """Messages that never came, by the gaps in the sequence numbers."""
+    """Missing messages, by the gaps in the sequence numbers."""
     last: int = field(default=0, repr=False)
     due: int = field(default=0, repr=False)
     """Stamp [ns] from which the next message is kept."""
@@ -125,7 +125,7 @@ class BagWriter:
         file_bytes: int = FILE_BYTES,
         compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
-        """Opens `folder` (created, parents included) for `channels` of the run called `run`.
+        """Open `folder` (created, parents included) for `channels` of the run called `run`.
 
         Raises OSError if it cannot be written.
         """
@@ -153,7 +153,7 @@ class BagWriter:
 
     def _begin_file(self) -> None:
         file = _File(self.folder / f"{self.folder.name}_{len(self._files)}.mcap")
-        self._stream = file.path.open("wb")  # where it cannot be, the files before are the recording
+        self._stream = file.path.open("wb")  # if this fails, the earlier files are the recording
         self._file = file
         self._files.append(file)
         self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=self._compression)
@@ -177,7 +177,7 @@ class BagWriter:
         return ids
 
     def write(self, topic: str, payload: bytes | memoryview, stamp: int, sequence: int) -> None:
-        """Appends one message, stamped `stamp` [ns], unless its channel is not due. Raises KeyError for an unknown topic."""
+        """Append a message, stamped `stamp` [ns], unless its channel is not due. Raises KeyError for an unknown topic."""
         count = self.counts[topic]
         if sequence > count.last + 1 and not self.channels[topic].open:
             count.missing += sequence - count.last - 1
@@ -200,7 +200,7 @@ class BagWriter:
                 self._begin_file()
 
     def flush(self) -> None:
-        """Hands everything written so far to the operating system, so that it survives a crash of this process."""
+        """Pass all written data to the operating system, so that it survives a crash of this process."""
         self._writer.flush()
 
     def _end_file(self) -> None:
@@ -208,7 +208,7 @@ class BagWriter:
         self._stream.close()
 
     def close(self) -> None:
-        """Completes the file with its index and writes `metadata.yaml`. A second call does nothing."""
+        """Complete the file with its index and write `metadata.yaml`. A second call does nothing."""
         if self._completed:
             return
         metadata = self.metadata()
@@ -222,7 +222,7 @@ class BagWriter:
         self._completed = True
 
     def metadata(self) -> dict[str, Any]:
-        """rosbag2's description of what has been written so far."""
+        """Return rosbag2's description of the recording."""
         stamps = [file.first for file in self._files if file.first is not None]
         total = sum(file.messages for file in self._files)
         extent = _extent(min(stamps, default=None), max(file.last for file in self._files), total)

@@ -1,4 +1,4 @@
-"""Makes a recording that was cut off by a crash readable by every tool again.
+"""Repairs a recording that was truncated by a crash.
 
     python -m palpate_recorder.recover DIR/recording_mcap
 
@@ -24,7 +24,7 @@ from palpate_recorder.bag import BagWriter, Channel
 
 
 def recover(folder: Path) -> Path:
-    """Writes what is complete in the recording `folder` to `<folder>_recovered`; returns that folder.
+    """Write the complete chunks of the recording `folder` to `<folder>_recovered`; return that folder.
 
     Raises FileNotFoundError if `folder` holds no recording, ValueError if not even its first chunk is complete.
     """
@@ -43,19 +43,19 @@ def recover(folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class Salvaged(Recording):
-    """What is complete in a recording that was cut off, in memory."""
+    """The complete chunks of a truncated recording, in memory."""
 
     held: tuple[RecordedMessage, ...] = ()
     """In order of their stamps."""
 
     def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
-        """As of any recording."""
+        """See `Recording.messages`."""
         wanted, first, last = frozenset(topics), begin or self.first, self.last if end is None else end
         return (message for message in self.held if message.topic in wanted and first <= message.stamp <= last)
 
 
 def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
-    """Reads what is complete of some topics in the recording `folder`, and writes nothing. Raises as `recover`."""
+    """Return the complete chunks of some topics of the recording `folder`. Raises as `recover`."""
     paths = _parts(folder)
     names = _channels(paths[0])
     if not names:
@@ -81,7 +81,7 @@ def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
 
 
 def _parts(folder: Path) -> list[Path]:
-    """The files of a recording. Raises FileNotFoundError if there are none."""
+    """Return the files of a recording. Raises FileNotFoundError if there are none."""
     numbered = (folder / f"{folder.name}_{number}.mcap" for number in count())
     paths = list(takewhile(Path.is_file, numbered))
     if not paths:
@@ -90,7 +90,7 @@ def _parts(folder: Path) -> list[Path]:
 
 
 def _channels(path: Path) -> dict[int, Channel]:
-    """The channels of a file by their numbers: they stand before its messages."""
+    """Return the channels of a file by their ids; they precede its messages."""
     schemas: dict[int, Schema] = {}
     names: dict[int, Channel] = {}
     for record in complete_records(path):

@@ -1,7 +1,7 @@
-"""The recorder as a service: it observes every topic of its rows in the contract and writes the raw messages.
+"""The recorder as a service: it writes the raw messages of every topic that it reads by the contract.
 
-It steps like any other observer, but its data does not come through the inbox: the runtime hands it each message's
-bytes as they came, so that nothing is decoded and none is skipped.
+It is an observer whose data does not come through the inbox: the runtime passes the bytes of each message to `record`, so that
+no message is decoded or skipped.
 """
 
 from __future__ import annotations
@@ -24,13 +24,13 @@ from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
 log = logging.getLogger(__name__)
 
 SPARE_BYTES = 10_000_000
-"""With less than this left on the disk the recording ends: report, page and map need it."""
-LOOK_NS = 200_000_000
-"""How often it looks how much is left, in simulated time [ns]."""
+"""Free disk space at which the recording ends; report, page and map need it."""
+CHECK_PERIOD_NS = 200_000_000
+"""Period of the check of disk space, simulated time."""
 
 
 def channels(rows: Contract, *, full: bool) -> list[Channel]:
-    """The channels of all topics that the contract lets the recorder observe, in contract order; `full`: of every message."""
+    """Return the channels of all topics that the recorder reads, in contract order; with `full`, of every message."""
     return [
         Channel(
             topic=f"/{topic.name}",
@@ -47,34 +47,34 @@ def channels(rows: Contract, *, full: bool) -> list[Channel]:
 
 
 class RecorderService(Service):
-    """Writes every message it is given into `folder`, a rosbag2 folder."""
+    """Writes messages into `folder`, a rosbag2 folder."""
 
     role = "recorder"
 
     def __init__(self, folder: Path, file_bytes: int = FILE_BYTES, *, full: bool = True) -> None:
-        """Opens the recording, in files of about `file_bytes`, `full` or thinned as the contract's `record_ms` say.
+        """Open the recording, in files of about `file_bytes`, `full` or thinned by the contract's `record_ms`.
 
         Raises OSError if the folder cannot be written.
         """
         self._bag = BagWriter(folder, channels(contract(), full=full), run=run_of(folder.parent), file_bytes=file_bytes)
         self._names = {topic.name: f"/{topic.name}" for topic, _ in contract().inputs(self.role)}
         self._unexpected = self._unwritten = 0
-        self._look_at = 0
+        self._check_at = 0
         self.trouble = ""
-        """Why nothing is written any more; empty while all is."""
+        """Text on why the recording ended early; else empty."""
 
     def record(self, topic: Topic, payload: bytes, stamp: int, sequence: int) -> None:
-        """Takes one message as it was sent: CDR bytes, simulated time [ns] and sequence number.
+        """Write a message: CDR bytes, simulated time [ns] and sequence number.
 
-        The runtime calls it for every message, in any order of topics. A topic that the contract does not give to the
-        recorder is counted and left out. A disk that has no more room than the report needs ends the recording, never the run.
+        The runtime calls it for every message, in any order of topics. Messages of topics that the recorder does not read are
+        counted and dropped. A full disk ends the recording, not the run.
         """
         name = self._names.get(topic.name)
         if name is None:
             self._unexpected += 1
             return
-        if not self.trouble and stamp >= self._look_at:
-            self._look_at = stamp + LOOK_NS
+        if not self.trouble and stamp >= self._check_at:
+            self._check_at = stamp + CHECK_PERIOD_NS
             self._check_room(stamp)
         if self.trouble:
             self._unwritten += 1
@@ -94,18 +94,18 @@ class RecorderService(Service):
             self._stop(stamp, f"{left / 1e6:.0f} MB are left on its disk, which the report needs")
 
     def _stop(self, stamp: int, why: str) -> None:
-        """Completes the recording as far as it came."""
+        """Complete the recording."""
         self.trouble = f"recorder: the recording ends at {stamp / 1e9:.3f} s: {why}"
         log.error("%s", self.trouble)
         with suppress(OSError):
             self._bag.close()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Nothing to do: messages come by `record`, and are flushed by their own stamps."""
+        """Return no messages; the input comes by `record`."""
         return {}
 
     def finish(self) -> Mapping[str, Any]:
-        """Completes the recording; returns what is in it."""
+        """Complete the recording; return its counts."""
         if not self.trouble:
             try:
                 self._bag.close()
@@ -128,9 +128,9 @@ class RecorderService(Service):
 
 
 def create(scenario: Scenario) -> RecorderService:
-    """The recorder of a run; its folder and the size of its files come from the settings `out` and `record_file_mb`.
+    """Return the recorder of a run; its folder and the size of its files come from the settings `out` and `record_file_mb`.
 
-    Raises BusConfigError if the folder is missing. The scenario does not matter: the recorder writes what the bus carries.
+    Raises BusConfigError if the folder is missing. The scenario is not used.
     """
     del scenario
     settings = Settings.read()

@@ -137,7 +137,7 @@ def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
     assert 0 < counts[0] < counts[1] < counts[2] < counts[3] == 3978
 
 
-def test_what_is_salvaged_is_what_is_recovered_and_nothing_is_written(tmp_path: Path) -> None:
+def test_salvage_returns_what_recover_writes(tmp_path: Path) -> None:
     service = RecorderService(tmp_path / RECORDING)
     record(service, 3900)
     crashed = kill(tmp_path / RECORDING, tmp_path / "crashed", 0.7)
@@ -153,7 +153,7 @@ def test_what_is_salvaged_is_what_is_recovered_and_nothing_is_written(tmp_path: 
         salvage(crashed, ["exam/state"])
 
 
-def test_recover_says_what_is_wrong(tmp_path: Path) -> None:
+def test_recover_reports_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no recording there"):
         recover(tmp_path)
     service = RecorderService(tmp_path / RECORDING)
@@ -356,9 +356,7 @@ def test_on_a_small_disk_room_is_left_for_the_report(small_disk: Path) -> None:
         assert reader.message_count == facts["messages"]
 
 
-def test_what_the_disk_does_not_take_ends_the_recording_and_not_the_run(
-    small_disk: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_write_error_ends_the_recording_and_not_the_run(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """As above, but it fills up faster than anybody looks."""
     monkeypatch.setattr("palpate_recorder.service.SPARE_BYTES", 0)
     service = RecorderService(small_disk / RECORDING)

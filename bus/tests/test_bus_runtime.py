@@ -1,0 +1,104 @@
+"""Parts of the runtimes: failures, latencies, priorities."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from palpate_bus.contract import Edge, contract
+from palpate_bus.messages import JointState, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.run import in_background
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, Packet
+from palpate_bus.runtime.wallclock import BIN_NS, LatencyHistogram
+
+ROW = contract().topics["joint_states"]
+NAMES = [f"lbr_A{k}" for k in range(1, 8)]
+
+
+def buffer(payload: bytes) -> InputBuffer:
+    held = InputBuffer(ROW, Edge.SAME_TICK, contract().roles["robot"].period)
+    held.deliver(Packet(payload, 0, 1))
+    held.take(0)
+    return held
+
+
+def joints(position: np.ndarray) -> bytes:
+    return codec.encode(JointState(header(0), NAMES, position, np.zeros(7), np.zeros(7)), ROW.type)
+
+
+def test_valid_inputs_are_not_named() -> None:
+    failure = Failure.of(ValueError("no"), "control", [buffer(joints(np.zeros(7)))])
+    assert failure == Failure(FailureCode.ROLE_FAILED, "ValueError: no", ("control",))
+    assert Failure.from_report("control", failure.report()) == failure
+
+
+def test_an_input_that_is_not_finite_is_named_with_topic_and_sender() -> None:
+    failure = Failure.of(IndexError("index -9"), "control", [buffer(joints(np.full(7, np.nan)))])
+    assert failure.topics == ("joint_states",)
+    assert failure.text.startswith("IndexError: index -9; joint_states from robot has position nan")
+
+
+def test_an_input_that_cannot_be_decoded_is_named() -> None:
+    failure = Failure.of(ValueError("no"), "control", [buffer(b"\x00\x01\x00\x00\xff")])
+    assert failure.topics == ("joint_states",)
+
+
+def test_some_errors_have_a_code_of_their_own() -> None:
+    for error, code in (
+        (ForgedSenderError("twice", "joint_states"), FailureCode.FORGED),
+        (OSError(28, "No space left on device"), FailureCode.DISK_FULL),
+    ):
+        assert Failure.of(error, "control", ()).code is code
+
+
+def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:
+    values = (np.random.default_rng(1).lognormal(0.0, 0.7, 5000) * 1e6).astype(int).tolist()
+    ages = LatencyHistogram()
+    for value in values:
+        ages.add(value)
+    for part in (0.5, 0.99):
+        assert ages.quantile(part) == pytest.approx(np.quantile(values, part), abs=2 * BIN_NS, rel=0.01)
+    told = ages.as_ms()
+    assert told["max"] == round(max(values) / 1e6, 3)
+    assert told["mean"] == pytest.approx(np.mean(values) / 1e6, abs=1e-3)
+    assert told["p50"] < told["p99"] < told["max"]
+
+
+def test_an_empty_histogram_and_extreme_values() -> None:
+    ages = LatencyHistogram()
+    assert ages.as_ms() == {"mean": 0.0, "p50": 0.0, "p99": 0.0, "max": 0.0}
+    ages.add(-5_000_000)
+    assert ages.quantile(0.99) == 0
+    ages.add(10**10)
+    assert ages.as_ms()["max"] == 1e4
+    assert ages.quantile(1.0) == 100_000_000, "beyond the last bin only the largest is known"
+
+
+PROGRAM = """
+import os, sys, threading, time
+from palpate_bus.runtime.process import BACKGROUND_NICENESS, run_in_background
+run_in_background()  # elsewhere than on Linux it lowers the priority at most
+after = threading.Thread(target=time.sleep, args=(30,), daemon=True)
+after.start()
+for thread in (0, after.native_id) if sys.platform == "linux" else ():
+    assert os.sched_getscheduler(thread) == os.SCHED_BATCH
+    assert os.getpriority(os.PRIO_PROCESS, thread) == min(int(os.environ["HERE"]) + BACKGROUND_NICENESS, 19)
+"""
+
+
+def test_a_background_service_and_its_threads_have_low_priority() -> None:
+    here = os.getpriority(os.PRIO_PROCESS, 0)
+    subprocess.run([sys.executable, "-c", PROGRAM], check=True, env={**os.environ, "HERE": str(here)})
+
+
+def test_in_lockstep_all_but_the_1_kHz_loop_run_in_the_background() -> None:
+    roles = contract().roles
+    assert {name for name, role in roles.items() if not in_background(role, "lockstep")} == {"robot", "tissue", "control"}
+    observers = {name for name, role in roles.items() if role.observer}
+    assert {name for name, role in roles.items() if in_background(role, "wallclock")} == observers
