@@ -58,7 +58,7 @@ def test_a_gap_is_an_error_that_names_topic_and_numbers(sequence: int) -> None:
 def test_a_repeated_message_is_an_error() -> None:
     joints = buffer("joint_states", Edge.SAME_TICK)
     joints.accept(1, b"")
-    with pytest.raises(LockstepError, match="came again"):
+    with pytest.raises(LockstepError, match="duplicate"):
         joints.accept(1, b"")
 
 
@@ -125,14 +125,14 @@ def test_a_service_that_leaves_out_a_periodic_message_is_named() -> None:
 
 
 def test_a_service_may_send_only_what_the_contract_gives_it() -> None:
-    with pytest.raises(LockstepError, match="control sent ft/wrench, which the contract does not give it"):
+    with pytest.raises(LockstepError, match="control sent ft/wrench"):
         Stepper(Intruder(), contract()).step(0)
 
 
 def test_a_message_off_its_tick_is_an_error() -> None:
     stepper = Stepper(OffTick(), contract())
     stepper.step(0)
-    with pytest.raises(LockstepError, match="no tick of its period"):
+    with pytest.raises(LockstepError, match="not a multiple of its period"):
         stepper.step(MS)
 
 

@@ -58,7 +58,7 @@ STATE = codec.encode(JointState(header(0), ["a"], np.zeros(1), np.zeros(1), np.z
 
 
 class Queue:
-    heard = True
+    hello_received = True
     garbage = 0
 
     def __init__(self, *payloads: bytes) -> None:

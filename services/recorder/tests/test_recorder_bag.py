@@ -244,7 +244,7 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
     assert recording.thinned.keys() == {name for name, topic in TOPICS.items() if topic.record_ms}
     recording.check(contract(), ["robot/status"])
     recording.check(contract(), ["joint_states"], whole=False)
-    with pytest.raises(RecordingError, match=r"of topic joint_states one message in \d+ ms was kept.*--record full"):
+    with pytest.raises(RecordingError, match=r"joint_states.*--record full"):
         recording.check(contract(), ["joint_states"])
 
 
