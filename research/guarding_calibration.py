@@ -26,7 +26,7 @@ import palpate_assessment
 from palpate.quick.case import assess, examined
 from palpate.report.results import truth_of_run
 from palpate.report.scoring import Truth
-from palpate.study.manifest import Case, Request, cases_of
+from palpate.study.cases import Case, Request, cases_of
 from palpate.study.spec import load_study
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned

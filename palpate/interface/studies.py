@@ -11,13 +11,11 @@ from typing import Any, get_args
 import pandas as pd
 
 from palpate.interface.scenarios import paths
-from palpate.study.digest import RunRecord, Session
-from palpate.study.folder import add_session, conclude, usual_folder
-from palpate.study.manifest import Request, cases_of, command_of
-from palpate.study.runner import missing, opened, run_cases
+from palpate.study.cases import Request, cases_of, command_of
+from palpate.study.folder import RunRecord, Session, default_folder, opened
+from palpate.study.runner import cluster, cores, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
-from palpate.study.summary import PAGE
-from palpate.study.workers import cores, threads
+from palpate.study.summary import PAGE, conclude
 from palpate_models.scenario.load import as_settings
 
 
@@ -108,12 +106,12 @@ def study(
     chosen = with_methods(load_study(str(source)), methods)
     request = Request(split, number, as_settings(dict(paths(settings))))
     cases = cases_of(chosen, request)
-    folder = usual_folder(chosen.name, split) if out is None else Path(out)
-    manifest = opened(folder, chosen.name, cases, command_of(str(source), request, methods or ()))
-    todo, begin, count = len(missing(folder, cases)), monotonic(), workers or cores()
-    with threads(count) as hands:
-        run_cases(folder, cases, hands, lambda _: None)
-    if todo:
-        add_session(folder, Session(workers=count, cases=todo, elapsed_s=round(monotonic() - begin, 1)))
+    path = default_folder(chosen.name, split) if out is None else Path(out)
+    folder, manifest = opened(path, chosen.name, cases, command_of(str(source), request, methods or ()))
+    if todo := len(folder.missing(cases)):
+        begin, count = monotonic(), workers or cores()
+        with cluster(count) as hands:
+            run_cases(folder, cases, hands, lambda _: None)
+        folder.add_session(Session(workers=count, cases=todo, elapsed_s=round(monotonic() - begin, 1)))
     record, _ = conclude(folder, manifest)
-    return StudyResult(folder, record)
+    return StudyResult(path, record)

@@ -1,103 +1,150 @@
-"""A case is examined in its own process: `python -m palpate.study.case [RUNS]`, a JSON line in for each case, a line out.
+"""Examines cases in a process of its own: `python -m palpate.study.case [RUNS]` reads a case and prints an attempt per line.
 
-The results of whole examinations stay in the folder RUNS, if there is one, each in a folder with the name of its case.
-
-A whole examination has its own process; quick ones share one that stays warm. It has one thread of BLAS and OpenMP, and ends
-at once when the process that started it does, however that ended.
+The process has a fixed environment (one thread of BLAS and OpenMP, fixed hash seed), so that results do not depend on the worker.
+It ends when the worker that started it ends. Results of whole examinations stay in RUNS/CASE_ID if RUNS is given.
 """
 
 from __future__ import annotations
 
 import os
-import queue
 import resource
 import shutil
 import socket
+import subprocess
 import sys
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from threading import Thread
-from time import perf_counter, process_time
-from typing import IO, Final
+from time import perf_counter, process_time, sleep
+from typing import Final
 
 from pydantic import BaseModel, ConfigDict
 
+from palpate.environment import FIXED
 from palpate.report.page import write_page
 from palpate.report.results import assemble, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
-from palpate.study.code import code_digest
-from palpate.study.manifest import Case, file_hash
+from palpate.study.cases import Case, file_hash
+from palpate.study.folder import code_digest
+from palpate_bus.settings import variable
 from palpate_conductor.outcome import Timing
+from palpate_errors import RunError
 from palpate_models.scenario.schema import Scenario
 
+LIMIT_S: Final = {"whole": 3600.0, "quick": 300.0}
+"""Time limit of a case; one that takes longer counts as hung."""
+KEEP_MEMORY: Final = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRESHOLD_": str(1 << 25)}
+"""Makes glibc's malloc keep freed memory for the next arrays; page faults would cost a tenth of a quick case."""
 KIB: Final = 1024
-"""Linux gives `ru_maxrss` in this many bytes."""
-
-
-class CaseError(Exception):
-    """A case that cannot be examined here. Says why."""
+"""Unit of `ru_maxrss` on Linux."""
 
 
 class Attempt(BaseModel):
-    """What one attempt at a case came to."""
+    """The result of one attempt at a case."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
     case_id: str
     report: Report | None
     why: str | None
-    """Why there is no report that counts; null where there is."""
+    """Reason why there is no valid report; null if there is one."""
     code: str = ""
     peak_memory_bytes: int = 0
     wall_time_s: float = 0.0
     assess_time_s: float | None = None
-    """What of that the assessment took."""
     core_s: float = 0.0
     host: str = ""
     loop_examinations: int | None = None
-    """From how many whole examinations the errors of a quick case are; null of a whole one."""
+
+
+def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
+    """Examines cases, given as JSON, one after another in one process; the task of a Dask worker.
+
+    Returns the attempts as JSON, in order. Fewer than there are cases if the process ended early: the last one is then the
+    failure of the case that it was busy with. `runs`: folder on the worker for the results of whole examinations.
+    """
+    cases = [Case.model_validate_json(text) for text in batch]
+    periods = ",".join(f"{role}={period}" for role, period in cases[0].periods.items())
+    environment = {**os.environ, **FIXED, **KEEP_MEMORY, **({variable("periods"): periods} if periods else {})}
+    limit_s = LIMIT_S[cases[0].tier] * len(cases)
+    command = [sys.executable, "-m", "palpate.study.case", *([] if runs is None else [runs])]
+    with tempfile.TemporaryFile("w+", encoding="utf-8", errors="replace") as log:
+        try:
+            done = subprocess.run(
+                command,
+                input="\n".join(batch) + "\n",
+                stdout=subprocess.PIPE,
+                stderr=log,
+                text=True,
+                env=environment,
+                timeout=limit_s,
+                start_new_session=True,  # Ctrl-C goes to the study, which ends its processes
+                check=False,
+            )
+            output, why = done.stdout, f"its process ended with status {done.returncode}"
+        except subprocess.TimeoutExpired as error:
+            partial = error.stdout or b""
+            output = partial.decode() if isinstance(partial, bytes) else partial
+            why = f"took longer than {limit_s:.0f} s"
+        log.seek(0)
+        lines = log.read().strip().splitlines()
+    attempts = [line for line in output.splitlines(keepends=True) if line.endswith("\n")]
+    if len(attempts) < len(cases):
+        cause = f"{why}: {lines[-1]}" if lines else why
+        attempts.append(Attempt(case_id=cases[len(attempts)].case_id, report=None, why=cause).model_dump_json())
+    return attempts
 
 
 def examine(case: Case, runs: Path | None = None) -> Attempt:
-    """Examines a patient in this process; `runs`: where the results of a whole examination stay.
-
-    Errors of the code are raised; a run that failed is in the report.
-    """
+    """Examines a patient in this process. A failed run is part of the report; errors of the code are raised."""
     begin, used = perf_counter(), _core_s()
     for path, known in case.files.items():
         if file_hash(path) != known:
-            raise CaseError(
-                f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}"
-            )
+            raise RunError(f"{path} is not the file that the study was made with: its SHA-256 begins with {file_hash(path)[:16]}")
     scenario = Scenario.model_validate(case.scenario)
-    quick = case.tier == "quick"
-    report, assess_s = _quick(scenario) if quick else _whole(scenario, case, runs)
+    examinations: int | None = None
+    assess_s: float | None
+    if case.tier == "quick":
+        from palpate.quick.case import run_quick  # noqa: PLC0415 - whole examinations do not need it
+        from palpate.quick.errors import loop_errors  # noqa: PLC0415
+
+        quick = run_quick(scenario)
+        report, assess_s = quick.report, quick.assess_s
+        examinations = loop_errors(scenario).examinations
+    else:
+        report, assess_s = _whole(scenario, case, runs)
     return Attempt(
         case_id=case.case_id,
         report=report,
-        why=report.failure if case.runtime == "wallclock" else None,  # simulated time would fail again in the same way
+        why=report.failure if case.runtime == "wallclock" else None,  # in simulated time it would fail again in the same way
         code=code_digest(),
-        peak_memory_bytes=_peak_memory(),
+        peak_memory_bytes=KIB
+        * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)),
         wall_time_s=perf_counter() - begin,
         assess_time_s=assess_s,
         core_s=_core_s() - used,
         host=socket.gethostname(),
-        loop_examinations=_behind_loop(scenario) if quick else None,
+        loop_examinations=examinations,
     )
 
 
 def _whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, float | None]:
-    """The report, and the real time of the assessment [s] where it is known."""
+    """Return the report, and the wall time of the assessment [s] where it is known."""
     with tempfile.TemporaryDirectory(prefix="palpate-case-") as temporary:
-        folder = Path(temporary) if runs is None else _emptied(runs / case.case_id)
+        folder = Path(temporary)
+        if runs is not None:
+            folder = runs / case.case_id
+            shutil.rmtree(folder, ignore_errors=True)
+            folder.mkdir(parents=True)
         if case.runtime == "lockstep":
             result = run_composed(scenario, folder, lambda _: None, observers=())
         else:
             result = run_distributed(scenario, folder, lambda _: None, (), Timing(wallclock=True))
     if result.interrupted:
-        raise CaseError("interrupted")
+        raise RunError("interrupted")
     blame = result.blame.get("assessment")
     if runs is None:
         report = assemble(scenario, result, truth_of_run(scenario, result.collected))
@@ -107,61 +154,30 @@ def _whole(scenario: Scenario, case: Case, runs: Path | None) -> tuple[Report, f
     return report, None if blame is None else blame["steps"] * blame["compute"] / 1e6
 
 
-def _emptied(folder: Path) -> Path:
-    """The folder, without what an earlier attempt left in it."""
-    shutil.rmtree(folder, ignore_errors=True)
-    folder.mkdir(parents=True)
-    return folder
-
-
-def _quick(scenario: Scenario) -> tuple[Report, float]:
-    from palpate.quick.case import run_quick  # noqa: PLC0415 - whole examinations need nothing of it
-
-    quick = run_quick(scenario)
-    return quick.report, quick.assess_s
-
-
-def _behind_loop(scenario: Scenario) -> int:
-    from palpate.quick.errors import loop_errors  # noqa: PLC0415 - whole examinations need nothing of it
-
-    return loop_errors(scenario).examinations
-
-
 def _core_s() -> float:
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return process_time() + children.ru_utime + children.ru_stime
-
-
-def _peak_memory() -> int:
-    """Largest memory so far of this process, and of the largest that it started [bytes]."""
-    return KIB * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN))
 
 
 def _attempt(line: str, runs: Path | None) -> Attempt:
     case = Case.model_validate_json(line)
     try:
         return examine(case, runs)
-    except Exception as error:  # whatever it is, it is this case's, and is told
+    except Exception as error:  # any error is a failed attempt at this case
         return Attempt(case_id=case.case_id, report=None, why=f"{type(error).__name__}: {error}", code=code_digest())
 
 
-def _listen(lines: queue.Queue[str]) -> None:
-    """Passes on what comes in; at its end the process that wanted results is gone."""
-    for line in sys.stdin:
-        lines.put(line)
-    os._exit(0)
-
-
-def serve(answers: IO[str], runs: Path | None) -> None:
-    """Examines the cases that come in, one after another, until nothing more can come; `runs` as in `examine`."""
-    lines: queue.Queue[str] = queue.Queue()
-    Thread(target=_listen, args=(lines,), daemon=True).start()
-    while True:
-        answers.write(_attempt(lines.get(), runs).model_dump_json() + "\n")
-        answers.flush()
+def _end_with(parent: int) -> None:
+    """Ends this process as soon as its parent has ended."""
+    while os.getppid() == parent:
+        sleep(1.0)
+    os._exit(1)
 
 
 if __name__ == "__main__":
-    own = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
-    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # whatever a library prints is no answer
-    serve(own, Path(sys.argv[1]) if len(sys.argv) > 1 else None)
+    Thread(target=_end_with, args=(os.getppid(),), daemon=True).start()
+    answers = os.fdopen(os.dup(sys.stdout.fileno()), "w", encoding="utf-8")
+    os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # output of libraries is not an answer
+    for text in sys.stdin.read().splitlines():
+        answers.write(_attempt(text, Path(sys.argv[1]) if len(sys.argv) > 1 else None).model_dump_json() + "\n")
+        answers.flush()

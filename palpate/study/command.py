@@ -1,28 +1,36 @@
-"""`palpate study`: runs a study, on this machine, on a cluster, or a part of it; and puts parts together."""
+"""`palpate study`: runs a study on this machine, on a cluster, or in parts, and merges parts."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from time import monotonic
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
+from rich.console import Console
+from rich.table import Table
 
-from palpate.console import output_folder, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, fail, output_folder, refuse
 from palpate.run.options import ServiceChoices, Settings
 
+if TYPE_CHECKING:
+    from palpate.study.cases import Case
+    from palpate.study.folder import Folder, Manifest, RunRecord
+    from palpate.study.spec import Study
+
 SPLITS = ("tune", "test")
+SHOWN = 10
+"""Maximum number of incomplete cases that are listed."""
 
 
 class _RunByDefault(typer.core.TyperGroup):
     """`palpate study NAME` is short for `palpate study run NAME`."""
 
-    usual = "run"
-    """The command of a word that is none."""
-
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """The words, with `run` before a name that is no command."""
-        words = [self.usual, *args] if args and not args[0].startswith("-") and args[0] not in self.commands else args
-        return super().parse_args(ctx, words)
+        """Parses the arguments, with `run` inserted before a name that is not a command."""
+        implicit = bool(args) and not args[0].startswith("-") and args[0] not in self.commands
+        return super().parse_args(ctx, ["run", *args] if implicit else args)
 
 
 app = typer.Typer(cls=_RunByDefault, no_args_is_help=True, help="Examine many randomly drawn patients and score the results.")
@@ -31,9 +39,14 @@ app = typer.Typer(cls=_RunByDefault, no_args_is_help=True, help="Examine many ra
 @app.command("list")
 def list_studies() -> None:
     """List the studies that come with Palpate."""
-    from palpate.study.perform import print_studies
+    from palpate.study.spec import load_study, study_names
 
-    print_studies()
+    table = Table("study", "tier", "cases of the split test", "description", box=None)
+    for name in study_names():
+        study = load_study(name)
+        patients = sum(population.number.test for population in study.populations.values())
+        table.add_row(name, study.tier, str(patients * len(study.methods) * len(study.error_levels())), study.description)
+    Console().print(table)
 
 
 @app.command()
@@ -43,9 +56,7 @@ def run(  # noqa: PLR0913 - the options of a command
     number: Annotated[int | None, typer.Option(min=1, help="Patients of each population, instead of the study's own.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Cases at a time on this machine; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")] = None,
-    shard: Annotated[
-        str | None, typer.Option(metavar="i/n", help="Run only every n-th case from the i-th, without Dask.")
-    ] = None,
+    shard: Annotated[str | None, typer.Option(metavar="i/n", help="Run only every n-th case from the i-th.")] = None,
     method: Annotated[list[str] | None, typer.Option(help="Only this method; may be repeated.")] = None,
     services: ServiceChoices = None,
     settings: Settings = None,
@@ -83,27 +94,29 @@ def run(  # noqa: PLR0913 - the options of a command
     if split not in SPLITS:
         raise typer.BadParameter(f"--split {split}: want one of {', '.join(SPLITS)}")
     if shard and scheduler:
-        refuse("--shard does without a scheduler: leave out one of the two")
-    from palpate.study.perform import StudyOrder, run_study
+        refuse("--shard and --scheduler cannot be combined")
+    from palpate.study.cases import Request, cases_of, command_of, secret_of
+    from palpate.study.folder import default_folder, opened
+    from palpate.study.runner import part_of
+    from palpate.study.spec import load_study
+    from palpate_errors import UserError
 
-    run_study(
-        StudyOrder(
-            name=name,
-            split=split,
-            number=number,
-            workers=workers,
-            scheduler=scheduler,
-            shard=shard,
-            methods=method,
-            services=services,
-            settings=settings or (),
-            seeds_file=seeds_file,
-            keep=keep,
-            runs=runs,
-            out=out,
-            quiet=quiet,
-        )
-    )
+    console = Console(stderr=True, quiet=quiet)
+    try:
+        study = _chosen(load_study(name), method, services)
+        secret = None if seeds_file is None else secret_of(seeds_file, study)
+        request = Request("tune" if split == "tune" else "test", number, settings or (), secret)
+        cases = cases_of(study, request)
+        own = part_of(cases, shard) if shard else cases
+        path = out or default_folder(study.name, split)
+        folder, manifest = opened(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
+        _examine(console, folder, own, (workers, scheduler), runs)
+    except (UserError, OSError) as error:
+        refuse(error)
+    if shard and folder.missing(cases):
+        console.print(f"shard {shard} is done; when all are: palpate study merge DIR...", highlight=False)
+    else:
+        _conclude(folder, manifest)
 
 
 @app.command("merge")
@@ -112,9 +125,14 @@ def merge_parts(
     out: Annotated[Path | None, output_folder("Folder for the whole; by default the first of the parts.", "--out", "-o")] = None,
 ) -> None:
     """Merge the parts of a study and make its tables, figures and page."""
-    from palpate.study.perform import merge_study
+    from palpate.study.folder import merge
+    from palpate.study.spec import StudyError
 
-    merge_study(parts, out or parts[0])
+    try:
+        folder, manifest = merge(parts, out or parts[0])
+    except StudyError as error:
+        refuse(error)
+    _conclude(folder, manifest)
 
 
 @app.command("scenario")
@@ -131,6 +149,99 @@ def scenario_of_case(
 
       palpate run patient.yaml --composed                   examine that patient
     """
-    from palpate.study.perform import print_scenario
+    from palpate.study.folder import Outcome
+    from palpate_models.scenario.load import dump_scenario
+    from palpate_models.scenario.schema import Scenario
 
-    print_scenario(case)
+    try:
+        outcome = Outcome.model_validate_json(case.read_text(encoding="utf-8"))
+    except (OSError, ValueError) as error:
+        why = error.strerror if isinstance(error, OSError) else "not an outcome of this version"
+        refuse(f"{case} is not a case of a study ({why}): want a file such as out/study/NAME-SPLIT/cases/ID.json")
+    print(dump_scenario(Scenario.model_validate(outcome.case.scenario)), end="")
+
+
+def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:
+    """Return the study with the chosen methods and one of the given services. Raises UserError."""
+    from palpate.run.roles import settings_of
+    from palpate.study.spec import Method, checked_study, with_methods
+
+    methods: dict[str, Any] = {name: method.model_dump(mode="json") for name, method in study.methods.items()}
+    if services:
+        settings_of(services)
+        roles = dict(option.split("=", 1) for option in services)
+        methods[Path(next(iter(roles.values()))).stem.lower()] = Method(services=roles).model_dump(mode="json")
+    return with_methods(checked_study({**study.model_dump(mode="json"), "methods": methods}, study.name, Path()), only)
+
+
+def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tuple[int | None, str | None], runs: bool) -> None:
+    """Runs the cases without an outcome on a number of local workers or a scheduler. Ends the command if they cannot be run."""
+    from palpate.study.folder import Outcome, Session
+    from palpate.study.runner import StudyStopped, cluster, cores, run_cases
+
+    todo = len(folder.missing(cases))
+    if len(cases) > todo:
+        console.print(f"{len(cases) - todo} of {len(cases)} cases are done already", highlight=False)
+    if not todo:
+        return
+    begin, finished, count = monotonic(), 0, 0
+    try:
+        with cluster(where[0] or cores(), where[1]) as workers, CaseDisplay(console, console.quiet, "cases") as display:
+            count = workers.count
+            console.print(f"{todo} cases, {count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
+            if workers.client.dashboard_link:
+                console.print(f"[dim]workers: {workers.client.dashboard_link}[/]", highlight=False, soft_wrap=True)
+            display.tell(0, todo, "")
+
+            def done(outcome: Outcome) -> None:
+                nonlocal finished
+                finished += 1
+                display.tell(finished, todo, f"{outcome.case.label}{'' if outcome.completed else f': {outcome.why}'}")
+
+            run_cases(folder, cases, workers, done, runs=runs)
+    except (StudyStopped, KeyboardInterrupt) as error:
+        why = "stopped" if isinstance(error, KeyboardInterrupt) else error
+        fail(f"{why}: {len(folder.missing(cases))} of {len(cases)} cases are left; run the same command to continue")
+    finally:
+        if finished:
+            folder.add_session(Session(workers=count, cases=finished, elapsed_s=round(monotonic() - begin, 1)))
+
+
+def _conclude(folder: Folder, manifest: Manifest) -> None:
+    """Writes tables, figures and page, and prints the result. The exit status is 3 if a case failed."""
+    from palpate.study.summary import conclude
+    from palpate_errors import UserError
+
+    try:
+        found, outcomes = conclude(folder, manifest)
+    except UserError as error:
+        fail(error)
+    out = Console()
+    out.print(_result(found), highlight=False, soft_wrap=True)
+    incomplete = [outcome for outcome in outcomes if not outcome.completed]
+    for outcome in incomplete[:SHOWN]:
+        failures = folder.failures(outcome.case.case_id) if outcome.status == "failed" else ()
+        tried = f" (attempts: {'; '.join(failures)})" if failures else ""
+        why = outcome.why or "nothing was assessed"
+        out.print(f"{outcome.case.label}: {why}{tried}", highlight=False, markup=False, soft_wrap=True)
+    if len(incomplete) > SHOWN:
+        out.print(f"... and {len(incomplete) - SHOWN} more that did not complete", highlight=False)
+    out.print(f"page: {folder.path / 'study.html'}", highlight=False, soft_wrap=True)
+    if found.failed:
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _result(found: RunRecord) -> str:
+    lines = [f"{found.study}, split {found.split}: {found.done} of {found.cases} cases done, {found.not_completed} not completed"]
+    lines += [f"digest {found.digest}" if found.digest else f"no digest: {found.no_digest}"]
+    if len(found.code) > 1:
+        lines.append(f"{len(found.code)} versions of the code made these cases: the figures are of none of them")
+    seconds = sum(session.elapsed_s for session in found.sessions)
+    if seconds:
+        rate = 3600 * sum(session.cases for session in found.sessions) / seconds
+        core_s = found.core_s / found.cases
+        lines.append(
+            f"{rate:.0f} cases per hour, {core_s:.0f} s of a core per case, peak memory {found.peak_memory_bytes / 1e9:.1f} GB"
+        )
+        lines.append(f"10,000 such cases on 1,000 such cores would take {10 * core_s / 60:.1f} min")
+    return "\n".join(lines)

@@ -1,30 +1,52 @@
-"""The folder of a study: which cases it is to hold, and what is made of them once it holds them all."""
+"""The folder of a study: everything that a study has computed. A run that stops, for any reason, continues from it.
+
+study.json, study.html     figures and page (`palpate.study.summary`)
+run.json                   what was run, where, with which code, and the digest
+manifest.json              all cases, without their scenarios
+cases/ID.json              the outcome of a case
+failures/ID.json           causes of failed attempts at a case
+cases.parquet, findings.parquet, lumps.parquet
+sessions.jsonl             duration of each call of the command
+real_time.md               lateness in wall-clock mode
+"""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import hashlib
+import json
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from importlib.util import find_spec
 from pathlib import Path
-from typing import Final
+from typing import Any, Final, Literal
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from palpate.report.files import write_text
-from palpate.study.digest import RunRecord, Session, record, write_record
-from palpate.study.manifest import Case
-from palpate.study.outcome import Outcome, read_outcome
-from palpate.study.real_time import write_real_time
+from palpate.report.rows import Report
+from palpate.run.roles import WORKERS
+from palpate.study.cases import Case
 from palpate.study.spec import StudyError
-from palpate.study.summary import summarise
-from palpate.study.tables import write_tables
 
 MANIFEST: Final = "manifest.json"
 SESSIONS: Final = "sessions.jsonl"
-FAILURES: Final = "failures"
-
-
-def usual_folder(study: str, split: str) -> Path:
-    """Where the results of a study go unless it is said where."""
-    return Path("out") / "study" / f"{study}-{split}"
+RUN: Final = "run.json"
+ATTEMPTS: Final = 3
+"""A case that fails this often is reported as failed."""
+NO_DIGEST: Final = "examinations in wall-clock mode depend on the machine and its load, so they have no digest"
+PACKAGES: Final = (
+    "palpate.quick",
+    "palpate.run",
+    "palpate.truth",
+    "palpate.report",
+    "palpate_bus",
+    "palpate_models",
+    "palpate_conductor",
+    "palpate_fmu",
+    *(f"palpate_{role}" for role in WORKERS),
+)
+"""Packages whose code decides results."""
+SUFFIXES: Final = (".py", ".yaml", ".csv", ".npz", ".c", ".h")
 
 
 class ManifestRow(BaseModel):
@@ -50,73 +72,266 @@ class Manifest(BaseModel):
     tier: str
     cases: list[ManifestRow]
     command: str = ""
-    """That runs the study again; empty where there is none."""
+    """Runs the study again; may be empty."""
+
+
+class Outcome(BaseModel):
+    """cases/ID.json: the report of a case, or the reason why there is none."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    case: Case
+    status: Literal["done", "failed"]
+    """`failed`: no report after three attempts. An examination that was aborted is done, and not completed."""
+    attempts: int
+    why: str | None
+    """Reason of the failure or of the abort; null for a completed examination."""
+    code: str
+    """SHA-256 over the code that made the result (`code_digest`)."""
+    report: Report | None
+    peak_memory_bytes: int
+    """Peak memory of the process that ran the case."""
+    wall_time_s: float
+    """From the start of the case to its report."""
+    assess_time_s: float | None
+    """Part of it that the assessment took."""
+    core_s: float
+    """Processor time."""
+    host: str
+    loop_examinations: int | None = None
+    """Number of whole examinations that the error model of a quick case was fitted to; null for a whole one."""
+
+    @property
+    def completed(self) -> bool:
+        """True if the examination was finished and assessed."""
+        return self.report is not None and self.report.failure is None and self.report.assessed
+
+
+class Session(BaseModel):
+    """One call of the command, to its end or until it was stopped."""
+
+    model_config = ConfigDict(frozen=True)
+
+    workers: int
+    cases: int
+    elapsed_s: float
+
+
+class RunRecord(BaseModel):
+    """run.json."""
+
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    study: str
+    split: str
+    cases: int
+    done: int
+    failed: int
+    """Cases without a report after three attempts."""
+    not_completed: int
+    """Examinations that were not finished, including failed cases."""
+    digest: str | None
+    """SHA-256 over the sorted pairs of case and run hash; null in wall-clock mode."""
+    no_digest: str | None
+    """Reason why there is no digest."""
+    code: list[str]
+    """SHA-256 of each version of the code that made cases. With more than one, figures mix versions."""
+    platforms: list[dict[str, Any]]
+    """Machines; equal digests are promised on equal platforms only."""
+    peak_memory_bytes: int
+    """Largest of all cases."""
+    wall_time_s: float
+    core_s: float
+    """Sum over the cases."""
+    sessions: list[Session]
+
+
+class Folder:
+    """A study's folder on the disk."""
+
+    def __init__(self, path: Path) -> None:
+        """Refers to a folder, which need not exist."""
+        self.path = path
+
+    def open(self, manifest: Manifest) -> None:
+        """Creates the folder, or reuses one of the same study, split and settings. Raises StudyError for any other."""
+        old = self.manifest()
+        if old is not None and (old.study, old.split) != (manifest.study, manifest.split):
+            raise StudyError(f"{self.path} holds {old.study}, split {old.split}: give {manifest.study} another folder with -o")
+        if old is not None and {row.case_id for row in old.cases}.isdisjoint(row.case_id for row in manifest.cases):
+            raise StudyError(
+                f"{self.path} holds {old.study} with other settings or patients: give this one another folder with -o"
+            )
+        for name in ("cases", "failures"):
+            (self.path / name).mkdir(parents=True, exist_ok=True)
+        write_text(self.path / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+
+    def manifest(self) -> Manifest | None:
+        """Return the manifest, or None for a folder without one. Raises StudyError for one that cannot be read."""
+        path = self.path / MANIFEST
+        try:
+            return Manifest.model_validate_json(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValidationError) as error:
+            raise StudyError(f"{path} cannot be read: {error}") from error
+
+    def case_file(self, case_id: str) -> Path:
+        """Return the path of a case's outcome."""
+        return self.path / "cases" / f"{case_id}.json"
+
+    def write(self, outcome: Outcome) -> None:
+        """Writes the outcome of a case, atomically."""
+        write_text(self.case_file(outcome.case.case_id), outcome.model_dump_json() + "\n")
+
+    def outcome(self, case_id: str) -> Outcome | None:
+        """Return the outcome of a case, or None if it has none yet. Raises StudyError for an unreadable file."""
+        path = self.case_file(case_id)
+        try:
+            return Outcome.model_validate_json(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
+        except (OSError, ValueError) as error:
+            raise StudyError(
+                f"{path} is not an outcome of this version ({error}): remove it, and its case is run again"
+            ) from error
+
+    def outcomes(self, manifest: Manifest) -> list[Outcome]:
+        """Return the outcomes that exist, in the order of the manifest. Raises StudyError for an unreadable file."""
+        found = (self.outcome(row.case_id) for row in manifest.cases)
+        return [outcome for outcome in found if outcome is not None]
+
+    def missing(self, cases: Iterable[Case]) -> list[Case]:
+        """Return the cases without an outcome."""
+        return [case for case in cases if not self.case_file(case.case_id).is_file()]
+
+    def of_other_code(self, cases: Iterable[Case]) -> list[Case]:
+        """Return the cases whose outcome was made by another version of the code."""
+        found = ((case, self.outcome(case.case_id)) for case in cases)
+        return [case for case, outcome in found if outcome is not None and outcome.code not in ("", code_digest())]
+
+    def failures(self, case_id: str) -> list[str]:
+        """Return the causes of failed attempts at a case."""
+        path = self._failures_file(case_id)
+        return list(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else []
+
+    def add_failure(self, case_id: str, why: str) -> None:
+        """Appends the cause of a failed attempt."""
+        write_text(self._failures_file(case_id), json.dumps([*self.failures(case_id), why]) + "\n")
+
+    def sessions(self) -> list[Session]:
+        """Return all calls of the command."""
+        path = self.path / SESSIONS
+        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
+        return [Session.model_validate_json(line) for line in lines]
+
+    def add_session(self, session: Session) -> None:
+        """Appends a call of the command."""
+        with (self.path / SESSIONS).open("a", encoding="utf-8") as file:
+            file.write(session.model_dump_json() + "\n")
+
+    def _failures_file(self, case_id: str) -> Path:
+        return self.path / "failures" / f"{case_id}.json"
+
+
+def default_folder(study: str, split: str) -> Path:
+    """Return the folder of a study for which no other is given."""
+    return Path("out") / "study" / f"{study}-{split}"
 
 
 def manifest_of(study: str, cases: Sequence[Case], command: str = "") -> Manifest:
-    """The manifest of these cases."""
+    """Return the manifest of cases."""
     rows = [ManifestRow.model_validate(case.model_dump()) for case in cases]
     return Manifest(study=study, split=cases[0].split, tier=cases[0].tier, cases=rows, command=command)
 
 
-def read_manifest(folder: Path) -> Manifest | None:
-    """What the folder holds; None when it holds nothing. Raises StudyError."""
-    path = folder / MANIFEST
-    try:
-        return Manifest.model_validate_json(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        return None
-    except (OSError, ValidationError) as error:
-        raise StudyError(f"{path} cannot be read: {error}") from error
+def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> tuple[Folder, Manifest]:
+    """Creates or reopens the folder of a study of these cases, which `command` runs again.
+
+    Raises StudyError for the folder of another study and, unless `keep`, for cases of another version of the code.
+    """
+    folder = Folder(path)
+    if not keep and (old := folder.of_other_code(cases)):
+        raise StudyError(f"{path}: {len(old)} of its cases were made by other code: give another folder with -o, or --keep them")
+    manifest = manifest_of(study, cases, command)
+    folder.open(manifest)
+    return folder, manifest
 
 
-def open_folder(folder: Path, manifest: Manifest) -> None:
-    """Makes the folder, or goes on in one of the same study, split and settings. Raises StudyError for another's."""
-    there = read_manifest(folder)
-    if there is not None and (there.study, there.split) != (manifest.study, manifest.split):
-        raise StudyError(f"{folder} holds {there.study}, split {there.split}: give {manifest.study} another folder with -o")
-    if there is not None and {row.case_id for row in there.cases}.isdisjoint(row.case_id for row in manifest.cases):
-        raise StudyError(f"{folder} holds {there.study} with other settings or patients: give this one another folder with -o")
-    folder.mkdir(parents=True, exist_ok=True)
-    write_text(folder / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
+def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
+    """Merges the parts of one study into a folder; repeated merges change nothing.
+
+    Raises StudyError if the parts are not of one study, or if a case has no outcome in any of them.
+    """
+    manifests = []
+    for part in parts:
+        manifest = Folder(part).manifest()
+        if manifest is None:
+            raise StudyError(f"{part} is not the folder of a study: it has no manifest.json")
+        manifests.append(manifest)
+    first = manifests[0]
+    for part, other in zip(parts, manifests, strict=True):
+        if (other.study, other.cases) != (first.study, first.cases):
+            raise StudyError(f"{part} holds another study, split or number of patients than {parts[0]}")
+    folder = Folder(path)
+    folder.open(first)
+    sessions = dict.fromkeys(session for part in (path, *parts) for session in Folder(part).sessions())
+    write_text(path / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in sessions))
+    for part in parts:
+        for outcome in Folder(part).outcomes(first):
+            folder.write(outcome)
+        for file in (part / "failures").glob("*.json"):
+            write_text(path / "failures" / file.name, file.read_text(encoding="utf-8"))
+    absent = [row.case_id for row in first.cases if not folder.case_file(row.case_id).is_file()]
+    if absent:
+        raise StudyError(f"{len(absent)} of {len(first.cases)} cases are in no part, {absent[0]} the first: run what is missing")
+    return folder, first
 
 
-def add_session(folder: Path, session: Session) -> None:
-    """Keeps how long a go at the study took."""
-    with (folder / SESSIONS).open("a", encoding="utf-8") as file:
-        file.write(session.model_dump_json() + "\n")
+def digest(outcomes: Iterable[Outcome]) -> str:
+    """Return the SHA-256 over the sorted pairs of case and run hash; a case without a hash counts by its reason."""
+    pairs = sorted((one.case.case_id, (one.report and one.report.run_hash) or f"without: {one.why}") for one in outcomes)
+    return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
 
 
-def sessions(folder: Path) -> list[Session]:
-    """All goes at the study."""
-    path = folder / SESSIONS
-    lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-    return [Session.model_validate_json(line) for line in lines]
+def record(study: str, outcomes: Sequence[Outcome], sessions: Sequence[Session]) -> RunRecord:
+    """Return the record of a finished study."""
+    wallclock = any(one.case.runtime == "wallclock" for one in outcomes)
+    platforms = {json.dumps(one.report.platform, sort_keys=True): one.report.platform for one in outcomes if one.report}
+    return RunRecord(
+        study=study,
+        split=outcomes[0].case.split,
+        cases=len(outcomes),
+        done=sum(one.status == "done" for one in outcomes),
+        failed=sum(one.status == "failed" for one in outcomes),
+        not_completed=sum(not one.completed for one in outcomes),
+        digest=None if wallclock else digest(outcomes),
+        no_digest=NO_DIGEST if wallclock else None,
+        code=sorted({one.code for one in outcomes if one.code}),
+        platforms=[platforms[key] for key in sorted(platforms)],
+        peak_memory_bytes=max(one.peak_memory_bytes for one in outcomes),
+        wall_time_s=sum(one.wall_time_s for one in outcomes),
+        core_s=sum(one.core_s for one in outcomes),
+        sessions=list(sessions),
+    )
 
 
-def put_together(parts: Sequence[Path], folder: Path) -> None:
-    """Takes over how long each go at a part took, each once however often this is done, and why attempts at cases failed."""
-    every = dict.fromkeys(session for part in (folder, *parts) for session in sessions(part))
-    write_text(folder / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in every))
-    (folder / FAILURES).mkdir(exist_ok=True)
-    for path in (path for part in parts for path in (part / FAILURES).glob("*.json")):
-        write_text(folder / FAILURES / path.name, path.read_text(encoding="utf-8"))
+@cache
+def code_digest() -> str:
+    """Return the SHA-256 over the files that decide results, by their path in the package, however they are installed."""
+    found = hashlib.sha256()
+    for name, path in sorted(_code_files()):
+        found.update(f"{name}\0{hashlib.sha256(path.read_bytes()).hexdigest()}\0".encode())
+    return found.hexdigest()
 
 
-def outcomes_of(folder: Path, manifest: Manifest) -> list[Outcome]:
-    """The outcomes that there are, in the order of the manifest. Raises StudyError for a file that is none."""
-    found = (read_outcome(folder, row.case_id) for row in manifest.cases)
-    return [outcome for outcome in found if outcome is not None]
-
-
-def conclude(folder: Path, manifest: Manifest) -> tuple[RunRecord, list[Outcome]]:
-    """Writes tables, run.json, study.json and study.html of a study all of whose cases have an outcome."""
-    outcomes = outcomes_of(folder, manifest)
-    if len(outcomes) < len(manifest.cases):
-        raise StudyError(f"{folder}: {len(manifest.cases) - len(outcomes)} of {len(manifest.cases)} cases have no outcome yet")
-    write_tables(folder, manifest.study, outcomes)
-    found = record(manifest.study, outcomes, sessions(folder))
-    write_record(folder, found)
-    write_real_time(folder, outcomes)
-    summarise(folder, manifest.command)
-    return found, outcomes
+def _code_files() -> Iterator[tuple[str, Path]]:
+    for package in PACKAGES:
+        spec = find_spec(package)
+        for root in map(Path, (spec.submodule_search_locations if spec else None) or ()):
+            for path in root.rglob("*"):
+                if path.suffix in SUFFIXES:
+                    yield f"{package}/{path.relative_to(root).as_posix()}", path
+            if package == "palpate_fmu":  # in a checkout the C sources are next to the package
+                for path in (root.parent / "src").glob("*.[ch]"):
+                    yield f"{package}/src/{path.name}", path

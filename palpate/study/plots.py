@@ -15,14 +15,13 @@ from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
 from palpate.study import human_line
+from palpate.study.statistics.accuracy import Agreement, FindingCalibration
 from palpate.study.statistics.analysis import Analysis
-from palpate.study.statistics.calibration import FindingCalibration
 from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, Surface
-from palpate.study.statistics.errors import Agreement
+from palpate.study.statistics.detection import GRID as ROC_GRID
+from palpate.study.statistics.detection import RATES
 from palpate.study.statistics.estimate import Estimate
-from palpate.study.statistics.froc import RATES
-from palpate.study.statistics.roc import GRID as ROC_GRID
 
 COLOURS: Final = ("#0f766e", "#c2410c", "#7c3aed", "#2563eb", "#be185d", "#854d0e")
 HUMAN: Final = "#b91c1c"

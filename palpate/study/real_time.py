@@ -8,7 +8,7 @@ from typing import Final
 
 from palpate.report.files import write_text
 from palpate.report.rows import Report
-from palpate.study.outcome import Outcome
+from palpate.study.folder import Outcome
 
 FILE: Final = "real_time.md"
 FAST: Final = ("robot", "tissue", "control")
@@ -22,7 +22,7 @@ Named = Sequence[tuple[str, Report]]
 
 def write_real_time(folder: Path, outcomes: Sequence[Outcome]) -> None:
     """Writes real_time.md into the folder of a study, if it has examinations by the wall clock."""
-    named = [(one.case.words, one.report) for one in outcomes if one.report is not None]
+    named = [(one.case.label, one.report) for one in outcomes if one.report is not None]
     clocked = [(name, report) for name, report in named if report.runtime == "wallclock" and report.failure is None]
     if clocked:
         machine = clocked[0][1].platform

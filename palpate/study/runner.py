@@ -1,143 +1,184 @@
-"""A study is run: every case that has no outcome yet is given to the workers, and what comes back is kept on the disk.
-
-The folder of a study is all that there is of it: whenever the run is stopped, and however, the next one goes on from there.
-
-    study.json, study.html     figures and page (`palpate.study.summary`)
-    run.json                   what was run, where, with which code, and the digest
-    manifest.json              all cases, without their scenarios
-    cases/ID.json              the outcome of a case
-    failures/ID.json           why earlier attempts at a case failed
-    cases.parquet, findings.parquet, lumps.parquet
-    sessions.jsonl             how long each go at it took
-    real_time.md               with examinations by the wall clock: how late they were
-"""
+"""Runs the cases of a study on Dask workers: threads of this process, or the workers of a scheduler elsewhere."""
 
 from __future__ import annotations
 
-import json
-from collections.abc import Callable, Iterable, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, wait
-from pathlib import Path
-from typing import Final
+import logging
+import os
+import re
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from typing import Any, Final
 
-from palpate.report.files import write_text
-from palpate.study.case import Attempt
-from palpate.study.child import run_batch
-from palpate.study.code import code_digest
-from palpate.study.folder import FAILURES, Manifest, manifest_of, open_folder
-from palpate.study.manifest import Case
-from palpate.study.outcome import ATTEMPTS, Outcome, case_file, read_outcome, write_outcome
+import psutil
+
+from palpate.study.case import Attempt, run_batch
+from palpate.study.cases import Case
+from palpate.study.folder import ATTEMPTS, Folder, Outcome
 from palpate.study.spec import StudyError
-from palpate.study.workers import Workers
 from palpate_errors import RunError
 
+CONNECT_S: Final = 30
+"""Time limit for the connection to a scheduler."""
 BATCH: Final = {"whole": 1, "quick": 8}
-"""Most cases a task ..."""
-SHARE: Final = 4
-"""... and so many tasks a worker at least, so that none waits for another at the end."""
-LOOK_S: Final = 2.0
-"""How often it is looked whether the workers are still there."""
-Tell = Callable[[Outcome], None]
-"""Hears of every case that has an outcome now."""
+"""Maximum number of cases of one task; they share a process."""
+TASKS_A_WORKER: Final = 4
+"""Minimum number of tasks for each worker, so that none waits for another at the end."""
+POLL_S: Final = 2.0
+"""Interval of the check that the scheduler is alive."""
 
 
 class StudyStopped(RunError):
-    """The workers are gone, or cannot work. What was done is kept. Says why."""
+    """The workers are gone or cannot work. Finished cases are kept."""
 
 
-def missing(folder: Path, cases: Iterable[Case]) -> list[Case]:
-    """The cases that have no outcome in the folder yet."""
-    return [case for case in cases if not case_file(folder, case.case_id).is_file()]
+@dataclass(frozen=True)
+class Workers:
+    """Dask workers."""
+
+    client: Any
+    executor: Executor
+    count: int
+    """Cases at a time, as known at the start: a cluster may grow."""
+    killed: type[Exception]
+    """Raised for a task whose worker was lost repeatedly."""
+
+    @property
+    def alive(self) -> bool:
+        """True if the client is connected; one without a scheduler would wait for ever."""
+        return bool(self.client.status == "running")
 
 
-def of_other_code(folder: Path, cases: Iterable[Case]) -> list[Case]:
-    """The cases whose outcome in the folder was made by other code than this."""
-    found = ((case, read_outcome(folder, case.case_id)) for case in cases)
-    return [case for case, outcome in found if outcome is not None and outcome.code not in ("", code_digest())]
+def cores() -> int:
+    """Return the number of processors that this process may use."""
+    return len(os.sched_getaffinity(0))
 
 
-def opened(folder: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> Manifest:
-    """Makes the folder of a study of these cases, which `command` runs again, or goes on in it. Returns its manifest.
+@contextmanager
+def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
+    """`count` worker threads in this process, or the workers of a scheduler elsewhere. Raises StudyError.
 
-    `keep`: cases that other code has made count. Raises StudyError for them otherwise, and for a folder of another study.
+    Local workers are threads because each case is examined in a process of its own.
     """
-    if not keep and (old := of_other_code(folder, cases)):
-        raise StudyError(
-            f"{folder}: {len(old)} of its cases were made by other code: give another folder with -o, or --keep them"
-        )
-    manifest = manifest_of(study, cases, command)
-    open_folder(folder, manifest)
-    return manifest
+    from distributed import Client, KilledWorker, LocalCluster  # noqa: PLC0415 - takes a second
+
+    with ExitStack() as stack:
+        stack.enter_context(warnings.catch_warnings())
+        warnings.filterwarnings("ignore", "Port .* is already in use")  # by another study; the address is printed anyway
+        try:
+            if scheduler is None:
+                local = LocalCluster(
+                    n_workers=1,
+                    threads_per_worker=count,
+                    processes=False,
+                    memory_limit=0,
+                    dashboard_address="127.0.0.1:8787",
+                    silence_logs=logging.CRITICAL,
+                )
+                stack.callback(_end_cases)
+                stack.enter_context(local)
+                client = stack.enter_context(Client(local))
+            else:
+                client = stack.enter_context(Client(scheduler, timeout=CONNECT_S))
+        except (OSError, ValueError, TimeoutError) as error:
+            raise StudyError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
+        known = sum(client.nthreads().values()) or 1
+        executor = client.get_executor(pure=False)
+        if scheduler is None:
+            stack.callback(_end_cases)
+        stack.callback(executor.shutdown, wait=False)
+        yield Workers(client, executor, known, KilledWorker)
 
 
-def run_cases(folder: Path, cases: Sequence[Case], workers: Workers, tell: Tell, *, runs: bool = False) -> None:
-    """Examines all cases that have no outcome yet, in any order. Raises StudyStopped.
+def _end_cases() -> None:
+    """Ends the case processes of an interrupted study, so that the threads that wait for them end."""
+    for child in psutil.Process().children():
+        if "palpate.study.case" in child.cmdline():
+            child.kill()
 
-    `runs`: the results of whole examinations stay in the folder `runs`, each in a folder of its own.
+
+def part_of(cases: Sequence[Case], shard: str) -> list[Case]:
+    """Return every n-th case from the i-th, for a shard `i/n`. Raises StudyError."""
+    words = re.fullmatch(r"(\d+)/(\d+)", shard)
+    if words is None or not 1 <= int(words[1]) <= int(words[2]):
+        raise StudyError(f"--shard {shard}: want i/n with 1 <= i <= n, such as 2/5")
+    return list(cases[int(words[1]) - 1 :: int(words[2])])
+
+
+def run_cases(
+    folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], *, runs: bool = False
+) -> None:
+    """Examines all cases without an outcome, in any order, and calls `done` after each. Raises StudyStopped.
+
+    `runs`: keep the results of whole examinations in the folder `runs`.
     """
-    (folder / "cases").mkdir(parents=True, exist_ok=True)
-    (folder / FAILURES).mkdir(exist_ok=True)
-    todo, kept = missing(folder, cases), str((folder / "runs").resolve()) if runs else None
+    todo, kept = folder.missing(cases), str((folder.path / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
 
     def submit(batch: list[Case]) -> None:
-        lines = [case.model_dump_json() for case in batch]
-        running[workers.executor.submit(run_batch, lines, kept)] = batch
+        running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch], kept)] = batch
 
-    size = max(1, min(BATCH[todo[0].tier], len(todo) // (SHARE * workers.count))) if todo else 1
-    for first in range(0, len(todo), size):
-        submit(todo[first : first + size])
+    size = max(1, min(BATCH[todo[0].tier], len(todo) // (TASKS_A_WORKER * workers.count))) if todo else 1
+    for batch in _batches(todo, size):
+        submit(batch)
     while running:
-        finished, _ = wait(running, timeout=LOOK_S, return_when=FIRST_COMPLETED)
-        if not finished and not workers.alive():
-            raise StudyStopped("the scheduler is gone")
+        finished, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+        if not finished and not workers.alive:
+            raise StudyStopped("connection to the scheduler lost")
         for future in finished:
             batch = running.pop(future)
-            for case, attempt in zip(batch, _attempts(future, batch, workers), strict=True):
+            attempts = _attempts(future, batch, workers)
+            for case, attempt in zip(batch, attempts, strict=False):
                 outcome = _outcome(folder, case, attempt)
                 if outcome is None:
                     submit([case])
                 else:
-                    write_outcome(folder, outcome)
-                    tell(outcome)
+                    folder.write(outcome)
+                    done(outcome)
+            if rest := batch[len(attempts) :]:
+                submit(rest)
+
+
+def _batches(cases: Sequence[Case], size: int) -> Iterator[list[Case]]:
+    """Yields up to `size` consecutive cases with the same periods, which are set for a whole process."""
+    batch: list[Case] = []
+    for case in cases:
+        if batch and (len(batch) == size or case.periods != batch[0].periods):
+            yield batch
+            batch = []
+        batch.append(case)
+    if batch:
+        yield batch
 
 
 def _attempts(future: Future[list[str]], batch: Sequence[Case], workers: Workers) -> list[Attempt]:
-    """What came of a batch. A worker that is lost again and again has lost it because of a case of the batch."""
+    """Return the attempts of a batch. A batch whose workers are lost repeatedly counts as their cause."""
     if future.cancelled():
-        raise StudyStopped("the scheduler is gone")
+        raise StudyStopped("connection to the scheduler lost")
     error = future.exception()
     if error is None:
         return [Attempt.model_validate_json(text) for text in future.result()]
-    if isinstance(error, workers.killers):
+    if isinstance(error, workers.killed):
         return [Attempt(case_id=case.case_id, report=None, why=f"its workers were lost: {error}") for case in batch]
     raise StudyStopped(f"a worker cannot examine: {type(error).__name__}: {error}") from error
 
 
-def _outcome(folder: Path, case: Case, attempt: Attempt) -> Outcome | None:
-    """The outcome of a case after another attempt; None when it is to be tried again."""
-    before = failures(folder, case)
+def _outcome(folder: Folder, case: Case, attempt: Attempt) -> Outcome | None:
+    """Return the outcome of a case after an attempt; None if it is to be tried again."""
+    failed = len(folder.failures(case.case_id))
     if attempt.why is not None:
-        before.append(attempt.why)
-        write_text(_failures_file(folder, case), json.dumps(before) + "\n")
-        if len(before) < ATTEMPTS:
+        folder.add_failure(case.case_id, attempt.why)
+        failed += 1
+        if failed < ATTEMPTS:
             return None
     report = attempt.report
     return Outcome(
         case=case,
         status="done" if attempt.why is None else "failed",
-        attempts=len(before) + (attempt.why is None),
+        attempts=failed + (attempt.why is None),
         why=attempt.why if report is None else report.failure,
         **attempt.model_dump(exclude={"case_id", "why", "report"}),
         report=report,
     )
-
-
-def failures(folder: Path, case: Case) -> list[str]:
-    """Why earlier attempts at a case failed."""
-    path = _failures_file(folder, case)
-    return list(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else []
-
-
-def _failures_file(folder: Path, case: Case) -> Path:
-    return folder / FAILURES / f"{case.case_id}.json"

@@ -12,17 +12,18 @@ from pydantic import ValidationError
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
 from palpate.study import human_line
+from palpate.study.folder import RUN, Folder, Manifest, Outcome, RunRecord, record
 from palpate.study.page import render
+from palpate.study.real_time import write_real_time
+from palpate.study.statistics.accuracy import CalibrationRow, ErrorsRow, Spread
 from palpate.study.statistics.analysis import Analysis, analyse
-from palpate.study.statistics.calibration import CalibrationRow
 from palpate.study.statistics.comparison import Comparison, compare
-from palpate.study.statistics.contrast import ContrastRow
 from palpate.study.statistics.detectability import Surface
-from palpate.study.statistics.effort import Spread
-from palpate.study.statistics.errors import ErrorsRow
+from palpate.study.statistics.detection import ContrastRow, Rates
 from palpate.study.statistics.estimate import FOLDS, LEVEL, Estimate, Row
-from palpate.study.statistics.rates import Rates
-from palpate.study.statistics.reading import Tables, TablesError, read_tables
+from palpate.study.statistics.reading import Tables, read_tables
+from palpate.study.tables import write_tables
+from palpate_errors import UserError
 
 JSON: Final = "study.json"
 PAGE: Final = "study.html"
@@ -106,10 +107,24 @@ class Analysed:
     analyses: tuple[Analysis, ...]
 
 
+def conclude(folder: Folder, manifest: Manifest) -> tuple[RunRecord, list[Outcome]]:
+    """Writes tables, run.json, study.json and study.html. Raises UserError if a case has no outcome yet."""
+    outcomes = folder.outcomes(manifest)
+    if len(outcomes) < len(manifest.cases):
+        left = len(manifest.cases) - len(outcomes)
+        raise UserError(f"{folder.path}: {left} of {len(manifest.cases)} cases have no outcome yet")
+    write_tables(folder.path, manifest.study, outcomes)
+    found = record(manifest.study, outcomes, folder.sessions())
+    write_text(folder.path / RUN, found.model_dump_json(indent=2) + "\n")
+    write_real_time(folder.path, outcomes)
+    summarise(folder.path, manifest.command)
+    return found, outcomes
+
+
 def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
     """Reads cases.parquet, findings.parquet and lumps.parquet of `folder`; writes study.json and study.html beside them.
 
-    `command` runs the study again. Intervals are of `folds` resamplings. Raises TablesError.
+    `command` runs the study again. Intervals are of `folds` resamplings. Raises UserError.
     """
     analysed = analysed_tables(read_tables(folder, folds), command)
     write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
@@ -117,14 +132,14 @@ def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
 
 
 def read_summary(path: Path) -> StudySummary:
-    """A study.json. Raises TablesError."""
+    """A study.json. Raises UserError."""
     try:
         return StudySummary.model_validate_json(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
-        raise TablesError(f"{path} cannot be read: {error}") from error
+        raise UserError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
-        raise TablesError(f"{path} is no study.json of this version: {'; '.join(wrong)}") from error
+        raise UserError(f"{path} is no study.json of this version: {'; '.join(wrong)}") from error
 
 
 def analysed_tables(tables: Tables, command: str) -> Analysed:

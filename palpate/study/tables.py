@@ -12,7 +12,7 @@ from pyarrow import parquet
 
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
-from palpate.study.outcome import Outcome
+from palpate.study.folder import Outcome
 from palpate_models.scenario.schema import Scenario
 
 Row = dict[str, Any]

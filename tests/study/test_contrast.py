@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import synthetic
 
-from palpate.study.statistics.contrast import by_contrast
+from palpate.study.statistics.detection import by_contrast
 
 
 def test_lumps_are_counted_in_the_class_of_what_they_feel_like() -> None:

@@ -7,9 +7,8 @@ import pytest
 import synthetic
 from sklearn.metrics import roc_auc_score
 
+from palpate.study.statistics.detection import GRID, RATES, froc, roc
 from palpate.study.statistics.estimate import Bootstrap
-from palpate.study.statistics.froc import RATES, froc
-from palpate.study.statistics.roc import GRID, roc
 
 
 def test_the_interval_of_the_auc_holds_the_truth_as_often_as_it_says() -> None:

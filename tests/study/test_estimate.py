@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import synthetic
 
+from palpate.study.statistics.detection import rates
 from palpate.study.statistics.estimate import Bootstrap, bounded, percentiles, wilson
-from palpate.study.statistics.rates import rates
 
 
 def test_wilson_of_twenty_in_twenty_says_what_twenty_patients_can_say() -> None:

@@ -9,8 +9,7 @@ import pandas as pd
 import pytest
 import synthetic
 
-from palpate.study.statistics.calibration import calibration, guarding
-from palpate.study.statistics.errors import finding_errors
+from palpate.study.statistics.accuracy import calibration, finding_errors, guarding
 from palpate.study.statistics.estimate import Bootstrap
 from palpate.study.statistics.reading import Tables, tables_of
 

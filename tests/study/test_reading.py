@@ -9,9 +9,9 @@ import pandas as pd
 import pytest
 import synthetic
 
-from palpate.study.statistics.rates import by_population, rates
-from palpate.study.statistics.reading import TablesError, read_tables, tables_of
-from palpate.study.statistics.roc import roc
+from palpate.study.statistics.detection import by_population, rates, roc
+from palpate.study.statistics.reading import read_tables, tables_of
+from palpate_errors import UserError
 
 FAILED = {"status": "failed", "completed": False, "score": np.nan, "palpable": np.nan, "not_palpable": np.nan}
 
@@ -84,15 +84,15 @@ def test_levels_of_errors_are_variants_and_populations_are_not() -> None:
 
 def test_two_cases_of_one_patient_by_one_method_are_refused() -> None:
     cases = [synthetic.case(3, "healthy"), synthetic.case(3, "healthy", case_id="again")]
-    with pytest.raises(TablesError, match="number 3"):
+    with pytest.raises(UserError, match="number 3"):
         synthetic.tables(cases, [], [])
 
 
 def test_tables_that_are_missing_or_of_another_version_are_named(tmp_path: Path) -> None:
-    with pytest.raises(TablesError, match=r"cases\.parquet"):
+    with pytest.raises(UserError, match=r"cases\.parquet"):
         read_tables(tmp_path)
     frames = synthetic.frames([synthetic.case(0, "healthy")], [], [])
-    with pytest.raises(TablesError, match="confidence"):
+    with pytest.raises(UserError, match="confidence"):
         read_tables(_write(tmp_path, (frames[0], frames[1].drop(columns="confidence"), frames[2])))
-    with pytest.raises(TablesError, match="no case"):
+    with pytest.raises(UserError, match="no case"):
         read_tables(_write(tmp_path, (frames[0].iloc[:0], frames[1], frames[2])))

@@ -7,8 +7,8 @@ from pathlib import Path
 import pytest
 from toy_study import TOY, study
 
-from palpate.study.folder import manifest_of, open_folder
-from palpate.study.manifest import Request, cases_of, command_of, patient_seeds, secret_of
+from palpate.study.cases import Request, cases_of, command_of, patient_seeds, secret_of
+from palpate.study.folder import Folder, manifest_of
 from palpate.study.spec import StudyError
 
 
@@ -105,8 +105,8 @@ def test_no_patient_at_all_is_refused() -> None:
 
 
 def test_a_folder_holds_the_cases_of_one_request(tmp_path: Path) -> None:
-    open_folder(tmp_path, manifest_of("toy", cases_of(study(), Request("test", 1))))
-    open_folder(tmp_path, manifest_of("toy", cases_of(study(), Request("test", 3))))
+    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 1))))
+    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 3))))
     poor = cases_of(study(), Request("test", 3, ("errors=poor",)))
     with pytest.raises(StudyError, match="other settings or patients: give this one another folder with -o"):
-        open_folder(tmp_path, manifest_of("toy", poor))
+        Folder(tmp_path).open(manifest_of("toy", poor))

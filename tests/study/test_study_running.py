@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import dataclasses
 import json
-import os
-import signal
 import subprocess
 import sys
 import threading
@@ -24,26 +22,28 @@ from toy_study import TOY, study
 
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
-from palpate.study.digest import Session, digest
-from palpate.study.folder import FAILURES, add_session, manifest_of, open_folder, outcomes_of, read_manifest, sessions
-from palpate.study.manifest import Case, cases_of
-from palpate.study.outcome import ATTEMPTS, case_file, read_outcome
-from palpate.study.runner import StudyStopped, failures, missing, of_other_code, opened, run_cases
-from palpate.study.shards import Shard, merge
+from palpate.study.cases import Case, cases_of
+from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, opened
+from palpate.study.runner import StudyStopped, cluster, part_of, run_cases
 from palpate.study.spec import StudyError
 from palpate.study.tables import write_tables
-from palpate.study.workers import cluster, threads
 from palpate_models.scenario.load import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 CASES = cases_of(study())
 
 
-def examined(folder: Path, cases: list[Case], count: int = 1) -> Path:
-    """The folder of the toy with these cases done, by threads."""
-    open_folder(folder, manifest_of("toy", CASES))
-    with threads(count) as workers:
-        run_cases(folder, cases, workers, lambda _: None)
+def examined(path: Path, cases: list[Case], count: int = 1) -> Path:
+    """The folder of the toy study after these cases were run."""
+    run(path, CASES, cases, count)
+    return path
+
+
+def run(path: Path, every: list[Case], cases: list[Case], count: int = 1, runs: bool = False) -> Folder:
+    folder = Folder(path)
+    folder.open(manifest_of("toy", every))
+    with cluster(count) as workers:
+        run_cases(folder, cases, workers, lambda _: None, runs=runs)
     return folder
 
 
@@ -51,11 +51,7 @@ def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
     one = cases_of(study(tier="whole"))[:1]
     hashes = []
     for keep in (True, False):
-        folder = tmp_path / str(keep)
-        open_folder(folder, manifest_of("toy", one))
-        with threads(1) as workers:
-            run_cases(folder, one, workers, lambda _: None, runs=keep)
-        outcome = read_outcome(folder, one[0].case_id)
+        outcome = run(tmp_path / str(keep), one, one, runs=keep).outcome(one[0].case_id)
         assert outcome is not None
         assert outcome.report is not None
         hashes.append(outcome.report.run_hash)
@@ -67,7 +63,7 @@ def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
 
 def digest_of(folder: Path) -> str:
     """The digest of a folder that holds all cases."""
-    outcomes = outcomes_of(folder, manifest_of("toy", CASES))
+    outcomes = Folder(folder).outcomes(manifest_of("toy", CASES))
     assert [outcome.case.case_id for outcome in outcomes] == [case.case_id for case in CASES]
     assert all(outcome.completed and outcome.attempts == 1 for outcome in outcomes)
     return digest(outcomes)
@@ -100,25 +96,24 @@ def test_the_digest_is_that_of_two_workers_in_another_order(folder: Path, tmp_pa
 def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Path) -> None:
     parts = [tmp_path / "one", tmp_path / "two"]
     for index, part in enumerate(parts, 1):
-        own = Shard(index, 2).part(CASES)
-        for case in own:  # what another machine has done
-            open_folder(part, manifest_of("toy", CASES, f"palpate study {part}/toy.yaml"))
-            case_file(part, case.case_id).parent.mkdir(exist_ok=True)
-            case_file(part, case.case_id).write_bytes(case_file(folder, case.case_id).read_bytes())
-        add_session(part, Session(workers=index, cases=len(own), elapsed_s=60.0))
-    (parts[0] / FAILURES).mkdir()
-    (parts[0] / FAILURES / f"{CASES[0].case_id}.json").write_text('["killed"]', encoding="utf-8")
+        own = part_of(CASES, f"{index}/2")
+        Folder(part).open(manifest_of("toy", CASES, f"palpate study {part}/toy.yaml"))
+        for case in own:  # the work of another machine
+            Folder(part).case_file(case.case_id).write_bytes(Folder(folder).case_file(case.case_id).read_bytes())
+        Folder(part).add_session(Session(workers=index, cases=len(own), elapsed_s=60.0))
+    Folder(parts[0]).add_failure(CASES[0].case_id, "killed")
     for _again in range(2):
-        assert merge(parts, tmp_path / "whole") == manifest_of("toy", CASES, f"palpate study {parts[0]}/toy.yaml")
-        assert [session.workers for session in sessions(tmp_path / "whole")] == [1, 2]
-    assert failures(tmp_path / "whole", CASES[0]) == ["killed"]
+        whole, manifest = merge(parts, tmp_path / "whole")
+        assert manifest == manifest_of("toy", CASES, f"palpate study {parts[0]}/toy.yaml")
+        assert [session.workers for session in whole.sessions()] == [1, 2]
+    assert whole.failures(CASES[0].case_id) == ["killed"]
     assert digest_of(tmp_path / "whole") == digest_of(folder)
     with pytest.raises(StudyError, match="1 of 3 cases are in no part"):
         merge(parts[:1], tmp_path / "half")
 
 
 def test_parts_of_different_studies_are_not_put_together(folder: Path, tmp_path: Path) -> None:
-    open_folder(tmp_path / "other", manifest_of("toy", CASES[:2]))
+    Folder(tmp_path / "other").open(manifest_of("toy", CASES[:2]))
     with pytest.raises(StudyError, match="holds another study"):
         merge([folder, tmp_path / "other"], tmp_path / "whole")
     with pytest.raises(StudyError, match=r"no manifest\.json"):
@@ -131,23 +126,25 @@ def command(tmp_path: Path, *options: str) -> list[str]:
     return [sys.executable, "-m", "palpate", "study", str(tmp_path / "toy.yaml"), "-o", str(tmp_path / "out"), *options]
 
 
-def test_a_killed_worker_costs_no_case(folder: Path, tmp_path: Path) -> None:
-    """Dask starts it anew, and gives its cases to workers that are free."""
-    killed = _strike(_case_process, lambda process: os.kill(process.ppid(), signal.SIGKILL))
+def test_a_killed_case_process_costs_an_attempt_and_no_case(folder: Path, tmp_path: Path) -> None:
+    killed = _strike(_case_process, lambda process: process.kill())
     subprocess.run(command(tmp_path, "--workers", "2"), check=True)
     assert killed.is_set()
-    assert digest_of(tmp_path / "out") == digest_of(folder)
+    outcomes = Folder(tmp_path / "out").outcomes(manifest_of("toy", CASES))
+    assert sorted(outcome.attempts for outcome in outcomes) == [1, 1, 2]
+    assert digest(outcomes) == digest_of(folder)
 
 
 def test_a_study_goes_on_after_its_scheduler_was_killed(
     folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
 ) -> None:
     address, head = scheduler
-    open_folder(tmp_path, manifest_of("toy", CASES))
+    own = Folder(tmp_path)
+    own.open(manifest_of("toy", CASES))
     with pytest.raises(StudyStopped), cluster(1, address) as workers:
         _strike(_case_process, lambda _: head.kill())
-        run_cases(tmp_path, CASES, workers, lambda _: None)
-    assert missing(tmp_path, CASES)
+        run_cases(own, CASES, workers, lambda _: None)
+    assert own.missing(CASES)
     assert digest_of(examined(tmp_path, CASES)) == digest_of(folder)
 
 
@@ -173,13 +170,11 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     bad.write_text("def create(scenario):\n    raise RuntimeError('no idea')\n")
     mine = study(methods={"bad": {"services": {"assessment": str(bad)}}})
     cases = cases_of(mine)[:1]
-    open_folder(tmp_path, manifest_of("toy", cases))
-    with threads(1) as workers:
-        run_cases(tmp_path, cases, workers, lambda _: None)
-    outcome = read_outcome(tmp_path, cases[0].case_id)
+    own = run(tmp_path, cases, cases)
+    outcome = own.outcome(cases[0].case_id)
     assert outcome is not None
     assert (outcome.status, outcome.attempts, outcome.completed) == ("failed", ATTEMPTS, False)
-    causes = failures(tmp_path, cases[0])
+    causes = own.failures(cases[0].case_id)
     assert len(causes) == ATTEMPTS
     assert all("bad.py': line 2: RuntimeError: no idea" in cause for cause in causes)
     write_tables(tmp_path, "toy", [outcome])
@@ -192,14 +187,14 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
 
 
 def test_a_case_can_be_examined_again(folder: Path, tmp_path: Path) -> None:
-    path = case_file(folder, CASES[1].case_id)
+    path = Folder(folder).case_file(CASES[1].case_id)
     printed = subprocess.run(
         [sys.executable, "-m", "palpate", "study", "scenario", str(path)], check=True, capture_output=True, text=True
     )
     patient = tmp_path / "patient.yaml"
     patient.write_text(printed.stdout)
     again = CASES[1].model_copy(update={"scenario": load_scenario(str(patient)).model_dump(mode="json")})
-    first, second = (read_outcome(place, CASES[1].case_id) for place in (folder, examined(tmp_path / "again", [again])))
+    first, second = (Folder(place).outcome(CASES[1].case_id) for place in (folder, examined(tmp_path / "again", [again])))
     assert first is not None
     assert second is not None
     assert first.report is not None
@@ -208,7 +203,7 @@ def test_a_case_can_be_examined_again(folder: Path, tmp_path: Path) -> None:
 
 
 def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
-    outcome = read_outcome(folder, CASES[0].case_id)
+    outcome = Folder(folder).outcome(CASES[0].case_id)
     assert outcome is not None
     report = outcome.report
     assert report is not None
@@ -236,27 +231,26 @@ def test_a_service_that_is_changed_in_mid_study_is_not_examined_with(tmp_path: P
     own.write_text("from palpate_assessment.service import create\n")
     cases = cases_of(study(methods={"own": {"services": {"assessment": str(own)}}}))[:1]
     own.write_text("from palpate_assessment.service import create  # changed\n")
-    open_folder(tmp_path, manifest_of("toy", cases))
-    with threads(1) as workers:
-        run_cases(tmp_path, cases, workers, lambda _: None)
-    assert all("own.py is not the file that the study was made with" in why for why in failures(tmp_path, cases[0]))
+    failures = run(tmp_path, cases, cases).failures(cases[0].case_id)
+    assert len(failures) == ATTEMPTS
+    assert all("own.py is not the file that the study was made with" in why for why in failures)
 
 
 def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
-    open_folder(tmp_path, manifest_of("toy", CASES))
-    path = case_file(tmp_path, CASES[0].case_id)
-    path.parent.mkdir()
-    outcome = read_outcome(folder, CASES[0].case_id)
+    own = Folder(tmp_path)
+    own.open(manifest_of("toy", CASES))
+    path = own.case_file(CASES[0].case_id)
+    outcome = Folder(folder).outcome(CASES[0].case_id)
     assert outcome is not None
-    assert of_other_code(folder, CASES) == []
+    assert Folder(folder).of_other_code(CASES) == []
     path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
-    assert of_other_code(tmp_path, CASES) == [CASES[0]]
+    assert own.of_other_code(CASES) == [CASES[0]]
     with pytest.raises(StudyError, match="1 of its cases were made by other code"):
         opened(tmp_path, "toy", CASES, "palpate study toy.yaml")
-    assert read_manifest(tmp_path) == manifest_of("toy", CASES), "what was refused leaves its command there"
+    assert own.manifest() == manifest_of("toy", CASES), "what was refused leaves its command there"
     path.write_text("{}")
-    with pytest.raises(StudyError, match=f"{path} is no outcome of this version"):
-        of_other_code(tmp_path, CASES)
+    with pytest.raises(StudyError, match=f"{path} is not an outcome of this version"):
+        own.of_other_code(CASES)
 
 
 def _case_process() -> psutil.Process | None:

@@ -8,7 +8,7 @@ import pytest
 import yaml
 from toy_study import TOY, study
 
-from palpate.study.manifest import Request, cases_of
+from palpate.study.cases import Request, cases_of
 from palpate.study.spec import Grid, Lumps, StudyError, load_study, study_names
 
 PLAIN = "populations: {a: {scenario: person}}\n"

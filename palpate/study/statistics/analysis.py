@@ -6,16 +6,22 @@ from dataclasses import dataclass
 
 import pandas as pd
 
-from palpate.study.statistics.calibration import FindingCalibration, calibration, guarding
-from palpate.study.statistics.contrast import ContrastRow, by_contrast
+from palpate.study.statistics.accuracy import (
+    COVERED,
+    MEASURED,
+    FindingCalibration,
+    FindingErrors,
+    Spread,
+    calibration,
+    coverage,
+    finding_errors,
+    guarding,
+    spread,
+)
 from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
-from palpate.study.statistics.effort import COVERED, MEASURED, Spread, coverage, spread
-from palpate.study.statistics.errors import FindingErrors, finding_errors
+from palpate.study.statistics.detection import ContrastRow, Froc, Rates, Roc, by_contrast, by_population, froc, rates, roc
 from palpate.study.statistics.estimate import Bootstrap, Estimate
-from palpate.study.statistics.froc import Froc, froc
-from palpate.study.statistics.rates import Rates, by_population, rates
 from palpate.study.statistics.reading import Variant
-from palpate.study.statistics.roc import Roc, roc
 
 
 @dataclass(frozen=True)

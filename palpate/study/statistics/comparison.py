@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 from statsmodels.stats.contingency_tables import mcnemar
 from statsmodels.stats.weightstats import ttost_paired
 
+from palpate.study.statistics.detection import froc, roc
 from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, estimate, percentiles, wilson
-from palpate.study.statistics.froc import froc
 from palpate.study.statistics.reading import Variant
-from palpate.study.statistics.roc import roc
 
 
 class Quantity(NamedTuple):

@@ -32,10 +32,6 @@ WORST_ILL, WORST_HEALTHY = -1.0, 2.0
 """Scores of cases that failed, beyond the confidences 0 to 1: of a patient with lumps, of one without."""
 
 
-class TablesError(UserError):
-    """Tables that no statistics can be made of. Names the file and what is wrong."""
-
-
 @dataclass(frozen=True)
 class Variant:
     """The cases of one method, at one tier, with one setting of the errors: one a patient, in the order of the patients.
@@ -76,26 +72,26 @@ class Tables:
 
 
 def read_tables(folder: Path, folds: int = FOLDS) -> Tables:
-    """The tables in `folder`. Raises TablesError."""
+    """The tables in `folder`. Raises UserError."""
     read = {}
     for name, columns in COLUMNS.items():
         path = folder / f"{name}.parquet"
         try:
             table = parquet.read_table(path).to_pandas()
         except FileNotFoundError as error:
-            raise TablesError(f"{path} is not there: give the folder of a study that has run") from error
+            raise UserError(f"{path} is not there: give the folder of a study that has run") from error
         except (OSError, ValueError) as error:
-            raise TablesError(f"{path} cannot be read: {error}") from error
+            raise UserError(f"{path} cannot be read: {error}") from error
         if missing := [column for column in columns.split() if column not in table.columns]:
-            raise TablesError(f"{path} has no column {', '.join(missing)}; it is of another version of Palpate")
+            raise UserError(f"{path} has no column {', '.join(missing)}; it is of another version of Palpate")
         read[name] = table
     if read["cases"].empty:
-        raise TablesError(f"{folder / 'cases.parquet'} has no case: run the study first")
+        raise UserError(f"{folder / 'cases.parquet'} has no case: run the study first")
     return tables_of(read["cases"], read["findings"], read["lumps"], folds)
 
 
 def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, folds: int = FOLDS) -> Tables:
-    """Tables from their frames. Raises TablesError for two cases of one patient in one variant."""
+    """Tables from their frames. Raises UserError for two cases of one patient in one variant."""
     cases = cases.copy()
     patients = cases[PATIENT].drop_duplicates().sort_values(PATIENT).reset_index(drop=True)
     cases["patient"] = cases[PATIENT].merge(patients.reset_index(names="patient"), on=PATIENT)["patient"].to_numpy()
@@ -105,7 +101,7 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
     if not doubled.empty:
         row = doubled.iloc[0]
         where = f"{row['population']}, {row['split']}, number {row['number']}"
-        raise TablesError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
+        raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
     facts = cases[["case_id", "patient", "failed"]]
     findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
     findings = findings[~findings["failed"]].assign(**{name: None for name in LATER if name not in findings})

@@ -53,8 +53,8 @@ class Case(Section):
     """SHA-256 of each file that the scenario names, by its path."""
 
     @property
-    def words(self) -> str:
-        """The case for people."""
+    def label(self) -> str:
+        """Population, number, method and errors, for messages."""
         return " ".join(filter(None, (self.population, str(self.number), self.method, self.errors)))
 
 
@@ -110,7 +110,7 @@ def cases_of(study: Study, request: Request = Request()) -> list[Case]:  # noqa:
     for case in _cases(study, request):
         twin = found.setdefault(case.case_id, case)
         if twin is not case:
-            raise StudyError(f"{study.name}: {case.words} and {twin.words} are the same examination: leave one of them out")
+            raise StudyError(f"{study.name}: {case.label} and {twin.label} are the same examination: leave one of them out")
     if not found:
         raise StudyError(f"{study.name}: no patient in the split {request.split}: want populations.*.number.{request.split} >= 1")
     return list(found.values())

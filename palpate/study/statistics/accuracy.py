@@ -1,0 +1,295 @@
+"""Accuracy of findings: errors of position, size and stiffness (Bland and Altman), calibration of confidences, and effort."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+from zlib import crc32
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from scipy.special import logit
+from sklearn.metrics import brier_score_loss
+
+from palpate.study.statistics.detectability import fit
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate
+from palpate.study.statistics.reading import Variant
+
+NORMAL: Final = 1.959964
+"""Between -NORMAL and NORMAL lie 95 % of a standard normal variable."""
+
+
+@dataclass(frozen=True)
+class Sample:
+    """Values of findings, each of a patient; shapes (m,)."""
+
+    values: Array
+    patient: NDArray[np.intp]
+
+    def mean(self, bootstrap: Bootstrap) -> Estimate:
+        """Their mean."""
+        if not len(self.values):
+            return Estimate(value=None, n=0, of="findings")
+        return estimate(float(self.values.mean()), self.mean_replicates(bootstrap), len(self.values), "findings")
+
+    def mean_replicates(self, bootstrap: Bootstrap) -> Array:
+        """Replicates of the mean, shape (folds,)."""
+        return bootstrap.ratio(*(bootstrap.sums(each, self.patient) for each in (self.values, np.ones(len(self.values)))))
+
+    def quantile(self, q: float, bootstrap: Bootstrap) -> Estimate:
+        """Their quantile `q`: the least value below or at which that part of them lies."""
+        if not len(self.values):
+            return Estimate(value=None, n=0, of="findings")
+        value = float(np.quantile(self.values, q, method="inverted_cdf"))
+        return estimate(value, bootstrap.quantile(self.values, self.patient, q), len(self.values), "findings")
+
+
+class AgreementRow(Row):
+    """Agreement of estimated and true."""
+
+    bias: Estimate
+    """Mean difference."""
+    lower: Estimate
+    """Limits of agreement, bias less and plus 1.96 standard deviations: 95 % of the differences, were they normal."""
+    upper: Estimate
+
+
+class ErrorsRow(Row):
+    """Of the reported findings that match a lump."""
+
+    place_mean_m: Estimate
+    """Distance of the centres."""
+    place_median_m: Estimate
+    place_p95_m: Estimate
+    """95 % of the findings have less."""
+    size_mean: Estimate
+    """Area over the true area, less one."""
+    ratio_mean: Estimate
+    """Stiffness ratio over the true ratio, less one."""
+    radius_m: AgreementRow
+    """Of the radius of the circle of equal area."""
+    log_ratio: AgreementRow
+    """Of the natural logarithm of the stiffness ratio."""
+    ratio_held: Estimate
+    """Findings whose 90 % band of the ratio holds the true one."""
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Estimated against true (Bland and Altman, Lancet 1986;1:307): differences against means."""
+
+    mean: Array
+    """Of estimated and true, shape (m,)."""
+    difference: Array
+    """Estimated less true."""
+    figures: AgreementRow
+
+
+@dataclass(frozen=True)
+class FindingErrors:
+    """Of the reported findings that match a lump."""
+
+    place_m: Sample
+    """Distance of the centres."""
+    radius: Agreement
+    """Radius of the circle of the finding's area [m]."""
+    log_ratio: Agreement
+    """Natural logarithm of the stiffness ratio."""
+    figures: ErrorsRow
+
+
+def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
+    """Errors of one method."""
+    matched = variant.findings[variant.findings["reported"].astype(bool) & (variant.findings["lump"] >= 0)]
+    patient = matched["patient"].to_numpy(dtype=np.intp)
+
+    def column(name: str) -> Array:
+        return matched[name].to_numpy(dtype=np.float64)
+
+    def sample(values: Array) -> Sample:
+        known = np.isfinite(values)
+        return Sample(values[known], patient[known])
+
+    area, area_true, ratio, ratio_true = map(column, ("area_m2", "area_true_m2", "ratio", "ratio_true"))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        size, stiffness = area / area_true - 1, ratio / ratio_true - 1
+        logs = np.log(ratio), np.log(ratio_true)
+    inside = np.where(
+        np.isfinite(ratio_true), (column("ratio_lower") <= ratio_true) & (ratio_true <= column("ratio_upper")), np.nan
+    )
+    held, place = sample(inside), sample(column("place_error_m"))
+    patients = len(np.unique(held.patient))
+    share = float(held.values.mean()) if len(held.values) else np.nan
+    radius = agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap)
+    log_ratio = agreement(*logs, patient, bootstrap)
+    figures = ErrorsRow(
+        place_mean_m=place.mean(bootstrap),
+        place_median_m=place.quantile(0.5, bootstrap),
+        place_p95_m=place.quantile(0.95, bootstrap),
+        size_mean=sample(size).mean(bootstrap),
+        ratio_mean=sample(stiffness).mean(bootstrap),
+        radius_m=radius.figures,
+        log_ratio=log_ratio.figures,
+        ratio_held=bounded(share, held.mean_replicates(bootstrap), len(held.values), "findings", patients),
+    )
+    return FindingErrors(place, radius, log_ratio, figures)
+
+
+def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstrap: Bootstrap) -> Agreement:
+    """Agreement of m pairs, each of a patient, where both are known."""
+    known = np.isfinite(estimated) & np.isfinite(true)
+    difference, mean, patient = (estimated - true)[known], (estimated + true)[known] / 2, patient[known]
+    bias = Sample(difference, patient)
+    first, second = bias.mean_replicates(bootstrap), Sample(difference**2, patient).mean_replicates(bootstrap)
+    n = len(difference)
+    spread = float(difference.std(ddof=1)) if n > 1 else np.nan
+    spreads = np.sqrt(np.maximum(second - first**2, 0) * n / max(n - 1, 1))
+    middle = float(difference.mean()) if n else np.nan
+    lower, upper = (estimate(middle + side * NORMAL * spread, first + side * NORMAL * spreads, n, "findings") for side in (-1, 1))
+    return Agreement(mean, difference, AgreementRow(bias=bias.mean(bootstrap), lower=lower, upper=upper))
+
+
+MEASURED: Final = ("peak_force_n", "exam_time_s", "depth_rms_m")
+COVERED: Final = ("coverage_area", "coverage_lumps", "coverage_ratio")
+
+
+class Spread(Row):
+    """One value of each examination that came to its end."""
+
+    mean: Estimate
+    median: Estimate
+    p95: Estimate
+    """95 % of the examinations have less."""
+    greatest: float | None
+
+
+def spread(variant: Variant, column: str, bootstrap: Bootstrap) -> Spread:
+    """The spread of a column of the cases."""
+    sample = of_cases(variant, column)
+    mean, median, p95 = (
+        each.model_copy(update={"of": "examinations"})
+        for each in (sample.mean(bootstrap), sample.quantile(0.5, bootstrap), sample.quantile(0.95, bootstrap))
+    )
+    return Spread(mean=mean, median=median, p95=p95, greatest=float(sample.values.max()) if len(sample.values) else None)
+
+
+def coverage(variant: Variant, column: str, bootstrap: Bootstrap) -> Estimate:
+    """Mean over examinations of the part on which a 90 % band holds the truth."""
+    return of_cases(variant, column).mean(bootstrap).model_copy(update={"of": "examinations"})
+
+
+def of_cases(variant: Variant, column: str) -> Sample:
+    """A column of the cases that came to their end, where it is known."""
+    cases = variant.cases[~variant.cases["failed"]].dropna(subset=[column])
+    return Sample(cases[column].to_numpy(dtype=np.float64), cases["patient"].to_numpy(dtype=np.intp))
+
+
+BINS: Final = 10
+LEAST: Final = 1e-6
+"""Confidences are kept this far from 0 and 1 before their log odds are taken."""
+
+
+class CalibrationRow(Row):
+    """Of findings and candidates together, or of the reported findings where a method publishes no candidates."""
+
+    slope: Estimate
+    """Of the log odds of a hit against those of the confidence: 1 is ideal, less is too sure (Cox, Biometrika 1958;45:562)."""
+    in_the_large: Estimate
+    """Part of hits less mean confidence: 0 is ideal."""
+    expected_error: Estimate
+    """Mean distance of hits from confidence over ten bins of equal number (Naeini et al., AAAI 2015). Resampling adds to it what
+    chance makes of it; the interval is moved back by the mean of that."""
+    expected_error_by_chance: float
+    """95 % of studies have less of it with confidences that are right (Broecker and Smith, Weather Forecast 2007;22:651)."""
+    brier: Estimate
+    """Mean square of confidence less hit (Brier 1950)."""
+
+
+@dataclass(frozen=True)
+class FindingCalibration:
+    """The calibration of one method's confidences."""
+
+    figures: CalibrationRow
+    bins: tuple[tuple[float, Estimate], ...]
+    """Mean confidence and part of hits of each bin: the reliability diagram."""
+
+
+def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
+    """The calibration of one method's confidences; None where it has no areas with a confidence."""
+    areas = variant.findings.dropna(subset=["confidence"])
+    return None if areas.empty else _calibration(areas, "confidence", (areas["lump"] >= 0).to_numpy(), bootstrap)
+
+
+def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
+    """The same of the probabilities of a tensed muscle, over the areas that are stiffer than their surroundings.
+
+    None where no area lies on a muscle, or none tells a probability.
+    """
+    areas = variant.findings.dropna(subset=["guarding", "on_guarding"])
+    areas = areas[areas["ratio"] > 1]
+    tensed = areas["on_guarding"].to_numpy(dtype=bool)
+    return _calibration(areas, "guarding", tensed, bootstrap) if tensed.any() else None
+
+
+def _calibration(areas: pd.DataFrame, told: str, hit: NDArray[np.bool_], bootstrap: Bootstrap) -> FindingCalibration:
+    """How the probabilities `told` of areas go with their hits, shape (n,)."""
+    p = areas[told].to_numpy(dtype=np.float64)
+    patient = areas["patient"].to_numpy(dtype=np.intp)
+    order = np.argsort(p, kind="stable")
+    p, hit, patient = p[order], hit[order], patient[order]
+    drawn = bootstrap.counts[:, patient].astype(np.float64)
+    label = _bins(p)
+    slope, slopes = _slope(p, hit, drawn)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        weights = drawn.sum(axis=1)
+        gaps, squares = drawn @ (hit - p) / weights, drawn @ (p - hit) ** 2 / weights
+    error = float(_expected_error(p, hit, label, np.ones((1, len(p))))[0])
+    errors = _expected_error(p, hit, label, drawn)
+    errors = np.maximum(errors - np.nanmean(errors) + error, 0)
+    figures = CalibrationRow(
+        slope=estimate(slope, slopes, len(p), "areas"),
+        in_the_large=estimate(float(np.mean(hit - p)), gaps, len(p), "areas"),
+        expected_error=estimate(error, errors, len(p), "areas"),
+        expected_error_by_chance=_by_chance(p, label),
+        brier=estimate(float(brier_score_loss(hit, p, labels=[False, True])), squares, len(p), "areas"),
+    )
+    bins = tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label))
+    return FindingCalibration(figures, bins)
+
+
+def _bins(p: Array) -> NDArray[np.intp]:
+    """Bins of equal number of sorted confidences; equal confidences are in one bin."""
+    _, first = np.unique(p, return_index=True)
+    rank = first[np.searchsorted(p[first], p)]
+    return (rank * BINS // len(p)).astype(np.intp)
+
+
+def _bin(p: Array, hit: NDArray[np.bool_], patient: NDArray[np.intp], bootstrap: Bootstrap) -> tuple[float, Estimate]:
+    hits, seen = (bootstrap.sums(values, patient) for values in (hit, np.ones(len(p))))
+    return float(p.mean()), bounded(float(hit.mean()), bootstrap.ratio(hits, seen), len(p), "areas", int((seen > 0).sum()))
+
+
+def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], drawn: Array) -> Array:
+    """Sums over the bins of |sum(hit - p)|, over the number of all areas, shape (folds,); areas are in order of their bins."""
+    _, first = np.unique(label, return_index=True)
+    gaps = np.abs(np.add.reduceat(drawn * (hit - p), first, axis=1)).sum(axis=1)
+    with np.errstate(invalid="ignore", divide="ignore"):
+        return np.asarray(gaps / drawn.sum(axis=1), dtype=np.float64)
+
+
+def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
+    rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([0, crc32(b"hits by their confidence")])))
+    hit = rng.random((FOLDS, len(p))) < p
+    return float(np.quantile(_expected_error(p, hit, label, np.ones((1, len(p)))), LEVEL))
+
+
+def _slope(p: Array, hit: NDArray[np.bool_], drawn: Array) -> tuple[float, Array]:
+    """The slope and its replicates, NaN where all or none hit or all confidences are one."""
+    x = logit(np.clip(p, LEAST, 1 - LEAST))
+    if hit.all() or not hit.any() or np.ptp(x) < LEAST:
+        return float("nan"), np.full(len(drawn), np.nan)
+    scale = x.std()
+    z = np.column_stack((np.ones(len(x)), (x - x.mean()) / scale))
+    best = fit(z, hit, np.ones(len(x)), False)[0]
+    return float(best[1] / scale), np.array([fit(z, hit, count, False, best)[0][1] for count in drawn]) / scale
