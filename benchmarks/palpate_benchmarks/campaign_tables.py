@@ -83,7 +83,7 @@ def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
         after = [f.detected_ms for f in cases if f.detected_ms is not None]
         outcomes: dict[str, int] = {}
         for finding in cases:
-            outcome = finding.reaction if finding.outcome is CaseOutcome.ENDED else "went on"
+            outcome = finding.reaction if finding.outcome is CaseOutcome.ENDED else "continued"
             outcomes[outcome] = outcomes.get(outcome, 0) + 1
         rows.append(
             (

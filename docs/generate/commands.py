@@ -41,8 +41,8 @@ def walked(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
 
 
 def _command(path: str, command: Any) -> Iterator[str]:
-    told = re.sub(r"\[/?(?:bold|dim)?\]", "", cleandoc(command.help or ""))
-    words, *examples = re.split(r"^Examples?\n", told, maxsplit=1, flags=re.MULTILINE)
+    text = re.sub(r"\[/?(?:bold|dim)?\]", "", cleandoc(command.help or ""))
+    words, *examples = re.split(r"^Examples?\n", text, maxsplit=1, flags=re.MULTILINE)
     yield f"### palpate {path}\n"
     yield words.strip() + "\n"
     if examples:
