@@ -3,13 +3,12 @@
     python -m research.assessment_calibration --patients 600 --more-healthy 100 -o FOLDER
     python -m research.assessment_calibration --patients 100 --first-seed 2000 --check -o FOLDER
 
-The first writes calibration.yaml anew, the second tells how the calibration does on others.
+The first command writes calibration.yaml, the second evaluates the calibration on other patients.
 
-Persons are examined by the quick tier with typical errors and quiet breathing; every second one is healthy, the others have one
-lump. What was weighed in each is kept in FOLDER, so that it can be made in pieces: cases that are there are not made again, and
-a changed assessment needs a new FOLDER. What
-the regression needs of contact mechanics (exponent, conversion, lead) stays as it is: it is measured where a sphere slides over
-the tissue, and a press is made beside it.
+Persons are examined by the quick tier with typical errors and quiet breathing; every second one is healthy, the others have
+one lump. The candidates of each are kept in FOLDER, so an interrupted calibration continues; a changed assessment needs a
+new FOLDER. The parameters of contact mechanics (exponent, conversion, lead) are kept: they are measured by slides and
+presses on the tissue.
 """
 
 from __future__ import annotations
@@ -53,14 +52,14 @@ _RIDGE: Final = 0.1
 NONE: Final = -20.0
 """Logit of a patient in whom nothing was weighed."""
 CLASSES: Final = ((1.05, 1.3), (1.3, 1.5), (1.5, 2.0), (2.0, 20.0))
-"""Felt contrasts by which lumps are told apart."""
+"""Classes of felt contrast."""
 WIDE_M: Final = 0.015
-"""Felt radius from which a lump is told apart, too."""
+"""Least felt radius of a separate class [m]."""
 
 
 @dataclass(frozen=True)
 class WeighedPatient:
-    """What was weighed in one patient."""
+    """Candidates of one patient."""
 
     seed: int
     features: list[list[float]]
@@ -68,7 +67,7 @@ class WeighedPatient:
     signs: list[list[float]]
     """Of muscles about them."""
     real: list[bool]
-    """Whether each is a lump of felt contrast FELT or more."""
+    """True where a candidate is a lump of felt contrast FELT or more."""
     contrast: float
     """Felt contrast of the patient's lump (its inverse if softer), 1 without one that is palpable."""
     radius_m: float
@@ -112,7 +111,7 @@ def weigh(seed: int) -> WeighedPatient:
 
 
 def real(candidate: Candidate, known: Truth) -> bool:
-    """Whether a lump of felt contrast FELT or more is felt within a candidate's radius."""
+    """True if a lump of felt contrast FELT or more is within a candidate's radius."""
     bump, sign = candidate.bump, np.sign(candidate.log_contrast)
     angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
     ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
@@ -151,8 +150,8 @@ def reported(case: WeighedPatient, calibration: Calibration) -> Array:
     return causes(calibration, np.array(case.features).reshape(-1, len(FEATURES)), np.array(case.signs).reshape(-1, 2))[0]
 
 
-def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:
-    """Prints what the calibration makes of cases, with 95 % intervals."""
+def evaluate(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:
+    """Print the performance of the calibration on cases, with 95 % intervals."""
     threshold = calibration.threshold(false_findings)
     logits = [reported(c, calibration) for c in cases]
     print(f"{len(cases)} patients, seeds {cases[0].seed} to {cases[-1].seed}; threshold: probability {expit(threshold):.3f}")
@@ -174,13 +173,13 @@ def told(cases: list[WeighedPatient], calibration: Calibration, false_findings: 
         if here.any():
             mean, part = float(probability[here].mean()), float(real[here].mean())
             error += here.mean() * abs(mean - part)
-            print(f"probability {low} to {high}: {here.sum()} candidates, {100 * mean:.0f} % told, {_part(real[here])} true")
-    told_true = ", ".join(f"{name} {e.value:.2f} ({e.low:.2f} to {e.high:.2f})" for name, e in slope(every, real).items())
-    print(f"expected calibration error {100 * error:.1f} %; calibration {told_true}")
+            print(f"probability {low} to {high}: {here.sum()} candidates, {100 * mean:.0f} % predicted, {_part(real[here])} true")
+    fit = ", ".join(f"{name} {e.value:.2f} ({e.low:.2f} to {e.high:.2f})" for name, e in slope(every, real).items())
+    print(f"expected calibration error {100 * error:.1f} %; calibration {fit}")
 
 
 def _part(true: Iterable[bool]) -> str:
-    """How many of them, with the interval (Wilson)."""
+    """Return number and share, with Wilson's interval."""
     rows = list(true)
     if not rows:
         return "0 of 0"
@@ -189,9 +188,9 @@ def _part(true: Iterable[bool]) -> str:
 
 
 def slope(logits: Array, real: Mask) -> dict[str, Estimate]:
-    """Slope and intercept of a logistic regression of what is real on the logits told (Cox 1958), with 95 % intervals.
+    """Slope and intercept of a logistic regression of real lumps on the predicted logits (Cox 1958), with 95 % intervals.
 
-    Where what is told is true they are 1 and 0.
+    For perfect calibration they are 1 and 0.
     """
     found = Logit(real.astype(float), np.column_stack((np.ones(len(logits)), logits))).fit(disp=False)
     ends = found.conf_int(alpha=1 - LEVEL)
@@ -209,7 +208,7 @@ def slope(logits: Array, real: Mask) -> dict[str, Estimate]:
 
 
 def kept(seed: int, folder: Path) -> WeighedPatient:
-    """What was weighed in a patient, from the folder if it is there."""
+    """Return the candidates of a patient, from the folder if present."""
     path = folder / f"{seed}.json"
     kind = TypeAdapter(WeighedPatient)
     if not path.is_file():
@@ -235,7 +234,7 @@ def main(
         calibration = fitted(cases, calibration)
         path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
         path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
-    told(cases, calibration)
+    evaluate(cases, calibration)
 
 
 if __name__ == "__main__":

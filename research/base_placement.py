@@ -1,7 +1,7 @@
-"""Where the robot's base should stand: x, y, height and yaw, found together with a posture for each of a grid of targets.
+"""Optimal pose of the robot's base: x, y, height and yaw, together with a posture for each of a grid of targets.
 
-The targets cover the examined region of the abdomen and a border about it, in contact and raised along their normals, so
-that approach and retreat, other patients and registration errors are served too.
+The targets cover the examined region of the abdomen and a border around it, in contact and raised along their normals, for
+approach and retreat, other patients and registration errors.
 """
 
 from __future__ import annotations

@@ -44,7 +44,7 @@ Script = Callable[[int], Mapping[str, Message]]
 
 
 class BusDelay:
-    """How long messages of one topic are under way: `delay_s`, and up to `jitter_s` more, uniform. They stay in order."""
+    """Delay of messages of one topic: `delay_s`, and up to `jitter_s` more, uniform, in order."""
 
     def __init__(self, delay_s: float, jitter_s: float = 0.0, seed: int = 0) -> None:
         if delay_s < 0 or jitter_s < 0:
@@ -103,7 +103,7 @@ class DelayedInbox:
         return self._real.latest(topic)
 
     def new(self, topic: str) -> Iterable[Message]:
-        """What arrived since the step before."""
+        """Yield the messages since the last step."""
         return self._new.get(topic, []) if self._mine(topic) else self._real.new(topic)
 
     def stamp(self, topic: str) -> int | None:
@@ -113,7 +113,7 @@ class DelayedInbox:
         return self._real.stamp(topic)
 
     def lost(self, role: str) -> bool:
-        """Whether that role's service is gone."""
+        """True if the service of that role is lost."""
         return self._real.lost(role)
 
 
@@ -154,9 +154,9 @@ WATCH_S = 0.3
 """The end of the run, over which ringing is measured [s]."""
 EVENTS = ("joint_states", "control/joint_torque", "sim/tool_state", "sim/contact_wrench")
 CONTROL_PATH = EVENTS[:2]
-"""What a real robot sends over its bus."""
+"""Messages that a real robot sends over its bus."""
 CONTACT_PATH = EVENTS[2:]
-"""What only a co-simulation sends: on hardware robot and tissue touch."""
+"""Messages of the co-simulation only: on hardware robot and tissue touch."""
 
 
 @dataclass(frozen=True)
@@ -179,14 +179,14 @@ class Delays:
 
 @dataclass(frozen=True)
 class Ringing:
-    """How a contact fared; arrays of shape (n,), a value a millisecond."""
+    """Course of a contact; arrays of shape (n,), one value per millisecond."""
 
     time: Array
     """[s]"""
     force: Array
     """Force of the tissue on the indenter, along the vertical [N]."""
     held: bool
-    """Whether the driver gave up into its safe hold."""
+    """True if the driver went into its safe hold."""
 
     def _swing(self, start: float) -> float:
         part = self.force[(self.time >= start) & (self.time < start + WATCH_S)]
@@ -204,7 +204,7 @@ class Ringing:
 
     @property
     def stable(self) -> bool:
-        """Whether the ringing dies: no safe hold, contact kept, at most 5 % of the force left swinging (and 0.05 N)."""
+        """True if the ringing decays: no safe hold, contact kept, at most 5 % of the force left swinging (and 0.05 N)."""
         return not self.held and self.mean_force > 0.1 and self.swing < max(0.05, 0.05 * self.mean_force)
 
 

@@ -95,7 +95,7 @@ def ellipsoid_surface(ellipsoid: Ellipsoid) -> tuple[Array, Array]:
 
 
 def ellipsoid_edges(ellipsoid: Ellipsoid) -> IntArray:
-    """Which vertices DART connects: along meridians and rings, and across both diagonals; shape (m, 2)."""
+    """Return the edges between vertices in DART: along meridians and rings, and across both diagonals; shape (m, 2)."""
     slices, rings = ellipsoid.slices, ellipsoid.stacks - 1
     index = 1 + np.arange(rings * slices).reshape(rings, slices)
     turned = np.roll(index, -1, axis=1)

@@ -1,4 +1,4 @@
-"""How wrong depth is, whether the examination knows it, and where descents meet the tissue: from recordings, against the truth.
+"""Error of the reported depth and of its uncertainty, and depth of first contact of descents: recordings against the truth.
 
 Run: `python -m research.depth FOLDER... [--picture FILE.png]`, each FOLDER that of a `palpate run --record normal`.
 """
@@ -24,23 +24,23 @@ from palpate_validation.plots import COLOURS, write_figure
 
 STATES, TRUTH = "exam/state", "truth/indentation"
 FEWEST = 20
-"""A stroke with fewer states tells nothing of itself."""
+"""Least number of states of a stroke."""
 PRESSED_M = 0.002
-"""Tissue that was pressed deeper than this may remember it,"""
-BESIDE_M = 0.014
+"""Depth from which a press has an after-effect [m]."""
+NEAR_M = 0.014
 """no farther than this from the indenter: so wide is the contact at the examination's depth."""
 
 
 @dataclass(frozen=True)
 class Depths:
-    """What an examination told of depth while it counted, n states, and how wrong it was."""
+    """Reported depth of an examination and its error, n states."""
 
     time: Array
     """[s], shape (n,)."""
     error: Array
-    """Told less true [m], shape (n,)."""
+    """Reported minus true depth [m], shape (n,)."""
     sigma: Array
-    """The standard deviation that was told [m], shape (n,)."""
+    """Reported standard deviation [m], shape (n,)."""
     stroke: NDArray[np.int64]
     """Number of the descent, shape (n,)."""
 
@@ -66,16 +66,16 @@ def read(folder: Path) -> Depths:
 
 
 class Met(NamedTuple):
-    """Where one descent met the tissue."""
+    """First contact of a descent."""
 
     depth: float
     """Below the skin as it was before it was ever pressed [m]."""
     pressed: bool
-    """Whether the skin there, or beside, was pressed before."""
+    """True if the skin there or near it was pressed before."""
 
 
 def where_met(folder: Path) -> list[Met]:
-    """Where the descents of a recorded run met the tissue: at the first true force. Raises RecordingError."""
+    """Return the first contacts of the descents of a recorded run, by the true force. Raises RecordingError."""
     began: dict[int, float] = {}
     rows: list[tuple[float, ...]] = []
     for message in open_recording(folder).messages((STATES, TRUTH)):
@@ -96,16 +96,16 @@ def met_by(began: Mapping[int, float], truth: Array) -> list[Met]:
         at = int(np.argmax((time >= begin) & (force > 0)))
         if stroke == 0 or at == 0:
             continue
-        beside = np.linalg.norm(truth[:, 3:] - truth[at, 3:], axis=1) < BESIDE_M
-        met.append(Met(float(depth[at]), bool(np.any((time < begin) & (depth > PRESSED_M) & beside))))
+        near = np.linalg.norm(truth[:, 3:] - truth[at, 3:], axis=1) < NEAR_M
+        met.append(Met(float(depth[at]), bool(np.any((time < begin) & (depth > PRESSED_M) & near))))
     return met
 
 
-def told_of(met: Sequence[Met]) -> str:
+def contact_summary(met: Sequence[Met]) -> str:
     """In a sentence."""
     depth, pressed = (np.array(column) for column in zip(*met, strict=True))
     parts = []
-    for which, where in ((~pressed, "where it was not pressed before"), (pressed, "beside earlier presses")):
+    for which, where in ((~pressed, "where it was not pressed before"), (pressed, "near earlier presses")):
         if which.any():
             parts.append(f"{1e3 * depth[which].mean():.2f} mm +- {1e3 * depth[which].std():.2f} ({which.sum()} descents) {where}")
     return f"the tissue is met below the skin as it was at first, {', '.join(parts)}"
@@ -114,24 +114,24 @@ def told_of(met: Sequence[Met]) -> str:
 def row(name: str, depths: Depths) -> str:
     """A row of the table."""
     between, within = (1e3 * x for x in depths.by_stroke())
-    wrong, told = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (depths.error, depths.sigma))
+    wrong, reported = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (depths.error, depths.sigma))
     strokes = len(np.unique(depths.stroke))
-    figures = (f"{x:.2f}" for x in (wrong, told, wrong / told, between, within))
+    figures = (f"{x:.2f}" for x in (wrong, reported, wrong / reported, between, within))
     cells = (name, str(len(depths.time)), str(strokes), *figures)
     return f"| {' | '.join(cells)} |"
 
 
-def draw(figure: Figure, told: Sequence[tuple[str, Depths]]) -> None:
-    """Error over time with the band of one standard deviation that was told, a panel an examination."""
-    panels = figure.subplots(len(told), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
-    for panel, (name, depths) in zip(panels, told, strict=True):
+def draw(figure: Figure, reported: Sequence[tuple[str, Depths]]) -> None:
+    """Plot the error over time with the band of one reported standard deviation, one panel per examination."""
+    panels = figure.subplots(len(reported), 1, sharex=True, sharey=True, squeeze=False)[:, 0]
+    for panel, (name, depths) in zip(panels, reported, strict=True):
         for k in np.unique(depths.stroke):
             part = depths.stroke == k
             t, sigma = depths.time[part], 1e3 * depths.sigma[part]
             panel.fill_between(t, -sigma, sigma, color=COLOURS[0], alpha=0.2, linewidth=0)
             panel.plot(t, 1e3 * depths.error[part], color=COLOURS[1], linewidth=1)
         panel.set_title(name, loc="left")
-        panel.set_ylabel("told less true [mm]")
+        panel.set_ylabel("reported minus true [mm]")
     panels[-1].set_xlabel("simulated time [s]")
 
 
@@ -141,16 +141,16 @@ def main() -> None:
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--picture", type=Path)
     args = parser.parse_args()
-    told = [(folder.name, read(folder)) for folder in args.folders]
-    print("| run | states | strokes | depth wrong by, RMS [mm] | told [mm] | ratio | between strokes [mm] | within [mm] |")
+    reported = [(folder.name, read(folder)) for folder in args.folders]
+    print("| run | states | strokes | depth error, RMS [mm] | reported [mm] | ratio | between strokes [mm] | within [mm] |")
     print("|" + "---|" * 8)
-    for name, depths in told:
+    for name, depths in reported:
         print(row(name, depths))
     print()
     for folder in args.folders:
-        print(f"{folder.name}: {told_of(where_met(folder))}")
+        print(f"{folder.name}: {contact_summary(where_met(folder))}")
     if args.picture is not None:
-        write_figure(lambda figure: draw(figure, told), args.picture, size_in=(7.0, 1.8 * len(told) + 0.4))
+        write_figure(lambda figure: draw(figure, reported), args.picture, size_in=(7.0, 1.8 * len(reported) + 0.4))
 
 
 if __name__ == "__main__":

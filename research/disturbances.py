@@ -1,10 +1,10 @@
-"""What one disturbance at a time makes of the assessment: healthy patients, scanned without physics in time.
+"""Effect of one disturbance at a time on the assessment: healthy patients, scanned without physics in time.
 
     OPENBLAS_NUM_THREADS=1 python -m research.disturbances --patients 30 --first-seed 1000
 
-Patients and scans are those of `felt_scans`. Where nothing else is said errors are the typical ones of a scan, and what a row
-adds to its samples is not told to the assessment. Prints a Markdown table: how many of the healthy have a finding, with Wilson's
-95 % interval, and on which part of the examined area the map's 90 % band holds, mean and tenth percentile over patients.
+Patients and scans are those of `felt_scans`. By default errors are the typical ones of a scan; the disturbance of a row is
+unknown to the assessment. Prints a Markdown table: healthy patients with a finding, with Wilson's 95 % interval, and the
+share of the area on which the map's 90 % band holds, mean and tenth percentile over patients.
 """
 
 from __future__ import annotations
@@ -38,10 +38,10 @@ FALSE_FINDINGS: Final = 0.02
 BAND_M: Final = 0.035
 """Distance of a rectus muscle's middle from the linea alba, and about half its width."""
 BAND_RATIO: Final = 1.5
-"""How much stiffer it is."""
+"""Stiffness ratio of the band."""
 
 Change = Callable[[ForceSample, float], ForceSample]
-"""What a row does to a sample; with 1 or -1, the sign of the patient's disturbance."""
+"""Change of a sample; the second argument, 1 or -1, is the sign of the patient's disturbance."""
 
 
 @dataclass(frozen=True)
@@ -53,7 +53,7 @@ class Disturbance:
     errors: ScanErrors = TYPICAL
     change: Change | None = None
     rectus: bool = False
-    """Whether the rectus muscles are two stiff bands."""
+    """True if the rectus muscles are two stiff bands."""
 
 
 def _deeper(sample: ForceSample, sign: float) -> ForceSample:

@@ -28,7 +28,7 @@ class ScanErrors:
     field_m: float = 0.0
     """Perceived surface, smooth over FIELD_LENGTH_M."""
     breathing_m: float = 0.0
-    """What is left of breathing, over 1 s and with its period."""
+    """Residual breathing, over 1 s and with its period [m]."""
     tare_n: float = 0.0
     """Zero of a stroke's force."""
     noise_n: float = 0.02

@@ -70,7 +70,7 @@ class FlexBlock:
 
     @property
     def vertices(self) -> int:
-        """How many the block has, in its volume."""
+        """Number of vertices in the volume."""
         return int(self.model.nflexvert)
 
     def press(self, depth: float) -> tuple[float, float]:
@@ -98,7 +98,7 @@ class FlexBlock:
 
 
 def _ignore(_message: str) -> None:
-    """MuJoCo warns at the first step that its preconditioner is poor; the forces tell whether it mattered."""
+    """Ignore MuJoCo's warning about its preconditioner at the first step; the forces are checked."""
 
 
 @dataclass(frozen=True)

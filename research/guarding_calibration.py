@@ -43,7 +43,7 @@ _RIDGE: Final = 0.1
 
 
 class TrueCause(StrEnum):
-    """What a candidate truly is."""
+    """True cause of a candidate."""
 
     LUMP = "lump"
     MUSCLE = "muscle"
@@ -91,7 +91,7 @@ def weigh(case: Case) -> list[Weighed]:
 
 
 def cause(candidate: Candidate, known: Truth) -> TrueCause:
-    """What a candidate truly is; a muscle only where it is stiffer."""
+    """Return the true cause of a candidate; a muscle only where it is stiffer."""
     if real(candidate, known):
         return TrueCause.LUMP
     middle = known.touched.places(np.array([[candidate.bump.x, candidate.bump.y]]))
@@ -107,13 +107,13 @@ def fitted(rows: list[Weighed]) -> Array:
     def loss(w: Array) -> float:
         muscle = np.where(softer, -np.inf, w[0] + signs @ w[1:])
         logits = np.stack((lump, muscle, np.zeros(len(rows))))
-        told = np.take_along_axis(logits, chosen[np.newaxis], axis=0)[0]
-        return float((np.logaddexp.reduce(logits, axis=0) - told).sum() + _RIDGE * w[1:] @ w[1:])
+        true_logit = np.take_along_axis(logits, chosen[np.newaxis], axis=0)[0]
+        return float((np.logaddexp.reduce(logits, axis=0) - true_logit).sum() + _RIDGE * w[1:] @ w[1:])
 
     return np.asarray(minimize(loss, np.zeros(3), method="BFGS").x)
 
 
-def told(rows: list[Weighed], calibration: Calibration, false_findings: float = 0.02) -> None:
+def evaluate(rows: list[Weighed], calibration: Calibration, false_findings: float = 0.02) -> None:
     """Prints what the weights change among the patients that they are fitted to."""
     muscle = calibration.muscle(np.array([row.signs for row in rows]))
     muscle[[row.softer for row in rows]] = -np.inf
@@ -131,7 +131,7 @@ def told(rows: list[Weighed], calibration: Calibration, false_findings: float = 
 
 
 def kept(case: Case, folder: Path) -> list[Weighed]:
-    """What was weighed in a patient, from the folder if it is there."""
+    """Return the candidates of a patient, from the folder if present."""
     path, kind = folder / f"{case.case_id}.json", TypeAdapter(list[Weighed])
     if not path.is_file():
         path.write_bytes(kind.dump_json(weigh(case)))
@@ -147,7 +147,7 @@ def main(
     new: dict[str, Any] = learned().model_dump(mode="json") | {"guarding": np.round(fitted(rows), 2).tolist()}
     path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
     path.write_text(yaml.safe_dump(new, sort_keys=False, default_flow_style=None), "utf-8")
-    told(rows, Calibration.model_validate(new))
+    evaluate(rows, Calibration.model_validate(new))
 
 
 if __name__ == "__main__":

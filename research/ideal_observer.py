@@ -1,11 +1,11 @@
-"""How far the assessment is from an ideal observer, who knows the background's spectrum and the sizes of all errors.
+"""The assessment against an ideal observer with known spectrum of the background and known sizes of all errors.
 
     python -m research.ideal_observer --patients 40
 
 Backgrounds are Gaussian fields of one length each, scanned as `felt_scans` does; every second patient has a round lump somewhere.
 With the true covariance S of the samples and the bump b of a lump, t = b' S^-1 y / sqrt(b' S^-1 b) is the best test for that
-lump (Kay 1998, "Detection theory", ch. 4); its greatest over places and radii is the ideal observer's, as he does not know
-either. The assessment says the greatest logit of its candidates. Both are judged by the area under the ROC curve (AUC), with its
+lump (Kay 1998, "Detection theory", ch. 4); the ideal observer uses its maximum over places and radii, which are unknown. The
+assessment uses the greatest logit of its candidates. Both are compared by the area under the ROC curve (AUC), with its
 95 % interval (Hanley and McNeil 1982), and by the lumps found where each gives 2 % of the healthy patients a finding (Wilson).
 """
 
@@ -41,7 +41,7 @@ LEVEL_N: Final = 2.5
 CONTRASTS: Final = (1.3, 3.0)
 """Felt contrast of the lumps, evenly spread in its logarithm."""
 CLASSES: Final = ((1.3, 1.5), (1.5, 2.0), (2.0, 3.0))
-"""Felt contrasts by which they are told apart."""
+"""Classes of felt contrast."""
 FALSE_ALARMS: Final = 0.02
 """Healthy patients with a finding."""
 RADII_M: Final = (0.012, 0.026)
@@ -112,7 +112,7 @@ def row(scores: Array, contrasts: Array) -> list[str]:
 
 
 def main() -> None:
-    """Prints what both observers make of each length of the background."""
+    """Print the performance of both observers for each length of the background."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--patients", type=int, default=40, help="for each length")
     parser.add_argument("--first-seed", type=int, default=0)

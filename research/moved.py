@@ -1,4 +1,4 @@
-"""When the examination notices that the patient has moved, and how hard the indenter pressed meanwhile.
+"""Delay of the detection of patient motion, and the highest force until the arm has lifted.
 
 Run: `palpate study moved --runs -o FOLDER`, then `python -m research.moved FOLDER/runs/*`.
 """
@@ -17,9 +17,9 @@ from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import ScenarioError, load_scenario
 
 NOTICED: Final = "the patient has moved"
-"""What `exam/state` says when it is noticed."""
-MEANWHILE_S: Final = 3.0
-"""The arm is away from the skin so long after the motion began."""
+"""Text of `exam/state` on detection."""
+LIFTED_S: Final = 3.0
+"""Time after the start of the motion until the arm is clear of the skin [s]."""
 
 
 @dataclass(frozen=True)
@@ -29,28 +29,28 @@ class Noticed:
     at_s: float
     """When the motion began [s]."""
     after_s: float
-    """How long after that it was noticed [s]; infinite if never, not a number if the examination was over before."""
+    """Delay of the detection [s]; infinite if never, NaN if the examination was over before."""
     early: int
-    """How often a motion was noticed before there was any."""
+    """Number of false detections before the motion."""
     peak_force_n: float
-    """Highest true force from the beginning of the motion on, for MEANWHILE_S [N]."""
+    """Highest true force from the beginning of the motion on, for LIFTED_S [N]."""
     looked_s: float
     """When the patient was looked at again, after the motion began [s]; infinite if never."""
 
 
 def noticed(folder: Path) -> Noticed:
-    """What became of the motion in the run of a folder. Raises EvidenceError or ScenarioError."""
+    """Return the detection of the motion in the run of a folder. Raises EvidenceError or ScenarioError."""
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
     at_s = BodyMotion(scenario.phantom.motion, scenario.seed).at_s
-    told = np.array([event.time_s for event in evidence.events if event.words == NOTICED])
+    detected = np.array([event.time_s for event in evidence.events if event.words == NOTICED])
     looked = np.array([event.time_s for event in evidence.events if event.words.startswith(f"{NOTICED}: ")])
-    meanwhile = (evidence.true_time >= at_s) & (evidence.true_time < at_s + MEANWHILE_S)
+    during = (evidence.true_time >= at_s) & (evidence.true_time < at_s + LIFTED_S)
     over = at_s > evidence.time[-1]
     return Noticed(
         at_s=at_s,
-        after_s=float("nan") if over else float(np.min(told[told >= at_s], initial=np.inf)) - at_s,
-        early=int((told < at_s).sum()),
-        peak_force_n=float(np.max(evidence.true_force[meanwhile], initial=0.0)),
+        after_s=float("nan") if over else float(np.min(detected[detected >= at_s], initial=np.inf)) - at_s,
+        early=int((detected < at_s).sum()),
+        peak_force_n=float(np.max(evidence.true_force[during], initial=0.0)),
         looked_s=float(np.min(looked[looked >= at_s], initial=np.inf)) - at_s,
     )
 
@@ -64,11 +64,11 @@ def main(folders: Annotated[list[Path], typer.Argument(help="Folders of runs who
     for folder, row in zip(folders, rows, strict=True):
         print(
             f"{folder.name}: at {row.at_s:.1f} s, noticed after {row.after_s:.2f} s, looked again after {row.looked_s:.1f} s, "
-            f"highest force meanwhile {row.peak_force_n:.1f} N, {row.early} false alarms"
+            f"highest force {row.peak_force_n:.1f} N, {row.early} false alarms"
         )
     after = np.array([row.after_s for row in rows])
-    told = after[np.isfinite(after)]
-    times = f"noticed after {np.median(told):.2f} s in the median, {told.max():.2f} s at most; " if len(told) else ""
+    found = after[np.isfinite(after)]
+    times = f"noticed after {np.median(found):.2f} s in the median, {found.max():.2f} s at most; " if len(found) else ""
     print(
         f"{len(rows)} examinations, {np.isnan(after).sum()} over before the motion, {np.isinf(after).sum()} never noticed; "
         f"{times}highest force {max(row.peak_force_n for row in rows):.1f} N; {sum(row.early for row in rows)} false alarms"

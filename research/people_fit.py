@@ -1,7 +1,7 @@
-"""The wall of each measured place: `python -m research.people_fit` writes `fitted.csv` beside the data.
+"""The wall of each measured place: `python -m research.people_fit` writes `fitted.csv` next to the data.
 
 Their test is simulated on the surface tier for a grid of wall lengths and stiffenings; k_w scales the force, and the zero offset
-shifts the depth. So a place is fitted by interpolation, and `palpate validate --only people` simulates each fit for itself.
+shifts the depth. A place is fitted by interpolation; `palpate validate --only people` simulates each fit.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""What a quick examination costs against the composed run of the same patient: `python -m research.quick_cost`.
+"""Cost of a quick examination against the composed run of the same patient: `python -m research.quick_cost`.
 
-Processor time: of quick cases in this process with one thread, after one that warms it, each patient pressed anew; of the
+Processor time: of quick cases in this process with one thread, after a warm-up, without cached presses; of the
 composed run by the command line in its own process, start and report included.
 """
 

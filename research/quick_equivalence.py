@@ -1,9 +1,9 @@
 """The quick tier against whole examinations of the same patients: `python -m research.quick_equivalence RUN... -o FOLDER`.
 
-RUN is the folder of a completed whole examination. Its patient is examined by the quick tier with what this run got wrong from
-beginning to end (offset, tilt, place, how far breathing was followed, when it began), so that both are paired; the rest is drawn
-anew. With `--drawn` all is drawn, as in studies. What is compared is what studies report, each as the mean over cases of quick
-less whole. The tiers count as equivalent in it when its 90 % interval lies within the margin (two one-sided t tests of 5 %).
+RUN is the folder of a completed whole examination. Its patient is examined by the quick tier with the constant errors of this run
+(offset, tilt, place, followed breathing, start), so that both are paired; other errors are drawn. With `--drawn` all errors are
+drawn, as in studies. Figures of studies are compared as the mean over cases of quick minus whole. The tiers are equivalent in a
+figure when its 90 % interval lies within the margin (two one-sided t tests of 5 %).
 """
 
 from __future__ import annotations

@@ -71,7 +71,7 @@ def read(folder: Path) -> tuple[Scenario, Collected, Known]:
 
 
 def again(scenario: Scenario, collected: Collected, known: Known, row: str) -> Scores:
-    """The scores of an examination with the error of a row, assessed anew."""
+    """Return the scores of a second assessment with the error of a row."""
     states = [copy(state) for state in collected.exam_states]
     sign = 1.0 if scenario.seed % 2 else -1.0
     if (change := ROWS[row]) is not None:

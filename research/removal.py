@@ -1,4 +1,4 @@
-"""What each compiled module and each codec of ours is worth: `python -m research.removal` prints a table.
+"""Gain of each compiled module and each codec: `python -m research.removal` prints a table.
 
 Whole composed examinations are run. Of their slots of 100 simulated ms, which contain every period but the slowest, every other
 one has one thing taken away, in turn: the compiled functions of a module run as the numpy or Python that they are written in, or
@@ -48,9 +48,9 @@ MODULES: dict[str, tuple[str, ...]] = {
     "perceived surface": ("palpate_planning.wall.surface", "palpate_planning.wall.surface"),
     "nearest vertex": ("palpate_models.numerics.nearest",),
 }
-"""The modules whose compiled functions call each other: taken away together."""
-SELDOM = {"tissue's step": 6}
-"""What is so slow without its compiled functions that it is taken away in every so many turns only."""
+"""Modules whose compiled functions call each other, removed together."""
+INTERVAL = {"tissue's step": 6}
+"""Removed only in every nth turn, because the run is very slow without it."""
 
 
 @contextmanager
@@ -109,7 +109,7 @@ def measure(scenario: Scenario) -> dict[str, list[float]]:
     while True:
         turn += 1
         for name, removal in removals.items():
-            if name in SELDOM and turn % SELDOM[name]:
+            if name in INTERVAL and turn % INTERVAL[name]:
                 continue
             with removal():
                 without = slot()
@@ -122,7 +122,7 @@ def measure(scenario: Scenario) -> dict[str, list[float]]:
 
 
 def table(runs: Sequence[dict[str, list[float]]]) -> Table:
-    """What the composed rate loses without each thing, with the interval that 95 % of resampled means are in."""
+    """Return the loss of composed rate without each thing, with its 95 % interval by resampling."""
     rows = Table("without", "rate falls by [%]", "95 % interval [%]", "slots", title="Composed rate", title_justify="left")
     rng = np.random.default_rng(0)
     for name in runs[0]:

@@ -1,4 +1,4 @@
-"""How wrong the perceived surface is, and how much of that the images and touches of an examination tell: against the truth.
+"""Error of the perceived surface before and after correction by images and touches: against the truth.
 
 Run: `python -m research.skin FOLDER [--picture FILE.png]`, FOLDER that of a `palpate run --record normal`.
 """
@@ -28,7 +28,7 @@ SURFACE, IMAGES, ALL = "perception/surface", "perception/correction", "exam/corr
 
 @dataclass(frozen=True)
 class SkinError:
-    """How far outward of the perceived surface the skin lies at n places of the region, but for an offset and a tilt [m]."""
+    """Outward offset of the skin from the perceived surface at n places of the region, without offset and tilt [m]."""
 
     xy: Array
     """In A, shape (n, 2)."""
@@ -37,9 +37,9 @@ class SkinError:
     images: Array
     """By the mean of all small images."""
     known: Array
-    """By images and touches, as the assessment has it."""
-    told: Array
-    """Standard deviation of `known` that is told."""
+    """Estimate from images and touches, as used by the assessment."""
+    reported: Array
+    """Reported standard deviation of `known`."""
 
 
 def read(folder: Path) -> SkinError:
@@ -52,18 +52,18 @@ def read(folder: Path) -> SkinError:
     half = 0.5 * np.array(scenario.exam.region_m)
     inside = (np.abs(p_A[:, :2] - scenario.exam.centre_m) <= half).all(axis=1)
     true, lifts = outward(scenario, p_W, n_W)
-    flat = np.column_stack((np.ones(len(p_A)), p_A[:, :2], lifts))[inside]  # what touches tell well
+    flat = np.column_stack((np.ones(len(p_A)), p_A[:, :2], lifts))[inside]  # well determined by touches
 
     def bent(values: Array) -> Array:
         inner = np.asarray(values, float)[inside]
         return np.asarray(inner - flat @ np.linalg.lstsq(flat, inner, rcond=None)[0])
 
-    told = np.asarray(newest[ALL].uncertainty, float)[inside]
-    return SkinError(p_A[inside, :2], bent(true), bent(newest[IMAGES].outward), bent(newest[ALL].outward), told)
+    reported = np.asarray(newest[ALL].uncertainty, float)[inside]
+    return SkinError(p_A[inside, :2], bent(true), bent(newest[IMAGES].outward), bent(newest[ALL].outward), reported)
 
 
 def outward(scenario: Scenario, p_W: Array, n_W: Array) -> tuple[Array, Array]:
-    """How far outward of points the true skin lies at the end of expiration [m], and how far breathing lifts it, (n,) each."""
+    """Return the outward offset of the true skin at the end of expiration [m] and its breathing amplitude, (n,) each."""
     X_WA = matrix(true_pose(scenario))
     model = build_phantom(scenario.phantom, scenario.seed)
     skin = TrueSurface(TrueBody(model.vertices, model.triangles, X_WA))
@@ -93,10 +93,10 @@ def main() -> None:
     args = parser.parse_args()
     skin = read(args.folder)
     left = {"images": skin.true - skin.images, "images and touches": skin.true - skin.known}
-    print(f"{args.folder}: beside an offset and a tilt the surface errs by {1e3 * skin.true.std():.2f} mm")
+    print(f"{args.folder}: error of the surface without offset and tilt {1e3 * skin.true.std():.2f} mm")
     for name, values in left.items():
-        print(f"of which {name} leave {1e3 * values.std():.2f} mm")
-    print(f"told is a standard deviation of {1e3 * np.sqrt(np.mean(skin.told**2)):.2f} mm")
+        print(f"remaining after {name}: {1e3 * values.std():.2f} mm")
+    print(f"reported standard deviation {1e3 * np.sqrt(np.mean(skin.reported**2)):.2f} mm")
     if args.picture is not None:
         write_figure(lambda figure: draw(figure, skin), args.picture, size_in=(9.0, 3.2))
 

@@ -1,4 +1,4 @@
-"""What examination after examination leaves in memory: the table and the figure of soaks.
+"""Memory over repeated examinations: table and figure.
 
 palpate run --repeat 200 --record none --out FOLDER
 python -m research.soak FOLDER [FOLDER ...] --out soak.png

@@ -1,4 +1,4 @@
-"""How much bus delay and jitter the contact of robot, tissue and controller bears: measured, and against linear theory."""
+"""Delay margins of the contact of robot, tissue and controller: measured, and by linear theory."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ CONTRASTS = (1.0, 4.0, 10.0)
 DELAYS_MS = (0, 2, 4, 6, 8, 10)
 PATHS = {"all": EVENTS, "control": CONTROL_PATH, "contact": CONTACT_PATH}
 AGREE_MS = 3
-"""How far a measured margin may be from theory: near the margin a ring takes longer to die than the run watches."""
+"""Tolerance between measured margin and theory [ms]: near the margin ringing decays more slowly than the run lasts."""
 WORDS = {"all": "all messages late", "control": "controller and robot", "contact": "robot and tissue"}
 LARGEST_MS = 24
 """Margins are sought up to here."""

@@ -1,4 +1,4 @@
-"""What keyed tags cost in a whole run: short examinations of processes in lockstep, with and without them in turns.
+"""Cost of keyed tags in a whole run: short examinations of processes in lockstep, with and without them in turns.
 
     python -m research.tags [PAIRS]
 

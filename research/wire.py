@@ -1,4 +1,4 @@
-"""What a message costs on its way, ours and others' side by side in one run, between this process and another.
+"""Cost of a message between two processes, against raw zenoh, in one run.
 
 Round trips of a joint state (300 B) and one way of a depth image (640 x 480 floats) at 200 Hz, written and read, with the session
 settings of a run: raw zenoh, ours (`Publisher`, `Subscription`), and ours over a secure router.
@@ -92,7 +92,7 @@ def _keys(kind: str) -> tuple[str, str]:
 
 
 def echo(options: BusOptions, kind: str) -> None:
-    """The other process: sends back what it gets; of an image it reads every float and tells how long it was on its way [ns]."""
+    """The other process: echo messages; read every float of an image and return its latency [ns]."""
     out, back = _keys(kind)
     with session(options) as opened:
         send, receive = KINDS[kind](opened, back, out)

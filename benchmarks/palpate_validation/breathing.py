@@ -93,7 +93,7 @@ def read(excursion: Array) -> Breaths:
 
 
 def measure(patients: int = PATIENTS) -> Measured:
-    """Reads the breaths of so many patients, and the default body's share of them."""
+    """Measure the breaths of this number of patients, and the default body's share of them."""
     curves = {name: sampled(breathing, 0, SHOWN_S) for name, breathing in KINDS.items()}
     speed = np.diff(curves["quiet"])
     body = build_phantom(Phantom(), 0)
@@ -132,7 +132,7 @@ def _memory(breaths: tuple[Breaths, ...], field: str) -> float:
 
 
 def section(found: Measured | None = None) -> PageSection:
-    """What is read from the curves against what was measured on people, with its bounds."""
+    """Return the comparison of breathing curves with measurements on people, with bounds."""
     found = found or measure()
     quiet, deep = found.quiet, found.deep
     depth_mm = 1e3 * float(_pooled(quiet, "depth").mean())

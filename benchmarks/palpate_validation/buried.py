@@ -48,7 +48,7 @@ ELASTIC_TIER = tuple(
         (0.040, 0.005, 4.0, 2.0722), (0.040, 0.010, 4.0, 1.7192), (0.040, 0.020, 4.0, 1.3151), (0.040, 0.040, 4.0, 1.0854),
     )
 )  # fmt: skip
-"""What `on_elastic_tier` gave for each, minutes each."""
+"""Results of `on_elastic_tier`, which takes minutes for each."""
 
 
 def on_elastic_tier(lump: Buried) -> float:

@@ -1,4 +1,4 @@
-"""What a comparison gives: checks with bounds, a figure, and the numbers behind both."""
+"""Result of a comparison: checks with bounds, a figure, and the data of both."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class Check:
     low: float | None = None
     high: float | None = None
     against: str = ""
-    """What it is measured against."""
+    """Reference."""
     timed: bool = False
-    """Whether it is a cost: such bounds are printed, but are no tests."""
+    """True for a cost: its bound is printed but not tested."""
 
     @property
     def passed(self) -> bool | None:
-        """Whether the bound holds; None where there is none. Not a number never passes."""
+        """True if the bound holds; None without a bound. NaN never passes."""
         if self.low is None and self.high is None:
             return None
         above = self.low is None or self.measured >= self.low
@@ -51,7 +51,7 @@ class PageSection:
     name: str
     title: str
     text: str
-    """What was done and found, as a paragraph of Markdown."""
+    """Method and result, as a paragraph of Markdown."""
     checks: tuple[Check, ...]
     draw: Draw | None = None
     size_in: tuple[float, float] = (7.0, 3.2)

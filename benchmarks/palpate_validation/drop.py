@@ -189,7 +189,7 @@ FLESH = Flesh(SoftBox((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damp
 
 @dataclass(frozen=True)
 class Drop:
-    """What a dropped indenter did; arrays of shape (n,)."""
+    """Motion of a dropped indenter; arrays of shape (n,)."""
 
     name: str
     time: Array

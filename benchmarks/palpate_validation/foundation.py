@@ -18,7 +18,7 @@ from palpate_models.numerics.frames import Array
 Profile = Callable[[Array], Array]
 
 OUTER_M = 0.12
-"""Where the surface is held: eight Pasternak lengths from the centre."""
+"""Radius at which the surface is fixed: eight Pasternak lengths."""
 MOST_ITERATIONS = 200
 
 

@@ -30,23 +30,23 @@ HALF_WAY_M = 0.05
 """A stroke slides to and fro, so far to either side."""
 STROKES = 4
 APART_S = 1.0
-"""Time between strokes, without touch. Its length does not matter: guarding does not change meanwhile."""
+"""Time between strokes, without contact. Guarding does not change during it."""
 BY_HAND = (0.25 + 0.75 * math.exp(-press.DEPTH_M / press.SPEED_MPS / FADING_S)) * math.exp(
     -(press.HOLD_S - press.READ_S / 2) / FADING_S
 )
-"""How far voluntary guarding is contracted where the press is read: 20 mm/s provoke a quarter of it, a hold at 10 mm nothing."""
+"""Contraction of voluntary guarding when the press is read: 20 mm/s provoke a quarter of it, a hold at 10 mm nothing."""
 
 
 @dataclass(frozen=True)
 class GuardedTouch:
-    """What was felt of one wall by a way of the sphere; n instants."""
+    """Forces of one wall on a path of the sphere; n instants."""
 
     time: Array
     """[s], shape (n,)."""
     force: Array
     """[N], shape (n,)."""
     contracted: Array
-    """How far the muscle was contracted [1], shape (n,)."""
+    """Contraction of the muscle [1], shape (n,)."""
 
 
 @dataclass(frozen=True)
@@ -59,7 +59,7 @@ class GuardingFelt:
     """At which instants of the strokes the sphere slides at depth: the number of the stroke, -1 elsewhere, shape (n,)."""
 
     def pressed_ratio(self, kind: str) -> float:
-        """What the press reads, over what it reads of the relaxed wall."""
+        """Return the force of the press divided by that of the relaxed wall."""
         read, _ = press.apparent_stiffness(np.stack([self.presses[which].force for which in (kind, "relaxed")]))
         return float(read[0] / read[1])
 
@@ -117,7 +117,7 @@ def measure() -> GuardingFelt:
 
 
 def section(found: GuardingFelt | None = None) -> PageSection:
-    """What the press and the strokes feel of guarding, with bounds."""
+    """Return the comparison of press and strokes under guarding, with bounds."""
     found = found or measure()
     read = found.presses["voluntary"].time > press.DURATION_S - press.READ_S
     level = float(found.presses["voluntary"].contracted[read].mean())

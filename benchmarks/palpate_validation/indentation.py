@@ -19,11 +19,11 @@ HALF_M = 0.08
 EDGE_M = 0.0025
 """Edge of its mesh: with half of the default the force of so small a sphere is within 1 % of the continuum's from 3 mm on."""
 XY_M = (0.00125, 0.0)
-"""Where it is pressed: in the middle of an edge, where the force is within 0.3 % of its mean over the lattice."""
+"""Place of the press: in the middle of an edge, where the force is within 0.3 % of its mean over the lattice."""
 SPACING_M = 1e-4
 """Spacing of the depths at which a force is taken."""
 REACH_M = 0.022
-"""How deep a curve goes: 20 mm and the largest zero offset."""
+"""Depth of a curve [m]: 20 mm and the largest zero offset."""
 COMPARED_M = np.arange(1.0, 20.01, 0.5) * 1e-3
 """Depths at which forces are compared: to 20 mm, and from 1 mm on, where a force is no longer a few hundredths of a newton."""
 RATIO_AT_M = 0.010

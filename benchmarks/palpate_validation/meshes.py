@@ -62,7 +62,7 @@ def measure_meshes() -> MeshForces:
 
 @dataclass(frozen=True)
 class Superposition:
-    """How far the tissue is from linear where it should be; relative."""
+    """Relative departure from linearity where the tissue is linear."""
 
     static: float
     """Displacement under two contacts' forces together, by a direct solution, against the sum of what each left."""

@@ -80,7 +80,7 @@ class People:
     median_measured: Array
     """Median force of all measured places at `COMPARED_M` [N]."""
     median_simulated: Array
-    """What the wall `MEDIAN` gives there, with the zero offset that is the median of the places'."""
+    """Force of the wall `MEDIAN`, with the median zero offset of the places."""
     loops: tuple[HysteresisLoop, ...]
 
 
@@ -117,13 +117,13 @@ def section(found: People | None = None) -> PageSection:
     found = found or measure()
     text = (
         f"{len(found.places)} curves of force over depth of ten relaxed people, places 1 to 5 (Remus et al. 2024, DOI "
-        "10.3389/fbioe.2024.1384062, CC BY 4.0), each beside a simulation of the same test on the surface tier: a sphere of "
+        "10.3389/fbioe.2024.1384062, CC BY 4.0), against a simulation of the same test on the surface tier: a sphere of "
         "10 mm pressed at 5 mm/s into a wall with the parameters of `models/palpate_models/data/remus2024/fitted.csv`. "
-        "Fitted are k_w, wall length, stiffening and, as their zero lies on slightly pressed skin, a zero offset of at most "
-        "2 mm a place; relaxation is the default's, as they did not measure it. The force alone hardly tells the wall length. "
+        "Fitted: k_w, wall length (weakly determined by force alone), stiffening, and a zero offset of at most 2 mm; "
+        "relaxation is the default's. "
         f"The loops are of the median person's wall (k_w {MEDIAN.k_w_n_per_m3:.3g} N/m³, {1e3 * MEDIAN.length_m:g} mm, "
-        f"{MEDIAN.stiffening_per_m:g} per m); no loss was found measured on a living abdomen, so only its order is asked for. "
-        "Tensed muscles are a spring beside the wall that makes its force at 10 mm as many times larger as they measured."
+        f"{MEDIAN.stiffening_per_m:g} per m); no measurement of loss on a living abdomen was found. "
+        "Tensed muscles are a parallel spring with the measured force ratio at 10 mm."
     )
     checks = (*_errors(found), *_exponents(found.places), _tensed(found.places), *_losses(found.loops))
     data = {
@@ -135,7 +135,7 @@ def section(found: People | None = None) -> PageSection:
 
 
 def _errors(found: People) -> Iterator[Check]:
-    """How far the forces are from those measured, place by place and over all."""
+    """Yield the errors of the force, per place and over all."""
     for number in remus2024.PLACES:
         errors = [p.rms_percent for p in found.places if p.region == f"R{number}"]
         if errors:
@@ -161,7 +161,7 @@ def _exponents(places: Sequence[Place]) -> Iterator[Check]:
 
 
 def _tensed(places: Sequence[Place]) -> Check:
-    """How many times larger tensed muscles make the force."""
+    """Return the force ratio of tensed muscles."""
     measured = float(np.median([p.fit.activated_ratio for p in places]))
     simulated = float(np.median([p.tensed_ratio for p in places]))
     name = f"tensed muscles: median ratio of the force at {1e3 * RATIO_AT_M:g} mm"
@@ -169,7 +169,7 @@ def _tensed(places: Sequence[Place]) -> Check:
 
 
 def _losses(loops: Sequence[HysteresisLoop]) -> Iterator[Check]:
-    """What a press and its release cost."""
+    """Yield the work lost in a press and its release."""
     for each in loops:
         name = f"work lost in a press of {1e3 * PRESSED_M:g} mm and its release at {1e3 * each.speed:g} mm/s"
         yield Check(name, each.lost_percent, "%", *LOST_PERCENT, "excised skin: 46 to 48 %")

@@ -37,13 +37,13 @@ class Person:
 
     @property
     def bone(self) -> Array:
-        """How far each vertex lies on bone, shape (n,)."""
+        """Return the weight of bone at each vertex, shape (n,)."""
         assert self.phantom.anatomy is not None
         return bone_share(self.model.vertices[:, 0], self.model.vertices[:, 1], self.phantom.anatomy.skeleton)
 
     @property
     def front(self) -> NDArray[np.bool_]:
-        """Whether each vertex faces forward, shape (n,)."""
+        """Return the mask of vertices that face forward, shape (n,)."""
         return np.asarray(self.model.normals[:, 2] > 0.3)
 
 

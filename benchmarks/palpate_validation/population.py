@@ -1,4 +1,4 @@
-"""Sampled persons pressed as Remus et al. pressed living people: their statistics beside the measured ones."""
+"""Sampled persons pressed as Remus et al. pressed living people: their statistics against the measured ones."""
 
 from __future__ import annotations
 
@@ -60,7 +60,7 @@ class PopulationSample:
 
 
 WITHIN = (0.08, 0.08, 0.10, 0.15, 0.15, 0.40, 0.20, 0.12, 0.07, 0.07, 0.40)
-"""How far each of the figures may be from the measured one, of the measured one: of ten people they are no nearer than that."""
+"""Relative tolerance of each figure: the uncertainty of a sample of ten people."""
 
 
 def measured() -> PopulationSample:
@@ -111,11 +111,10 @@ def section(found: PopulationSample | None = None) -> PageSection:
     )
     text = (
         f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places "
-        "of the belly away from bone by a sphere of 10 mm at 5 mm/s, beside the 48 places of ten relaxed people (Remus et "
-        "al. 2024, CC BY 4.0). Level, stiffening and length of a person and their variation from place to place are drawn "
-        "with the moments of `fitted.csv`. Both sides are treated alike: neither deviation is freed of what the other "
-        "leaves in it. Ten people tell a deviation between people to a quarter, so the bounds are as wide. The people "
-        "were young, male and slim: other builds are models."
+        "of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus et "
+        "al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
+        "Ten people determine a deviation between people to a quarter; the bounds are as wide. The people were young, male "
+        "and slim: other builds are models."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
     return PageSection("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)

@@ -14,7 +14,7 @@ from palpate_tissue.backends.winkler.tissue import WinklerTissue
 ELASTIC = Stiffness(k_w_n_per_m3=1.7e5, length_m=0.015, stiffening_per_m=0.0, prony_g=(), prony_tau_s=(), friction=0.0)
 """The linear wall that is near a half-space of 10 kPa, without relaxation and friction: what static references know."""
 SETTLE_S = 0.3
-"""How long a depth is held: six times the dashpot's 0.05 s."""
+"""Duration of a hold [s]: six times the dashpot's 0.05 s."""
 OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 0.0017))
 """Places on the vertex lattice over which a force is averaged [m]: on a vertex, an edge, a triangle."""
 STILL = np.zeros(3)

@@ -71,7 +71,7 @@ class FmuVariable:
 
     @property
     def size(self) -> int:
-        """How many values it has."""
+        """Number of values."""
         return prod(self.shape)
 
 
@@ -103,31 +103,31 @@ def _variable(name: str, references: tuple[int, ...], shape: tuple[int, ...], v:
     return FmuVariable(name, references, shape, v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
 
 
-_said = threading.local()
+_messages = threading.local()
 
 
-def _hear(*arguments: Any) -> None:
-    """Keeps what an FMU says, by the thread in which it does: in the call that failed."""
+def _keep_message(*arguments: Any) -> None:
+    """Keep a message of an FMU, per thread: it belongs to the call that failed."""
     message = arguments[-1]
-    said = _said.__dict__.setdefault("lines", [])
-    said.append(message.decode("utf-8", "replace") if isinstance(message, bytes) else str(message))
-    del said[:-20]
+    lines = _messages.__dict__.setdefault("lines", [])
+    lines.append(message.decode("utf-8", "replace") if isinstance(message, bytes) else str(message))
+    del lines[:-20]
 
 
-def _heard() -> str:
-    """What was said since this was last asked."""
-    lines = _said.__dict__.pop("lines", [])
+def _take_messages() -> str:
+    """Return and delete the messages since the last call."""
+    lines = _messages.__dict__.pop("lines", [])
     return "; ".join(lines)
 
 
 @cache
 def _callbacks_2() -> Any:
-    """FMI 2.0's callbacks, one set for all instances: FMPy's expansion of messages has one logger a process."""
+    """FMI 2.0's callbacks, one set for all instances: FMPy expands messages with one logger per process."""
     from fmpy import calloc, fmi2, free  # noqa: PLC0415
     from fmpy.logging import addLoggerProxy  # noqa: PLC0415
 
     callbacks = fmi2.fmi2CallbackFunctions()
-    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_hear)
+    callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_keep_message)
     callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(calloc)
     callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(free)
     try:
@@ -151,7 +151,7 @@ def _instantiate(folder: str, description: Any) -> Any:
     if older:
         fmu.instantiate(callbacks=_callbacks_2())
     else:
-        fmu.instantiate(logMessage=_hear)
+        fmu.instantiate(logMessage=_keep_message)
     return fmu
 
 
@@ -210,7 +210,9 @@ class FmuInstance:
             self._fmu = _instantiate(self._folder, self.description)
         except Exception as error:
             self.close()
-            raise FmuError(f"{path}: cannot be instantiated on {fmpy.platform_tuple}: {error} {_heard()}".strip()) from error
+            raise FmuError(
+                f"{path}: cannot be instantiated on {fmpy.platform_tuple}: {error} {_take_messages()}".strip()
+            ) from error
         self._component = self._fmu.component
         self._bind()
         try:
@@ -230,7 +232,7 @@ class FmuInstance:
     def _check(self, status: int, what: str) -> None:
         if status > 1:
             name = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")[min(status, 5)]
-            raise FmuError(f"{self.path.name}: {what}: fmi{self.version}{name}: {_heard() or 'no message'}")
+            raise FmuError(f"{self.path.name}: {what}: fmi{self.version}{name}: {_take_messages() or 'no message'}")
 
     def _function(self, name: str) -> Callable[..., int]:
         """A function of the library itself: FMPy's wrappers cost several microseconds a call."""
@@ -257,7 +259,7 @@ class FmuInstance:
                 fmu.enterInitializationMode(startTime=start_s)
             fmu.exitInitializationMode()
         except Exception as error:
-            raise FmuError(f"{self.path.name}: initialization: {error}: {_heard()}") from error
+            raise FmuError(f"{self.path.name}: initialization: {error}: {_take_messages()}") from error
 
     def port(self, names: Sequence[str]) -> Port:
         """The variables of some names, which must be of one type. Raises FmuError naming one that is not there."""

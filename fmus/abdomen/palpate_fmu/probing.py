@@ -17,7 +17,7 @@ GAP_M = 0.002
 
 @dataclass(frozen=True)
 class Probing:
-    """What a probing motion gave; all of shape (n,)."""
+    """Result of a probing motion; all of shape (n,)."""
 
     time: Array
     """[s]"""

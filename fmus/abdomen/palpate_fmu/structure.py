@@ -1,7 +1,7 @@
-"""ModelStructure of the model description: outputs, derivatives of the continuous states, and what is known of dependencies.
+"""ModelStructure of the model description: outputs, derivatives of the continuous states, and their dependencies.
 
-Where no dependencies are written, FMI reads: on every input, state and time. That is so for what contact gives. FMI 2.0, in
-which each element of an array is a scalar, is told the sparsity of the states' derivatives, as integrators use it.
+Without dependencies FMI assumes every input, state and time, which holds for contact outputs. For FMI 2.0, in which each element
+of an array is a scalar, the sparsity of the states' derivatives is written, since integrators use it.
 """
 
 from __future__ import annotations

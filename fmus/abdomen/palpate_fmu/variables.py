@@ -19,7 +19,7 @@ BRANCHES = 4
 
 
 class VariableKind(StrEnum):
-    """What a variable is for, by the C code's names."""
+    """Purpose of a variable, by the C code's names."""
 
     INPUT = "INPUT"
     FIXED = "FIXED"
@@ -29,7 +29,7 @@ class VariableKind(StrEnum):
 
 
 class VariableRole(StrEnum):
-    """How FMI classifies what can only be read."""
+    """FMI's classes of read-only variables."""
 
     OUTPUT = "output"
     LOCAL = "local"
@@ -54,7 +54,7 @@ class Variable:
     vr: int
     name: str
     member: str
-    """Where the C code keeps it."""
+    """Member of the C structure."""
     doc: str
     unit: str | None = None
     shape: tuple[int | str, ...] = ()
@@ -62,7 +62,7 @@ class Variable:
     kind: VariableKind = VariableKind.READ
     role: VariableRole = VariableRole.OUTPUT
     group: str = "NONE"
-    """What the C code refreshes before it is read."""
+    """Group that the C code refreshes before it is read."""
     integer: bool = False
     low: float | None = None
     high: float | None = None
@@ -75,17 +75,17 @@ class Variable:
 
     @property
     def parameter(self) -> bool:
-        """Whether it is set before or, if tunable, during the simulation and held."""
+        """True if it is set before or, if tunable, during the simulation and held."""
         return self.kind in (VariableKind.FIXED, VariableKind.TUNABLE)
 
     @property
     def behind(self) -> bool:
-        """Whether the C code keeps a pointer to the values; those whose extent is the phantom's always are."""
+        """True if the C code keeps a pointer to the values, as for all whose extent is the phantom's."""
         return self.kind is VariableKind.STATE or self.rate_of is not None
 
     @property
     def settable(self) -> bool:
-        """Whether a master gives it a value, if only to start from."""
+        """True if a master may set it, if only as start value."""
         return self.kind is not VariableKind.READ
 
     def extents(self, sizes: Sizes) -> tuple[int, ...]:
@@ -93,7 +93,7 @@ class Variable:
         return tuple(getattr(sizes, extent) if isinstance(extent, str) else extent for extent in self.shape)
 
     def count(self, sizes: Sizes) -> int:
-        """How many values it has."""
+        """Return the number of values."""
         return prod(self.extents(sizes))
 
 

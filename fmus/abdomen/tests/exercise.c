@@ -273,7 +273,7 @@ static void exchange(const char *resources, const char *token, long n) {
     expect(place(h, 0, 0.05, -0.5) && get_dx(h, dx, states) && place(h, 9, -9, 9) && get_dx(h, dx, states), "far in, far out");
     expect(derive(h, 10, 1, change), "a derivative far away");
     drop(h, &saved);
-    expect(reset(h) && start_exchange(h) && force(h) == 0 && end(h) && !set_time(h, 1), "anew, and to the end");
+    expect(reset(h) && start_exchange(h) && force(h) == 0 && end(h) && !set_time(h, 1), "again, and to the end");
     discard(h);
     free(x);
     free(dx);
@@ -327,7 +327,7 @@ int main(int argc, char **argv) {
     expect(press(b, &later) == second, "which goes on alike");
     drop(a, &saved);
     for (int k = 0; k < 20; k++) expect(place(a, 0.3 * k, -0.2 * k, 0.01), "far away") , step(a, 0.3 + 0.05 * k, 0.05);
-    expect(reset(a) && initialise(a), "after a reset it starts anew");
+    expect(reset(a) && initialise(a), "after a reset it starts again");
     expect(step(a, 0, 0.1), "a long step");
     expect(!step(a, 99.95, 1.0), "no step beyond");
     expect(end(a) && !step(a, 0.1, 1e-3), "no step after the end");

@@ -75,7 +75,7 @@ def test_springs_give_back_what_they_store(stiffening: Path, model: PhantomModel
 def test_the_rates_of_bent_and_straight_springs_have_the_derivative_of_finite_differences(
     stiffening: Path, model: PhantomModel
 ) -> None:
-    """Where no vertex is within reach of a kink: neither at rest nor where a spring stiffens no further."""
+    """No vertex is near a kink: neither at rest nor at the limit of stiffening."""
     rng = np.random.default_rng(3)
     depth = np.where(rng.random(len(model.areas)) < 0.5, 0.004, 0.012)
     u = depth * np.where(rng.random(len(depth)) < 0.3, -1, 1) * rng.uniform(0.9, 1.1, len(depth))
@@ -91,8 +91,8 @@ def test_the_rates_of_bent_and_straight_springs_have_the_derivative_of_finite_di
     np.testing.assert_allclose(by_muscle, np.where(model.fixed, 0, expected), atol=1e-12)
 
 
-def test_energy_falls_when_the_sphere_is_gone(stiffening: Path) -> None:
-    """Where it is stiffest, and the steps are cut for that: the bound holds for the largest modulus."""
+def test_energy_falls_without_the_sphere(stiffening: Path) -> None:
+    """The stability bound of the sub-steps holds for the largest modulus."""
     values = {"breathing_scale": 0.0, "dashpot": 0.0064}
     with FmuInstance(stiffening, values=values) as fmu:
         for k in range(150):
