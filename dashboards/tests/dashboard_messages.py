@@ -176,6 +176,7 @@ def look(t: int) -> Messages:
             0.001,
             20,
             1.0,
+            0,
             "",
         ),
         "planning/path": Path(

@@ -276,6 +276,18 @@ class PalpationSample:
 @dataclass
 class PalpationTargets:
     __msgtype__: ClassVar[str]
+    NONE: ClassVar[int]
+    VIEW_BLOCKED: ClassVar[int]
+    SELF_OCCLUDED: ClassVar[int]
+    OUT_OF_IMAGE: ClassVar[int]
+    NO_DEPTH: ClassVar[int]
+    BEYOND_ABDOMEN: ClassVar[int]
+    TOO_FEW_POINTS: ClassVar[int]
+    PATIENT_MOVED: ClassVar[int]
+    NO_FRAMES: ClassVar[int]
+    NO_CAMERA: ClassVar[int]
+    NO_CALIBRATION: ClassVar[int]
+    BAD_FRAMES: ClassVar[int]
     header: Header
     positions: list[Point]
     normals: list[Vector3]
@@ -283,6 +295,7 @@ class PalpationTargets:
     surface_noise: float
     frames_fused: int
     coverage: float
+    reason: int
     message: str
 
 @dataclass

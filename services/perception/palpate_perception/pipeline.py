@@ -17,6 +17,7 @@ from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
 from palpate_perception.surface import HeightField
 from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
+from palpate_perception.visibility import Gaps, Reason
 from palpate_perception.wall import BreathingMode
 
 MARGIN_M: Final = 0.03
@@ -76,8 +77,10 @@ class Perceived:
     frames: int
     coverage: float
     """Part of the region of interest that was seen."""
+    reason: Reason
+    """Why there are no targets."""
     message: str
-    """Description of the failure; empty if there is none."""
+    """The reason, or a remark about the targets, as text for people; empty when there is neither."""
     field: HeightField | None = None
     """The surface over x and y of A; None when too little was seen."""
 
@@ -118,13 +121,13 @@ class Pipeline:
         seen = visibility.seen(p_A, self._exam)
         coverage = float(np.mean(seen))
         if coverage < MIN_COVERAGE:
-            why = self._reasons(seen, p_A, depth, origin, camera)
-            message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {why}"
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
+            gaps = self._gaps(seen, p_A, depth, origin, camera)
+            message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {gaps}"
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, gaps.reason, message)
 
         if (away := float(np.abs(shift).max())) > MARGIN_M:  # beyond what is cropped, fitted and judged for what is missing
-            message = f"the patient has moved by {1e3 * away:.0f} mm since the first look; at most {1e3 * MARGIN_M:.0f} mm can be"
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, message)
+            message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * MARGIN_M:.0f} mm)"
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, Reason.PATIENT_MOVED, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
@@ -136,14 +139,14 @@ class Pipeline:
         motion = self._motion(fusion, fused, points, p_A, camera)
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
-        return Perceived(points, self._mesh(field, p_A, mode, shift), targets, sigma, fused.frames, coverage, message, field)
+        mesh = self._mesh(field, p_A, mode, shift)
+        return Perceived(points, mesh, targets, sigma, fused.frames, coverage, Reason.NONE, message, field)
 
-    def _reasons(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> str:
-        """Describe why cells of the region have no points."""
+    def _gaps(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> Gaps:
         xy, _ = visibility.cells(self._exam)
         missing = np.column_stack((xy[~seen], visibility.quadric(p_A, xy[~seen])))
         X_CA = inverse(camera.X_WC) @ self._X_WA
-        return visibility.explain(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
+        return visibility.gaps(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
 
     def _motion(self, fusion: DepthFusion, fused: FusedDepth, points: Cloud, p_A: Array, camera: Intrinsics) -> float:
         """Standard deviation over the frames of the surface's height in the region [m]."""

@@ -8,12 +8,12 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import PalpationTargets, Point, PointCloud2, PointField, SurfaceMesh, Vector3
+from palpate_bus.messages import PalpationTargets
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_in_metres
+from palpate_bus.messages.geometry import cloud_message, depth_in_metres, mesh_message, point_message, vector_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception import messages
@@ -21,8 +21,9 @@ from palpate_perception.cloud import Cloud
 from palpate_perception.follower import Follower
 from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
-from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline, Targets
+from palpate_perception.pipeline import Perceived, Pipeline, Targets
 from palpate_perception.views import Intrinsics
+from palpate_perception.visibility import Reason
 from palpate_perception.wall import BreathingMode
 from palpate_perception.watch import LONGEST_S
 
@@ -112,11 +113,12 @@ class PerceptionService(Service):
         perceived = self._pipeline.perceive(burst.fusion, burst.camera, mode, self._follower.shift)
         self._last, self._corrected = perceived, t
         outbox: dict[str, Message | list[Message]] = {
-            "perception/points": points(t, perceived.cloud.p_W),
+            "perception/points": cloud_message(header(t, FRAME), perceived.cloud.p_W),
             "perception/targets": targets(t, perceived),
         }
         if perceived.mesh is not None:
-            outbox["perception/surface"] = surface(t, perceived.mesh)
+            mesh = perceived.mesh
+            outbox["perception/surface"] = mesh_message(header(t, FRAME), mesh.p_W, mesh.n_W, mesh.triangles, mesh.lifts)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
@@ -185,34 +187,21 @@ def _disagreement(frame: Message, camera: Intrinsics) -> str:
 
 
 def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
-    """The answer to a burst of which nothing could be used."""
+    """Return the answer to a burst of which no frame could be used."""
     if burst.wrong:
-        why = burst.wrong
+        reason, why = Reason.BAD_FRAMES, burst.wrong
     elif inbox.lost("camera"):
-        why = "the camera's service is gone"
+        reason, why = Reason.NO_CAMERA, "the camera service has left the run"
     elif burst.waiting and inbox.latest("tf_static") is None:
-        why = "frames came, but no tf_static with the camera's pose"
+        reason, why = Reason.NO_CALIBRATION, "frames received, but no tf_static with the camera's pose"
     elif burst.waiting:
-        why = f"frames came, but no camera/depth/camera_info or no pose of {burst.waiting[0].header.frame_id!r} in world"
+        reason, frame = Reason.NO_CALIBRATION, burst.waiting[0].header.frame_id
+        why = f"frames received, but no camera/depth/camera_info or no pose of {frame!r} in world"
     else:
+        reason = Reason.NO_FRAMES
         why = f"no frame on camera/depth/image_raw within {PATIENCE_NS / NS:.0f} s of the expected end of the burst"
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
-    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, f"nothing seen: {why}")
-
-
-def points(t: int, p_W: Array) -> Message:
-    """`sensor_msgs/PointCloud2` in world: x y z float32 [m]."""
-    fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
-    data = np.ascontiguousarray(p_W, "<f4").view(np.uint8).reshape(-1)
-    return PointCloud2(header(t, FRAME), 1, len(p_W), fields, False, 12, 12 * len(p_W), data, True)
-
-
-def surface(t: int, mesh: PerceivedMesh) -> Message:
-    """`palpation_msgs/SurfaceMesh` in world."""
-    vertices, normals = (np.ascontiguousarray(x, np.float32).reshape(-1) for x in (mesh.p_W, mesh.n_W))
-    return SurfaceMesh(
-        header(t, FRAME), vertices, normals, np.ascontiguousarray(mesh.triangles).reshape(-1), mesh.lifts.astype(np.float32)
-    )
+    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"nothing seen: {why}")
 
 
 def targets(t: int, perceived: Perceived) -> Message:
@@ -220,11 +209,12 @@ def targets(t: int, perceived: Perceived) -> Message:
     found = perceived.targets
     return PalpationTargets(
         header(t, FRAME),
-        [Point(*map(float, p)) for p in found.p_W],
-        [Vector3(*map(float, n)) for n in found.n_W],
+        [point_message(p) for p in found.p_W],
+        [vector_message(n) for n in found.n_W],
         found.line,
         perceived.sigma,
         perceived.frames,
         perceived.coverage,
+        perceived.reason,
         perceived.message,
     )

@@ -1,7 +1,9 @@
-"""Coverage of the region of interest by the camera, and reasons for gaps."""
+"""Coverage of the region of interest by the camera, and the reasons for gaps."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from enum import IntEnum
 from typing import Final
 
 import numpy as np
@@ -59,22 +61,63 @@ def quadric(p_A: Array, xy: Array) -> Array:
     return np.asarray(rows(xy) @ np.linalg.lstsq(system, right)[0])
 
 
-def explain(
-    missing: Array,
-    total: int,
-    X_CA: Array,
-    K: Array,
-    depth: Array,
-    origin: tuple[int, int],
-    image: tuple[int, int],
-) -> str:
-    """Describe why cells have no points, most frequent reason first; empty if none is missing.
+class Reason(IntEnum):
+    """Reasons for an answer without targets; values as in `palpation_msgs/PalpationTargets`."""
 
-    `missing`: expected points, in A, shape (m, 3); `total`: cells in all; `depth`: the fused window [m], whose
-    first pixel is `origin` of an image of shape `image`.
+    NONE = 0
+    VIEW_BLOCKED = 1
+    SELF_OCCLUDED = 2
+    OUT_OF_IMAGE = 3
+    NO_DEPTH = 4
+    BEYOND_ABDOMEN = 5
+    TOO_FEW_POINTS = 6
+    PATIENT_MOVED = 7
+    NO_FRAMES = 8
+    NO_CAMERA = 9
+    NO_CALIBRATION = 10
+    BAD_FRAMES = 11
+
+
+HINTS: Final = {
+    Reason.VIEW_BLOCKED: "view blocked by an object, probably the arm, up to {:.2f} m in front of the surface",
+    Reason.SELF_OCCLUDED: "hidden behind the abdomen itself: place the camera higher",
+    Reason.OUT_OF_IMAGE: "outside the image: turn the camera towards the region",
+    Reason.NO_DEPTH: "no depth: seen at too grazing an angle or out of range",
+    Reason.BEYOND_ABDOMEN: "no abdomen there: the surface lies deeper, the region reaches past its edge",
+    Reason.TOO_FEW_POINTS: "seen by too few pixels, or cut off by a jump in depth",
+}
+
+
+@dataclass(frozen=True, slots=True)
+class Gaps:
+    """Parts of the region that were not seen, by reason."""
+
+    shares: dict[Reason, float]
+    """Fraction of the region, largest first, without those of at most half a percent."""
+    obstacle_m: float
+    """Largest distance of an obstacle from the surface behind it [m]."""
+
+    @property
+    def reason(self) -> Reason:
+        """The reason to act on: a blocked view even if it is not the largest part, since another view can avoid it."""
+        return Reason.VIEW_BLOCKED if Reason.VIEW_BLOCKED in self.shares else next(iter(self.shares), Reason.TOO_FEW_POINTS)
+
+    def __str__(self) -> str:
+        """Text for people."""
+        parts = (f"{HINTS[r].format(self.obstacle_m)} ({100 * share:.0f} % of the region)" for r, share in self.shares.items())
+        return "; ".join(parts)
+
+
+def gaps(
+    missing: Array, total: int, X_CA: Array, K: Array, depth: Array, origin: tuple[int, int], image: tuple[int, int]
+) -> Gaps:
+    """Return why cells were not seen.
+
+    `missing`: points expected in those cells, in A [m], shape (m, 3); `total`: number of cells of the region; `depth`: the
+    fused window [m], whose first pixel is `origin` of an image of shape `image`.
     """
     if len(missing) == 0:
-        return ""
+        return Gaps({}, 0.0)
     p_C = apply(X_CA, missing)
     front = p_C[:, 2] > 0.01
     u, v = project(np.where(front[:, np.newaxis], p_C, (0.0, 0.0, 1.0)), K)
@@ -91,18 +134,14 @@ def explain(
     hidden = behind & ~itself
     none = inside & np.isnan(measured)
     before = float(np.max(nearer[hidden], initial=0.0))
-    reasons = (
-        (hidden, f"view blocked: something, likely the arm, stands up to {before:.2f} m before the surface"),
-        (itself, "hidden behind the abdomen itself: place the camera higher"),
-        (~inside, "outside the image: turn the camera towards the region"),
-        (none, "no depth there: seen at too grazing an angle or out of range"),
-        (beyond, "no abdomen there: the surface lies deeper, the region reaches past its edge"),
-        (inside & ~behind & ~beyond & ~none, "seen by too few pixels, or cut off by a jump in depth"),
-    )
-    counted = [(int(np.count_nonzero(mask)), words) for mask, words in reasons]
-    parts = [
-        f"{words} ({100 * count / total:.0f} % of the region)"
-        for count, words in sorted(counted, key=lambda item: -item[0])
-        if count > 0.005 * total
-    ]
-    return "; ".join(parts)
+    masks = {
+        Reason.VIEW_BLOCKED: hidden,
+        Reason.SELF_OCCLUDED: itself,
+        Reason.OUT_OF_IMAGE: ~inside,
+        Reason.NO_DEPTH: none,
+        Reason.BEYOND_ABDOMEN: beyond,
+        Reason.TOO_FEW_POINTS: inside & ~behind & ~beyond & ~none,
+    }
+    shares = {reason: np.count_nonzero(mask) / total for reason, mask in masks.items()}
+    listed = {r: share for r, share in sorted(shares.items(), key=lambda item: -item[1]) if share > 0.005}
+    return Gaps(listed, before)

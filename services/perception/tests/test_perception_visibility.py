@@ -1,13 +1,15 @@
-"""Coverage of the region, and the reasons in words where there is none."""
+"""Coverage of the region, and the reasons for gaps in it."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from palpate_bus.messages import PalpationTargets
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
+from palpate_perception.visibility import Gaps, Reason
 
 K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])
 X_AC = look_at(np.array([0.4, -0.45, 0.92]), np.array([0.0, 0.0, -0.03]))
@@ -27,8 +29,8 @@ def all_cells() -> np.ndarray:
     return np.column_stack((xy, np.zeros(len(xy))))
 
 
-def explain(missing: np.ndarray, depth: np.ndarray) -> str:
-    return visibility.explain(missing, len(all_cells()), X_CA, K, depth, (0, 0), SHAPE)
+def gaps(missing: np.ndarray, depth: np.ndarray) -> Gaps:
+    return visibility.gaps(missing, len(all_cells()), X_CA, K, depth, (0, 0), SHAPE)
 
 
 def test_cells_cover_the_region_and_points_fill_them() -> None:
@@ -45,40 +47,46 @@ def test_cells_cover_the_region_and_points_fill_them() -> None:
     assert not visibility.seen(np.empty((0, 3)), exam).any()
 
 
-def test_nothing_missing_needs_no_words() -> None:
-    assert explain(np.empty((0, 3)), flat_depth()) == ""
+def test_no_gap_without_missing_cells() -> None:
+    assert gaps(np.empty((0, 3)), flat_depth()).shares == {}
 
 
-def test_the_arm_is_named_with_its_distance_and_share() -> None:
-    missing = all_cells()[:120]
-    words = explain(missing, flat_depth(0.3))
-    assert words.startswith("view blocked: something, likely the arm, stands up to 0.3")
-    assert words.endswith("(30 % of the region)")
+@pytest.mark.parametrize(
+    ("offset", "plane_m", "reason"),
+    [
+        ((0.0, 0.0, 0.0), 0.3, Reason.VIEW_BLOCKED),
+        ((0.0, 0.0, -0.06), 0.0, Reason.SELF_OCCLUDED),
+        ((0.0, 0.0, 0.0), np.nan, Reason.NO_DEPTH),
+        ((0.0, 0.0, 0.0), -0.2, Reason.BEYOND_ABDOMEN),
+        ((3.0, 0.0, 0.0), 0.0, Reason.OUT_OF_IMAGE),
+        ((0.0, 0.0, 0.0), 0.0, Reason.TOO_FEW_POINTS),
+    ],
+)
+def test_reason_of_missing_cells(offset: tuple[float, float, float], plane_m: float, reason: Reason) -> None:
+    found = gaps(all_cells() + np.array(offset), flat_depth(plane_m))
+    assert found.reason == reason
+    assert found.shares == {reason: 1.0}
 
 
-def test_the_abdomen_itself_in_the_way_is_not_the_arm() -> None:
-    # Cells expected 60 mm below what the camera sees there, a wall at the umbilicus' height.
-    behind = all_cells() - np.array((0, 0, 0.06))
-    assert explain(behind, flat_depth(0.0)).startswith("hidden behind the abdomen itself")
+def test_obstacle_has_distance_and_share() -> None:
+    found = gaps(all_cells()[:120], flat_depth(0.3))
+    assert found.shares == {Reason.VIEW_BLOCKED: pytest.approx(0.3)}
+    assert found.obstacle_m == pytest.approx(0.35, abs=0.05)
 
 
-def test_no_depth_too_deep_and_outside_are_told_apart() -> None:
-    assert explain(all_cells(), np.full(SHAPE, np.nan)).startswith("no depth there")
-    assert explain(all_cells(), flat_depth(-0.2)).startswith("no abdomen there")
-    aside = all_cells() + np.array((3.0, 0.0, 0.0))
-    assert explain(aside, flat_depth()).startswith("outside the image")
-    assert explain(all_cells(), flat_depth()).startswith("seen by too few pixels")
-
-
-def test_the_most_frequent_reason_comes_first() -> None:
+def test_largest_gap_comes_first_but_a_blocked_view_is_the_reason() -> None:
     depth = flat_depth()
     u, _ = cloud.project(apply(X_CA, all_cells()), K)
     middle = int(np.quantile(u, 0.7))
     depth[:, :middle] = np.nan
     depth[:, middle:] = flat_depth(0.3)[:, middle:]
-    first, second = explain(all_cells(), depth).split("; ")
-    assert first.startswith("no depth there")
-    assert second.startswith("view blocked")
+    found = gaps(all_cells(), depth)
+    assert list(found.shares) == [Reason.NO_DEPTH, Reason.VIEW_BLOCKED]
+    assert found.reason == Reason.VIEW_BLOCKED
+
+
+def test_reasons_are_those_of_the_message() -> None:
+    assert {r.name: r.value for r in Reason} == {r.name: getattr(PalpationTargets, r.name) for r in Reason}
 
 
 def test_the_rough_guess_follows_the_cloud_and_stays_sane_without_one() -> None:

@@ -98,7 +98,7 @@ class BusWorld(World):
             normals = [Vector3(0.0, 0.0, 1.0)] * len(found)
             points = [Point(*map(float, p)) for p in found]
             lines = np.asarray(mesh.lines, dtype=np.uint32)
-            targets = PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, "")
+            targets = PalpationTargets(header(t, "world"), points, normals, lines, 5e-4, 20, 1.0, 0, "")
             self.targets(targets)
             inbox.put("perception/targets", targets)
         if self.exam.status.phase is Phase.ASSESS:
