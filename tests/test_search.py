@@ -12,8 +12,8 @@ from examination import GATE, palpate_run
 import palpate
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
-from palpate.search.whole import told
 from palpate_search.choice import policy
+from research.search.whole import told
 
 CENTRE = (0.04, -0.03)
 STILL = {"breathing": {"kind": "none"}}

@@ -1,4 +1,4 @@
-"""`Palpate/Search-v0`: a Gymnasium environment in which an agent says where to press next.
+"""`Palpate/Search-v0`: a Gymnasium environment in which an agent selects the next press.
 
     >>> import gymnasium
     >>> import palpate.search.environment  # registers it
@@ -7,9 +7,9 @@
     >>> observation["history"].shape
     (30, 5)
 
-An episode is one patient and `presses` presses. The reward of a press is the information that it gave, what the entropy of the
-posterior over "no lump, or one at this place" lost [nat], less TIME_COST for each second that it took. At the end comes the
-logarithm of the probability of what is true: no lump, or one near where it is; at least WORST.
+An episode is one patient and `presses` presses. The reward of a press is the decrease of the entropy of the posterior over
+"no lump, or one at this place" [nat], less TIME_COST per second. The last press adds the logarithm of the probability of the truth
+(no lump, or one near its true place), at least WORST.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from gymnasium import spaces
 from numpy.typing import NDArray
 
 from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.population import SearchCase, case
+from palpate.search.trial import SearchCase, case
 from palpate_models.numerics.frames import Array
 from palpate_search.maps import LAYERS, maps, shape
 from palpate_search.posterior import Posterior
@@ -34,26 +34,26 @@ ID: Final = "Palpate/Search-v0"
 TIME_COST: Final = 0.01
 WORST: Final = -5.0
 NEAR_M: Final = 0.020
-"""A lump within this distance of where it is counts as there."""
+"""A lump hypothesis within this distance of the true place counts as correct."""
 ONE_MODEL: Final = ((1.0, 1.0),)
-"""Reward is counted with usual roughness and errors: a fifth of the time."""
+"""The reward uses one model of roughness and errors: a fifth of the computing time."""
 Observation = dict[str, NDArray[np.float32]]
 _cases = lru_cache(maxsize=512)(case)
 
 
 class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
-    """One patient after the other. Equal seeds and actions give equal rewards."""
+    """Search environment; each episode is one patient. Equal seeds and actions give equal rewards."""
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as Gymnasium has it
 
     def __init__(
         self, hand: Literal["surrogate", "patient"] = "surrogate", presses: int = 40, patients: int = 64, *, maps: bool = False
     ) -> None:
-        """`hand`: who presses; `presses` an episode; `patients`: so many of the tuning seeds; `maps`: observe the posterior, too.
+        """`hand`: press model; `presses` per episode; `patients`: number of tuning seeds; `maps`: observe the posterior, too.
 
-        An action is place and depth, each from -1 to 1 over what is allowed. The observation has `history`, a row for each press,
-        zeros for those to come: x, y and depth as of an action, the logarithm of the force over 5 N, and 1; and `left`, the share
-        of presses that is left. With maps it has `maps`: what is known of every place (`palpate_search.maps`).
+        An action is place and depth, each scaled to -1..1 over the allowed range. The observation has `history`, one row per
+        press: x, y and depth as in an action, the logarithm of the force over 5 N, and 1, or zeros for future presses; and `left`,
+        the share of remaining presses. With maps it has `maps`, the posterior at every place (`palpate_search.maps`).
         """
         if hand not in ("surrogate", "patient"):
             raise ValueError(f"hand = {hand!r}: want surrogate or patient")
@@ -71,14 +71,14 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.observation_space: spaces.Space[Any] = spaces.Dict(parts)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Another patient, drawn from the environment's seed; `options={"patient": 7}` asks for one."""
+        """Starts an episode with a patient drawn from the environment's seed, or `options={"patient": 7}`."""
         super().reset(seed=seed)
         patient = (options or {}).get("patient", int(self.np_random.integers(self._patients)))
         self._begin(_cases(patient))
         return self._observed(), {"patient": patient}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """One press."""
+        """Presses once; returns observation, reward, terminated, truncated, info."""
         task = self._hand.task
         share = 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0)
         xy = task.low + share[:2] * (task.high - task.low)
@@ -92,8 +92,8 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         over = self._count == self._presses
         if over:
             reward += max(float(np.log(max(self._truth(), 1e-12))), WORST)
-        told = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
-        return self._observed(), float(reward), over, False, told
+        info = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
+        return self._observed(), float(reward), over, False, info
 
     def _begin(self, patient: SearchCase) -> None:
         hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
@@ -104,32 +104,32 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     @property
     def task(self) -> Task:
-        """What is searched in this episode."""
+        """Task of this episode."""
         return self._hand.task
 
     @property
     def posterior(self) -> Posterior:
-        """What is known in this episode."""
+        """Posterior of this episode."""
         return self._posterior
 
     @property
     def maps_shape(self) -> tuple[int, int, int]:
-        """Layers, places along x and along y."""
+        """Number of layers, places along x and along y."""
         return LAYERS, *shape(self._posterior)
 
     @property
     def usual_depth(self) -> float:
-        """The usual depth of a press, as of an action."""
+        """Nominal depth of a press, scaled as in an action."""
         task = self._hand.task
         return 2 * (task.depth - task.shallowest) / (task.deepest - task.shallowest) - 1
 
     def _entropy(self) -> float:
-        """Of the posterior over no lump, or one at each place [nat]."""
+        """Return the entropy of the posterior over no lump, or one at each place [nat]."""
         p = np.append(self._posterior.by_place, self._posterior.none)
         return float(-(p * np.log(np.maximum(p, 1e-300))).sum())
 
     def _truth(self) -> float:
-        """The probability of what is true."""
+        """Return the posterior probability of the truth."""
         centre: Array | None = self._case.centre
         if centre is None:
             return self._posterior.none

@@ -1,7 +1,7 @@
-"""Presses of a patient with the errors that whole examinations have, each with the time that it takes.
+"""Single presses on a simulated patient, with the errors and durations of whole examinations.
 
-Two hands press alike: one the true tissue, in steps of 10 ms, the other what the standard press feels of the wall
-(`palpate.quick.felt`), which takes no physics and a hundredth of the time. Places are in the abdomen frame as it is registered.
+`PatientHand` presses the true tissue in steps of 10 ms. `SurrogateHand` scales the apparent stiffness of the standard press
+(`palpate.quick.felt`): no physics, a hundredth of the time. Places are in the registered abdomen frame.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from palpate_search.presses import Press, Task, seconds
 DESCENT_MPS: Final = 0.030
 HOLD_S: Final = 0.3
 _TARE_N: Final = 0.05
-"""Error of the zero of the surrogate's force sensor, and ..."""
+"""SD of the surrogate's force after taring."""
 _NOISE_N: Final = 0.02
-"""... of a press's mean force."""
+"""SD of the surrogate's mean force of a press."""
 _EXPONENT: Final = (1.35, 0.1)
-"""How its force grows with depth, over persons."""
+"""Mean and SD over persons of the surrogate's exponent of force over depth."""
 _SHALLOWEST_M: Final = 0.002
 
 
@@ -40,23 +40,23 @@ class Hand(Protocol):
     """Time since the search began [s]."""
 
     def press(self, xy: Array, depth: float) -> Press:
-        """Presses at a place [m], shape (2,), to `depth` [m]: what the examination measured. Raises ValueError off the region."""
+        """Presses at a place [m], shape (2,), to `depth` [m]; returns the measurement. Raises ValueError outside the region."""
 
 
 class _Timed:
-    """What both hands have: the examination's errors and the time."""
+    """Errors of the examination and elapsed time, common to both hands."""
 
     def __init__(self, scenario: Scenario, errors: LoopErrors | None) -> None:
         self._errors = errors or loop_errors(scenario)
-        self._told_m = self._errors.uncertainty_m
-        self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._told_m)
+        self._reported_sd_m = self._errors.uncertainty_m
+        self.task = replace(Task.of(exam_input(scenario)), depth_uncertainty=self._reported_sd_m)
         self._loop = Loop(scenario, self._errors)
         self.spent = 0.0
         self._here: Array | None = None
         self._strokes = 0
 
     def _begin(self, xy: Array, depth: float) -> float:
-        """Checks a press and counts it; returns how long it takes [s]."""
+        """Checks and counts a press; returns its duration [s]."""
         if not np.all((xy >= self.task.low - 1e-9) & (xy <= self.task.high + 1e-9)):
             raise ValueError(f"place = {xy.tolist()} m: want one within {self.task.low.tolist()} to {self.task.high.tolist()} m")
         if not 0 < depth <= self.task.deepest + 1e-9:
@@ -66,8 +66,8 @@ class _Timed:
         self._here, self._strokes = xy, self._strokes + 1
         return duration
 
-    def _wrong(self, xy: Array) -> float:
-        """How much too deep the stroke is believed to be, all the while [m]."""
+    def _depth_error(self, xy: Array) -> float:
+        """Return the constant depth error of the stroke [m], positive where depth is overestimated."""
         return float(self._loop.wrong(xy[None])[0]) + self._loop.zero(self._strokes)
 
 
@@ -75,7 +75,7 @@ class PatientHand(_Timed):
     """Presses the true tissue."""
 
     def __init__(self, scenario: Scenario, errors: LoopErrors | None = None) -> None:
-        """`errors`: None for those of loop.yaml. Raises what `Patient` does, and UnknownLoopError where it has none."""
+        """`errors`: None for those of loop.yaml. Raises what `Patient` does, and UnknownLoopError without fitted errors."""
         super().__init__(scenario, errors)
         self.patient = Patient(scenario, time=self._loop.begin_s)
         self._begin_s = self._loop.begin_s
@@ -91,7 +91,7 @@ class PatientHand(_Timed):
         places, normals = patient.surface.points((xy + loop.aside_m)[None])
         place, normal = places[0], normals[0]
         gain = loop.gains(normals)[0]
-        share, wrong = float(self._breathing((xy + loop.aside_m)[None])[0]), self._wrong(xy)
+        share, wrong = float(self._breathing((xy + loop.aside_m)[None])[0]), self._depth_error(xy)
         measured, force, limited, held = 0.0, 0.0, False, 0
         depths: list[float] = []
         forces: list[float] = []
@@ -112,7 +112,14 @@ class PatientHand(_Timed):
         patient.rest(PERIOD_S)
         noise = float(np.std(forces) / np.sqrt(len(forces)))
         return Press(
-            float(xy[0]), float(xy[1]), float(np.mean(depths)), float(np.mean(forces)), patient.time, noise, limited, self._told_m
+            float(xy[0]),
+            float(xy[1]),
+            float(np.mean(depths)),
+            float(np.mean(forces)),
+            patient.time,
+            noise,
+            limited,
+            self._reported_sd_m,
         )
 
     @property
@@ -121,10 +128,10 @@ class PatientHand(_Timed):
 
 
 class SurrogateHand(_Timed):
-    """Presses what the standard press feels of the wall; it knows nothing of relaxation, friction or earlier presses."""
+    """Scales the standard press's apparent stiffness; without relaxation, friction or memory of earlier presses."""
 
     def __init__(self, scenario: Scenario, errors: LoopErrors | None = None, felt: FeltPatient | None = None) -> None:
-        """`errors` as of the other hand; `felt`: of the scenario's patient, who is made where there is none."""
+        """`errors` as for `PatientHand`; `felt`: apparent stiffness of the patient, computed if None."""
         super().__init__(scenario, errors)
         self.felt = felt or felt_patient(scenario.phantom, scenario.seed)
         self._breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
@@ -142,7 +149,7 @@ class SurrogateHand(_Timed):
         stiff = float(self.felt.force_at((xy + loop.aside_m)[None])[0])
 
         def felt(measured: float) -> float:
-            true = max(measured - self._wrong(xy) - wander + unseen, 0.0)
+            true = max(measured - self._depth_error(xy) - wander + unseen, 0.0)
             return float(stiff * (true / 0.010) ** self._exponent)
 
         limited = felt(depth) > self.task.force
@@ -150,4 +157,4 @@ class SurrogateHand(_Timed):
             depths = np.linspace(0.0, depth, 50)
             depth = float(np.interp(self.task.force, [felt(d) for d in depths.tolist()], depths))
         force = max(felt(depth) + float(rng.normal(0.0, _TARE_N) + rng.normal(0.0, _NOISE_N)), 0.02)
-        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited, self._told_m)
+        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited, self._reported_sd_m)

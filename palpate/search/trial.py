@@ -1,16 +1,63 @@
-"""One search of one patient by one policy: what was pressed, and what was known after each press."""
+"""One search of one patient by one policy, and the population of such patients."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from time import perf_counter
+from typing import Final
 
 import numpy as np
 
+from palpate.quick.felt import FeltPatient, felt_patient
 from palpate.search.hand import Hand
 from palpate_models.numerics.frames import Array
+from palpate_models.numerics.seeds import generator
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Scenario
 from palpate_search.choice import Policy
 from palpate_search.posterior import Posterior
+
+CONTRAST: Final = 2.0
+"""Felt contrast of each lump, by the surrogate, at its centre."""
+RADIUS_M: Final = 0.020
+BORDER_M: Final = 0.030
+"""Least distance of a lump's centre from the region's edge."""
+PRESSES: Final = 100
+_MODULI: Final = (1.2, 30.0)
+"""Search interval of the modulus contrast."""
+_ROUNDS: Final = 5
+
+
+@dataclass(frozen=True)
+class SearchCase:
+    """A patient of the search population."""
+
+    scenario: Scenario
+    felt: FeltPatient
+    """Apparent stiffness by the standard press."""
+    centre: Array | None
+    """Centre of the lump [m], shape (2,); None without one."""
+
+
+def case(seed: int, errors: str = "typical") -> SearchCase:
+    """Return the patient of a seed: odd seeds have a lump, whose modulus gives the felt contrast CONTRAST."""
+    settings = [f"errors={errors}", "phantom.breathing.kind=quiet", "phantom.draw.lumps=[0, 0]"]
+    settings += [f"exam.budget.presses={PRESSES}", "exam.budget.seconds=3600"]
+    if seed % 2 == 0:
+        scenario = load_scenario("person", settings, seed)
+        return SearchCase(scenario, felt_patient(scenario.phantom, seed), None)
+    region = load_scenario("person", settings, seed).exam
+    half = 0.5 * np.array(region.region_m) - BORDER_M
+    centre = generator(seed, "search lump").uniform(-half, half) + region.centre_m
+    low, high = np.log(_MODULI)
+    for _ in range(_ROUNDS):  # log felt contrast is nearly linear in log modulus
+        middle = 0.5 * (low + high)
+        lump = f"{{centre_m: {centre.tolist()}, radii_m: [{RADIUS_M}, {RADIUS_M}], contrast: {np.exp(middle):.4f}}}"
+        scenario = load_scenario("person", [*settings, f"phantom.lesions=[{lump}]"], seed)
+        felt = felt_patient(scenario.phantom, seed)
+        excess = float(felt.excess_at(centre[None])[0])
+        low, high = (middle, high) if excess < np.log(CONTRAST) else (low, middle)
+    return SearchCase(scenario, felt, centre)
 
 
 @dataclass(frozen=True, eq=False)
@@ -18,36 +65,36 @@ class Trial:
     """A search of n presses."""
 
     xy: Array
-    """Where it pressed [m], shape (n, 2)."""
+    """Places of the presses [m], shape (n, 2)."""
     depth: Array
     """[m], shape (n,)"""
     force: Array
     """[N], shape (n,)"""
     seconds: Array
-    """Time since the search began, after each press [s], shape (n,)."""
+    """Time from the start to the end of each press [s], shape (n,)."""
     near: Array
-    """Probability, after each press, that a lump is near the most probable place, shape (n,)."""
+    """Probability of a lump near the most probable place after each press, shape (n,)."""
     lump: Array
-    """Probability that there is a lump anywhere, shape (n,)."""
+    """Probability of any lump after each press, shape (n,)."""
     place: Array
     """The most probable place [m], shape (n, 2)."""
-    think_s: float
-    """What policy and posterior took a press [s]."""
+    computing_s: float
+    """Mean computing time of policy and posterior per press [s]."""
 
     def decided(self, threshold: float) -> int | None:
-        """The press, counted from 0, after which a lump was first said to be near a place; None where none was."""
+        """Return the index of the first press after which `near` reaches `threshold`; None if it never does."""
         above = np.flatnonzero(self.near >= threshold)
         return int(above[0]) if len(above) else None
 
 
 def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Posterior | None = None) -> Trial:
-    """Presses a patient as a policy says until the budget is spent, or `presses` are made.
+    """Runs a policy on a patient until the budget is spent, or for `presses` presses.
 
-    `posterior`: one that has felt nothing yet; it holds all that was felt afterwards.
+    `posterior`: initial posterior; updated in place.
     """
     belief = posterior or Posterior(hand.task)
     rows: list[tuple[float, ...]] = []
-    thought = 0.0
+    computing_s = 0.0
     left = belief.left(hand.spent)
     count = hand.task.budget.presses if presses is None else presses
     while len(rows) < count and left.presses > 0 and left.seconds > 0:
@@ -58,7 +105,7 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
         pressed = perf_counter()
         belief.add(felt)
         place, near = belief.at
-        thought += perf_counter() - pressed + chosen - begin
+        computing_s += perf_counter() - pressed + chosen - begin
         rows.append((*felt.xy, felt.depth, felt.force, hand.spent, near, belief.lump, *place))
         left = belief.left(hand.spent)
     table = np.array(rows).reshape(-1, 9)
@@ -70,5 +117,5 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
         near=table[:, 5],
         lump=table[:, 6],
         place=table[:, 7:],
-        think_s=thought / max(len(rows), 1),
+        computing_s=computing_s / max(len(rows), 1),
     )

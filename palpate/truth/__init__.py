@@ -1,1 +1,1 @@
-"""What is true of a simulated patient, found out by pressing a copy of him: for scoring alone."""
+"""Ground truth of a simulated patient, from pressing a copy of the tissue. For scoring only."""

@@ -1,4 +1,4 @@
-"""What can be felt of a pressed patient: apparent stiffness between the places pressed, and the areas of lumps.
+"""Palpable properties of a pressed patient: apparent stiffness between the pressed places, and areas of lumps.
 
 The felt contrast of a lump is the force with it over the force without it, and e its logarithm. A lump's area is the connected
 set about its greatest |e| in which e has the sign that it has there and |e| is at least half of it. Everything is in the xy plane
@@ -31,11 +31,11 @@ PALPABLE: Final = 0.05
 
 @dataclass(frozen=True)
 class Lump:
-    """What can be felt of a lump."""
+    """Palpable properties of a lump."""
 
     palpable: bool
     contrast: float
-    """Felt contrast where |e| is greatest [1]; below 1 where the lump is softer than what is around it."""
+    """Felt contrast where |e| is greatest [1]; below 1 if softer than its surroundings."""
     centroid: Array
     """Centre of its area [m], shape (2,); where |e| is greatest if it is not palpable."""
     area: float
@@ -45,7 +45,7 @@ class Lump:
 
 
 class Felt:
-    """What the standard press feels over the examined region and a border about it."""
+    """Apparent stiffness by the standard press over the examined region and a border around it."""
 
     def __init__(self, pressed: Pressed, surface: TrueSurface, exam: Exam) -> None:
         mesh = Delaunay(pressed.places[:, :2])
@@ -61,30 +61,30 @@ class Felt:
         self._x, self._y = (np.arange(a + 0.5 * RASTER_M, b, RASTER_M) for a, b in zip(low, high, strict=True))
         xx, yy = np.meshgrid(self._x, self._y)
         self.raster = np.column_stack((xx.ravel(), yy.ravel()))
-        """Points of a raster over all of it [m], shape (ny nx, 2)."""
+        """Raster points [m], shape (ny nx, 2)."""
         self.cells = surface.steepness(self.raster) * RASTER_M**2
-        """Area of the skin that belongs to each of them [m^2], shape (ny nx,)."""
+        """Skin area of each raster point [m^2], shape (ny nx,)."""
         half = 0.5 * np.asarray(exam.region_m)
         self._examined = (np.abs(self.raster - exam.centre_m) <= half).all(axis=1).reshape(xx.shape)
         self.lumps = tuple(self._lump(between(np.log(pressed.force / alone))) for alone in pressed.alone)
         guard = np.nan_to_num(between(np.log(pressed.force / pressed.relaxed))(self.raster)).reshape(xx.shape)
         self.guarded: Mask = guard >= max(0.5 * float(guard.max()), PALPABLE)
-        """Where guarding is felt: at least half as much as where it is felt most, shape (ny, nx)."""
+        """Mask of guarding: at least half of its maximum effect, shape (ny, nx)."""
 
     def force(self, xy: Array) -> Array:
-        """Apparent stiffness [N] at points [m], shape (p, 2) -> (p,); NaN where nothing was pressed."""
+        """Return apparent stiffness [N] at points [m], shape (p, 2) -> (p,); NaN outside the pressed places."""
         return np.asarray(np.exp(self._force(xy)))
 
     def limited(self, xy: Array) -> Mask:
-        """Whether the press ended at its limit there, so that the apparent stiffness is more than `force` says, shape (p,)."""
+        """Return True where the press ended at its limit, so `force` is a lower bound, shape (p,)."""
         return np.asarray(np.nan_to_num(self._limited(xy)) > 0.5)
 
     def excess(self, xy: Array) -> Array:
-        """E of all lumps together at points, shape (p,); NaN where nothing was pressed."""
+        """Return e of all lumps together at points, shape (p,); NaN outside the pressed places."""
         return np.asarray(self._excess(xy))
 
     def inside(self, area: Mask, xy: Array) -> Mask:
-        """Whether points [m], shape (p, 2), lie in an area of the raster, shape (p,)."""
+        """Return True for points [m], shape (p, 2), in an area of the raster, shape (p,)."""
         j = np.floor((xy[:, 1] - self._y[0]) / RASTER_M + 0.5).astype(np.intp)
         i = np.floor((xy[:, 0] - self._x[0]) / RASTER_M + 0.5).astype(np.intp)
         there = (i >= 0) & (i < len(self._x)) & (j >= 0) & (j < len(self._y))
@@ -93,7 +93,7 @@ class Felt:
         return found
 
     def in_lump(self, xy: Array) -> Mask:
-        """Whether points [m], shape (p, 2), lie in the area of any lump, shape (p,)."""
+        """Return True for points [m], shape (p, 2), in the area of any lump, shape (p,)."""
         found = np.zeros(len(xy), dtype=bool)
         for lump in self.lumps:
             found |= self.inside(lump.inside, xy)

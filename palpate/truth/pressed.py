@@ -1,7 +1,7 @@
-"""The patient pressed: a copy of the true tissue, in its own tier, felt by the standard press with its lumps and without.
+"""Standard presses on a copy of the true tissue, with and without its lumps.
 
-The body is at rest, at the end of expiration; nothing moves but the press. What it feels without a lump, at the same places, says
-what of the lump can be felt at all.
+The copy uses the scenario's own tier and rests at the end of expiration. The difference with and without a lump at the same
+places is the palpable effect of the lump.
 """
 
 from __future__ import annotations
@@ -27,60 +27,60 @@ if TYPE_CHECKING:
     from palpate_tissue.backend import TissueBackend
 
 PITCH_M: Final = 0.010
-"""Distance of the places that are pressed, over the examined region and a border of as much ..."""
+"""Distance of pressed places, over the examined region and a border of this width."""
 FINE_PITCH_M: Final = 0.005
-"""... and so far about the outline of a lump, inward and outward, where it is this one."""
+"""Distance of pressed places within `PITCH_M` of a lump's outline."""
 REACH_M: Final = 0.040
-"""So far beyond its outline, and for each metre of depth a metre more, a lump is not felt: the influence K0(r / l) is below 3 %
-there, and what is felt goes with its square."""
+"""A lump is not palpable further outside its outline than this plus its depth: the influence K0(r / l) is below 3 % there, and
+the felt effect goes with its square."""
 
 
 @dataclass(frozen=True)
 class Pressed:
-    """What the standard press feels of a patient; p places, l lumps."""
+    """Apparent stiffness of a patient by the standard press; p places, l lumps."""
 
     places: Array
     """[m], on the skin at rest, shape (p, 3), in A."""
     force: Array
-    """As he is [N], shape (p,)."""
+    """Of the patient as is [N], shape (p,)."""
     limited: NDArray[np.bool_]
-    """Where the press ended at its limit, shape (p,)."""
+    """True where the press ended at its limit, shape (p,)."""
     healthy: Array
     """Without any lump [N], shape (p,)."""
     alone: Array
-    """Without this lump alone [N], shape (l, p)."""
+    """Without one lump each [N], shape (l, p)."""
     relaxed: Array
-    """With no muscle guarded [N], shape (p,)."""
+    """Without guarding [N], shape (p,)."""
 
 
 class Copies:
-    """Copies of a scenario's tissue, as it is and otherwise."""
+    """Creates variants of a scenario's tissue."""
 
     def __init__(self, scenario: Scenario) -> None:
         self._scenario = scenario
         self.phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none")})
-        """The patient at rest."""
+        """The patient without breathing."""
 
     def with_lesions(self, lesions: Sequence[Lesion]) -> TissueBackend | None:
-        """The patient with no lesions but these; None where no copy of his tissue can be made."""
+        """Return the patient with exactly these lesions; None if the tissue cannot be copied."""
         return self._copy(self.phantom.model_copy(update={"lesions": tuple(lesions)}))
 
     def relaxed(self) -> TissueBackend | None:
-        """The patient with no muscle guarded; None where none is."""
+        """Return the patient without guarding; None if there is none."""
         if not self.phantom.guarding:
             return None
         return self._copy(self.phantom.model_copy(update={"guarding": ()}))
 
     def _copy(self, phantom: Phantom) -> TissueBackend | None:
-        from palpate.truth.tissue import true_tissue  # noqa: PLC0415 - it imports a service, and who reads results needs none
+        from palpate.truth.tissue import true_tissue  # noqa: PLC0415 - imports a service, which reading results does not need
 
         return true_tissue(self._scenario.model_copy(update={"phantom": phantom}))
 
 
 def press_patient(scenario: Scenario) -> Pressed | None:
-    """The patient of a scenario, pressed all over the examined region; None where no copy of his tissue can be made.
+    """Presses the patient of a scenario over the examined region; returns None if the tissue cannot be copied.
 
-    It takes seconds, and is kept in the user's cache folder by patient, tier and indenter.
+    Takes seconds; cached in the user's cache folder by patient, tier and indenter.
     """
     copies, radius = Copies(scenario), scenario.robot.indenter_radius_m
     lesions = copies.phantom.lesions
@@ -121,7 +121,7 @@ def press_patient(scenario: Scenario) -> Pressed | None:
 
 
 def _code(scenario: Scenario) -> list[Path]:
-    """The source files that decide what is felt."""
+    """Return the source files that affect the result."""
     import palpate_tissue  # noqa: PLC0415 - as above
 
     files = [path for package in (palpate_models, palpate_tissue) for path in Path(package.__path__[0]).rglob("*.py")]
@@ -130,10 +130,10 @@ def _code(scenario: Scenario) -> list[Path]:
 
 
 def _places(skin: TrueSurface, exam: Exam, lesions: Sequence[Lesion]) -> tuple[Array, Array]:
-    """Places on the skin [m] and outward unit normals there, shape (p, 3): a grid, finer about the outlines of lumps."""
+    """Return places on the skin [m] and outward unit normals, shape (p, 3): a grid, finer near outlines of lumps."""
     centre, half = np.asarray(exam.centre_m), 0.5 * np.asarray(exam.region_m) + PITCH_M
     count = np.ceil(half / FINE_PITCH_M - 1e-9).astype(int)
-    count += count % 2  # so that the coarse grid is every second of the fine one, to the border
+    count += count % 2  # the coarse grid is every second point of the fine one, up to the border
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(-n, n + 1) for n in count)))
     xy = centre + np.column_stack((i, j)) * half / count
     coarse = (i % 2 == 0) & (j % 2 == 0)
@@ -144,6 +144,6 @@ def _places(skin: TrueSurface, exam: Exam, lesions: Sequence[Lesion]) -> tuple[A
 
 
 def _near(places: Array, lesions: Sequence[Lesion]) -> NDArray[np.bool_]:
-    """Whether each lump might be felt at each place, shape (l, p)."""
+    """Return True where each lump may be palpable, shape (l, p)."""
     near = [edge_distance(places[:, :2], lesion) <= REACH_M + (lesion.depth_m or 0.0) for lesion in lesions]
     return np.array(near, dtype=bool).reshape(len(lesions), len(places))

@@ -1,4 +1,4 @@
-"""The true rest surface as functions of place in the xy plane of the abdomen frame A."""
+"""True rest surface as functions of xy in the abdomen frame A."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from palpate_models.numerics.frames import Array
 
 @dataclass(frozen=True)
 class TrueBody:
-    """The body at rest."""
+    """The body at rest, as a mesh."""
 
     vertices: Array
     """[m], shape (n, 3), in A."""
@@ -25,7 +25,7 @@ class TrueBody:
 
 
 class TrueSurface:
-    """The outward (front) side of the true rest surface as functions of xy, in A."""
+    """The front side of the true rest surface as functions of xy, in A."""
 
     def __init__(self, body: TrueBody) -> None:
         corners = body.vertices[body.triangles]
@@ -42,19 +42,19 @@ class TrueSurface:
         self._normal = LinearNDInterpolator(mesh, unit)
 
     def between(self, values: Array) -> LinearNDInterpolator:
-        """Values at the body's vertices, shape (n,), as a function of xy, shape (p, 2) -> (p,); NaN off the surface."""
+        """Return an interpolator of values at the vertices, shape (n,): xy, shape (p, 2) -> (p,); NaN off the surface."""
         return LinearNDInterpolator(self._mesh, values[self._front])
 
     def points(self, xy: Array) -> tuple[Array, Array]:
-        """Points of the surface [m] and outward unit normals there, each of shape (p, 3); NaN off the surface."""
+        """Return points of the surface [m] and outward unit normals, each of shape (p, 3); NaN off the surface."""
         normal = np.asarray(self._normal(xy))
         return np.column_stack((xy, self.height(xy))), normal / np.linalg.norm(normal, axis=1, keepdims=True)
 
     def height(self, xy: Array) -> Array:
-        """Height z [m] at points, shape (p,); NaN off the surface."""
+        """Return height z [m] at points, shape (p,); NaN off the surface."""
         return np.asarray(self._height(xy))
 
     def steepness(self, xy: Array) -> Array:
-        """Area of the surface over area in xy at points [1], shape (p,)."""
+        """Return area of the surface over area in xy at points [1], shape (p,)."""
         normal = np.asarray(self._normal(xy))
         return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))

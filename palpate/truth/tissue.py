@@ -1,4 +1,4 @@
-"""The true tissue of a scenario, whatever plays it, for those who press it without the bus."""
+"""True tissue of a scenario, of any implementation, for pressing without the bus."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.service import TissueService
 
 _OWN_FMU: Final = "winkler"
-"""The tier whose equations our own FMU has."""
+"""Tier with the equations of our own FMU."""
 
 
 def true_tissue(scenario: Scenario) -> TissueBackend | None:
-    """The tissue of a scenario at rest, on a body that stays where it lies.
+    """Return the tissue of a scenario at rest, on a body that does not move.
 
-    None where it cannot be copied: a foreign FMU, a user's own service, real tissue.
+    None if it cannot be copied: a foreign FMU, a custom service, real tissue.
     """
     chosen = scenario.services.tissue
     if chosen == "none" or (chosen == "fmu" and scenario.tissue.fmu is not None):

@@ -1,7 +1,7 @@
-"""Where the tool truly touched: from places as the examination believes them to places on the true skin.
+"""Maps places as estimated by the examination to the places on the true skin that the tool touched.
 
-Errors of kinematics and registration are lateral too. So what the examination says of a place is compared with what the tool felt
-there, which is the place that it truly touched.
+Kinematics and registration have lateral errors. So an estimate at a place is compared with the truth at the place that the tool
+actually touched.
 """
 
 from __future__ import annotations
@@ -14,19 +14,19 @@ from scipy.spatial import cKDTree
 from palpate_models.numerics.frames import Array
 
 _NEAREST: Final = 4
-"""Contacts whose errors are averaged, the nearer the more."""
+"""Number of nearest contacts whose errors are averaged, weighted by inverse distance."""
 
 
 class Touched:
-    """Contacts of a run: k places on the skin, as believed and as they truly were."""
+    """Contacts of a run: k estimated and true places on the skin."""
 
     def __init__(self, believed: Array, true: Array) -> None:
-        """Both [m], shape (k, 3), in A: as registered, and the true one. Without a contact all places are taken as they are."""
+        """Both [m], shape (k, 3), in the registered and in the true A. Without contacts places are unchanged."""
         self.believed, self.true = believed, true
         self._tree = cKDTree(believed[:, :2]) if len(believed) else None
 
     def places(self, xy: Array) -> Array:
-        """Where the tool truly was when it was believed at xy [m], both of shape (p, 2)."""
+        """Return true places of the tool for estimated ones xy [m], both of shape (p, 2)."""
         if self._tree is None:
             return xy
         count = min(_NEAREST, len(self.believed))

@@ -1,1 +1,1 @@
-"""The search: where to press next, given what was felt so far, and when to stop."""
+"""Search: selects the next press from the measurements, and decides when to stop."""

@@ -1,10 +1,10 @@
-"""Expected information gain of one more press about the place and the existence of a lump.
+"""Expected information of the next press about the presence and place of a lump.
 
 It is the mutual information of the hypothesis h and the next observation y,
 
     I = H(y) - sum_h p_h H(y | h),
 
-in nats. Under each hypothesis y is Gaussian, so that H(y | h) is a formula and y a mixture, whose entropy is a sum over a grid
+in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The entropy of the mixture y is a sum over a grid
 (Lindley 1956; MacKay 1992, "Information-based objective functions for active data selection").
 """
 
@@ -17,21 +17,21 @@ from palpate_models.numerics.frames import Array
 
 _BINS = 64
 _BIN = 0.25
-"""Hypotheses whose mean observation differs by less than this part of the standard deviation count as one Gaussian."""
+"""Bin width in SDs: hypotheses in one bin are merged to one Gaussian."""
 _NODES = 41
 _REACH = 4.0
-"""Margin of the grid beyond the mixture, in standard deviations."""
+"""Margin of the grid around the mixture in SDs."""
 _RARE = 2e-5
-"""Hypotheses less probable than this count as no lump."""
+"""Less probable hypotheses count as no lump."""
 _SAME = 0.02
-"""Hypotheses that change the observation by less than this part of its standard deviation count as no lump."""
+"""Hypotheses that shift the observation by fewer SDs count as no lump."""
 
 
 @compiled
 def information(unexplained: Array, contrast: Array, contrast_variance: Array, probability: Array, variance: Array) -> Array:
-    """Information of an observation at each place [nat], shape (p,).
+    """Return the information of an observation at each place [nat], shape (p,).
 
-    `unexplained`: shape (p, h), what a lump of log-contrast 1 adds to the mean; `contrast` and its variance, shape (h,);
+    `unexplained`: shape (p, h), added mean per unit log-contrast of a lump; `contrast` and its variance, shape (h,);
     `probability` of each hypothesis, shape (h,); `variance` of the observation without a lump, shape (p,).
     """
     places, hypotheses = unexplained.shape

@@ -1,4 +1,4 @@
-"""The posterior as maps over the places: the input of a learned policy."""
+"""Posterior as maps over the places: the input of the learned policy."""
 
 from __future__ import annotations
 
@@ -12,17 +12,16 @@ LAYERS = 6
 
 
 def shape(posterior: Posterior) -> tuple[int, int]:
-    """Places along x and along y."""
+    """Return the number of places along x and y."""
     rows = len(np.unique(posterior.task.places[:, 0]))
     return rows, len(posterior.task.places) // rows
 
 
 def maps(posterior: Posterior) -> Array:
-    """Layers over the places, shape (LAYERS, nx, ny), all about -1 to 1.
+    """Return layers over the places, shape (LAYERS, nx, ny), all within about -1 to 1.
 
-    The logarithm of the probability of a lump there, over that of chance; mean (about that of all places) and standard deviation
-    of the field, in the logarithm; how long the way there takes [s]; the probability that there is a lump; the share of presses
-    that is left.
+    Log probability of a lump at the place over chance; mean (centred) and SD of the log field; travel time to the place [s];
+    probability of any lump; share of remaining presses.
     """
     mean, variance = posterior.field()
     left = 1.0 - len(posterior.presses) / posterior.task.budget.presses

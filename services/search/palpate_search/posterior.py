@@ -1,13 +1,13 @@
-"""Posterior of a lump given the presses: a sequential Bayesian test under the model of the assessment.
+"""Posterior probability of a lump and its place: a sequential Bayesian test under the assessment's model.
 
-The logarithm of the force of the standard press is a Gaussian field z with errors (`palpate_assessment.model`). A
-hypothesis h is a round lump of some place and radius; under it z has the bump b_h in addition, times an unknown log-contrast e.
-With S the covariance of everything else, and e ~ N(m, s^2), the evidence of the data y for it, against no lump, is
+The log-force of the standard press is a Gaussian field z with errors (`palpate_assessment.model`). A hypothesis h is a round lump with
+a place and radius; it adds the bump b_h to z, times an unknown log-contrast e. With S the covariance of everything else, and
+e ~ N(m, s^2), the Bayes factor of the data y against no lump is
 
     log B_h = -1/2 log(1 + s^2 p) + 1/2 (m / s^2 + c)^2 / (1 / s^2 + p) - 1/2 m^2 / s^2,    p = b' S^-1 b,  c = b' S^-1 y
 
-Natural variation and depth errors have unknown size: S has a few amplitudes, each model weighted by its evidence. One more
-press adds a row to each Cholesky factor, so that an update takes about a millisecond.
+The amplitudes of natural variation and depth errors are unknown: S has a few variants, each weighted by its evidence. A press adds one
+row to each Cholesky factor, so an update takes about a millisecond.
 """
 
 from __future__ import annotations
@@ -28,48 +28,48 @@ from palpate_models.scenario import press
 from palpate_search.presses import SHALLOWEST_M, Budget, Press, Task
 
 RADII_M: Final = (0.014, 0.022, 0.030)
-"""Radii of the lumps that are looked for, as they are felt."""
+"""Palpable radii of the lump hypotheses."""
 EDGE_M: Final = 0.013
-"""Standard deviation of the edge with which a press feels a lump: it presses a dent some centimetres wide."""
+"""SD of the smooth edge of a palpated lump: a press deforms a few centimetres of skin."""
 OUTSIDE: Final = 0.2
-"""Prior factor of a lump that extends beyond the region."""
+"""Relative prior of a lump that extends beyond the region: the region is chosen to contain the lump."""
 LUMP_PROBABILITY: Final = 0.5
 """Prior probability of a lump."""
 ANOTHER: Final = 0.2
-"""Prior probability of another lump besides those found."""
+"""Prior probability of another lump after one was found."""
 CONTRAST: Final = (float(np.log(2.0)), 0.25)
 """Prior mean and standard deviation of a lump's log-contrast."""
 NATURAL_SD: Final = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
-"""Amplitudes of the fields of natural variation, the strips last (`palpate_assessment.model.natural`)."""
+"""Amplitudes of the fields of natural variation, strips last (`palpate_assessment.model.natural`)."""
 BONE_SD: Final = 0.27
 """Amplitude of bone."""
 SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
-"""Depth error shared by neighbouring presses and of each press, as shares of the reported uncertainty; maximum likelihood over
-healthy tuning patients (docs/search.md)."""
-ROUGH: Final = (0.75, 1.3)
-"""Natural variation, of its usual amplitude."""
-WRONG: Final = (0.75, 1.3)
-"""Errors of depth, of what is usual."""
+"""Fractions of the reported depth uncertainty that are spatially correlated and independent. Maximum likelihood over healthy tuning
+patients (`research.search.prior`, docs/search.md)."""
+VARIATION_SCALES: Final = (0.75, 1.3)
+"""Model variants: natural variation over its typical amplitude."""
+DEPTH_ERROR_SCALES: Final = (0.75, 1.3)
+"""Model variants: depth errors over their typical size."""
 USUAL_N, LEVEL_SD = 2.2, 1.0
-"""Force of the standard press on a belly, and how belly and equipment differ, in the logarithm: far more than people do."""
+"""Prior mean [N] and SD (in the logarithm) of the force of the standard press; much wider than the variation between people."""
 NEAR_M: Final = 0.020
-"""Hypotheses within this distance speak of one lump."""
+"""Hypotheses within this distance count as one lump."""
 FOUND: Final = 0.95
-"""Probability from which a lump counts as found."""
+"""A lump with this probability counts as found."""
 PLACED_M: Final = 0.006
-"""Largest root mean square error of the place of a found lump [m]."""
+"""RMS uncertainty of the place below which a lump counts as located."""
 
 
 class Posterior:
-    """The probability of each hypothesis, and the field, given the presses so far."""
+    """Posterior probability of each hypothesis, and of the field, given the presses."""
 
     def __init__(
         self,
         task: Task,
         accepted: Sequence[Bump] = (),
-        models: Sequence[tuple[float, float]] = tuple(product(ROUGH, WRONG)),
+        models: Sequence[tuple[float, float]] = tuple(product(VARIATION_SCALES, DEPTH_ERROR_SCALES)),
     ) -> None:
-        """`accepted`: lumps that count as found. `models`: scale of natural variation and of depth errors of each model."""
+        """`accepted`: lumps that were found; the search is for others. `models`: scales of natural variation and depth errors."""
         self.task = task
         self.accepted = tuple(accepted)
         self.presses: list[Press] = []
@@ -79,7 +79,7 @@ class Posterior:
         self.centres: Array = np.tile(places, (len(RADII_M), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
         self.open: NDArray[np.bool_] = np.ones(len(places), dtype=bool)
-        """Mask of the places within reach, shape (p,)."""
+        """Places that may be pressed, shape (p,): all but those that the arm could not take."""
         self.radii: Array = np.repeat(RADII_M, len(places))
         """Their radii [m], shape (h,)."""
         self.shapes: Array = self._shapes(places)
@@ -105,12 +105,12 @@ class Posterior:
 
     @property
     def lump(self) -> float:
-        """Probability that there is a lump besides those accepted: that something was missed, if none is reported."""
+        """Probability of a lump besides the accepted ones: of a missed one, if none is reported."""
         return float(1.0 - self.none)
 
     @property
     def at(self) -> tuple[Array, float]:
-        """The most probable place of a lump [m], shape (2,), and the probability that one is within NEAR_M of it."""
+        """Most probable place of a lump [m], shape (2,), and the probability of a lump within NEAR_M of it."""
         centre = self.task.places
         there = self.by_place
         peak = centre[int(np.argmax(there))]
@@ -126,17 +126,17 @@ class Posterior:
 
     @property
     def asked(self) -> int:
-        """Number of requested presses that are completed."""
+        """Number of finished requests."""
         return len(self.presses) + self.vain
 
     @property
     def here(self) -> Array | None:
-        """Position of the indenter, shape (2,) [m]; None before the first press."""
+        """Place of the indenter [m], shape (2,); None before the first press."""
         return self.presses[-1].xy if self.presses else None
 
     @property
     def found(self) -> Bump | None:
-        """A lump that is there (FOUND) and whose place is known (PLACED_M); None while there is none."""
+        """A lump with probability FOUND and uncertainty of place PLACED_M; None without one."""
         (x, y), probability = self.at
         apart = np.hypot(self.centres[:, 0] - x, self.centres[:, 1] - y)
         weight = np.where(apart <= NEAR_M, self.probability, 0.0)
@@ -146,24 +146,24 @@ class Posterior:
 
     @property
     def likeliest(self) -> int:
-        """The most probable model of roughness and errors."""
+        """Index of the most probable model."""
         return int(np.argmax(self._weights))
 
     @property
     def noise_m(self) -> float:
-        """Error of the next press's depth under it, standard deviation [m]: that of the latest one."""
-        reported = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
-        return float(self._models[self.likeliest][1] * reported)
+        """SD of the next press's depth error under that model [m], taken from the latest press."""
+        told = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
+        return float(self._models[self.likeliest][1] * told)
 
     def contrast(self) -> tuple[Array, Array]:
-        """Posterior mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the likeliest model."""
+        """Return mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the most probable model."""
         k = self.likeliest
         mean, sd = CONTRAST
         variance = 1.0 / (1.0 / sd**2 + self._power[k])
         return (mean / sd**2 + self._match[k]) * variance, variance
 
     def field(self) -> tuple[Array, Array]:
-        """Mean and variance of z at the places if there is no lump, shape (p,) each, by the likeliest model."""
+        """Return mean and variance of z without a lump at the places, shape (p,) each, by the most probable model."""
         k, n = self.likeliest, len(self.presses)
         seen = self._field[k, :n]
         mean = np.log(USUAL_N) + self._whitened[k, :n] @ seen
@@ -172,14 +172,14 @@ class Posterior:
         return mean, np.maximum(variance - (seen**2).sum(axis=0), 1e-6)
 
     def unexplained(self) -> Array:
-        """Contribution of a bump of log-contrast one to the mean at each place, shape (p, h), by the likeliest model."""
+        """Return the added mean at each place per unit log-contrast, shape (p, h), by the most probable model."""
         k, n = self.likeliest, len(self.presses)
         return np.asarray(self.shapes - self._field[k, :n].T @ self._bumps[k, :n])
 
     # --- one more press -----------------------------------------------------------------------------------------------
 
     def add(self, felt: Press) -> None:
-        """Takes one more press into account."""
+        """Updates the posterior with a press."""
         calibration = learned()
         depth, force = max(felt.depth, SHALLOWEST_M), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
@@ -214,11 +214,11 @@ class Posterior:
         self._weigh()
 
     def refuse(self, xy: Array) -> None:
-        """The place nearest to xy [m], shape (2,), cannot be pressed."""
+        """Excludes the place nearest to xy [m], shape (2,): the arm cannot press it."""
         self.open[np.argmin(np.linalg.norm(self.task.places - xy, axis=1))] = False
 
     def accept(self, bump: Bump) -> Posterior:
-        """The posterior of what else there is, given that this lump is there."""
+        """Return the posterior of further lumps, given this one."""
         other = Posterior(self.task, (*self.accepted, bump), self._models)
         for felt in self.presses:
             other.add(felt)
@@ -242,21 +242,21 @@ class Posterior:
         self.probability: Array = joint[:, :-1].sum(axis=0)
         """Probability of each hypothesis, shape (h,)."""
         self.none = float(joint[:, -1].sum())
-        """Probability that there is no lump besides those accepted."""
+        """Probability of no lump besides the accepted ones."""
 
     def _natural(self, a: Array, b: Array) -> Array:
-        """Covariance of the field without the lump sought, under each model, shape (models, k, l)."""
+        """Return the covariance of the field without a lump under each model, shape (models, k, l)."""
         parts = np.array(natural(a, b))
         known = sum((bump.covariance(a, b) for bump in self.accepted), np.zeros((len(a), len(b))))
         return np.asarray(LEVEL_SD**2 + np.tensordot(self._parts, parts, 1) + known)
 
     def _shapes(self, xy: Array) -> Array:
-        """Each hypothesis' bump at places, shape (k, 2) -> (k, h)."""
+        """Return the bump of each hypothesis at places, shape (k, 2) -> (k, h)."""
         r = np.linalg.norm(xy[:, None] - self.centres, axis=2)
         return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * EDGE_M)))
 
     def _likely(self) -> Array:
-        """Return the prior of each hypothesis besides the accepted lumps, shape (h,), not normalised."""
+        """Return the unnormalised prior of each hypothesis given the accepted lumps, shape (h,)."""
         out = np.abs(self.centres - self.task.centre) + self.radii[:, None] > 0.5 * np.array(self.task.size) + 1e-9
         likely = np.where(out.any(axis=1), OUTSIDE, 1.0)
         for bump in self.accepted:

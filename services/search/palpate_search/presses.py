@@ -1,4 +1,4 @@
-"""Region, presses and remaining budget of a search."""
+"""Data of a search: the task (region, limits), presses, and the budget."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import ExamInput
 
 PLACES_M = 0.010
-"""Distance of the places that are weighed."""
+"""Spacing of candidate places."""
 BORDER_M = 0.010
-"""Margin of presses from the edge of the region [m]."""
+"""Least distance of presses from the region's edge: reach and surface are known only inside."""
 SHALLOWEST_M = 0.002
-"""A depth below this counts as this: it may be measured as none."""
+"""Lower bound of a measured depth, which may be zero."""
 SHALLOWER = 0.6
-"""Shallowest press, as a share of the usual depth."""
+"""Shallowest press over the nominal depth."""
 DEEPER = 1.4
-"""Deepest press, as a share of the usual depth."""
+"""Deepest press over the nominal depth."""
 TRAVEL_MPS = 0.12
-"""Mean speed of a hop from one place to the next."""
+"""Mean speed between presses."""
 PRESS_S = 3.2
-"""Duration of a press without the hop [s]: rest and tare in the air, descent, settling, hold and lift."""
+"""Duration of a press without travel: rest and tare in free air, descent, settling, hold and lift."""
 
 
 @dataclass(frozen=True)
@@ -43,21 +43,21 @@ class Press:
     noise_n: float = 0.02
     """Standard error of the force [N]."""
     limited: bool = False
-    """True if the force limit reduced the depth."""
+    """True if depth yielded to the force limit."""
     depth_uncertainty: float = 0.001
-    """Standard deviation of the depth, as reported [m]."""
+    """Reported SD of the depth [m]."""
     stroke: int = 0
-    """Number of the descent in which it was felt."""
+    """Number of the descent."""
 
     @property
     def xy(self) -> Array:
-        """Place, shape (2,) [m]."""
+        """Place [m], shape (2,)."""
         return np.array((self.x, self.y))
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Remaining presses and seconds."""
+    """Remaining presses and time."""
 
     presses: int
     seconds: float
@@ -65,24 +65,24 @@ class Budget:
 
 @dataclass(frozen=True)
 class Task:
-    """Region of a search, and limits of its presses."""
+    """The searched region and the limits of presses."""
 
     centre: tuple[float, float]
     """Centre of the region, in the abdomen frame [m]."""
     size: tuple[float, float]
     """Size of the region along x and y [m]."""
     depth: float = 0.010
-    """Usual depth of a press [m]."""
+    """Nominal depth of a press [m]."""
     deepest: float = 0.014
     """[m]"""
     force: float = 15.0
-    """At this force depth yields [N]."""
+    """Depth yields at this force [N]."""
     depth_uncertainty: float = 0.001
-    """Standard deviation of a press's depth that is expected before the first one [m]."""
+    """Expected SD of the depth before the first press [m]."""
     budget: Budget = Budget(100, 600.0)
-    """At the beginning."""
+    """Budget at the start."""
     seed: int = 0
-    """Seed of what a policy draws."""
+    """Seed of a policy's random numbers."""
 
     @property
     def shallowest(self) -> float:
@@ -91,7 +91,7 @@ class Task:
 
     @classmethod
     def of(cls, known: ExamInput) -> Task:
-        """The task of an examination."""
+        """Return the task of an examination."""
         exam, limits = known.exam, known.limits
         deepest = min(DEEPER * exam.depth_m, limits.depth_m)
         budget = Budget(exam.budget.presses, exam.budget.seconds)
@@ -99,7 +99,7 @@ class Task:
 
     @cached_property
     def places(self) -> Array:
-        """Places that may be pressed [m], shape (p, 2): a lattice about PLACES_M apart, x by x."""
+        """Candidate places [m], shape (p, 2): a lattice with a spacing of about PLACES_M, ordered by x."""
         axes = [self._axis(k) for k in (0, 1)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -123,6 +123,6 @@ class Task:
 
 
 def seconds(begin: Array | None, end: Array) -> Array:
-    """Return the duration [s] of a press at `end` (2,), or at each of several (k, 2), from `begin`: shape () or (k,)."""
+    """Return the duration [s] of a press at `end`, shape (2,) or (k, 2), coming from `begin`: shape () or (k,)."""
     hop = np.linalg.norm(end - (end if begin is None else begin), axis=-1)
     return np.asarray(PRESS_S + hop / TRAVEL_MPS)

@@ -1,4 +1,4 @@
-"""Search as a service: samples in, the next press out, until the budget is spent or nothing is likely to be missed."""
+"""Search service: samples in, next press out, until the budget is spent or a missed lump is improbable."""
 
 from __future__ import annotations
 
@@ -24,56 +24,55 @@ from palpate_search.presses import Press, Task
 FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 LEAST_UNCERTAINTY_M: Final = 0.0002
-"""No depth is believed to be surer than this."""
-ELSEWHERE_M: Final = 0.005
-"""A place is out of the arm's reach if no press came nearer to it than this."""
-AROUND: Final = 6
-"""Number of presses that outline a found lump."""
+"""Lower bound of the depth SD."""
+REACHED_M: Final = 0.005
+"""A requested place counts as out of reach if no press came nearer than this."""
+OUTLINE_PRESSES: Final = 6
+"""Presses around a lump that was found."""
 ROUNDED_M: Final = 1e-9
 FEWEST: Final = 12
-"""Least number of presses: the assessment needs them."""
+"""Least number of presses: with fewer the assessment has no result."""
 
 
 class SearchService(Service):
-    """Requests one press after another, from the first palpation on, each after the previous one is completed."""
+    """Requests one press at a time, from the first palpation on, each when the previous one is finished."""
 
     role: ClassVar[str] = "search"
 
     def __init__(self, scenario: Scenario) -> None:
-        """Starts from the examination's view of a scenario. Raises PluginError for a policy that there is not."""
+        """Raises PluginError for an unknown policy."""
         self._posterior = Posterior(Task.of(exam_input(scenario)))
         self._policy = policy(scenario.search.policy)
         self._missed = scenario.search.missed
         self._begin: int | None = None
-        """When the first press was asked for [ns]."""
+        """Time of the first request [ns]."""
         self._number = 0
-        """Number of the latest request."""
         self._asked: Array | None = None
-        """Requested place [m], shape (2,)."""
+        """Place of the latest request [m], shape (2,)."""
         self._outline: list[Array] = []
-        """Places about the lump found last that are still to be pressed."""
+        """Remaining presses around lumps that were found."""
         self._felt: list[Press] = []
-        """Samples since that."""
+        """Samples since the latest request."""
         self._spent_s = 0.0
-        """From the first request to the latest."""
+        """Time from the first request to the latest."""
         self._ended = ""
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """A request when the examination is ready for one."""
+        """Sends a request when the examination is ready for one."""
         self._felt += [_press(sample) for sample in inbox.new("assessment/samples")]
         state = inbox.latest("exam/state")
-        if state is not None and state.patient_moved:  # what was felt since the last request may lie elsewhere
+        if state is not None and state.patient_moved:  # samples since the last request may be misplaced
             self._felt.clear()
             self._asked = None
         if state is None or state.phase not in PALPATING or self._ended or state.target_index != self._number:
             return {}
         if self._begin is None:
             self._begin = t
-        for press in {press.stroke: press for press in self._felt}.values():  # one that waits for the breath has several samples
+        for press in {press.stroke: press for press in self._felt}.values():  # a gated press has several samples
             self._posterior.add(press)
         if self._asked is not None and not self._felt:
             self._posterior.vain += 1
-        if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < ELSEWHERE_M for press in self._felt):
+        if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < REACHED_M for press in self._felt):
             self._posterior.refuse(self._asked)
         self._felt.clear()
         while (lump := self._posterior.found) is not None:
@@ -84,7 +83,7 @@ class SearchService(Service):
         return {"exam/request": self._request(t)}
 
     def finish(self) -> Mapping[str, Any]:
-        """Return the numbers of requests and findings, and the reason of the end."""
+        """Return counts of requests and presses, found lumps, and the reason for the end."""
         return {
             "requests": self._number,
             "presses": len(self._posterior.presses),
@@ -115,39 +114,39 @@ class SearchService(Service):
         )
 
     def _over(self) -> str:
-        """Return the reason why the search is over; empty while it continues."""
+        """Return the reason for the end; empty while the search continues."""
         posterior, left = self._posterior, self._posterior.left(self._spent_s)
         if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= FEWEST:
-            return f"a lump that was not found has a probability of {100 * posterior.lump:.1f} %"
+            return f"the probability of a missed lump is {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
-            return f"{posterior.task.budget.presses} presses are made"
+            return f"{posterior.task.budget.presses} presses made"
         if left.seconds <= 0:
-            return f"{posterior.task.budget.seconds:g} s are over"
+            return f"{posterior.task.budget.seconds:g} s elapsed"
         return ""
 
 
 def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
-    """A place [m] and a depth [m] that a policy asks for. Raises PluginError for what the arm must not press."""
+    """Return the place [m] and depth [m] requested by a policy. Raises PluginError outside the allowed range."""
     place = np.asarray(place, dtype=float)
-    if place.shape != (2,) or not np.all((place >= task.low - ROUNDED_M) & (place <= task.high + ROUNDED_M)):  # nor what is NaN
-        raise PluginError(f"search.policy: it asks for the place {place} m; allowed are {task.low} to {task.high} m")
+    if place.shape != (2,) or not np.all((place >= task.low - ROUNDED_M) & (place <= task.high + ROUNDED_M)):  # also rejects NaN
+        raise PluginError(f"search.policy: requested place {place} m; allowed: {task.low} to {task.high} m")
     if not 0 < depth <= task.deepest + ROUNDED_M:
-        raise PluginError(f"search.policy: it asks for a depth of {depth} m; allowed are depths above 0, up to {task.deepest} m")
+        raise PluginError(f"search.policy: requested depth {depth} m; allowed: above 0, at most {task.deepest} m")
     return place, float(depth)
 
 
 def outline(lump: Bump, posterior: Posterior) -> list[Array]:
-    """Return presses that outline a lump for the assessment: its middle and places around it, [m], shape (2,) each.
+    """Return presses that outline a lump for the assessment: its centre and places around it [m], shape (2,) each.
 
-    Places outside the region, or already pressed, are left out.
+    Places outside the region, or already pressed, are omitted.
     """
-    angles = 2 * np.pi * np.arange(AROUND) / AROUND
+    angles = 2 * np.pi * np.arange(OUTLINE_PRESSES) / OUTLINE_PRESSES
     about = np.array((lump.x, lump.y)) + lump.radius * np.column_stack((np.cos(angles), np.sin(angles)))
     places = np.vstack(((lump.x, lump.y), about))
     task, pressed = posterior.task, np.array([press.xy for press in posterior.presses])
     inside = np.all((places >= task.low) & (places <= task.high), axis=1)
     apart = np.linalg.norm(places[:, None] - pressed, axis=2).min(axis=1)
-    return list(places[inside & (apart > ELSEWHERE_M)])
+    return list(places[inside & (apart > REACHED_M)])
 
 
 def _press(sample: Message) -> Press:
@@ -164,5 +163,5 @@ def _press(sample: Message) -> Press:
 
 
 def create(scenario: Scenario) -> Service:
-    """The search of a scenario; it knows nothing of the patient."""
+    """Return the search of a scenario; it uses the examination's view only."""
     return SearchService(scenario)

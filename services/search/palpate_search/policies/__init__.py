@@ -1,1 +1,1 @@
-"""Policies: each is one function of the posterior and the budget that is left, and returns place [m] and depth [m]."""
+"""Policies: functions of the posterior and the remaining budget that return place [m] and depth [m]."""

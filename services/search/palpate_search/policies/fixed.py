@@ -1,4 +1,4 @@
-"""Baselines that do not look at what they felt: raster, random, Latin hypercube."""
+"""Baselines that ignore measurements: raster, random, Latin hypercube."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from palpate_search.presses import PLACES_M, Budget
 
 
 def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """Line by line, to and fro, over a lattice of as many places as the whole budget has presses."""
+    """Return the next place of a serpentine lattice with as many places as the budget has presses."""
     task, k = posterior.task, posterior.asked
     width, height = task.high - task.low
     columns = max(1, round(np.sqrt(task.budget.presses * width / max(height, PLACES_M))))
@@ -23,14 +23,14 @@ def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 
 
 def random(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """Anywhere, every place as probable as any other."""
+    """Return a uniformly random place."""
     task = posterior.task
     rng = np.random.Generator(np.random.PCG64((task.seed, posterior.asked)))
     return rng.uniform(task.low, task.high), task.depth
 
 
 def latin_hypercube(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """McKay, Beckman and Conover 1979: as many strata along x and y as the budget has presses, each used once."""
+    """Return the next Latin hypercube sample: one stratum per press along x and y (McKay, Beckman and Conover 1979)."""
     task = posterior.task
     sampler = qmc.LatinHypercube(d=2, rng=np.random.Generator(np.random.PCG64(task.seed)))
     share = sampler.random(task.budget.presses)[posterior.asked % task.budget.presses]

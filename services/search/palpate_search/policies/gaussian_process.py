@@ -1,7 +1,7 @@
-"""Baselines that fit a Gaussian process to the forces felt, by scikit-learn, and press where an acquisition function is greatest.
+"""Baselines: a Gaussian process of the measured forces (scikit-learn) and the maximum of an acquisition function.
 
-They know nothing of lumps: the process is one smooth field of log-force. Its amplitude is that of what was felt, its length and
-noise are the papers' kind, a squared exponential and white noise, with values of this task rather than of the papers' phantoms.
+They have no lump model: the process is one smooth field of log-force with a squared exponential kernel and white noise, as in the
+papers. The amplitude comes from the measurements; length and noise are set for this task, not for the papers' phantoms.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import SHALLOWEST_M, Budget, Task
 
 LENGTH_M: Final = 0.020
-"""Length scale of the process: the radius of the lumps sought."""
+"""Length scale of the process: the lump radius."""
 NOISE: Final = 0.15
-"""White noise of an observation, of the process's standard deviation."""
+"""SD of the white noise over that of the process."""
 FIRST: Final = 4
 """Presses before the first fit, spread over the region."""
 UCB: Final = 2.0
@@ -31,18 +31,18 @@ UCB: Final = 2.0
 STRADDLE: Final = 1.96
 """Weight of the standard deviation in the straddle (Bryan et al. 2005)."""
 LEVEL: Final = 0.5
-"""The level sought, between the least and the greatest mean."""
+"""Level between the least (0) and greatest (1) mean."""
 GARG: Final = 0.5
 """Weight of nearness to the level against uncertainty."""
 LOCALISED: Final = 30
 """Presses after which Yan and Pan's search has localised the lump."""
 
 Acquisition = Callable[[Array, Array, Array], Array]
-"""A function of mean and standard deviation at the places, shape (p,) each, and of what was felt, shape (n,)."""
+"""A function of mean and SD at the places, shape (p,) each, and the measurements, shape (n,)."""
 
 
 def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
-    """Mean and standard deviation of the process at the places, and what was felt, in standard deviations of that."""
+    """Return mean and SD of the process at the places, and the standardised measurements."""
     exponent = learned().exponent
     xy = np.array([felt.xy for felt in posterior.presses])
     force = np.array([max(felt.force, 0.1) for felt in posterior.presses])
@@ -63,13 +63,13 @@ def _greatest(posterior: Posterior, budget: Budget, acquisition: Acquisition) ->
 
 
 def first(task: Task, k: int) -> Array:
-    """The k-th of the first presses: the middles of the region's quarters, shape (2,) [m]."""
+    """Return the k-th initial press, the centre of a quarter of the region [m], shape (2,)."""
     share = np.array(((0.25, 0.25), (0.75, 0.75), (0.25, 0.75), (0.75, 0.25))[k])
     return np.asarray(task.low + share * (task.high - task.low))
 
 
 def expected_improvement(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """Mockus 1975; Jones, Schonlau and Welch 1998: by how much a press is expected to exceed the stiffest place so far."""
+    """Mockus 1975; Jones, Schonlau and Welch 1998: expected excess over the stiffest place measured."""
 
     def improvement(mean: Array, sd: Array, felt: Array) -> Array:
         gain = mean - felt.max()
@@ -91,17 +91,16 @@ def straddle(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 def garg_2016(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Garg et al. 2016, implicit level set upper confidence bound: uncertainty against distance from the implicit level.
 
-    Their level is a share of the greatest mean. The values of the weights on their phantom say nothing about this one; these
-    are GARG and LEVEL.
+    Their level is a share of the greatest mean. Their weights were set for their phantom; here they are GARG and LEVEL.
     """
     return _greatest(posterior, budget, lambda mean, sd, _: (1 - GARG) * sd - GARG * np.abs(mean - _level(mean)))
 
 
 def yan_pan_2021(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """Yan and Pan 2021: Bayesian optimisation for LOCALISED presses, then along the border of what was found.
+    """Yan and Pan 2021: Bayesian optimisation for LOCALISED presses, then along the border of the finding.
 
-    Their acquisition function is not in the abstract, which is what was read: this is expected improvement. They slide along
-    the border; here it is pressed where it is least sure which side a place is on.
+    Expected improvement stands in for their acquisition function, which the abstract does not state. They slide along the border;
+    this policy presses where the side of the border is least certain.
     """
     if len(posterior.presses) < LOCALISED:
         return expected_improvement(posterior, budget)

@@ -1,4 +1,4 @@
-"""The default policy: the press with the most information per second about place and existence of a lump."""
+"""Default policy: the press with the greatest expected information per second."""
 
 from __future__ import annotations
 
@@ -16,15 +16,15 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, seconds
 
 _PROMISING: Final = 12
-"""Number of places for which a deeper press is evaluated too."""
+"""Number of best places that are also evaluated for a deeper press."""
 _SAFE: Final = 0.8
-"""Largest predicted force of a deeper press, as a share of the force limit."""
+"""A deeper press must have an expected force below this share of the force limit."""
 _KNOWN: Final = 1.0
-"""Largest variance of the log-force for a deeper press."""
+"""A deeper press needs a variance of the log-force below this."""
 
 
 def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """The place and depth with the greatest expected information a second, the hop there counted."""
+    """Return the place and depth with the greatest expected information per second, including travel."""
     task, calibration = posterior.task, learned()
     mean, variance = posterior.field()
     contrast, contrast_variance = posterior.contrast()
@@ -33,14 +33,14 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     exponent, spread = calibration.exponent, calibration.exponent_sd
 
     def rate(some: NDArray[np.intp], depth: float) -> Array:
-        """Information a second of presses at some of the places, shape (k,)."""
+        """Return information per second of presses at some of the places, shape (k,)."""
         noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2 + WHITE_SD**2
         gain = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
         return np.asarray(gain / duration[some])
 
     rates = np.where(posterior.open, rate(np.arange(len(task.places)), task.depth), 0.0)
     best, depth = int(np.argmax(rates)), task.depth
-    if rates[best] <= 0:  # no press has more information than another: the level is unknown before the first one
+    if rates[best] <= 0:  # no information before the first press: the level is unknown
         best = int(np.argmin(np.where(posterior.open, np.linalg.norm(task.places - np.array(task.centre), axis=1), np.inf)))
         return task.places[best], task.depth
     greatest = rates[best]

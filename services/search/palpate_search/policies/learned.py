@@ -1,7 +1,7 @@
-"""A policy that was learned by reinforcement: a small convolutional network weighs every place alike.
+"""Policy learned by reinforcement: a small convolutional network over the places.
 
-`python -m palpate.search.learn` trains it by proximal policy optimisation (Schulman et al. 2017) and writes `ppo.npz`. Here it is
-three convolutions in numpy: what it presses for is in the weights, and its region may have any size.
+`python -m research.search.learn` trains it by proximal policy optimisation (Schulman et al. 2017) and writes `ppo.npz`. Inference
+is three convolutions in numpy, for a region of any size.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ WEIGHTS: Final = "ppo.npz"
 
 @cache
 def _weights() -> tuple[tuple[Array, Array], ...]:
-    """Kernel (out, in, 3, 3) or (out, in, 1, 1) and bias (out,) of each layer."""
+    """Return kernel (out, in, 3, 3) or (out, in, 1, 1) and bias (out,) of each layer."""
     with as_file(files(__package__) / WEIGHTS) as file, np.load(file) as saved:
         return tuple((saved[f"kernel{k}"], saved[f"bias{k}"]) for k in range(len(saved.files) // 2))
 
 
 def convolved(layers: Array, kernel: Array, bias: Array) -> Array:
-    """A convolution with zeros beyond the edge: (in, nx, ny) to (out, nx, ny)."""
+    """Return a zero-padded convolution: (in, nx, ny) to (out, nx, ny)."""
     width = kernel.shape[-1] // 2
     padded = np.pad(layers, ((0, 0), (width, width), (width, width)))
     windows = np.lib.stride_tricks.sliding_window_view(padded, kernel.shape[2:], axis=(1, 2))
@@ -36,7 +36,7 @@ def convolved(layers: Array, kernel: Array, bias: Array) -> Array:
 
 
 def scores(posterior: Posterior) -> Array:
-    """Return logits of a press of usual and of greatest depth at each place, shape (2, p)."""
+    """Return logits of presses with nominal and greatest depth at each place, shape (2, p)."""
     layers = maps(posterior)
     *hidden, last = _weights()
     for kernel, bias in hidden:
@@ -45,7 +45,7 @@ def scores(posterior: Posterior) -> Array:
 
 
 def ppo(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
-    """The press with the greatest score."""
+    """Return the press with the greatest score."""
     task = posterior.task
     depth, place = np.divmod(int(np.argmax(np.where(posterior.open, scores(posterior), -np.inf))), len(task.places))
     return task.places[place], (task.depth, task.deepest)[depth]

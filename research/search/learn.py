@@ -1,4 +1,4 @@
-"""Trains the policy `ppo`: `python -m palpate.search.learn`, for which `pip install 'palpate[learn]'`.
+"""Trains the policy `ppo`: `python -m research.search.learn`, for which `pip install 'palpate[learn]'`.
 
 First it imitates `informed` (behaviour cloning), which is quicker than to begin from nothing; then it learns by itself, by
 Stable-Baselines3's proximal policy optimisation on `Palpate/Search-v0`. Actor and critic share the convolutions over the maps

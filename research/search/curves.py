@@ -1,4 +1,4 @@
-"""What the study of searches says: `python -m palpate.search.curves out/search-study` prints the table and draws the curves.
+"""What the study of searches says: `python -m research.search.curves out/search-study` prints the table and draws the curves.
 
 The threshold of each policy is the SPECIFICITY quantile, over healthy tuning patients, of the greatest probability within the
 budget. A lump is found at the press after which it is first said to be near a place within NEAR_M of where it is; one that is

@@ -1,4 +1,4 @@
-"""How far the surrogate's presses are from those of the true tissue: `python -m palpate.search.agreement`.
+"""How far the surrogate's presses are from those of the true tissue: `python -m research.search.agreement`.
 
 The same patients, places and errors of the examination, pressed by both hands. What counts for a search is the logarithm of the
 force: its
@@ -14,7 +14,7 @@ import typer
 from rich.progress import track
 
 from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.population import case
+from palpate.search.trial import case
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 

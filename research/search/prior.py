@@ -1,4 +1,4 @@
-"""What bellies and errors are like, for the posterior: `python -m palpate.search.prior`.
+"""What bellies and errors are like, for the posterior: `python -m research.search.prior`.
 
 The amplitudes of its Gaussian model (`palpate_search.posterior`) by maximum likelihood over healthy tuning patients, each pressed
 at random places by the surrogate.
@@ -15,8 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import minimize
 
 from palpate.search.hand import SurrogateHand
-from palpate.search.population import case
-from palpate.search.trial import search
+from palpate.search.trial import case, search
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import LENGTHS_M, SURFACE_M, TARE_N, WHITE_SD, natural
 from palpate_models.numerics.frames import Array

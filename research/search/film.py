@@ -1,4 +1,4 @@
-"""A film of a search: `python -m palpate.search.film` searches a patient and draws where it pressed and what it knew."""
+"""A film of a search: `python -m research.search.film` searches a patient and draws where it pressed and what it knew."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Presses a second of processor time of `Palpate/Search-v0`: `python -m palpate.search.speed`."""
+"""Presses a second of processor time of `Palpate/Search-v0`: `python -m research.search.speed`."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The whole system searches: the arm presses the patients of the study. `python -m palpate.search.whole` examines and prints.
+"""The whole system searches: the arm presses the patients of the study. `python -m research.search.whole` examines and prints.
 
 Each patient is examined by `palpate run --composed` with the pattern `search`, and what counts is what the examination reports:
 the findings of the assessment, scored as those of any scan. An examination that failed has found nothing.
@@ -16,9 +16,9 @@ import typer
 from rich.progress import track
 
 import palpate
-from palpate.search.curves import in_words, share
-from palpate.search.population import PRESSES, case
+from palpate.search.trial import PRESSES, case
 from palpate_bus.messages.geometry import Array
+from research.search.curves import in_words, share
 
 FILE: Final = "whole.csv"
 

@@ -1,4 +1,4 @@
-"""The study of searches: the same patients by every policy. `python -m palpate.search.study` makes the trials.
+"""The study of searches: the same patients by every policy. `python -m research.search.study` makes the trials.
 
 Each trial goes on for the whole budget, and what was known is kept after each press. All policies have one judge, the posterior:
 a lump is said to be near the most probable place when its probability exceeds a threshold, which is chosen for each policy on
@@ -17,8 +17,7 @@ import typer
 from rich.progress import track
 
 from palpate.search.hand import PatientHand, SurrogateHand
-from palpate.search.population import case
-from palpate.search.trial import search
+from palpate.search.trial import case, search
 from palpate_search.choice import policies, policy
 
 HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}
@@ -42,7 +41,7 @@ def run(seeds: Sequence[int], hand: str, names: Sequence[str], out: Path) -> Non
             if patient.centre is not None:
                 apart = np.linalg.norm(trial.place - patient.centre, axis=1)
             columns = {"press": np.arange(1, len(apart) + 1), "seconds": trial.seconds, "near": trial.near, "apart_m": apart}
-            rows.append(pd.DataFrame({"seed": seed, "policy": name, **columns, "think_s": trial.think_s}))
+            rows.append(pd.DataFrame({"seed": seed, "policy": name, **columns, "computing_s": trial.computing_s}))
         pd.concat(rows).to_csv(file, index=False, float_format="%.5g")
 
 
@@ -54,7 +53,7 @@ def main(
     names: Annotated[list[str] | None, typer.Option("--policy", help="Only these policies.")] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where the trials are.")] = Path("out/search-study"),
 ) -> None:
-    """Search the patients of some seeds by every policy. `python -m palpate.search.curves` compares what was done."""
+    """Search the patients of some seeds by every policy. `python -m research.search.curves` compares what was done."""
     if hand not in HANDS:
         raise typer.BadParameter(f"--hand {hand}: want one of {', '.join(HANDS)}")
     run(range(first_seed, first_seed + number * every, every), hand, names or policies(), out)
