@@ -8,8 +8,8 @@
     (30, 5)
 
 An episode is one patient and `presses` presses. The reward of a press is the decrease of the entropy of the posterior over
-"no lump, or one at this place" [nat], less TIME_COST per second. The last press adds the logarithm of the probability of the truth
-(no lump, or one near its true place), at least WORST.
+"no lump, or one at this place" [nat], less TIME_COST per second. The last press adds the logarithm of the probability of the
+truth (no lump, or one near its true place), at least WORST.
 """
 
 from __future__ import annotations
@@ -52,8 +52,8 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """`hand`: press model; `presses` per episode; `patients`: number of tuning seeds; `maps`: observe the posterior, too.
 
         An action is place and depth, each scaled to -1..1 over the allowed range. The observation has `history`, one row per
-        press: x, y and depth as in an action, the logarithm of the force over 5 N, and 1, or zeros for future presses; and `left`,
-        the share of remaining presses. With maps it has `maps`, the posterior at every place (`palpate_search.maps`).
+        press: x, y and depth as in an action, the logarithm of the force over 5 N, and 1, or zeros for future presses; and
+        `left`, the share of remaining presses. With maps it has `maps`, the posterior at every place (`palpate_search.maps`).
         """
         if hand not in ("surrogate", "patient"):
             raise ValueError(f"hand = {hand!r}: want surrogate or patient")

@@ -41,7 +41,7 @@ def run(seeds: Sequence[int], hand: str, names: Sequence[str], out: Path) -> Non
             if patient.centre is not None:
                 apart = np.linalg.norm(trial.place - patient.centre, axis=1)
             columns = {"press": np.arange(1, len(apart) + 1), "seconds": trial.seconds, "near": trial.near, "apart_m": apart}
-            rows.append(pd.DataFrame({"seed": seed, "policy": name, **columns, "computing_s": trial.computing_s}))
+            rows.append(pd.DataFrame({"seed": seed, "policy": name, **columns, "think_s": trial.computing_s}))
         pd.concat(rows).to_csv(file, index=False, float_format="%.5g")
 
 

@@ -1,13 +1,13 @@
 """Posterior probability of a lump and its place: a sequential Bayesian test under the assessment's model.
 
-The log-force of the standard press is a Gaussian field z with errors (`palpate_assessment.model`). A hypothesis h is a round lump with
-a place and radius; it adds the bump b_h to z, times an unknown log-contrast e. With S the covariance of everything else, and
+The log-force of the standard press is a Gaussian field z with errors (`palpate_assessment.model`). A hypothesis h is a round lump
+with a place and radius; it adds the bump b_h to z, times an unknown log-contrast e. With S the covariance of everything else, and
 e ~ N(m, s^2), the Bayes factor of the data y against no lump is
 
     log B_h = -1/2 log(1 + s^2 p) + 1/2 (m / s^2 + c)^2 / (1 / s^2 + p) - 1/2 m^2 / s^2,    p = b' S^-1 b,  c = b' S^-1 y
 
-The amplitudes of natural variation and depth errors are unknown: S has a few variants, each weighted by its evidence. A press adds one
-row to each Cholesky factor, so an update takes about a millisecond.
+The amplitudes of natural variation and depth errors are unknown: S has a few variants, each weighted by its evidence. A press
+adds one row to each Cholesky factor, so an update takes about a millisecond.
 """
 
 from __future__ import annotations
@@ -44,8 +44,8 @@ NATURAL_SD: Final = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
 BONE_SD: Final = 0.27
 """Amplitude of bone."""
 SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
-"""Fractions of the reported depth uncertainty that are spatially correlated and independent. Maximum likelihood over healthy tuning
-patients (`research.search.prior`, docs/search.md)."""
+"""Fractions of the reported depth uncertainty that are spatially correlated and independent. Maximum likelihood over healthy
+tuning patients (`research.search.prior`, docs/search.md)."""
 VARIATION_SCALES: Final = (0.75, 1.3)
 """Model variants: natural variation over its typical amplitude."""
 DEPTH_ERROR_SCALES: Final = (0.75, 1.3)

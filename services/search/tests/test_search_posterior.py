@@ -13,16 +13,16 @@ from palpate_search.information import information
 from palpate_search.posterior import (
     BONE_SD,
     CONTRAST,
+    DEPTH_ERROR_SCALES,
     EDGE_M,
     LEVEL_SD,
     LUMP_PROBABILITY,
     NATURAL_SD,
     OUTSIDE,
-    ROUGH,
     STROKE_SHARE,
     SURFACE_SHARE,
     USUAL_N,
-    WRONG,
+    VARIATION_SCALES,
     Posterior,
 )
 from palpate_search.presses import Press, Task
@@ -60,8 +60,8 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(TASK.size) + 1e-9, axis=1)
     prior = np.where(out, OUTSIDE, 1.0)
     prior *= LUMP_PROBABILITY / prior.sum()
-    for rough in ROUGH:
-        for wrong in WRONG:
+    for rough in VARIATION_SCALES:
+        for wrong in DEPTH_ERROR_SCALES:
             u = wrong * presses[0].depth_uncertainty
             S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(NATURAL_SD, parts, strict=False))
             S = S + BONE_SD**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
