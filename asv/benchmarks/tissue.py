@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.backends.elastic.compliance import SizeError, compliance
+from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
-from palpate_tissue.backends.winkler.mechanics import StabilityError
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.surface import SkinSurface
 
@@ -86,7 +86,7 @@ class FlatPatch(Slide):
                 self.body = WinklerTissue(model, Stiffness())
             else:  # a layer of 0.2 m: the cost of a step does not depend on the entries of the matrix
                 self.body = ElasticTissue(model, compliance(model, thickness_m=0.2), Stiffness())
-        except (SizeError, StabilityError) as error:
+        except UserError as error:
             raise NotImplementedError from error
         x = -SPEED_MPS * 5e-4 * STEPS + SPEED_MPS * 1e-3 * np.arange(STEPS)
         self.path = np.column_stack((x, np.full(STEPS, 0.001), np.full(STEPS, RADIUS_M - DEPTH_M)))

@@ -1,28 +1,28 @@
-"""Impedance control of a redundant arm: arrays in, joint torques out. Gravity is the driver's.
+"""Impedance control of a redundant arm: arrays in, joint torques out. The driver adds gravity.
 
 Cartesian, with e the pose error and all task quantities in axes of the desired indenter frame D:
 
     F   = K clip(e) + B (V_d - V) + F_ff,  B_i = 2 zeta_i sqrt(K_i m_i) - b_i
     tau = J^T F + N^T tau_0 + C(q, qd) qd + friction(qd_d)
 
-m_i and b_i are the inertia and the joints' own viscous friction along axis i while the other axes are held: the diagonal of
-(J M^-1 J^T)^-1 and what it gains a second when M + T D takes the place of M. So the arm shows the ratio of damping that
-is asked for. N is the null-space projector of Khatib (1987, doi 10.1109/JRA.1987.1087068), consistent with M + T D: at
-10 Nms/rad a joint's torque makes it move, not accelerate, and consistency with M alone lets the posture drag the indenter
-along by millimetres. The rotational spring is the gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs
-store energy and never create any.
+m_i and b_i are the inertia and the joints' own viscous friction along axis i while the other axes are held: m_i is the diagonal
+of (J M^-1 J^T)^-1, b_i its increase per second when M + T D replaces M. With both, the arm shows the requested damping ratio.
+N is the null-space projector of Khatib (1987, doi 10.1109/JRA.1987.1087068), consistent with M + T D. At 10 Nms/rad a joint
+torque causes motion rather than acceleration; with a projector consistent with M alone the posture drags the indenter by
+millimetres. The rotational spring is the gradient of 1/2 phi^T K phi, phi the rotation vector, so the springs are conservative.
 
 In joint space, with M = L L^T and L^-1 K L^-T = V diag(w^2) V^T, so that the columns of P = L V decouple inertia and stiffness:
 
     tau = P diag(w^2) P^T clip(q_d - q) + P diag(max(2 zeta w - b, ..)) P^T (qd_d - qd) + M qdd_d + C(q, qd) qd + friction(qd_d)
 
-the double diagonalisation of Albu-Schaeffer et al. (ICRA 2003): each mode has the damping that its own
-inertia needs. With M_ii joint by joint, two joints of almost one axis are damped as if the whole arm moved when they only turn
-against each other, and then a few milliseconds from measuring to acting shake the arm.
+the double diagonalisation of Albu-Schaeffer et al. (ICRA 2003): each mode gets the damping that its own inertia needs. With
+M_ii joint by joint, two nearly coaxial joints that turn against each other are damped as if the whole arm moved; a delay of a
+few milliseconds then makes the arm oscillate.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from math import isfinite
 from typing import NamedTuple
 
@@ -38,41 +38,51 @@ from palpate_models.numerics.frames import Array
 
 Arrays = tuple[Array, ...]
 
+# Read by compiled functions, which take no dataclass.
 POSITION_CLIP_M = 0.1
-"""Largest position error that stretches the spring, each axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use the like)."""
+"""Largest position error that loads the spring, per axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use similar values)."""
 ROTATION_CLIP_RAD = 0.5
-"""The same for rotation."""
-JOINT_CLIP_RAD = 0.25
-"""The same for a joint in mode JOINT."""
 NULL_TORQUE_NM = 5.0
-"""Cap of the null-space torque, each joint."""
+"""Limit of the null-space torque per joint."""
 JOINT_DAMPING_RATIO = 0.7
 """Damping ratio of the joint springs in mode JOINT and of the null-space posture [1]."""
-STICTION_SPEED = 0.02
-"""Joint speed at which half of the Coulomb friction is compensated [rad/s]; keeps the compensation smooth."""
+STICTION_SPEED_RADPS = 0.02
+"""Joint speed at which half of the Coulomb friction is compensated. Keeps the compensation smooth."""
 LEAST_DAMPING = 0.1
-"""Part of the designed damping that is commanded even where friction alone would do: friction is known badly."""
+"""Fraction of the designed damping that is always commanded [1]: the friction estimate is poor."""
 REGULARISATION = 1e-7
 """Added to the diagonal of a task mobility [1/kg, 1/(kg m^2)], which loses rank where the arm is singular."""
 SLOW_S = 0.1
-"""T: time scale on which motion is as much friction's as inertia's [s]. Postures and scans move this slowly or slower."""
-DEAD_TICKS = 2
-"""From measuring to acting: a tick of transport, one of holding the torque, half of velocity's age, rounded up."""
-SPRING_ANGLE = 0.3
-"""Fastest undamped frequency of a spring, times the dead time [rad]: past it sampled damping adds energy."""
-DESIGN_TICKS = 10
-"""Gains are designed for each set-point, and again after so many ticks: meanwhile the arm moves by milliradians."""
+"""T: time scale on which friction and inertia matter equally. Postures and scans move this slowly or slower."""
+SPRING_ANGLE_RAD = 0.3
+"""Largest undamped spring frequency times the dead time. Above it sampled damping adds energy."""
+
+
+@dataclass(frozen=True)
+class ControllerTuning:
+    """Settings of the controller outside the compiled law."""
+
+    joint_clip_rad: float = 0.25
+    """Largest joint error that loads the spring in mode JOINT."""
+    dead_ticks: int = 2
+    """Delay from measurement to torque: one tick of transport, one of zero-order hold, half a tick of velocity age, rounded
+    up."""
+    design_ticks: int = 10
+    """Gains are designed for each set-point and after this many ticks, in which the arm moves by milliradians."""
+
+
+TUNING = ControllerTuning()
 
 
 class CartesianGains(NamedTuple):
-    """Gains of mode CARTESIAN: of the six axes of D, shape (6,), and of the posture in the null space, shape (7,)."""
+    """Gains of mode CARTESIAN: K and B for the six axes of D, shape (6,); K_0 and B_0 for the null-space posture, shape (7,)."""
 
     K: Array
     B: Array
     K_0: Array
     B_0: Array
     J_bar: Array
-    """Inverse of the Jacobian in world axes, consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (7, 6)."""
+    """Inverse of the Jacobian (world axes) consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (7, 6)."""
 
 
 class JointGains(NamedTuple):
@@ -83,13 +93,13 @@ class JointGains(NamedTuple):
 
 
 class ImpedanceController:
-    """The control law with its safety net. One instance an arm: it remembers the torque before, for the rate limit."""
+    """The control law with its safety net. One instance per arm: the rate limit needs the previous torque."""
 
     def __init__(self, model: ArmModel, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
-        """A controller on `model`, called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
+        """Creates a controller called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
         self.model = model
         self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
-        self._dead_time = DEAD_TICKS * period_s
+        self._dead_time = TUNING.dead_ticks * period_s
         self._friction = np.stack((model.viscous_friction, model.coulomb_friction, model.velocity_limit))
         self._designed_for: Setpoint | None = None
         self._design_age = 0
@@ -97,12 +107,12 @@ class ImpedanceController:
         self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
 
     def reset(self) -> None:
-        """Starts the rate limit from zero torque: nothing has been commanded of late."""
+        """Restarts the rate limit from zero torque, after a pause without commands."""
         self._net.reset()
         self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
+        """Return the torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
 
         Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
         """
@@ -113,14 +123,14 @@ class ImpedanceController:
         return self._net.torque(law(q, qd, reference), q, self.model.gravity)
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """The torque that the law asks for in mode CARTESIAN [N m], shape (7,)."""
+        """Return the unlimited torque of mode CARTESIAN [N m], shape (7,)."""
         model, (R_WD, x) = self.model, reference.motion
         model.update(q, qd)
         if self._outdated(reference.setpoint):
-            setpoint = reference.setpoint  # copied: arrays of messages are read-only, which is another type to numba
-            asked = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
+            setpoint = reference.setpoint  # copied: arrays of messages are read-only, a different type for numba
+            requested = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
             inertia, friction = model.inertia(q), model.viscous_friction
-            self._cartesian_gains = tuple(cartesian_gains(asked, R_WD, model.J_W, inertia, friction, self._dead_time))
+            self._cartesian_gains = tuple(cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time))
         arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
         R_DI = R_WD.T.dot(model.R_WI)
         gains, torque = self._cartesian_gains, np.empty(DOF)
@@ -128,47 +138,47 @@ class ImpedanceController:
         return torque
 
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """The torque that the law asks for in mode JOINT [N m], shape (7,)."""
+        """Return the unlimited torque of mode JOINT [N m], shape (7,)."""
         model, motion = self.model, reference.motion
         model.update_gravity(q)
         if self._outdated(reference.setpoint):
             self._joint_gains = joint_gains(
                 reference.setpoint.joint_stiffness, model.inertia(q), model.viscous_friction, self._dead_time
             )
-        error = np.minimum(np.maximum(motion.q - q, -JOINT_CLIP_RAD), JOINT_CLIP_RAD)
+        error = np.minimum(np.maximum(motion.q - q, -TUNING.joint_clip_rad), TUNING.joint_clip_rad)
         impedance = self._joint_gains.K @ error + self._joint_gains.B @ (motion.qd - qd)
         inertial = model.inverse_dynamics(q, qd, motion.qdd) - model.gravity
         return impedance + inertial + friction_torque(motion.qd, model.viscous_friction, model.coulomb_friction)
 
     def _outdated(self, setpoint: Setpoint) -> bool:
-        """Whether gains are to be designed now for the set-point."""
-        if setpoint is self._designed_for and self._design_age < DESIGN_TICKS:
+        """Return True if the gains for `setpoint` must be designed now."""
+        if setpoint is self._designed_for and self._design_age < TUNING.design_ticks:
             self._design_age += 1
             return False
         self._designed_for, self._design_age = setpoint, 1
         return True
 
 
-# The law is compiled, because it is most of a tick at 1 kHz; pinocchio's log3 and Jlog3 are called before it. Each array that it
-# takes costs 0.1 us and one that it returned would cost 0.5 us, so some come as the rows or parts of one, and the result is
-# written into the last one. Plain tuples are read in half the time of named ones.
+# The law is compiled because it takes most of a tick at 1 kHz. pinocchio's log3 and Jlog3 are called before it. Each array
+# argument costs 0.1 us and a returned array 0.5 us, so arguments are packed and the result is written into the last one. Reading
+# a plain tuple takes half the time of a named one.
 
 
 @compiled
 def cartesian_torque(
     arm: Arrays, R_WD: Array, x: Array, phi: Array, Jlog: Array, gains: Arrays, friction: Array, torque: Array
 ) -> None:
-    """The law of mode CARTESIAN, before limits.
+    """Compute the torque of mode CARTESIAN before limits.
 
     Args:
         arm: q, qd, p_WI, J_W, C(q, qd) qd + gravity, and gravity, as `ArmModel` evaluates them.
         R_WD: desired rotation of the indenter, shape (3, 3).
         x: coordinates of the desired `ReferenceMotion`, shape (39,).
         phi: rotation vector of R_DI [rad], shape (3,).
-        Jlog: derivative of `phi` by a rotation in axes of I, shape (3, 3).
+        Jlog: derivative of `phi` with respect to a rotation in axes of I, shape (3, 3).
         gains: the fields of `CartesianGains`.
         friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, 7).
-        torque: is set to the torque [N m], shape (7,).
+        torque: output [N m], shape (7,).
     """
     q, qd, p_WI, J, bias, gravity = arm
     p_WD, V_WD, F_W, q_0, qd_0 = x[P], x[V], x[F], x[Q], x[QD]
@@ -178,12 +188,12 @@ def cartesian_torque(
     p_error = clip(R_WD.T @ (p_WD - p_WI), POSITION_CLIP_M)
     R_error = clip(-phi, ROTATION_CLIP_RAD)
     V_error = to_axes(R_WD.T, V_WD - J @ qd)
-    spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # the gradient of 1/2 phi' K phi
+    spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # gradient of 1/2 phi' K phi
     force = to_axes(R_WD, spring + B * V_error) + F_W
 
     tau_0 = K_0 * (q_0 - q) + B_0 * (qd_0 - qd)
     null = tau_0 - J.T @ (J_bar.T @ tau_0)
-    null *= NULL_TORQUE_NM / max(NULL_TORQUE_NM, np.abs(null).max())  # as a whole: so it stays in the null space
+    null *= NULL_TORQUE_NM / max(NULL_TORQUE_NM, np.abs(null).max())  # scaled as a whole: stays in the null space
 
     qd_d = clip(qd_0 + J_bar @ (V_WD - J @ qd_0), velocity_limit)
     torque[:] = J.T @ force + null + (bias - gravity) + friction_torque(qd_d, viscous, coulomb)
@@ -191,45 +201,45 @@ def cartesian_torque(
 
 @compiled
 def clip(x: Array, bound: Array | float) -> Array:
-    """`x` within plus and minus `bound`."""
+    """Return `x` limited to plus or minus `bound`."""
     return np.minimum(np.maximum(x, -bound), bound)
 
 
 @compiled
 def friction_torque(qd: Array, viscous: Array, coulomb: Array) -> Array:
-    """Torque that overcomes the joints' friction at desired velocities `qd` [rad/s], [N m], shape (7,)."""
-    return (viscous + coulomb / (np.abs(qd) + STICTION_SPEED)) * qd
+    """Return the torque that compensates joint friction at desired velocities `qd` [rad/s], [N m], shape (7,)."""
+    return (viscous + coulomb / (np.abs(qd) + STICTION_SPEED_RADPS)) * qd
 
 
 @compiled
 def to_axes(R_AB: Array, x_B: Array) -> Array:
-    """A twist or wrench at the same point, linear and angular part, shape (6,), from axes of B to those of A."""
+    """Rotate a twist or wrench at one point (linear, angular), shape (6,), from axes of B to axes of A."""
     return (x_B.reshape(2, 3) @ R_AB.T).ravel()
 
 
 @compiled
-def cartesian_gains(asked: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> CartesianGains:
-    """Stiffness that sampling can bear, the damping that goes with it, and the null space, at a posture.
+def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> CartesianGains:
+    """Return the stiffness that is stable when sampled, the matching damping, and the null-space gains at a posture.
 
     Args:
-        asked: stiffness, damping ratio and joint stiffness of a `Setpoint`.
+        requested: stiffness, damping ratio and joint stiffness of a `Setpoint`.
         R_WD: desired rotation of the indenter, shape (3, 3).
         J_W: Jacobian in world axes, shape (6, 7).
-        M: inertia of the joints [kg m^2], shape (7, 7).
-        D: their viscous friction [N m s/rad], shape (7,).
-        dead_time: from measuring to acting [s].
+        M: joint-space inertia [kg m^2], shape (7, 7).
+        D: viscous joint friction [N m s/rad], shape (7,).
+        dead_time: delay from measurement to torque [s].
     """
-    stiffness, damping_ratio, K_0 = asked
-    turn = np.kron(np.eye(2), R_WD.T)  # a twist or wrench from world axes to D's
+    stiffness, damping_ratio, K_0 = requested
+    turn = np.kron(np.eye(2), R_WD.T)  # twist or wrench from world axes to axes of D
     J = turn @ J_W
     M_inverse, W = np.linalg.inv(M), np.linalg.inv(M + SLOW_S * np.diag(D))
     mobility = J @ M_inverse @ J.T
     inertia = np.diag(np.linalg.inv(mobility + REGULARISATION * np.eye(6)))
     slow_inertia = np.linalg.inv(J @ W @ J.T + REGULARISATION * np.eye(6))
     friction = (np.diag(slow_inertia) - inertia) / SLOW_S
-    # Near a singularity the inertia with the other axes held grows without bound: four times the free one is enough.
+    # Near a singularity the inertia with the other axes held grows without bound; four times the free inertia is enough.
     mass = np.minimum(inertia, 4 / np.diag(mobility))
-    K = np.minimum(stiffness, np.maximum((SPRING_ANGLE / dead_time) ** 2 * mass, friction / (4 * dead_time)))
+    K = np.minimum(stiffness, np.maximum((SPRING_ANGLE_RAD / dead_time) ** 2 * mass, friction / (4 * dead_time)))
     B = 2 * damping_ratio * np.sqrt(K * mass)
     B_0 = 2 * JOINT_DAMPING_RATIO * np.sqrt(K_0 / np.diag(M_inverse))
     J_bar = W @ J.T @ slow_inertia @ turn
@@ -237,12 +247,12 @@ def cartesian_gains(asked: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, 
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
-    """Gains of mode JOINT at a posture of inertia `M`, shape (7, 7): bounded as in `cartesian_gains`, mode by mode."""
+    """Return the gains of mode JOINT at inertia `M`, shape (7, 7), bounded mode by mode as in `cartesian_gains`."""
     L = np.linalg.cholesky(M)
     L_inverse = np.linalg.inv(L)
     squared, V = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)
     P, P_inverse = L @ V, V.T @ L_inverse
     friction = P_inverse**2 @ viscous_friction
-    squared = np.clip(squared, 0.0, np.maximum((SPRING_ANGLE / dead_time) ** 2, friction / (4 * dead_time)))
+    squared = np.clip(squared, 0.0, np.maximum((SPRING_ANGLE_RAD / dead_time) ** 2, friction / (4 * dead_time)))
     damping = 2 * JOINT_DAMPING_RATIO * np.sqrt(squared)
     return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LEAST_DAMPING * damping)) @ P.T)

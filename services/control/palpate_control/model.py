@@ -1,4 +1,4 @@
-"""The controller's own model of the arm, on pinocchio: kinematics, inertia and Coriolis torques at one state."""
+"""Arm model of the controller, on pinocchio: kinematics, inertia and Coriolis torques at one state."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 class ArmModel:
     """Kinematics and dynamics of the arm, evaluated by `update(q, qd)` into its attributes.
 
-    Attributes after `update` (most are views of pinocchio's own memory, valid until the next evaluation):
+    Attributes after `update` (most are views of pinocchio's memory, valid until the next evaluation):
         R_WI: rotation of the indenter frame I in world, shape (3, 3), in Fortran order.
         p_WI: origin of I in world [m], shape (3,).
         J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).
@@ -24,10 +24,10 @@ class ArmModel:
     J_W: Array
 
     def __init__(self, urdf: str, frame: str = "indenter") -> None:
-        """Builds the model from URDF text. Raises ValueError if it is no seven-joint arm with a link `frame`."""
+        """Builds the model from URDF text. Raises ValueError unless it is a seven-joint arm with a link `frame`."""
         self._model = pin.buildModelFromXML(urdf)
         if self._model.nq != DOF or self._model.nv != DOF:
-            raise ValueError(f"robot description has {self._model.nv} joints, the controller wants {DOF}")
+            raise ValueError(f"robot description has {self._model.nv} joints, want {DOF}")
         if not self._model.existFrame(frame):
             raise ValueError(f"robot description has no link {frame!r}")
         self._data = self._model.createData()
@@ -52,20 +52,20 @@ class ArmModel:
         self.update_gravity(q)
 
     def update_gravity(self, q: Array) -> None:
-        """Evaluates `gravity` alone: what joint-space control needs besides its own calls."""
+        """Evaluates `gravity` only, for joint-space control."""
         pin.computeGeneralizedGravity(self._model, self._data, q)
 
     @property
     def coriolis(self) -> Array:
-        """Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,)."""
+        """Return Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,)."""
         return self.bias - self.gravity
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Torques without friction that give accelerations `qdd` [rad/s^2], gravity's among them, shape (7,)."""
+        """Return the torques for accelerations `qdd` [rad/s^2], with gravity and without friction [N m], shape (7,)."""
         torque: Array = pin.rnea(self._model, self._data, q, qd, qdd)
         return torque
 
     def inertia(self, q: Array) -> Array:
-        """The joint-space inertia matrix [kg m^2], shape (7, 7)."""
+        """Return the joint-space inertia matrix [kg m^2], shape (7, 7)."""
         M: Array = pin.crba(self._model, self._data, q)
         return M

@@ -1,4 +1,4 @@
-"""What keeps any law's torque safe: repulsion from joint limits, saturation, and a bound on its rate."""
+"""Limits on the torque of any control law: repulsion from joint limits, saturation, and a rate limit."""
 
 from __future__ import annotations
 
@@ -14,16 +14,15 @@ REPULSION_FRACTION = 0.3
 
 
 class SafetyNet:
-    """Between any law and the arm: torques away from joint limits, within the joints' limits, and without jumps.
+    """Adds repulsion from joint limits and limits torque and torque rate.
 
-    The repulsion is a progressive spring in the last `zone` before each joint limit: conservative, and smooth at the zone's edge.
-    Torques saturate with gravity counted in. Their change from tick to tick is bounded.
+    The repulsion is a progressive spring in the last `zone` before each joint limit: conservative, and smooth at the edge of the
+    zone. Saturation includes gravity. The change from tick to tick is bounded.
     """
 
     def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float) -> None:
-        """Limits [rad] and torque limits [N m], shapes (7,); `zone` [rad], 0 switches the repulsion off.
-
-        One torque comes every `period_s`.
+        """Takes joint limits [rad] and torque limits [N m], shapes (7,); `zone` [rad] (0: no repulsion); one torque per
+        `period_s`.
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
         self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit))
@@ -31,13 +30,13 @@ class SafetyNet:
         self._last = np.zeros_like(torque_limit)
 
     def reset(self) -> None:
-        """Starts again from zero torque, as after a pause in which nothing was commanded."""
+        """Restarts from zero torque, as after a pause without commands."""
         self._last = np.zeros_like(self._last)
 
     def torque(self, wanted: Array, q: Array, gravity: Array) -> Array:
-        """The torque that may be commanded [N m], shape (7,), at joint positions `q` [rad], in place of the `wanted` one.
+        """Return the torque to command instead of `wanted` [N m], shape (7,), at joint positions `q` [rad].
 
-        It and it plus `gravity` are within limits.
+        The torque, and the torque plus `gravity`, are within limits.
         """
         safe = np.empty_like(self._last)
         safe_torque(wanted, q, gravity, self._last, self._rate, self._joints, safe)
@@ -47,11 +46,10 @@ class SafetyNet:
 
 @compiled
 def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: Array, safe: Array) -> None:
-    """Sets `safe` [N m], shape (7,): it pushes away from the joint limits, else is as `wanted`, within all limits.
+    """Set `safe` [N m], shape (7,), to `wanted` plus repulsion from joint limits, within all limits.
 
-    It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. The rows of `joints` are the
-    middle of the joints' ranges [rad], the angle from it at which the repulsion begins [rad], its gain [N m/rad^2] and the torque
-    limits [N m].
+    It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. Rows of `joints`: middle of each
+    joint range [rad], angle from it at which the repulsion begins [rad], its gain [N m/rad^2], torque limit [N m].
     """
     middle, free, gain, limit = joints[0], joints[1], joints[2], joints[3]
     off = q - middle

@@ -246,7 +246,7 @@ def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: 
     B_0 = 2 * impedance.JOINT_DAMPING_RATIO * np.sqrt(asked.joint_stiffness / np.diag(np.linalg.inv(M)))
     tau_0 = asked.joint_stiffness * (asked.q - q) + B_0 * (qd_0 - qd)
     qd_d = qd_0 + J_bar @ (twist - J @ qd_0)
-    friction = D @ qd_d + arm.coulomb_friction * qd_d / (np.abs(qd_d) + impedance.STICTION_SPEED)
+    friction = D @ qd_d + arm.coulomb_friction * qd_d / (np.abs(qd_d) + impedance.STICTION_SPEED_RADPS)
     F = X.T @ (B * (X @ (twist - J @ qd)))
     expected = J.T @ F + (np.eye(7) - J.T @ J_bar.T) @ tau_0 + arm.coriolis + friction
     np.testing.assert_allclose(torque, expected, rtol=1e-4, atol=1e-4)

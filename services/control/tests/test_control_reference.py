@@ -105,7 +105,7 @@ def test_silent_sender_is_braked_smoothly() -> None:
     values = [guide.at(t * MS) for t in range(200)]
     v = np.array([value.motion.V_WD[0] for value in values])
     p = np.array([value.motion.p_WD[0] for value in values])
-    bridge = module.BRIDGED_PERIODS * 10
+    bridge = module.TUNING.bridged_periods * 10
     assert v[bridge] == pytest.approx(0.1)
     assert v[bridge + 1] > 0.07
     assert abs(v[bridge + 30]) < 1e-3
@@ -129,4 +129,4 @@ def test_joint_setpoints_tell_their_acceleration_within_bounds() -> None:
     guide.accept(at(10 * MS, 0.0, 0.05, ControlMode.JOINT), 10 * MS)
     assert guide.at(10 * MS).motion.qdd == pytest.approx(np.full(7, 5.0))
     guide.accept(at(20 * MS, 0.0, 1.5, ControlMode.JOINT), 20 * MS)
-    assert guide.at(20 * MS).motion.qdd == pytest.approx(np.full(7, module.MAX_ACCELERATION))
+    assert guide.at(20 * MS).motion.qdd == pytest.approx(np.full(7, module.TUNING.max_acceleration_radps2))

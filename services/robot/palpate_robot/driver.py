@@ -1,8 +1,9 @@
-"""The driver's contract: which torque the joints get, and when the driver stops obeying and holds safely by itself.
+"""Driver: chooses the joint torque, and enters a safe hold when commands, limits or requests demand it.
 
-A driver is IDLE until its first valid command, then ACTIVE. On an expired or invalid command, a lost commander, a
-broken limit or a stop request it goes to SAFE_HOLD and stays there until released. IDLE and SAFE_HOLD carry gravity and
-damp the joints, without any stiffness: tissue that is pressed pushes the arm away, so the force on it falls.
+A driver is IDLE until its first valid command, then ACTIVE. On an expired or invalid command, a lost commander, a violated limit
+or a stop request it enters SAFE_HOLD and stays there until released. IDLE and SAFE_HOLD compensate gravity and damp the joints,
+without
+stiffness: pressed tissue pushes the arm away, so the force falls.
 """
 
 from __future__ import annotations
@@ -19,21 +20,31 @@ from palpate_models.robot import lbr
 
 HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
 """Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. Breathing at 8 mm/s against it adds less than 3 N."""
-BRAKE: Final = 5.0
-"""Times the damping while a hold begins [A]: a scan at 30 mm/s stops in 0.2 mm, before tissue that stiffens on the way pushes
-noticeably harder."""
-BRAKE_TICKS: Final = 100
-"""How long that lasts [ms]: many times what stopping takes, and a small part of a breath."""
-TORQUE_RATE: Final = 2.0
-"""Largest change of a joint's command in a millisecond [N m]. libfranka ends a motion beyond 1, our controller keeps to 1 a tick.
-A command that was damaged on its way rarely stays within it."""
-FIRST_TORQUE: Final = 20.0
-"""Largest first command of a joint [N m] [A]: the arm rests, and a set-point that lies where it is asks for next to nothing."""
-VALIDITY: Final = 50_000_000
-"""So long [ns] a command is obeyed at most, as in the contract, and counts the time since the one before."""
-AHEAD: Final = 500_000_000
-"""A command stamped so far ahead [ns] comes from a clock that is wrong: its expiry protects nobody. More than a driver can be
-behind its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) and the command's validity: a busy machine is no wrong clock."""
+
+
+@dataclass(frozen=True)
+class DriverTuning:
+    """Limits on commands, and the braking phase of a hold."""
+
+    brake_factor: float = 5.0
+    """Factor on the damping at the start of a hold [A]: a scan at 30 mm/s stops in 0.2 mm, before stiffening tissue adds
+    force."""
+    brake_ticks: int = 100
+    """Duration of that phase [ms]: much longer than stopping takes, and a small part of a breath."""
+    torque_rate_nm_per_ms: float = 2.0
+    """Largest change of a joint command. libfranka aborts beyond 1; our controller keeps to 1. A corrupted command rarely
+    passes."""
+    first_torque_nm: float = 20.0
+    """Largest first command per joint [A]: the arm is at rest, and a set-point at its position needs almost no torque."""
+    validity_ns: int = 50_000_000
+    """Longest validity of a command, as in the contract, and longest interval counted since the previous one."""
+    ahead_ns: int = 500_000_000
+    """A command stamped further ahead comes from a wrong clock, so its expiry is meaningless. Larger than the lag of a driver
+    behind
+    its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) plus the validity."""
+
+
+TUNING: Final = DriverTuning()
 _LIMITS: Final = tuple(
     zip(
         lbr.JOINT_NAMES,
@@ -68,73 +79,78 @@ class HoldCause(IntEnum):
     FORCE_LIMIT = 7
     STOP_REQUESTED = 8
     DEVICE = 9
-    """The arm, its controller, its sensor or the connection to them: of drivers of hardware."""
+    """The arm, its controller, its sensor or the connection to them."""
 
 
 @dataclass(slots=True)
 class Command:
-    """Joint torques without gravity [N m], when they were sent [ns], and when they expire [ns]."""
+    """Joint torques without gravity [N m], their stamp [ns] and expiry [ns]."""
 
     torque: Array
-    """An array of its own memory, that nobody writes to."""
+    """Owned by the command and never written to."""
     stamp: int
     expires: int
     problem: str = ""
-    """Why the commander gives up; empty while it commands."""
+    """Text of the commander's reason to stop commanding; for messages only."""
 
 
 class Driver:
-    """Decides what the joints get. All arrays are of shape (7,), order lbr_A1..lbr_A7."""
+    """Chooses joint torques and damping. All arrays have shape (7,), order lbr_A1..lbr_A7."""
 
     def __init__(self, force_emergency_n: float) -> None:
-        """`force_emergency_n` is the external force at the tool [N] above which the driver holds."""
+        """`force_emergency_n`: external force at the tool [N] above which the driver holds."""
         self._force_emergency = force_emergency_n
         self.mode = DriverMode.IDLE
         self.cause = HoldCause.NONE
         self.reason = ""
         self.rejected = 0
-        """Invalid commands since start."""
         self.holds: list[tuple[int, HoldCause, str]] = []
-        """Every safe hold so far: when [ns], cause, reason."""
+        """All safe holds: time [ns], cause, reason."""
         self._since = -1
         self._brake = 0
-        self._judged: Command | None = None
+        self._checked: Command | None = None
         self._before: Array | None = None
-        """The torques of the command judged last; None when none was obeyed since the driver was IDLE."""
-        still = np.zeros(7)  # compiles what a tick calls
+        """Torques of the last checked command; None if no command was accepted since the driver was IDLE."""
+        still = np.zeros(7)  # compiles the functions of a tick
         _within(still, still, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT)
-        _obeyable(still, still, still, lbr.TORQUE_LIMIT, TORQUE_RATE)
+        _acceptable(still, still, still, lbr.TORQUE_LIMIT, TUNING.torque_rate_nm_per_ms)
 
     @property
     def held(self) -> bool:
-        """Whether a safe hold is latched."""
+        """True while a safe hold is latched."""
         return self.mode is DriverMode.SAFE_HOLD
 
     def hold(self, t: int, cause: HoldCause, reason: str) -> None:
-        """Latches a safe hold at `t` [ns]. The first cause stands until the release."""
+        """Latches a safe hold at `t` [ns]. The first cause is kept until the release."""
         if not self.held:
             self.mode, self.cause, self.reason = DriverMode.SAFE_HOLD, cause, reason
-            self._brake = BRAKE_TICKS
+            self._brake = TUNING.brake_ticks
             self.holds.append((t, cause, reason))
 
     def release(self, t: int) -> None:
-        """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a broken limit holds again."""
+        """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again."""
         if self.mode is DriverMode.SAFE_HOLD:
             self.mode, self.cause, self.reason = DriverMode.IDLE, HoldCause.NONE, ""
             self._since = t
             self._before = None
 
     def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:
-        """Joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` is to act instead.
+        """Return the joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` acts instead.
 
-        Takes measured positions [rad] and velocities [rad/s], the gravity torques [N m], the external force at the tool
-        [N], the newest command, and whether the commander is known to be lost.
+        Args:
+            t: time [ns].
+            q: measured positions [rad].
+            v: measured velocities [rad/s].
+            gravity: gravity torques [N m].
+            force: external force at the tool [N].
+            command: newest command.
+            lost: True if the commander is lost.
         """
         if self.held:
             return _ZERO
         if lost:
-            self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control, which commands, is gone")
-        elif not force <= self._force_emergency:  # NaN, too
+            self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control is lost")
+        elif not force <= self._force_emergency:  # also for NaN
             limit = self._force_emergency
             self.hold(t, HoldCause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
         else:
@@ -142,19 +158,19 @@ class Driver:
         if command is not None and not self.held:
             if command.stamp > self._since:
                 self._take(t, command, gravity)
-            elif self.mode is DriverMode.ACTIVE:  # it has not been judged, so it must not be obeyed
+            elif self.mode is DriverMode.ACTIVE:  # not checked, so it must not be applied
                 age = (t - command.stamp) / 1e6
-                self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is stamped {age:.0f} ms ago")
+                self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is {age:.0f} ms old")
         return command.torque if command is not None and self.mode is DriverMode.ACTIVE else _ZERO
 
     def damping(self, v: Array, gravity: Array) -> Array:
-        """Joint damping that the driver adds in this tick [N m s/rad]; in a hold as much as the torque limits leave room for."""
+        """Return the joint damping of this tick [N m s/rad]; in a hold it is limited by the torque limits."""
         if self.mode is DriverMode.ACTIVE:
             return _ZERO
         wanted = HOLD_DAMPING
         if self._brake:
             self._brake -= 1
-            wanted = BRAKE * HOLD_DAMPING
+            wanted = TUNING.brake_factor * HOLD_DAMPING
         room = lbr.TORQUE_LIMIT - np.abs(gravity)
         return np.asarray(np.minimum(wanted, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
 
@@ -168,49 +184,56 @@ class Driver:
                 self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
 
     def _take(self, t: int, command: Command, gravity: Array) -> None:
-        """Judges a command: obey it, ignore it (already expired while IDLE), or hold."""
-        given_up = command.expires <= command.stamp  # however far its sender's clock is ahead of ours
-        expires = min(command.expires, command.stamp + VALIDITY)
-        if given_up or t > expires:
+        """Accepts a command, ignores it (already expired while IDLE), or holds."""
+        no_command = command.expires <= command.stamp  # also if the sender's clock is ahead
+        expires = min(command.expires, command.stamp + TUNING.validity_ns)
+        if no_command or t > expires:
             if self.mode is DriverMode.ACTIVE:
                 late = max(t - expires, 0) / 1e6
-                words = f"the last command of control expired {late:.0f} ms ago, none came after it"
-                self.hold(t, HoldCause.COMMAND_EXPIRED, f"control gives up: {command.problem}" if command.problem else words)
+                expired = f"the last command of control expired {late:.0f} ms ago"
+                reason = f"control stopped commanding: {command.problem}" if command.problem else expired
+                self.hold(t, HoldCause.COMMAND_EXPIRED, reason)
             return
-        if command is not self._judged:
-            self._judge(t, command, gravity)
-            self._judged = command
+        if command is not self._checked:
+            self._check(t, command, gravity)
+            self._checked = command
         if self.mode is DriverMode.IDLE:
             self.mode = DriverMode.ACTIVE
 
-    def _judge(self, t: int, command: Command, gravity: Array) -> None:
+    def _check(self, t: int, command: Command, gravity: Array) -> None:
         shape = np.shape(command.torque)
         if shape != (7,):
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control commands torques of shape {shape}, want (7,)")
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: torque of shape {shape}, want (7,)")
             return
-        if command.stamp > t + AHEAD:
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control stamps its command {(command.stamp - t) / 1e6:.0f} ms ahead")
+        if command.stamp > t + TUNING.ahead_ns:
+            ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6
+            reason = f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f} ms"
+            self._reject(t, HoldCause.INVALID_COMMAND, reason)
             return
         first = self._before is None
         before = _ZERO if self._before is None else self._before
-        apart = 1.0
-        if self._judged is not None:
-            apart = min(max((command.stamp - self._judged.stamp) / 1e6, 1.0), VALIDITY / 1e6)
-        change = FIRST_TORQUE if first else TORQUE_RATE * apart
-        if not _obeyable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
+        interval_ms = 1.0
+        if self._checked is not None:
+            interval_ms = min(max((command.stamp - self._checked.stamp) / 1e6, 1.0), TUNING.validity_ns / 1e6)
+        change = TUNING.first_torque_nm if first else TUNING.torque_rate_nm_per_ms * interval_ms
+        if not _acceptable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
             for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
                 if torque - torque != 0.0:  # NaN or infinite
-                    self._reject(t, HoldCause.INVALID_COMMAND, f"control commands {joint} {torque} N m, want a finite torque")
+                    self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {joint} = {torque} N m, must be finite")
                     return
                 if not -limit <= torque + weight <= limit:
-                    text = f"control commands {joint} {torque:.1f} N m plus {weight:.1f} N m of gravity, limit +-{limit:.0f} N m"
-                    self._reject(t, HoldCause.TORQUE_LIMIT, text)
+                    total = f"{torque:.1f} N m plus {weight:.1f} N m of gravity"
+                    reason = f"control/joint_torque: {joint} = {total}, limit +-{limit:.0f} N m"
+                    self._reject(t, HoldCause.TORQUE_LIMIT, reason)
                     return
                 if not -change <= torque - last <= change:
-                    after, rate = f"after {last:.1f} N m, {apart:.0f} ms apart", f"{TORQUE_RATE:g} N m/ms"
-                    how, most = ("to begin with", f"{FIRST_TORQUE:g} N m") if first else (after, rate)
-                    self._reject(t, HoldCause.INVALID_COMMAND, f"control commands {joint} {torque:.1f} N m {how}, limit {most}")
+                    jump = f"{joint} = {torque:.1f} N m, {interval_ms:.0f} ms after {last:.1f} N m"
+                    rate = f"control/joint_torque: {jump}, limit {TUNING.torque_rate_nm_per_ms:g} N m/ms"
+                    start = (
+                        f"control/joint_torque: first command {joint} = {torque:.1f} N m, limit {TUNING.first_torque_nm:g} N m"
+                    )
+                    self._reject(t, HoldCause.INVALID_COMMAND, start if first else rate)
                     return
         self._before = command.torque
 
@@ -221,11 +244,11 @@ class Driver:
 
 @compiled
 def _within(q: Array, v: Array, position_limit: Array, velocity_limit: Array) -> bool:
-    """Whether positions and velocities, shapes (7,), are numbers and at most their limits in size."""
+    """Return True if positions and velocities, shapes (7,), are within plus or minus their limits and not NaN."""
     return bool(np.all(np.abs(q) <= position_limit) and np.all(np.abs(v) <= velocity_limit))
 
 
 @compiled
-def _obeyable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
-    """Whether a command (7,), gravity added, is within its limit and no more than `change` away from the one before [N m]."""
+def _acceptable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
+    """Return True if a command (7,) plus gravity is within its limit and within `change` of the previous one [N m]."""
     return bool(np.all(np.abs(torque + gravity) <= limit) and np.all(np.abs(torque - before) <= change))

@@ -1,4 +1,4 @@
-"""What the service needs of a simulated arm, so that another physics engine can stand behind the same driver and sensor."""
+"""Interface of a simulated arm: physics engines behind the same driver and sensors."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from palpate_models.scenario.schema import Robot
 DT: Final = 1e-3
 """Step [s]."""
 END_STOP_MARGIN_RAD: Final = 0.03
-"""How far behind the position limit the mechanical end stop is [A]; the driver acts at the limit."""
+"""Distance of the mechanical end stop behind the position limit [A]; the driver acts at the limit."""
 STICK_RADPS: Final = 1e-3
-"""Below this speed friction is viscous: a joint under less than its friction creeps slower than this [A]."""
+"""Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this [A]."""
 FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
-"""Links that stand on or turn over the base and so have no collision shapes."""
+"""Links at the base, which have no collision shapes."""
 
 NOMINAL_ARM: Final = draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)))
-"""An arm that is as its tables say."""
+"""An arm without errors."""
 
 Wrench = tuple[float, float, float, float, float, float]
 
@@ -47,35 +47,32 @@ class Plant(Protocol):
         ...
 
     def gravity_torque(self) -> Array:
-        """Joint torques [N m], shape (7,), with which the arm's own controller carries arm and tool here.
-
-        It knows its load data, so the tool's nominal mass.
-        """
+        """Return the joint torques that compensate gravity [N m], shape (7,), with the nominal tool mass."""
         ...
 
     def sensor_wrench(self) -> Wrench:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m], in its axes."""
+        """Return the wrench on the F/T sensor from the tool below it: force [N], then moment [N m], in sensor axes."""
         ...
 
     def tool_motion(self) -> Array:
-        """The indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+        """Return the indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
         ...
 
     def link_poses(self) -> Array:
-        """Poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Return the poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         ...
 
     def contacts(self) -> int:
-        """Number of contact points with table or base in the last step."""
+        """Return the number of contact points with table or base in the last step."""
         ...
 
 
 class PlantFactory(Protocol):
-    """Makes the plant of a scenario's robot."""
+    """Creates the plant of a scenario's robot."""
 
     def __call__(self, robot: Robot, *, drawn: DrawnArm) -> Plant:
-        """The nominal robot with an arm that differs from it as `drawn` says, at rest at `lbr.HOME`."""
+        """Return a plant at rest at `lbr.HOME`: the nominal robot with the arm errors `drawn`."""
         ...

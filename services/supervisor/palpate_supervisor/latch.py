@@ -1,4 +1,4 @@
-"""The stop that stays: what a breach latches, when a soft stop becomes an emergency stop, when a release is granted."""
+"""Latched stop: which breach latches it, when a soft stop escalates to an emergency stop, when a release is granted."""
 
 from __future__ import annotations
 
@@ -7,46 +7,50 @@ from dataclasses import dataclass
 
 from palpate_supervisor.watch import Breach, Cause, Level
 
-GRACE = 50_000_000
-"""Within this time of a release [ns] the driver's old hold is passed over: the word has to reach it."""
+
+@dataclass(frozen=True)
+class LatchTuning:
+    """Timing and tolerance of a release."""
+
+    driver_grace_ns: int = 50_000_000
+    """Driver hold is ignored for this long after a release (message latency)."""
+    further_m: float = 0.010
+    """After a release, a tool that goes this much further beyond its limit is stopped again."""
+
+
+TUNING = LatchTuning()
 RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
-"""Causes that only motion can end: released, they are passed over until the tool is back within the limit, or they grow worse."""
-FURTHER_M = 0.010
-"""A tool that goes this much further beyond its limit than it was when released is stopped again [m]."""
+"""Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
 
 
 @dataclass(frozen=True, slots=True)
 class Stop:
-    """A stop that was latched."""
+    """A latched stop at time `t` [ns]."""
 
     t: int
-    """[ns]"""
     level: Level
     cause: Cause
     reason: str
 
 
 class Latch:
-    """Level, cause and reason that stand until released."""
+    """Level, cause and reason, kept until a release."""
 
     def __init__(self) -> None:
         self.level = Level.OK
         self.cause = Cause.NONE
         self.reason = ""
         self.releases = 0
-        """Granted so far."""
         self.refusals = 0
         self.stops: list[Stop] = []
-        """Every stop so far; one that grew worse counts again."""
+        """All stops; an escalation counts again."""
         self._since = 0
-        self._released = -GRACE
-        self._recovering: dict[Cause, Breach] = {}
-        """What is passed over, as it was when released."""
-        self._begun: dict[Cause, int] = {}
-        """Since when each cause that stands now has stood without a break [ns]."""
+        self._released = -TUNING.driver_grace_ns
+        self._recovering: dict[Cause, Breach] = {}  # ignored breaches, as they were at the release
+        self._begun: dict[Cause, int] = {}  # start of each uninterrupted present cause [ns]
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
-        """One period at `t` [ns]: what does not hold now, and whether an operator asks for release."""
+        """Updates the latch at `t` [ns] with the present breaches and an operator's request for release."""
         if not (breaches or release):
             self._recovering.clear()
             self._begun.clear()
@@ -54,28 +58,25 @@ class Latch:
         causes = {breach.cause for breach in breaches}
         self._recovering = {cause: released for cause, released in self._recovering.items() if cause in causes}
         self._begun = {cause: self._begun.get(cause, t) for cause in causes}
-        fresh = t - self._released < GRACE
+        fresh = t - self._released < TUNING.driver_grace_ns
         standing = [breach for breach in breaches if not (self._recovers(breach) or (fresh and breach.cause is Cause.DRIVER))]
         if release:
             standing = self._release(t, standing)
         for breach in sorted(standing, key=lambda breach: -breach.level):
-            self._take(t, breach)
+            if breach.level > self.level:
+                self._latch(t, breach)
         for breach in standing:
             began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
-            if self.level is Level.SOFT_STOP and t - began > breach.heed:
-                words = f"soft stop not heeded within {breach.heed / 1e6:.0f} ms: {breach.reason}"
-                self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, words))
+            if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
+                reason = f"soft stop did not help within {breach.timeout_ns / 1e6:.0f} ms: {breach.reason}"
+                self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, reason))
 
     def _recovers(self, breach: Breach) -> bool:
-        """Whether it was released and has not grown worse since."""
+        """Return True if `breach` was released and has not grown since."""
         released = self._recovering.get(breach.cause)
         if released is None:
             return False
-        return breach.level <= released.level and breach.beyond <= released.beyond + FURTHER_M
-
-    def _take(self, t: int, breach: Breach) -> None:
-        if breach.level > self.level:
-            self._latch(t, breach)
+        return breach.level <= released.level and breach.beyond_m <= released.beyond_m + TUNING.further_m
 
     def _latch(self, t: int, breach: Breach) -> None:
         self.level, self.cause, self.reason = breach.level, breach.cause, breach.reason
@@ -83,7 +84,7 @@ class Latch:
         self.stops.append(Stop(t, breach.level, breach.cause, breach.reason))
 
     def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
-        """Grants a release unless something that motion cannot mend still stands; returns what is still to be judged."""
+        """Grants a release unless a breach that motion cannot end is present; returns the breaches still to be judged."""
         against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not Cause.DRIVER]
         if against:
             self.refusals += 1

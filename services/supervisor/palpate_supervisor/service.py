@@ -1,8 +1,9 @@
-"""The supervisor on the bus: messages to numbers and back."""
+"""Supervisor service: converts messages to numbers and publishes the latched stop."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,21 +20,32 @@ from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch
 
-NOWHERE = -1.0
-"""Depth [m] while no surface is known."""
-MISSED = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
-"""Roles and what their loss calls for: without the first two the arm must stand still, without assessment there is no reason to
-go on pressing."""
-RETREAT = 4000 * MS
-"""So long planning may take to be out of contact and on the way home after a loss [ns]; nothing brings the lost one back."""
+LOSS_LEVELS = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
+"""Stop level when a role is lost. Without control or planning the arm must stand still; without assessment pressing is
+pointless."""
 WATCHED = ("robot/status", "exam/state")
-"""Topics whose age is watched: the arm's and planning's."""
-SETTLE = 1000 * MS
-"""Ages are not judged for so long after the start [ns]: processes come up one by one."""
+"""Topics whose age is checked."""
+
+
+@dataclass(frozen=True)
+class ServiceTuning:
+    """Delays of the presence checks and the range of the published depth."""
+
+    retreat_ns: int = 4000 * MS
+    """Time that planning has to leave contact after a role is lost; a lost role does not come back."""
+    settle_ns: int = 1000 * MS
+    """Ages are not checked for this long after the start: processes start one by one."""
+    no_depth_m: float = -1.0
+    """Published depth while there is no surface, and its lower bound."""
+    deepest_m: float = 0.2
+    """Upper bound of the published depth."""
+
+
+TUNING = ServiceTuning()
 
 
 class SupervisorService(Service):
-    """Watches the examination and stops it. It knows no more about control and planning than whether they are alive."""
+    """Watches the examination and stops it. Of control and planning it uses only whether they are alive."""
 
     role: ClassVar[str] = "supervisor"
 
@@ -42,38 +54,37 @@ class SupervisorService(Service):
         self._sense = ToolSense(known.robot)
         self._watch = LimitWatch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
-        RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it ahead of any deadline
+        RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it before the first deadline
         self._max_age = contract().topics["planning/setpoint"].expiry
-        """Age [ns] at which a topic counts as silent: when set-points expire. Control and driver watch their inputs, faster."""
+        """Age limit of watched topics [ns]: the expiry of set-points. Control and driver check their own inputs faster."""
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
         self._measured: list[Breach] = []
         self._stamp: int | None = None
-        self._stamped = 0
-        """When the newest measurement was first heard [ns]."""
-        self._depth = NOWHERE
+        self._stamped = 0  # arrival of the newest distinct measurement [ns]
+        self._depth = TUNING.no_depth_m
         self._peak_force = self._peak_speed = 0.0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """One period: measure, judge, latch."""
+        """Runs one period: measure, judge, latch."""
         release = False
         breaches = self._presence(t, inbox)
         for request in inbox.new("operator/request"):
             if request.request == OperatorRequest.STOP:
                 breaches.append(Breach(Level.EMERGENCY, Cause.OPERATOR, f"stopped by the operator: {request.reason}"))
             elif request.request == OperatorRequest.SOFT_STOP:
-                breaches.append(Breach(Level.SOFT_STOP, Cause.OPERATOR, f"stopped softly by the operator: {request.reason}"))
+                breaches.append(Breach(Level.SOFT_STOP, Cause.OPERATOR, f"soft stop by the operator: {request.reason}"))
             elif request.request in (OperatorRequest.RELEASE, OperatorRequest.END):
                 release = True
             else:
-                words = f"operator/request: request = {request.request} is unknown, which counts as a stop"
-                breaches.append(Breach(Level.EMERGENCY, Cause.INVALID, words))
+                reason = f"operator/request: unknown request {request.request} is treated as a stop"
+                breaches.append(Breach(Level.EMERGENCY, Cause.INVALID, reason))
         for mesh in inbox.new("perception/surface"):
-            breaches += self._perceive(mesh)
+            breaches += self._take_surface(mesh)
         if inbox.new("robot/status"):
             self._measured = self._measure(t, inbox.latest("robot/status"))
-        breaches += self._measured  # what was measured stands until it is measured again
+        breaches += self._measured  # valid until the next measurement
         self._latch.update(t, breaches, release)
         latch, tool = self._latch, self._tool
         state = SupervisorState(
@@ -83,7 +94,7 @@ class SupervisorService(Service):
         return {"supervisor/state": state}
 
     def finish(self) -> Mapping[str, Any]:
-        """Every stop with its cause, granted releases, and the largest force [N] and speed [m/s] seen."""
+        """Return all stops with their cause, granted releases, and the largest force [N] and speed [m/s]."""
         stops = [
             {"t_s": stop.t / NS, "level": stop.level.name, "cause": stop.cause.name, "reason": stop.reason}
             for stop in self._latch.stops
@@ -96,20 +107,20 @@ class SupervisorService(Service):
         }
 
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
-        """Who is gone, and who has said nothing for too long."""
-        gone = [(role, level) for role, level in MISSED if inbox.lost(role)]
-        found = [Breach(level, Cause.LOST, f"the service of role {role} is gone", RETREAT) for role, level in gone]
+        """Return breaches for lost roles and for watched topics that are too old."""
+        lost = [(role, level) for role, level in LOSS_LEVELS if inbox.lost(role)]
+        found = [Breach(level, Cause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns) for role, level in lost]
         self._began = t if self._began is None else self._began
-        if t - self._began <= SETTLE:
+        if t - self._began <= TUNING.settle_ns:
             return found
         for name in WATCHED:
-            heard = inbox.stamp(name)
-            if heard is not None and t - heard > self._max_age:
-                words = f"nothing on {name} for {(t - heard) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-                found.append(Breach(Level.EMERGENCY, Cause.SILENT, words))
+            received = inbox.stamp(name)
+            if received is not None and t - received > self._max_age:
+                reason = f"no message on {name} for {(t - received) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
+                found.append(Breach(Level.EMERGENCY, Cause.SILENT, reason))
         return found
 
-    def _perceive(self, mesh: Any) -> list[Breach]:
+    def _take_surface(self, mesh: Any) -> list[Breach]:
         if not len(mesh.vertices):
             return []
         try:
@@ -129,19 +140,19 @@ class SupervisorService(Service):
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
         depth = None if self._surface is None else self._surface.depth(tool.p_W)
-        self._depth = NOWHERE if depth is None else min(max(depth, NOWHERE), 0.2)
+        self._depth = TUNING.no_depth_m if depth is None else min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             self._stamp, self._stamped = stamp, t
         found = self._watch.judge(tool, depth, stamp, t)
         if t - self._stamped > self._max_age:
-            words = f"robot/status repeats what was measured {(t - self._stamped) / 1e6:.0f} ms ago"
-            found.append(Breach(Level.EMERGENCY, Cause.SILENT, f"{words}, limit {self._max_age / 1e6:.0f} ms"))
+            age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
+            found.append(Breach(Level.EMERGENCY, Cause.SILENT, f"robot/status repeats a measurement of age {age}"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
-            found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"the driver holds safely: {status.reason}"))
+            found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"safe hold of the driver: {status.reason}"))
         return found
 
 
 def create(scenario: Scenario) -> SupervisorService:
-    """The supervisor of a scenario; it gets no phantom."""
+    """Return the supervisor of a scenario; it uses the exam input only."""
     return SupervisorService(exam_input(scenario))

@@ -1,7 +1,8 @@
-"""Where the tool is, how fast it moves and what presses it, from joint state and F/T reading alone."""
+"""Position, speed and external force of the tool, from joint state and F/T reading only; the perceived rest surface."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -14,25 +15,34 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-STILL_MPS = 0.005
-"""A tool that is slower than this rests."""
-LARGEST_BIAS_N = 6.0
-"""What presses a tool that has not moved yet by more than this is no bias: poor sensors have up to 5.2 N (docs/errors.md)."""
+
+
+@dataclass(frozen=True)
+class BiasTuning:
+    """Limits within which a reading counts as sensor bias."""
+
+    still_mps: float = 0.005
+    """Tool speed below which the tool is at rest."""
+    largest_n: float = 6.0
+    """A larger force before the first motion is contact, not bias: poor sensors have up to 5.2 N of bias."""
+
+
+TUNING = BiasTuning()
 
 
 class Tool(NamedTuple):
-    """The indenter as measured."""
+    """Measured state of the indenter."""
 
     p_W: Array
     """Centre of the sphere [m], shape (3,)."""
     speed: float
     """Speed of the centre [m/s]."""
     force: float
-    """Magnitude of the external force [N]: the reading less the tool's weight and the sensor's bias."""
+    """Magnitude of the external force [N]: the reading minus tool weight and sensor bias."""
 
 
 class ToolSense:
-    """Kinematics and weight of arm and tool, and the sensor's bias: the mean of what is measured until the arm moves."""
+    """Evaluates tool state from joint state and F/T reading. The sensor bias is the mean reading before the arm first moves."""
 
     def __init__(self, robot: Robot) -> None:
         self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
@@ -41,19 +51,19 @@ class ToolSense:
         self._sensor = self._model.getFrameId("ft_sensor")
         self._p_WI: Array = self._data.oMf[self._indenter].translation
         self._R_SW: Array = self._data.oMf[self._sensor].rotation.T
-        """Views of what pinocchio has computed last."""
+        """Views of pinocchio's latest result."""
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
         self._bias_S, self._rested, self._moved = np.zeros(3), 0, False
 
     def sense(self, q: Array, qd: Array, wrench_S: Array) -> Tool:
-        """From joint positions [rad] and velocities [rad/s], shapes (7,), and the F/T reading, shape (6,)."""
+        """Return the tool state at joint positions [rad] and velocities [rad/s], shapes (7,), and the F/T reading, shape (6,)."""
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, qd)
         pin.updateFramePlacement(model, data, self._indenter)
         pin.updateFramePlacement(model, data, self._sensor)
         speed = float(np.linalg.norm(pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear))
         force_S = wrench_S[:3] - self._R_SW @ self._weight_W
-        self._moved = self._moved or speed > STILL_MPS or bool(np.linalg.norm(force_S) > LARGEST_BIAS_N)
+        self._moved = self._moved or speed > TUNING.still_mps or bool(np.linalg.norm(force_S) > TUNING.largest_n)
         if not self._moved:
             self._rested += 1
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
@@ -63,22 +73,23 @@ class ToolSense:
 class RestSurface:
     """Depth below the perceived rest surface: the sphere against the tangent plane of the nearest vertex.
 
-    Coarser than planning's splines on purpose, and shares nothing with them: on a 5 mm mesh of 0.25 m radius the plane is off by
-    less than 0.05 mm.
+    Deliberately independent of planning's splines: on a 5 mm mesh of 0.25 m radius the plane is off by less than 0.05 mm.
     """
 
     def __init__(self, vertices_W: Array, normals_W: Array, radius: float) -> None:
-        """Vertices [m] and outward unit normals, shapes (n, 3); `radius` of the sphere [m].
+        """Takes vertices [m] and outward unit normals, shapes (n, 3), and the sphere's `radius` [m].
 
-        Raises ValueError when there are none, or they do not fit each other.
+        Raises ValueError for an empty mesh, different shapes, or values that are not finite.
         """
         if vertices_W.shape != normals_W.shape or not len(vertices_W):
-            raise ValueError(f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals, want one each")
+            raise ValueError(
+                f"perceived surface: {vertices_W.shape} vertices, {normals_W.shape} normals: want the same non-empty shape"
+            )
         if not (np.isfinite(vertices_W).all() and np.isfinite(normals_W).all()):
-            raise ValueError("perceived surface: vertices or normals that are not finite")
+            raise ValueError("perceived surface: vertices and normals must be finite")
         self._vertices, self._normals, self._radius = np.ascontiguousarray(vertices_W, float), normals_W, radius
 
     def depth(self, p_W: Array) -> float:
-        """Depth of the sphere's deepest point [m]; negative above the surface."""
+        """Return the depth of the sphere's deepest point [m]; negative above the surface."""
         _, i = nearest_vertex(p_W, self._vertices)
         return self._radius - float(self._normals[i] @ (p_W - self._vertices[i]))

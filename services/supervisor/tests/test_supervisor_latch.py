@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-from palpate_supervisor.latch import FURTHER_M, GRACE, Latch
-from palpate_supervisor.watch import HEED, HEED_RISING, Breach, Cause, Level
+from palpate_supervisor import latch as latch_module
+from palpate_supervisor.latch import Latch
+from palpate_supervisor.watch import TUNING, Breach, Cause, Level
 
 MS = 1_000_000
 SOFT = Breach(Level.SOFT_STOP, Cause.FORCE, "26 N")
@@ -34,18 +35,18 @@ def test_the_worst_counts_and_the_first_of_equals() -> None:
 
 def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
     latch = Latch()
-    for t in range(0, HEED + 1, 10 * MS):
+    for t in range(0, TUNING.soft_stop_timeout_ns + 1, 10 * MS):
         latch.update(t, [SOFT], False)
     assert latch.level is Level.SOFT_STOP
-    latch.update(HEED + 10 * MS, [SOFT], False)
+    latch.update(TUNING.soft_stop_timeout_ns + 10 * MS, [SOFT], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
     assert "26 N" in latch.reason
 
 
 def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
     latch = Latch()
-    rising = Breach(Level.SOFT_STOP, Cause.FORCE, "20 N, rising", HEED_RISING)
-    for t in range(0, HEED_RISING + 20 * MS, 10 * MS):
+    rising = Breach(Level.SOFT_STOP, Cause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
+    for t in range(0, TUNING.rising_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [rising], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
@@ -53,7 +54,7 @@ def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
 def test_a_soft_stop_that_helps_stays_one() -> None:
     latch = Latch()
     latch.update(0, [SOFT], False)
-    for t in range(10 * MS, 2 * HEED, 10 * MS):
+    for t in range(10 * MS, 2 * TUNING.soft_stop_timeout_ns, 10 * MS):
         latch.update(t, [], False)
     assert latch.level is Level.SOFT_STOP
 
@@ -91,7 +92,7 @@ def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
 
 def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
     latch = Latch()
-    for n in range(HEED // (10 * MS) + 4):
+    for n in range(TUNING.soft_stop_timeout_ns // (10 * MS) + 4):
         latch.update(n * 10 * MS, [SOFT] if n % 2 == 0 else [], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
@@ -99,7 +100,7 @@ def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
 def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
     latch = Latch()
     latch.update(0, [Breach(Level.SOFT_STOP, Cause.OPERATOR, "enough")], False)
-    for t in range(1000 * MS, 1000 * MS + HEED + 20 * MS, 10 * MS):
+    for t in range(1000 * MS, 1000 * MS + TUNING.soft_stop_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [SOFT], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
@@ -110,7 +111,7 @@ def test_a_driver_is_given_time_to_hear_of_its_release_and_no_more() -> None:
     latch.update(10 * MS, [DRIVER], True)
     latch.update(20 * MS, [DRIVER], False)
     assert latch.level is Level.OK
-    latch.update(10 * MS + GRACE, [DRIVER], False)
+    latch.update(10 * MS + latch_module.TUNING.driver_grace_ns, [DRIVER], False)
     assert latch.cause is Cause.DRIVER
 
 
@@ -122,10 +123,10 @@ def test_a_release_of_nothing_is_harmless() -> None:
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
     latch = Latch()
-    outside = Breach(Level.EMERGENCY, Cause.WORKSPACE, "tool at y = 0.12 m", beyond=0.02)
+    outside = Breach(Level.EMERGENCY, Cause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
     latch.update(0, [outside], False)
     latch.update(10 * MS, [outside], True)
-    latch.update(20 * MS, [replace(outside, beyond=0.02 + 0.9 * FURTHER_M)], False)
+    latch.update(20 * MS, [replace(outside, beyond_m=0.02 + 0.9 * latch_module.TUNING.further_m)], False)
     assert latch.level is Level.OK
-    latch.update(30 * MS, [replace(outside, beyond=0.02 + 1.1 * FURTHER_M)], False)
+    latch.update(30 * MS, [replace(outside, beyond_m=0.02 + 1.1 * latch_module.TUNING.further_m)], False)
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.WORKSPACE)

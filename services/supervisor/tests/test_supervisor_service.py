@@ -13,7 +13,7 @@ from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario
-from palpate_supervisor.service import SETTLE, SupervisorService, create
+from palpate_supervisor.service import TUNING, SupervisorService, create
 
 MS = 1_000_000
 
@@ -53,7 +53,7 @@ def test_what_was_measured_stands_until_it_is_measured_again() -> None:
 def test_a_measurement_that_is_only_repeated_is_silence() -> None:
     service = create(load_scenario("healthy"))
     state = None
-    for t in range(0, SETTLE, 10 * MS):
+    for t in range(0, TUNING.settle_ns, 10 * MS):
         state = after(service, t, robot__status=status(0, 0.0))
     assert (state.level, state.cause) == (SupervisorState.LEVEL_EMERGENCY, SupervisorState.CAUSE_SILENT)
 
@@ -75,7 +75,7 @@ def test_without_the_assessment_planning_has_time_to_retreat() -> None:
     service, state = create(load_scenario("healthy")), None
     inbox = HandInbox()
     inbox.gone.add("assessment")
-    for t in range(0, SETTLE, 10 * MS):
+    for t in range(0, TUNING.settle_ns, 10 * MS):
         state = service.step(t, inbox)["supervisor/state"]
     assert (state.level, state.cause) == (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.CAUSE_LOST)
     state = service.step(5000 * MS, inbox)["supervisor/state"]

@@ -1,4 +1,4 @@
-"""What the service asks of the physics behind it: one class to write for another tissue."""
+"""Interface of the tissue physics behind the service: implement `TissueBackend` for another tissue."""
 
 from __future__ import annotations
 
@@ -15,50 +15,48 @@ from palpate_models.scenario import press
 
 
 class TissueBackend(ABC):
-    """A soft body with a skin of n vertices that a sphere presses. Everything is in the abdomen frame A and in SI units."""
+    """A soft body with a surface of n vertices, pressed by a sphere. All quantities are in the abdomen frame A and in SI
+    units.
+    """
 
     touching: bool = False
-    """Whether the sphere holds a vertex after the step."""
+    """True if the sphere holds a vertex after the step."""
     activation: float = 1.0
-    """How far guarding muscles are contracted, from 0 to 1: the a of `palpate_models.patient.wall`."""
+    """Contraction of guarding muscles, 0 to 1: a in `palpate_models.patient.wall`."""
 
     def __init__(self, model: PhantomModel, breathing: BreathingCurve, dt: float) -> None:
         self.model = model
-        """The body at rest."""
         self.dt = dt
-        """Period of a step [s]."""
         self.breathing = breathing
-        """How the body breathes."""
         self._guarding = Activation(model.voluntary, dt)
 
     @abstractmethod
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """Advances by one period to time `t_s` [s] with the sphere's centre at `p_A` [m], and returns the wrench on it.
+        """Advances by one period to time `t_s` [s] with the sphere's centre at `p_A` [m]; returns the wrench on it.
 
-        `v_A` [m/s] and `w_A` [rad/s] are the sphere's velocities, `radius` [m]. The result is the force [N] that the tissue
-        exerts on the sphere and its torque about the centre [N m], each of shape (3,), the mean over the period. Raises
-        ValueError for a position that is not finite.
+        `v_A` [m/s] and `w_A` [rad/s] are the sphere's velocities, `radius` [m]. The result is the force [N] on the sphere and the
+        torque about its centre [N m], shapes (3,), averaged over the period. Raises ValueError for a position that is not finite.
         """
 
     @abstractmethod
     def idle(self, t_s: float) -> None:
-        """Advances by one period to time `t_s` [s] with no sphere anywhere."""
+        """Advances by one period to time `t_s` [s] without contact."""
 
     @abstractmethod
     def settle(self) -> None:
-        """Brings the body to rest: as if nothing had ever touched it."""
+        """Resets the body to its undisturbed rest state."""
 
     def in_steps_of(self, dt: float) -> TissueBackend:
-        """The same body at rest, for steps of about `dt` [s] where its physics allows them; else this one, at rest, as it is."""
+        """Return the same body at rest for steps of about `dt` [s] if the physics allows them, else this one at rest."""
         self.settle()
         return self
 
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Standard presses with a sphere of `radius` [m], each into the body at rest, as it is afterwards.
+        """Performs standard presses with a sphere of `radius` [m], each into the body at rest, and leaves it at rest.
 
-        Guarding muscle is contracted at rest and does what it does under any press: involuntarily it stays, voluntarily it fades.
-        `places` [m] on the skin at rest and outward unit `normals` there, shape (k, 3). Returns their apparent stiffness [N] and
-        whether they ended at their limit, each of shape (k,). Here it is done step by step; faster ways are the subclass's.
+        Guarding muscle is contracted at rest; involuntary contraction stays during a press, voluntary contraction fades.
+        `places` [m] on the rest surface and outward unit `normals` there have shape (k, 3). Returns the apparent stiffness [N]
+        and True where the force limit ended the press, shapes (k,). This implementation steps in time; subclasses may be faster.
         """
         at = press.times(self.dt)
         depths = press.depths(at)
@@ -75,29 +73,29 @@ class TissueBackend(ABC):
     @property
     @abstractmethod
     def contacts(self) -> NDArray[np.intp]:
-        """Vertices in contact after the step, shape (k,)."""
+        """Return the vertices in contact after the step, shape (k,)."""
 
     @property
     @abstractmethod
     def deepest(self) -> tuple[int, float]:
-        """The vertex in contact that is displaced most, and how far along its inward normal [m]. There has to be contact."""
+        """Return the most displaced vertex in contact and its inward displacement [m]. Requires contact."""
 
     @property
     @abstractmethod
     def inward(self) -> Array:
-        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+        """Return the displacement of each vertex from rest along its inward normal [m], with breathing, shape (n,)."""
 
     @property
     def deformed_vertices(self) -> Array:
-        """The surface as it is now [m], shape (n, 3)."""
+        """Return the present surface [m], shape (n, 3)."""
         return self.model.vertices - self.inward[:, None] * self.model.normals
 
     def guard(self, v_A: Array) -> None:
-        """Advances `activation` by a period, from how the sphere of velocity `v_A` [m/s] holds the skin: how each step ends."""
+        """Advances `activation` by a period for a sphere of velocity `v_A` [m/s]. Call it at the end of each step."""
         if self._guarding.voluntary and self.touching:
             vertex, depth = self.deepest
             self.activation = self._guarding.after(self.activation, depth, -float(v_A @ self.model.normals[vertex]))
 
     def excursion(self, t_s: float) -> float:
-        """Breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
+        """Return the breathing excursion [m] at time `t_s` [s], outward positive, where the profile is 1."""
         return self.breathing.excursion(t_s)

@@ -1,4 +1,12 @@
-"""The vertices of the skin that a sphere might touch while it stays near a place."""
+"""Contact of the spherical indenter with the skin, shared by all backends: candidate vertices and friction.
+
+Friction is Coulomb's with the skin's shear compliance before it slips, an elastic-plastic bristle: the skin sticks and shears by
+s with a constant stiffness k, and slips at the Coulomb limit,
+
+    s' = P v   while k |s| < mu N,     F = -k s
+
+P removes the component along the normal. It is passive: k is constant, and slipping, turning and unloading only shorten s.
+"""
 
 from __future__ import annotations
 
@@ -14,67 +22,69 @@ from palpate_models.numerics.frames import Array
 from palpate_models.numerics.vectors import Vector, add, cross, divide, dot, norm, scale, subtract, velocity_at
 
 RIM = 0.2
-"""Vertices are held by the sphere where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""
+"""The sphere holds vertices where its surface makes less than 78 degrees with the tangent plane (cos > 0.2)."""
 _REACH_M = 0.030
-"""Least depth of the sphere's centre below the rest surface at which the vertices found are still all that it might touch."""
+"""Depth of the sphere's centre below the rest surface up to which the candidates found are complete."""
 
 
 class Near(NamedTuple):
-    """Vertices that a sphere might touch while its centre stays near `origin`; m of them."""
+    """The m vertices that a sphere can touch while its centre stays near `origin`."""
 
     origin: list[float]
-    """[m], three of them."""
+    """Search centre [m], shape (3,)."""
     reach: float
-    """How far the centre may go from there [m]."""
+    """Distance from `origin` within which the candidates are complete [m]."""
     radius: float
     """Radius of the sphere [m]."""
     vertex: NDArray[np.intp]
-    """Which of the vertices searched, ascending, shape (m,)."""
+    """Indices among the searched vertices, ascending, shape (m,)."""
     n: Array
     """Their outward normals, shape (m, 3)."""
     X: Array
     """Their positions from `origin` [m], shape (m, 3)."""
 
     def holds(self, p: list[float], radius: float) -> bool:
-        """Whether this is still all that a sphere of `radius` [m] at `p` [m] might touch."""
+        """Return True if the candidates are complete for a sphere of `radius` [m] at `p` [m]."""
         return radius == self.radius and math.dist(p, self.origin) <= self.reach
 
 
 class VertexSearch:
-    """Finds the vertices near a sphere among some at rest. Everything is in A."""
+    """Finds the vertices near a sphere. All quantities are in frame A."""
 
     def __init__(self, vertices: Array, normals: Array, excursion: float, margin: float) -> None:
-        """`vertices` [m] and outward `normals`, shape (n, 3); the largest breathing `excursion` [m].
+        """Takes rest `vertices` [m] and outward `normals`, shapes (n, 3), and the largest breathing `excursion` [m].
 
-        The centre may move by `margin` [m] before they have to be searched again.
+        The centre may move by `margin` [m] before the next search.
         """
         self._vertices, self._normals = vertices, normals
         self._tree = cKDTree(vertices)
         self._excursion, self._margin = excursion, margin
 
     def around(self, p: list[float], radius: float, deepest: float) -> Near:
-        """What a sphere of `radius` [m] near `p` [m] might touch, where the skin is displaced by at most `deepest` [m]."""
+        """Return the vertices that a sphere of `radius` [m] near `p` [m] can touch if the skin is displaced by up to `deepest`
+        [m].
+        """
         ball = math.hypot(radius, max(_REACH_M, deepest + 0.01)) + self._excursion + self._margin
         distance, nearest = self._tree.query(p)
         index = np.sort(np.asarray(self._tree.query_ball_point(p, ball), dtype=np.intp))
         n, X = self._normals[index], self._vertices[index] - p
         height = (n * X).sum(axis=1)
         lateral = np.linalg.norm(X - height[:, None] * n, axis=1)
-        facing = n @ self._normals[nearest] > 0  # not the far side of something thin
+        facing = n @ self._normals[nearest] > 0  # excludes the far side of a thin body
         keep = (lateral < radius + self._margin) & facing
         return Near(p, max(self._margin, float(distance) - ball), radius, index[keep], n[keep], X[keep])
 
 
 REFERENCE_K_W = 1.7e5
 REFERENCE_E = 1.0e4
-"""A half-space of 10 kPa is the tissue of k_w = 1.7e5 N/m^3 (`palpate validate`: Hertz and this foundation agree at 10 mm)."""
+"""A half-space of 10 kPa corresponds to k_w = 1.7e5 N/m^3 (`palpate validate`: Hertz and the foundation agree at 10 mm)."""
 REFERENCE_RADIUS_M = 0.012
 """Contact radius at 10 mm depth, about sqrt(R d) for indenters of 15 mm."""
 POISSON = 0.49
 
 
 def shear_stiffness(k_w: float) -> float:
-    """Tangential contact stiffness [N/m] of tissue of foundation modulus `k_w` [N/m^3].
+    """Return the tangential contact stiffness [N/m] of tissue with foundation modulus `k_w` [N/m^3].
 
     8 a G / (2 - nu) of a sticking contact of radius a on a half-space (Mindlin 1949; Johnson, Contact Mechanics, section 7.2).
     """
@@ -83,34 +93,34 @@ def shear_stiffness(k_w: float) -> float:
 
 
 class Bristle(NamedTuple):
-    """The skin under the indenter, as friction sees it."""
+    """Friction state of the skin under the indenter."""
 
     coefficient: float
-    """mu."""
+    """mu [1]."""
     stiffness: float
     """k [N/m]."""
     stretch: Array
-    """s [m], shape (3,): how far the skin is sheared. Changed in place."""
+    """s: shear of the skin [m], shape (3,). Changed in place."""
 
     def release(self) -> None:
-        """Contact is lost: the skin springs back."""
+        """Resets the shear after contact is lost."""
         self.stretch[:] = 0.0
 
     def energy(self) -> float:
-        """What the sheared skin stores [J]."""
+        """Return the elastic energy of the shear [J]."""
         return 0.5 * self.stiffness * float(self.stretch @ self.stretch)
 
 
 def skin(coefficient: float, background: Array) -> Bristle:
-    """Unsheared skin over a wall of foundation moduli `background` [N/m^3], shape (n,)."""
+    """Return unsheared skin over a wall of foundation moduli `background` [N/m^3], shape (n,)."""
     return Bristle(float(coefficient), shear_stiffness(float(np.median(background))), np.zeros(3))
 
 
 class Sphere(NamedTuple):
-    """The indenter, in the abdomen frame A."""
+    """The indenter in the abdomen frame A."""
 
     p: Vector
-    """Its centre [m]."""
+    """Centre [m]."""
     v: Vector
     """Velocity of the centre [m/s]."""
     w: Vector
@@ -120,21 +130,22 @@ class Sphere(NamedTuple):
 
 
 class Push(NamedTuple):
-    """What holding the skin on the frictionless sphere takes."""
+    """Resultant of the frictionless contact forces."""
 
     force: Vector
     """On the sphere [N]."""
     normal: Vector
-    """Sum of the vertices' contact forces times their outward normals [N]."""
+    """Sum of contact forces times outward vertex normals [N]."""
     arm: Vector
-    """Centre of the contact forces from the sphere's centre [m]."""
+    """Centre of the contact forces relative to the sphere's centre [m]."""
 
 
 @compiled
 def shear(bristle: Bristle, velocity: Vector, normal: Vector, load: float, h: float) -> Vector:
-    """Friction force on the indenter [N] after `h` [s].
+    """Return the friction force on the indenter [N] after `h` [s].
 
-    `velocity` [m/s] is of the indenter's surface against the tissue, `normal` of unit length, `load` the normal force [N].
+    `velocity` [m/s] is that of the indenter's surface relative to the tissue, `normal` a unit vector, `load` the normal force
+    [N].
     """
     s = add((bristle.stretch[0], bristle.stretch[1], bristle.stretch[2]), scale(h, velocity))
     s = subtract(s, scale(dot(s, normal), normal))
@@ -148,10 +159,10 @@ def shear(bristle: Bristle, velocity: Vector, normal: Vector, load: float, h: fl
 
 
 @compiled
-def rub(bristle: Bristle, sphere: Sphere, push: Push, h: float, wrench: Array) -> None:
-    """Adds friction to a push: `wrench` (6,) gets force [N] and torque about the centre [N m] on the sphere after `h` [s].
+def add_friction(bristle: Bristle, sphere: Sphere, push: Push, h: float, wrench: Array) -> None:
+    """Set `wrench` (6,) to force [N] and torque about the centre [N m] on the sphere after `h` [s]: push plus friction.
 
-    Friction acts in the mean tangent plane, at the centre of the contact forces, against the sphere's surface there.
+    Friction acts in the mean tangent plane at the centre of the contact forces, against the motion of the sphere's surface there.
     """
     load = norm(push.normal)
     friction = shear(bristle, velocity_at(sphere.v, sphere.w, push.arm), divide(push.normal, load), load, h)

@@ -1,7 +1,7 @@
-"""A patient who moves on the table: any tissue service, carried along by the body.
+"""A patient who moves on the table: wraps any tissue service and transforms its messages.
 
-The tissue goes on as if the body lay still, in a world W' that the body takes with it: X_WW' = X_WA X_AA' X_AW. What the tissue
-reads is brought from W to W', what it sends from W' to W.
+The tissue simulates a body at rest in a world W' that moves with the body: X_WW' = X_WA X_AA' X_AW. Inputs are transformed from W
+to W', outputs from W' to W.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ TOOL = "sim/tool_state"
 
 
 def carried(tissue: Service, scenario: Scenario) -> Service:
-    """The tissue of a scenario, on the body that moves as the scenario says. Where it never does, the tissue itself."""
+    """Return the tissue on the moving body of a scenario; the tissue itself if the body never moves."""
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     return MovingBody(tissue, motion, matrix(true_pose(scenario))) if motion.moves else tissue
 
@@ -38,16 +38,15 @@ class MovingBody(Service):
     role: ClassVar[str] = "tissue"
 
     def __init__(self, tissue: Service, motion: BodyMotion, X_WA: Array) -> None:
-        """`X_WA`, shape (4, 4): the true pose of the body before it moves, which `tissue` takes it to keep."""
+        """`X_WA`, shape (4, 4): true pose of the body before the motion, which `tissue` uses throughout."""
         self._tissue = tissue
         self._motion = motion
         self._X_WA, self._X_AW = X_WA, inverse(X_WA)
         self._X_WV = np.eye(4)
-        """V stands for W', the world as the body takes it along."""
+        """V stands for W', the world that moves with the body."""
         self._v_A, self._w_A = np.zeros(3), np.zeros(3)
-        """The body's twist: see `BodyMotion.twist`."""
-        self._known_s = -np.inf
-        """The time [s] to which these belong."""
+        """Twist of the body, see `BodyMotion.twist`."""
+        self._evaluated_s = -np.inf
         self._sent: Mapping[str, Callable[[Any], Message]] = {
             "sim/contact_wrench": self._wrench,
             "sim/surface": self._surface,
@@ -56,38 +55,38 @@ class MovingBody(Service):
         }
 
     def start(self) -> Outbox:
-        """What the tissue says of itself: its pose is the one before the motion."""
+        """Publishes the tissue's latched topics, with the pose before the motion."""
         return self._tissue.start()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """One millisecond of tissue."""
+        """Advances the tissue by one period."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """The tissue's parts."""
+        """Same as `step`, in the tissue's order."""
         t_s = t / NS
         if t_s <= self._motion.at_s:
             yield from self._tissue.parts(t, inbox)
             return
-        if self._known_s < self._motion.until_s:
+        if self._evaluated_s < self._motion.until_s:
             self._X_WV = self._X_WA @ self._motion.pose(t_s) @ self._X_AW
             self._v_A, self._w_A = self._motion.twist(t_s)
-            self._known_s = t_s
-        for part in self._tissue.parts(t, _AlongInbox(inbox, self._seen_from_body)):
+            self._evaluated_s = t_s
+        for part in self._tissue.parts(t, _ConvertedInbox(inbox, self._seen_from_body)):
             yield {topic: self._sent[topic](message) if topic in self._sent else message for topic, message in part.items()}
 
     def finish(self) -> Mapping[str, Any]:
-        """The tissue's facts, and when the body moved and where its origin went."""
+        """Return the tissue's facts, the time of the motion, and the displacement of the body's origin."""
         moved_m = self._X_WV[:3, :3] @ self._X_WA[:3, 3] + self._X_WV[:3, 3] - self._X_WA[:3, 3]
         return {**self._tissue.finish(), "moved_at_s": round(self._motion.at_s, 3), "moved_m": moved_m.round(4).tolist()}
 
     def _seen_from_body(self, message: Any) -> Message:
-        """A tool state in W as one in V: its velocity there is that against the body."""
+        """Transform a tool state from W to V, with the velocity relative to the body."""
         X_WI, V_WI_W = pose_matrix(message.pose), twist(message.twist)
         X_VW = inverse(self._X_WV)
         X_VI = X_VW @ X_WI
         p_AI = self._X_AW[:3, :3] @ X_WI[:3, 3] + self._X_AW[:3, 3]
-        V_A = np.stack((self._v_A + np.cross(self._w_A, p_AI), self._w_A))  # of the body's point at the indenter's centre
+        V_A = np.stack((self._v_A + np.cross(self._w_A, p_AI), self._w_A))  # of the body point at the indenter's centre
         V_VI = (V_WI_W.reshape(2, 3) - V_A @ self._X_WA[:3, :3].T) @ X_VW[:3, :3].T
         pose = pose_message(X_VI[:3, :3], X_VI[:3, 3])
         return ToolState(message.header, pose, twist_message(V_VI.ravel()), message.radius)
@@ -109,8 +108,8 @@ class MovingBody(Service):
         return replace(message, pose=pose_message(X_WA[:3, :3], X_WA[:3, 3]))
 
 
-class _AlongInbox:
-    """An inbox whose tool states are changed as they are read."""
+class _ConvertedInbox:
+    """Inbox that transforms tool states on access."""
 
     def __init__(self, inbox: Inbox, change: Callable[[Message], Message]) -> None:
         self._inbox, self._change = inbox, change
@@ -131,5 +130,5 @@ class _AlongInbox:
 
 
 def _turned(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
-    """Triples one after the other, shape (3 n,), turned by R and moved by p [m]."""
+    """Return n points or vectors, flat, shape (3 n,), rotated by R and translated by p [m]."""
     return np.asarray(values.reshape(-1, 3) @ R.T + p, dtype=np.float32).ravel()

@@ -1,6 +1,6 @@
-"""The tissue service: the indenter's pose in, the wrench on it and the deformed surface out, at 1 kHz.
+"""Tissue service: tool state in; contact wrench, deformed surface and ground truth out, at 1 kHz.
 
-The physics is behind `TissueBackend`; here messages become arrays in the patient's true frame, and the truth is published.
+The physics is behind `TissueBackend`. This module converts messages to arrays in the patient's true frame.
 """
 
 from __future__ import annotations
@@ -27,19 +27,18 @@ from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
 
-MADE_UP = 200
-"""So many steps are made up at once, of those that were missed by the wall clock."""
+MOST_MISSED_STEPS = 200
+"""Largest number of missed steps that one tick makes up for, in wall-clock mode."""
 
 
 class TissueService(Service):
-    """The soft abdomen. Before the first tool state it exerts nothing; between two it holds the newest."""
+    """The soft abdomen. The wrench is zero before the first tool state; between two the newest is used."""
 
     role: ClassVar[str] = "tissue"
 
     def __init__(self, backend: TissueBackend, truth: PhantomModel, pose: Pose, facts: Mapping[str, Any]) -> None:
-        """A tissue whose true stiffness is that of `truth`, at its true pose in world; `facts` are for log and report."""
+        """Takes the physics, the true phantom and its true pose in world; `facts` go to log and report."""
         self.backend = backend
-        """The physics."""
         self._truth = truth
         self._facts = {"vertices": len(truth.vertices), **facts}
         topics = contract().topics
@@ -55,23 +54,23 @@ class TissueService(Service):
         self._p_WA = self._X_WA[:3, 3].copy()
         self._lies = pose_message(self._R_WA, self._p_WA)
         self._transposed_X_AW = np.ascontiguousarray(inverse(self._X_WA)[:3].T)
-        """Shape (4, 3): takes rows of homogeneous coordinates in world, of points (1) and vectors (0), to rows in A."""
+        """Maps rows of homogeneous world coordinates, points (1) and vectors (0), to rows in A; shape (4, 3)."""
         self._vertices_W = np.ascontiguousarray(apply(self._X_WA, truth.vertices).T)
         self._normals_W = self._R_WA @ truth.normals.T
-        """At rest, shape (3, n): with the long axis last numpy is several times faster."""
+        """At rest, shape (3, n): numpy is several times faster with the long axis last."""
         self._triangles = truth.triangles.astype(np.uint32).ravel()
         self._period = contract().roles[self.role].period
         self._t: int | None = None
-        """The tick before [ns]; None before the first tool state."""
+        """Previous tick [ns]; None before the first tool state."""
         self._p_A: Array = np.zeros(3)
-        """The indenter's centre then [m]."""
+        """Indenter centre at that tick [m]."""
         self._peak_n = self._recent_peak_n = 0.0
         self._contact_steps = 0
         self._onsets = 0
         self._touching = False
 
     def start(self) -> Outbox:
-        """The truth about the phantom, latched; logs the facts."""
+        """Publishes the latched ground truth of the phantom; logs the facts."""
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
         surface = SurfaceMesh(
@@ -81,11 +80,11 @@ class TissueService(Service):
         return {"truth/phantom": message}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """One millisecond of tissue."""
+        """Advances the tissue by one period."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
-        """The same: first the wrench, for which the robot waits."""
+        """Same as `step`; the wrench comes first because the robot waits for it."""
         tool = inbox.latest("sim/tool_state")
         F_W = self._wrench(t, tool)
         yield {"sim/contact_wrench": WrenchStamped(header(t, "world"), wrench_message(F_W))}
@@ -102,7 +101,7 @@ class TissueService(Service):
             yield outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Facts about the body and the contact."""
+        """Return facts about the body and the contact."""
         return {
             **self._facts,
             "peak_force_n": round(max(self._peak_n, self._recent_peak_n), 4),
@@ -111,7 +110,7 @@ class TissueService(Service):
         }
 
     def _wrench(self, t: int, tool: Message | None) -> Array:
-        """Steps the tissue to `t` [ns]; force [N] and torque [N m] on the indenter, about its centre, world axes, shape (6,)."""
+        """Steps the tissue to `t` [ns]; returns force [N] and torque [N m] on the indenter about its centre, world axes, (6,)."""
         if tool is None:
             self.backend.idle(t / NS)
             self._t = None
@@ -119,7 +118,7 @@ class TissueService(Service):
         p, v, w = tool.pose.position, tool.twist.linear, tool.twist.angular
         motion_W = np.array((p.x, p.y, p.z, 1.0, v.x, v.y, v.z, 0.0, w.x, w.y, w.z, 0.0)).reshape(3, 4)
         p_A, v_A, w_A = motion_W.dot(self._transposed_X_AW)  # `dot` takes a third of the time of `@`
-        for at, place in self._way(t, nanoseconds(tool.header.stamp), p_A):
+        for at, place in self._path(t, nanoseconds(tool.header.stamp), p_A):
             F_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
             self._t, self._p_A = at, place
         if not self.backend.touching:
@@ -127,20 +126,20 @@ class TissueService(Service):
         F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
         return F_W
 
-    def _way(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:
-        """Times [ns] and places [m] of the steps up to `t` [ns], given where the tool was at `stamp`; one if nothing is late.
+    def _path(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:
+        """Return times [ns] and positions [m] of the steps up to `t` [ns], given the tool at `stamp`; one if nothing is late.
 
-        By the wall clock a process that was kept from its core hears where the tool is by now. In one step it would be there at
-        once, and the tissue's dashpots would push with what no tool does.
+        In wall-clock mode a process that was not scheduled receives a tool that has moved on. One step to that position would be
+        a jump, and the dashpots would push with an unreal force.
         """
         if self._t is None or (t - self._t <= self._period and stamp <= t):
             return ((t, p_A),)
         end = self._p_A + (p_A - self._p_A) * ((t - self._t) / max(stamp - self._t, t - self._t))
-        steps = min(max((t - self._t) // self._period, 1), MADE_UP)
+        steps = min(max((t - self._t) // self._period, 1), MOST_MISSED_STEPS)
         return [(self._t + (t - self._t) * k // steps, self._p_A + (end - self._p_A) * (k / steps)) for k in range(1, steps + 1)]
 
     def _count(self, F_W: Array) -> None:
-        """Counts the step and the force on the indenter."""
+        """Updates contact counts and the peak force."""
         touching = self.backend.touching
         if touching:
             self._contact_steps += 1
@@ -156,7 +155,7 @@ class TissueService(Service):
         return SurfaceMesh(header(t, "world"), _flat(vertices_W), _flat(normals_W), self._triangles, np.empty(0, np.float32))
 
     def _indentation(self, t: int, tool: Message | None, f_W: Array) -> Message:
-        """Where the indenter is against the rest surface, and the force on it along the normal there and across."""
+        """Return depth of the indenter below the rest surface, and the normal and tangential force on it."""
         if tool is None:
             return IndentationTruth(header(t, "world"), self._out_of_reach, 0.0, 0.0, 0.0, 0, Point(0.0, 0.0, 0.0), 0.0)
         under = self._surface.nearest(self._p_A, self.backend.excursion(t / NS))
@@ -175,6 +174,6 @@ class TissueService(Service):
 
 
 def _flat(vectors: Array) -> NDArray[np.float32]:
-    """The columns of an array of shape (3, n) one after the other, shape (3 n,)."""
+    """Return the columns of an array of shape (3, n), concatenated, shape (3 n,)."""
     x, y, z = vectors.astype(np.float32)
     return np.stack((x, y, z), axis=1).ravel()

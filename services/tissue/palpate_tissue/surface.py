@@ -1,4 +1,4 @@
-"""Geometry of the surface: the rest point under the indenter, and the normals of the deformed mesh."""
+"""Surface geometry: the rest point under the indenter, and the normals of the deformed mesh."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from palpate_models.numerics.vectors import Vector, add, dot, row, scale, subtra
 from palpate_models.patient.phantom import PhantomModel
 
 _FAR_M = 0.15
-"""Further away than this, the nearest vertex stands for the nearest point."""
+"""Distance beyond which the nearest vertex replaces the nearest point."""
 
 
 class RestPoint(NamedTuple):
-    """The point of the rest surface that is nearest to a point p, in A."""
+    """Point of the rest surface nearest to a point p, in A."""
 
     position: Array
     """[m], shape (3,)."""
@@ -39,12 +39,12 @@ class SkinSurface:
         self._normals = np.ascontiguousarray(model.normals.T)
         self._faces = _incident_faces(model)
         self._gradient = _gradient(model)
-        self.nearest(model.vertices[0].copy())  # compiles the search before it has a deadline
+        self.nearest(model.vertices[0].copy())  # compiles the search before the first deadline
 
     def nearest(self, p: Array, excursion: float = 0.0) -> RestPoint:
-        """The rest point nearest to `p` [m], shape (3,), at a breathing excursion [m].
+        """Return the rest point nearest to `p` [m], shape (3,), at a breathing excursion [m].
 
-        It is interpolated between the corners of the nearest triangle; far away it is the nearest vertex.
+        Interpolates between the corners of the nearest triangle; far away it uses the nearest vertex.
         """
         model = self._model
         distance, vertex = nearest_vertex(p, model.vertices)
@@ -63,7 +63,7 @@ class SkinSurface:
         return RestPoint(position, normal, float(height), float(weights @ model.stiffness[corner]))
 
     def normals(self, inward: Array) -> Array:
-        """Unit normals of the surface whose vertices have moved `inward` by (n,) [m] along their normals, shape (3, n).
+        """Return unit normals, shape (3, n), of the surface whose vertices have moved `inward` (n,) [m] along their normals.
 
         n + grad u, normalised. Exact for a plane, and otherwise to first order in u times curvature.
         """
@@ -74,11 +74,11 @@ class SkinSurface:
 
 @compiled
 def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
-    """Square distances [m^2] of `p` from k triangles, shape (k,), and the barycentric coordinates of the nearest points, (k, 3).
+    """Return square distances [m^2] of `p` from k triangles, shape (k,), and barycentric coordinates of the nearest points, (k,
+    3).
 
-    The nearest point a + v (b - a) + w (c - a) is p's projection on the plane where that lies inside, else that on a side.
-    `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows. Compiled: of so few numbers numpy makes two hundred
-    small arrays.
+    The nearest point a + v (b - a) + w (c - a) is the projection of p on the plane if it lies inside, else that on a side.
+    `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows. Compiled because numpy would create 200 small arrays.
     """
     squares, weights = np.full(len(corners), np.inf), np.empty((len(corners), 3))
     point = row(p.reshape(1, 3), 0)
@@ -101,12 +101,12 @@ def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
 
 @compiled
 def _share(offset: Vector, side: Vector) -> float:
-    """Where a point at `offset` [m] from the start of a `side` [m] projects on it, as a share of it from 0 to 1."""
+    """Return the projection of a point at `offset` [m] from the start of a `side` [m] as a fraction of the side, 0 to 1."""
     return min(max(dot(offset, side) / dot(side, side), 0.0), 1.0)
 
 
 def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:
-    """The triangles at each vertex."""
+    """Return the triangles at each vertex."""
     corner = model.triangles.ravel()
     order = np.argsort(corner, kind="stable")
     first = np.searchsorted(corner[order], np.arange(1, len(model.vertices)))
@@ -114,14 +114,14 @@ def _incident_faces(model: PhantomModel) -> list[NDArray[np.intp]]:
 
 
 def _gradient(model: PhantomModel) -> sparse.csr_array:
-    """Surface gradient [1/m] of a field at the vertices, area-weighted from triangles, shape (3 n, n): all x, all y, all z."""
+    """Return the surface gradient [1/m] of a vertex field, area-weighted from triangles, shape (3 n, n): all x, all y, all z."""
     m, n = len(model.triangles), len(model.vertices)
     sides = model.vertices[model.triangles[:, 1:]] - model.vertices[model.triangles[:, :1]]
-    flat = np.linalg.pinv(sides.transpose(0, 2, 1))  # an offset from the first corner to its barycentric coordinates, (m, 2, 3)
+    flat = np.linalg.pinv(sides.transpose(0, 2, 1))  # offset from the first corner to barycentric coordinates, (m, 2, 3)
     area = np.linalg.norm(np.cross(sides[:, 0], sides[:, 1]), axis=1)
     total = np.bincount(model.triangles.ravel(), np.repeat(area, 3), n)
     slopes = np.concatenate((-flat.sum(axis=1, keepdims=True), flat), axis=1)  # of the three hat functions, (m, 3, 3)
-    share = area[:, None] / total[model.triangles]  # (m, 3): a face's weight at each of its corners
+    share = area[:, None] / total[model.triangles]  # (m, 3): weight of a face at each corner
     values = share[:, :, None, None] * slopes[:, None, :, :]  # (m, at corner, of corner, axis)
     rows = np.broadcast_to(model.triangles[:, :, None], (m, 3, 3)).ravel()
     columns = np.broadcast_to(model.triangles[:, None, :], (m, 3, 3)).ravel()

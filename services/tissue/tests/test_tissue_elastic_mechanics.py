@@ -11,10 +11,11 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import nnls
 
+from palpate_errors import UserError
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import Compliance, LayerKernel, SizeError, compliance, layer_factor
+from palpate_tissue.backends.elastic.compliance import Compliance, LayerKernel, compliance, layer_factor
 from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_tissue.backends.elastic.solid import brick_stiffness, graded_grid, skin_compliance
@@ -261,7 +262,7 @@ def test_sliding_friction_is_coulombs() -> None:
 
 
 def test_too_many_vertices_are_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    with monkeypatch.context() as patch, pytest.raises(SizeError, match="edge_m"):
+    with monkeypatch.context() as patch, pytest.raises(UserError, match="edge_m"):
         patch.setattr("palpate_tissue.backends.elastic.compliance.MOST_VERTICES", 100)
         compliance(flat(), thickness_m=0.1)
     with pytest.raises(ValueError, match="thickness_m"):

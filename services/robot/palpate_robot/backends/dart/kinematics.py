@@ -1,13 +1,13 @@
-"""Where the links and the tool are, how fast the tool moves, and what the arm weighs, from the tables of `robot.lbr`.
+"""Link poses, tool motion and gravity torques from the tables of `robot.lbr`, compiled.
 
-With X_WL the pose of link i behind joint i, a its axis, r the way from the joint to what is behind it:
+With X_WL the pose of link i behind joint i, a its axis, r the vector from the joint to the point or mass behind it:
 
     R_WL = exp(a_W q) R_WP,    p_WL = p_WP + R_WP p_PL                      (poses along the chain)
     v = sum a_W qd x r,      w = sum a_W qd                                 (motion of the tool)
-    tau_g = a_W . (r x (0, 0, m g))                                         (torque that carries the mass m behind a joint)
+    tau_g = a_W . (r x (0, 0, m g))                                         (torque that supports the mass m behind a joint)
 
-DART knows all this, too, but through its Python binding an answer takes five times as long, and the poses of all links twenty
-times. `palpate_models.robot.kinematics` is the same in numpy; the tests hold one against the other.
+DART computes the same, but through its Python binding a call takes five times as long, and the poses of all links twenty times.
+`palpate_models.robot.kinematics` is the same in numpy; tests compare them.
 """
 
 from __future__ import annotations
@@ -25,33 +25,34 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 
 _LIFT_W: Final = (0.0, 0.0, GRAVITY)
-"""Against gravity [m/s^2]."""
+"""Minus the gravitational acceleration [m/s^2]."""
 _MOUNTS: Final[Array] = np.cumsum((lbr.LINK_7_TO_FLANGE_M, lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M))
 """Flange, F/T sensor and indenter along the last link's z axis [m], shape (3,)."""
 _TOOL_M: Final = float(_MOUNTS[-1])
 _X, _Y, _Z, _ORIGIN, _AXIS, _CENTRE, _MASS = 0, 3, 6, 9, 12, 15, 18
-"""Columns of a table of links: axes and origin of the link's frame, the axis of the joint before it, which is of unit length, the
-centre of its mass, and the mass [kg]. A chain, shape (8, 19), has the base, in world, and the seven links, each at q = 0 in the
-frame before it. It is one array, as each that is handed to compiled code costs a tenth of a microsecond."""
+"""Columns of a table of links: axes and origin of the link frame, unit axis of its joint, centre of mass, mass [kg]. A chain,
+shape
+(8, 19), holds the base in world and the seven links, each at q = 0 in the previous frame. One array, because each argument of a
+compiled function costs 0.1 us."""
 
 
 @compiled
 def _turned(a: Vector, axis: Vector, angle: float) -> Vector:
-    """`a` turned by exp([axis] angle): Rodrigues' formula; `axis` is of unit length."""
+    """Return `a` rotated by exp([axis] angle) with Rodrigues' formula; `axis` is of unit length."""
     c, s = cos(angle), sin(angle)
     return add(add(scale(c, a), scale(s, cross(axis, a))), scale((1.0 - c) * dot(axis, a), axis))
 
 
 @compiled
 def _in_world(links: Array, i: int, a: Vector) -> Vector:
-    """A vector in the axes of frame `i` of a table of links in world."""
+    """Return a vector given in axes of frame `i` of a table of links, in world axes."""
     along_xy = add(scale(a[0], row(links, i, _X)), scale(a[1], row(links, i, _Y)))
     return add(along_xy, scale(a[2], row(links, i, _Z)))
 
 
 @compiled
 def _placed(chain: Array, q: Array) -> Array:
-    """The links of a chain in world at joint positions `q`, shape (8, 19)."""
+    """Return the links of a chain in world at joint positions `q`, shape (8, 19)."""
     links = chain.copy()
     for i in range(1, len(links)):
         axis = _in_world(links, i - 1, row(chain, i, _AXIS))
@@ -64,7 +65,7 @@ def _placed(chain: Array, q: Array) -> Array:
 
 @compiled
 def _quaternion(links: Array, i: int) -> tuple[float, float, float, float]:
-    """Unit quaternion x, y, z, w of frame `i`, by one of its larger parts (Shepperd 1978, doi 10.2514/3.55767b)."""
+    """Return the unit quaternion x, y, z, w of frame `i` (Shepperd 1978, doi 10.2514/3.55767b)."""
     (xx, yx, zx), (xy, yy, zy), (xz, yz, zz) = row(links, i, _X), row(links, i, _Y), row(links, i, _Z)
     trace = xx + yy + zz
     largest = max(xx, yy, zz)
@@ -82,7 +83,7 @@ def _quaternion(links: Array, i: int) -> tuple[float, float, float, float]:
 
 @compiled
 def _state(chain: Array, q: Array, v: Array) -> Array:
-    """See `Kinematics.state`. From the last joint to the first, what is behind a joint grows by a link."""
+    """Return `Kinematics.state`. From the last joint to the first, the mass behind a joint grows by a link."""
     links, torque = _placed(chain, q), np.empty(7)
     p_WI = add(row(links, 7, _ORIGIN), scale(_TOOL_M, row(links, 7, _Z)))
     velocity = angular_velocity = moment = (0.0, 0.0, 0.0)
@@ -102,7 +103,7 @@ def _state(chain: Array, q: Array, v: Array) -> Array:
 
 @compiled
 def _links(chain: Array, mounts: Array, q: Array) -> Array:
-    """See `Kinematics.links`. What is fixed to the last link is `mounts` (3,) along its z axis [m]."""
+    """Return `Kinematics.links`. Flange, sensor and indenter are at `mounts` (3,) along the last link's z axis [m]."""
     links = _placed(chain, q)
     poses = np.empty((11, 7))
     for i in range(8):
@@ -116,9 +117,9 @@ class Kinematics:
     """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (7,)."""
 
     def __init__(self, robot: Robot, origin_m: Array | None = None) -> None:
-        """For an arm on its base, with its tool. Compiles, which takes seconds the first time.
+        """Takes the arm on its base with its tool. Compiles, which takes seconds the first time.
 
-        `origin_m`, shape (7, 3), is added to the nominal origin of each joint in the link before it.
+        `origin_m`, shape (7, 3), is added to the nominal origin of each joint in the previous link.
         """
         mass, centre = _masses(robot)
         yaw = robot.base_yaw_rad
@@ -135,23 +136,23 @@ class Kinematics:
         self.links(np.zeros(7))
 
     def state(self, q: Array, v: Array) -> Array:
-        """Motion of the indenter in world, and the joint torques that carry arm and tool, shape (20,).
+        """Return the indenter's motion in world and the gravity torques, shape (20,).
 
-        Position p_WI [m], orientation x, y, z, w, velocity of the sphere's centre [m/s], angular velocity [rad/s]; then the
-        torques [N m].
+        Position p_WI [m], orientation x, y, z, w, velocity of the sphere's centre [m/s], angular velocity [rad/s]; then the joint
+        torques that compensate gravity [N m].
         """
         state: Array = _state(self._chain, q, v)
         return state
 
     def links(self, q: Array) -> Array:
-        """Position [m] and orientation x, y, z, w in world of each link of `lbr.LINK_NAMES`, shape (11, 7)."""
+        """Return position [m] and orientation x, y, z, w in world of each link of `lbr.LINK_NAMES`, shape (11, 7)."""
         poses: Array = _links(self._chain, _MOUNTS, q)
         return poses
 
 
 def _masses(robot: Robot) -> tuple[Array, Array]:
-    """Mass [kg], shape (7,), and centre in the link [m], shape (7, 3), of each moving link with what is fixed to it."""
-    links = list(lbr.inertias(robot).values())[1:]  # the first does not move
+    """Return mass [kg], shape (7,), and centre in the link [m], shape (7, 3), of each moving link with its fixed parts."""
+    links = list(lbr.inertias(robot).values())[1:]  # without the base
     mass, centre = np.array([link.mass for link in links]), np.array([link.com for link in links])
     centre[7:, 2] += _MOUNTS
     moment = mass[:, None] * centre

@@ -1,4 +1,4 @@
-"""The arm as LBRState tells it: joint positions and velocities, and whether it takes commands. Arrays in, arrays out."""
+"""Joint state from a stream of LBRState, and whether the arm accepts commands. Arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -18,24 +18,23 @@ VELOCITY_LAG_S: Final = 0.004
 """Time constant of the low-pass on the differentiated position: LBRState carries no velocity. It keeps the encoder's steps
 (about 1e-5 rad) below 3 mrad/s at 500 Hz and costs the damping 4 ms."""
 STATE_AGE_NS: Final = contract().topics["joint_states"].max_age
-"""A state older than this [ns] counts as none."""
 CLOCK_SET_NS: Final = 1_000_000_000
-"""A stamp that is so much older than the newest [ns] is of a controller whose clock was set back; any other is a state that was
+"""A stamp older than the newest by this much means that the controller's clock was set back; otherwise the state was
 overtaken."""
 
 
 @dataclass(frozen=True, slots=True)
 class CarriedLoad:
-    """Pose-dependent quantities that the driver needs."""
+    """Gravity and sensor orientation at a posture."""
 
     gravity: Array
     """Gravity torques [N m], shape (7,)."""
     up_S: Array
-    """World's z axis in the F/T sensor's axes, shape (3,)."""
+    """World z axis in F/T sensor axes, shape (3,)."""
 
 
 class GravityModel:
-    """Gravity and the sensor's orientation."""
+    """Evaluates gravity torques and the sensor's orientation."""
 
     def __init__(self, robot: Robot) -> None:
         self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
@@ -43,7 +42,7 @@ class GravityModel:
         self._sensor = self._model.getFrameId("ft_sensor")
 
     def at(self, q: Array) -> CarriedLoad:
-        """At joint positions q [rad], shape (7,)."""
+        """Return both at joint positions q [rad], shape (7,)."""
         pin.forwardKinematics(self._model, self._data, q)
         rotation = pin.updateFramePlacement(self._model, self._data, self._sensor).rotation
         gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
@@ -51,7 +50,7 @@ class GravityModel:
 
 
 class Arm:
-    """Joint state out of a stream of LBRState."""
+    """Joint state from a stream of LBRState."""
 
     def __init__(self) -> None:
         self.q = np.zeros(lbr.HOME.shape)
@@ -59,20 +58,20 @@ class Arm:
         self.v = np.zeros(lbr.HOME.shape)
         """Velocities [rad/s], shape (7,), see `VELOCITY_LAG_S`."""
         self.session = SessionState.IDLE
-        self.heard: int | None = None
-        """When the newest state came [ns], None before the first."""
+        self.received: int | None = None
+        """Arrival of the newest state [ns], None before the first."""
         self._stamp: int | None = None
-        self._trouble = "no LBRState has come yet"
+        self._fault: str | None = "no LBRState received yet"
 
     def update(self, t: int, state: Any) -> bool:
-        """Takes a state that came at `t` [ns]; returns whether it is new and usable.
+        """Takes a state received at `t` [ns]; returns True if it is new and usable.
 
-        Where the controller's clock was set, velocities start anew from zero.
+        Velocities restart from zero after the controller's clock was set.
         """
         q = np.array(state.measured_joint_position)
         stamp = int(state.time_stamp_sec) * 1_000_000_000 + int(state.time_stamp_nano_sec)
         if not np.isfinite(q).all():
-            self._trouble = f"LBRState: measured_joint_position = {q}: must be finite"
+            self._fault = f"LBRState: measured_joint_position = {q}: must be finite"
             return False
         if self._stamp is not None and 0 <= self._stamp - stamp < CLOCK_SET_NS:
             return False
@@ -81,21 +80,21 @@ class Arm:
             self.v = self.v + dt / (VELOCITY_LAG_S + dt) * ((q - self.q) / dt - self.v)
         else:
             self.v = np.zeros(lbr.HOME.shape)
-        self.q, self._stamp, self.heard = q, stamp, t
+        self.q, self._stamp, self.received = q, stamp, t
         try:
-            self.session, self._trouble = SessionState(state.session_state), _trouble(state)
-        except ValueError as error:  # a value that FRI does not have
-            self.session, self._trouble = SessionState.IDLE, f"LBRState: {error}"
+            self.session, self._fault = SessionState(state.session_state), _fault(state)
+        except ValueError as error:  # not a value of FRI
+            self.session, self._fault = SessionState.IDLE, f"LBRState: {error}"
         return True
 
-    def trouble(self, t: int) -> str:
-        """Why the arm does not take commands now, in words; empty when it does."""
-        if self.heard is not None and t - self.heard > STATE_AGE_NS:
-            return f"no LBRState for {(t - self.heard) / 1e6:.0f} ms: the FRI session or the ROS side has ended"
-        return self._trouble
+    def fault(self, t: int) -> str | None:
+        """Return None if the arm accepts commands at `t` [ns], else a message that says why not."""
+        if self.received is not None and t - self.received > STATE_AGE_NS:
+            return f"no LBRState for {(t - self.received) / 1e6:.0f} ms: the FRI session or the ROS side has ended"
+        return self._fault
 
 
-def _trouble(state: Any) -> str:
+def _fault(state: Any) -> str | None:
     if state.safety_state != SafetyState.NORMAL_OPERATION:
         return f"the arm's safety state is {SafetyState(state.safety_state).name}"
     if state.session_state != SessionState.COMMANDING_ACTIVE:
@@ -105,4 +104,4 @@ def _trouble(state: Any) -> str:
     if state.client_command_mode != ClientCommandMode.TORQUE:
         mode = ClientCommandMode(state.client_command_mode).name
         return f"the client command mode is {mode}: set client_command_mode: torque in lbr_system_config.yaml"
-    return ""
+    return None

@@ -1,17 +1,22 @@
-"""The rules of KUKA's Fast Robot Interface and of the stack's command handling, as an emulator has to keep them. No transport.
+"""Emulates a KUKA LBR with lbr_fri_ros2_stack and an F/T sensor on the ROS graph.
 
-What is modelled, and where it stands in lbr_fri_ros2_stack (rolling) and in KUKA's FRI manual:
+    python -m palpate_robot.backends.lbr.emulator scenario.yaml --listen tcp/127.0.0.1:7447
+
+It publishes and accepts the stack's messages under rmw_zenoh's keys. Its physics is that of `palpate_robot`. For simulated tissue
+and camera it also exchanges exact poses and contact wrenches on topics under `emulator/`.
+
+`FriSession` keeps the rules of lbr_fri_ros2_stack (rolling) and of KUKA's FRI manual:
 
 - the send period is a whole number of milliseconds, 1 to 100;
-- the session goes IDLE, MONITORING_WAIT, MONITORING_READY, COMMANDING_WAIT, COMMANDING_ACTIVE, and leaves the last for good:
+- the session passes IDLE, MONITORING_WAIT, MONITORING_READY, COMMANDING_WAIT, COMMANDING_ACTIVE, and leaves the last for good:
   the stack then ends ("LBR left COMMANDING_ACTIVE", system_interface.cpp);
-- only in COMMANDING_ACTIVE are commands taken; the last one is kept for ever (lbr_torque_command_controller.cpp has no time-out);
+- commands are accepted only in COMMANDING_ACTIVE; the last one is kept for ever (lbr_torque_command_controller.cpp: no time-out);
 - a NaN in the command means "position as measured, no torque" (torque_command.cpp);
-- the command guard ends the session when the commanded position leaves the joint's limits or the measured speed is above the
-  joint's; it does not look at torques (command_guard.cpp: `is_valid_command`);
-- the joint position that reaches the arm is the old one plus `pid_p` times what is missing (filters.cpp, `JointPIDArray`);
-- the controller itself ends the session when overlay and gravity are above a joint's torque limit, or when the client does not
-  answer: connection quality falls from EXCELLENT to POOR, at which commanding ends.
+- the command guard ends the session when the commanded position leaves the joint limits or the measured speed exceeds the joint
+  limit; it does not check torques (command_guard.cpp: `is_valid_command`);
+- the joint position sent to the arm is the previous one plus `pid_p` times the difference (filters.cpp, `JointPIDArray`);
+- the controller ends the session when overlay plus gravity exceed a torque limit, or when the client does not answer: connection
+  quality falls from EXCELLENT to POOR, at which commanding ends.
 """
 
 from __future__ import annotations
@@ -43,13 +48,13 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import header
-from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.errors import draw_errors
-from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
+from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.lbr.port import (
@@ -72,42 +77,42 @@ from palpate_robot.sensors import FtSensor, JointSensor
 
 PERIODS_MS: Final = range(1, 101)
 MONITORING_S: Final = 0.2
-"""In each of the monitoring states [A]; on the arm it lasts until the Sunrise application goes on."""
+"""Time in each monitoring state [A]; on the arm it lasts until the Sunrise application continues."""
 SYNC_S: Final = 0.1
-"""In COMMANDING_WAIT [A]."""
+"""Time in COMMANDING_WAIT [A]."""
 QUALITY_WINDOW: Final = 100
-"""Answers over which connection quality is judged."""
+"""Answers over which connection quality is computed."""
 QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.GOOD), (0.30, ConnectionQuality.FAIR))
-"""Share of lost answers up to which the quality holds [A]; beyond it is POOR."""
+"""Largest fraction of lost answers per quality [A]; above the last it is POOR."""
 
 
 @dataclass(frozen=True, slots=True)
 class Drive:
-    """What the arm's controller applies in a cycle."""
+    """Position and overlay applied by the arm's controller in a cycle."""
 
     position: Array
-    """Commanded joint position [rad], shape (7,): the spring's other end where the controller has stiffness."""
+    """Commanded joint position [rad], shape (7,): set-point of the joint springs if the controller has stiffness."""
     torque: Array
     """Overlay [N m], shape (7,)."""
 
 
 class FriSession:
-    """One FRI session with the stack behind it."""
+    """One FRI session behind the stack."""
 
     def __init__(self, period_ms: int, q: Array, *, pid_p: float = 0.1, command_timeout_ms: int = 0) -> None:
-        """`command_timeout_ms`: a time-out on commands, as a site may add one; 0 for none, as in the stack.
+        """`command_timeout_ms`: optional time-out on commands; 0 for none, as in the stack.
 
-        Raises ValueError for a period that FRI does not have.
+        Raises UserError for a period outside FRI's range.
         """
         if period_ms not in PERIODS_MS:
-            raise ValueError(f"send period {period_ms} ms: FRI takes whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
+            raise UserError(f"send period {period_ms} ms: want whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
         self._dt = period_ms * 1e-3
         self._pid_p = pid_p
         self._timeout = command_timeout_ms * 1e-3
         self.state = SessionState.IDLE
         self.quality = ConnectionQuality.POOR
         self.ended = ""
-        """Why the session is over; empty while it is not."""
+        """Message on the end of the session; empty while it runs."""
         self._in_state = 0.0
         self._answers: deque[bool] = deque(maxlen=QUALITY_WINDOW)
         self._target = Drive(q.copy(), np.zeros(7))
@@ -125,13 +130,13 @@ class FriSession:
             self._enter(SessionState.IDLE)
 
     def take(self, position: Array, torque: Array) -> None:
-        """A command of the client: joint positions [rad], overlay [N m], shapes (7,). Passed over unless COMMANDING_ACTIVE."""
+        """Takes a command: joint positions [rad], overlay [N m], shapes (7,). Ignored unless COMMANDING_ACTIVE."""
         if self.state is SessionState.COMMANDING_ACTIVE:
             self._target = Drive(position, torque)
             self._since_command = 0.0
 
     def cycle(self, q: Array, gravity: Array, *, answered: bool = True) -> Drive:
-        """One send period at measured positions q [rad] and gravity torques [N m]; what the arm's controller applies."""
+        """Runs one send period at measured positions q [rad] and gravity torques [N m]; returns the applied drive."""
         self._in_state += self._dt
         self._answers.append(answered)
         lost = 1.0 - sum(self._answers) / len(self._answers)
@@ -173,9 +178,9 @@ class FriSession:
         self._q_before = q.copy()
         for i, joint in enumerate(lbr.JOINT_NAMES):
             if abs(self._position[i]) > lbr.POSITION_LIMIT[i]:
-                self.end(f"command guard: position of {joint} commanded to {self._position[i]:.3f} rad")
+                self.end(f"command guard: {joint} commanded to {self._position[i]:.3f} rad")
             elif speed[i] > lbr.VELOCITY_LIMIT[i]:
-                self.end(f"command guard: {joint} moves at {speed[i]:.2f} rad/s, limit {lbr.VELOCITY_LIMIT[i]:.2f} rad/s")
+                self.end(f"command guard: {joint} at {speed[i]:.2f} rad/s, limit {lbr.VELOCITY_LIMIT[i]:.2f} rad/s")
             elif abs(self._target.torque[i] + gravity[i]) > lbr.TORQUE_LIMIT[i]:
                 self.end(
                     f"controller: {joint} at {self._target.torque[i] + gravity[i]:.0f} N m, limit {lbr.TORQUE_LIMIT[i]:.0f} N m"
@@ -185,14 +190,14 @@ class FriSession:
 log = logging.getLogger("emulator")
 
 BRAKE: Final = np.full(7, 2000.0)
-"""Joint damping while nothing is commanded [N m s/rad]: the arm's own position control, then its brakes, hold it."""
+"""Joint damping without commands [N m s/rad]: the arm's position control and brakes hold it."""
 CONTACT_AGE_NS: Final = 200_000_000
-"""A contact wrench older than this is none: the tissue is gone."""
+"""Age above which a contact wrench is dropped: the tissue is lost."""
 
 
 @dataclass(frozen=True)
 class Options:
-    """How the emulated arm is set up; see `main`."""
+    """Options of the emulated arm; see `main`."""
 
     period_ms: int = 2
     stiffness_nm: float = 0.0
@@ -203,10 +208,10 @@ class Options:
 
 
 class Emulator:
-    """Physics and session; `cycle` once a send period. Time comes from outside."""
+    """Physics and session; call `cycle` once per send period. Time comes from the caller."""
 
     def __init__(self, known: PlantInput, options: Options) -> None:
-        """The arm of a scenario, with its errors."""
+        """Creates the arm of a scenario, with its errors."""
         drawn = draw_errors(known.errors, known.seed)
         self._options = options
         self._plant = DartPlant(known.robot, drawn=drawn.arm)
@@ -217,13 +222,13 @@ class Emulator:
         self.session = FriSession(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
         self._radius = known.robot.indenter_radius_m
         self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
-        """What the arm's load data get wrong [N m], constant."""
+        """Constant error of the arm's load data [N m]."""
         self._applied = Drive(self._joints.q.copy(), np.zeros(7))
         self.force_W, self.moment_W = np.zeros(3), np.zeros(3)
         self.measured: Array = self._joints.q.copy()
 
     def cycle(self, *, answered: bool = True) -> None:
-        """Moves the arm by one send period under the newest command."""
+        """Advances the arm by one send period under the newest command."""
         plant, joints, options = self._plant, self._joints, self._options
         self.measured, _ = joints.read()
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
@@ -237,7 +242,7 @@ class Emulator:
             joints.update(plant.q, plant.v, torque)
 
     def state(self, now: int) -> Any:
-        """LBRState at wall time `now` [ns]."""
+        """Return LBRState at wall time `now` [ns]."""
         session, drive = self.session, self._applied
         gravity = self._plant.gravity_torque()
         ipo = self.measured if session.state >= SessionState.COMMANDING_WAIT else np.full(7, np.nan)
@@ -263,18 +268,18 @@ class Emulator:
         )
 
     def wrench(self, now: int) -> Any:
-        """What the F/T sensor's driver publishes."""
+        """Return the F/T reading."""
         fx, fy, fz, mx, my, mz = self._ft.read(self._plant.sensor_wrench())
         return WrenchStamped(header(now, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
 
     def tool(self, now: int) -> Any:
-        """palpation_msgs/ToolState, exact."""
+        """Return the exact palpation_msgs/ToolState."""
         motion = self._plant.tool_motion().tolist()
         pose = Pose(Point(*motion[:3]), Quaternion(*motion[3:7]))
         return ToolState(header(now, "world"), pose, Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), self._radius)
 
     def links(self, now: int) -> Any:
-        """tf2_msgs/TFMessage of all links in world, exact."""
+        """Return the exact tf2_msgs/TFMessage of all links in world."""
         found = []
         for link, pose in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
             transform = Transform(Vector3(*pose[:3]), Quaternion(*pose[3:]))
@@ -283,19 +288,19 @@ class Emulator:
 
 
 class Metronome:
-    """When cycles are due and what they are stamped with. Time comes from outside.
+    """Due times and stamps of cycles. Time comes from the caller.
 
-    A real arm never hurries: a late cycle moves all that follow, and by its own clock one period passes in every cycle.
+    A real arm does not catch up: a late cycle delays all that follow, and its own clock advances one period per cycle.
     """
 
     def __init__(self, period: int, now: int, wall: int) -> None:
-        """The first cycle is one `period` [ns] after `now` [ns] of a steady clock, when the time of day is `wall` [ns]."""
+        """Puts the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns]."""
         self._period = period
         self._due = now + period
         self._stamp = wall
 
     def wait(self, now: int) -> int:
-        """How long it is until the next cycle [ns], 0 when it is due."""
+        """Return the time until the next cycle [ns], 0 when it is due."""
         return max(self._due - now, 0)
 
     def begin(self, now: int) -> int:
@@ -321,11 +326,11 @@ class Graph:
 
 
 def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool]) -> None:
-    """Cycles on the wall clock while `running[0]`; after the session's end the arm stands, and the stack says no more."""
+    """Runs cycles in wall-clock time while `running[0]`; after the session ends the arm stands and no state is published."""
     metronome = Metronome(options.period_ms * 1_000_000, monotonic_ns(), time_ns())
     contact_at = 0
     cycles = 0
-    said = ""
+    reported = ""
     while running[0]:
         sleep(metronome.wait(monotonic_ns()) / 1e9)
         now = monotonic_ns()
@@ -343,9 +348,9 @@ def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool
         emulator.cycle()
         if not emulator.session.ended:
             graph.state.publish(emulator.state(stamp))
-        elif said != emulator.session.ended:
-            said = emulator.session.ended
-            log.error("the session has ended: %s", said)
+        elif reported != emulator.session.ended:
+            reported = emulator.session.ended
+            log.error("the session has ended: %s", reported)
         graph.wrench.publish(emulator.wrench(stamp))
         graph.tool.publish(emulator.tool(stamp))
         if cycles % (50 // options.period_ms or 1) == 0:
@@ -356,12 +361,12 @@ def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool
 def main(arguments: list[str] | None = None) -> int:
     """Runs the emulator until a signal; returns the exit status."""
     parser = argparse.ArgumentParser(prog="python -m palpate_robot.backends.lbr.emulator", description=__doc__.partition("\n")[0])
-    parser.add_argument("scenario", nargs="?", default="clean", help="where the arm stands and what tool it has")
-    parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint, where rmw_zenohd would be")
+    parser.add_argument("scenario", nargs="?", default="clean", help="base placement and tool")
+    parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint that replaces rmw_zenohd")
     parser.add_argument("--domain", type=int, default=0, help="ROS domain")
     parser.add_argument("--period-ms", type=int, default=2, help="FRI send period")
-    parser.add_argument("--stiffness", type=float, default=0.0, help="of the joint impedance controller [N m/rad]")
-    parser.add_argument("--gravity-error", type=float, default=0.0, help="error of the load data, up to this a joint [N m]")
+    parser.add_argument("--stiffness", type=float, default=0.0, help="stiffness of the joint impedance controller [N m/rad]")
+    parser.add_argument("--gravity-error", type=float, default=0.0, help="largest error of the load data per joint [N m]")
     parser.add_argument(
         "--command-timeout-ms", type=int, default=0, help="end the session without commands; 0: never, as the stack"
     )
@@ -371,7 +376,7 @@ def main(arguments: list[str] | None = None) -> int:
     try:
         emulator = Emulator(plant_input(load_scenario(given.scenario)), options)
         node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
-    except (ScenarioError, BusConfigError, ValueError) as error:
+    except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2
     running = [True]
@@ -382,7 +387,7 @@ def main(arguments: list[str] | None = None) -> int:
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
-    gc.freeze()  # a controller cabinet takes no tenth of a second to collect garbage
+    gc.freeze()  # avoids garbage collections of 0.1 s
     try:
         serve(emulator, Graph(node, options), options, running)
     finally:

@@ -1,6 +1,7 @@
-"""The messages of `lbr_fri_idl` (branch fri-1, FRI 1.11 to 1.16) and the values of FRI's enumerations.
+"""Messages between the driver and the ROS side, and the port that exchanges them.
 
-Field names and types are those of the ROS package, so that type hash and CDR are the same.
+The messages are those of `lbr_fri_idl` (branch fri-1, FRI 1.11 to 1.16) with the values of FRI's enumerations. Field names and
+types are those of the ROS package, so that type hash and CDR are equal.
 """
 
 from __future__ import annotations
@@ -43,7 +44,7 @@ DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat6
 
 
 def register() -> None:
-    """Makes the messages known to the codec; further calls do nothing."""
+    """Registers the messages with the codec; further calls do nothing."""
     if STATE in codec.store.types:
         return
     types: dict[str, Any] = {}
@@ -110,42 +111,42 @@ CONTACT_TOPIC, TOOL_TOPIC, LINKS_TOPIC = "emulator/contact_wrench", "emulator/to
 
 
 class LbrPort(ABC):
-    """The driver's view of the arm."""
+    """The driver's connection to the arm."""
 
     @abstractmethod
     def states(self) -> list[Any]:
-        """LBRState since last time, oldest first."""
+        """Return LBRState messages since the last call, oldest first."""
 
     @abstractmethod
     def wrenches(self) -> list[Any]:
-        """WrenchStamped of the F/T sensor since last time, oldest first."""
+        """Return WrenchStamped messages of the F/T sensor since the last call, oldest first."""
 
     @abstractmethod
     def command(self, q: Array, torque: Array) -> None:
-        """Joint positions [rad] and torque overlay [N m], shapes (7,)."""
+        """Sends joint positions [rad] and torque overlay [N m], shapes (7,)."""
 
     @abstractmethod
     def rivals(self) -> list[bytes]:
-        """GIDs of others who commanded the arm since last time, oldest first."""
+        """Return the GIDs of other senders of commands since the last call, oldest first."""
 
     @abstractmethod
     def contact(self, wrench: Any) -> None:
-        """Emulated: the tissue's wrench on the indenter."""
+        """Emulated: sends the tissue's wrench on the indenter."""
 
     @abstractmethod
     def physics(self) -> tuple[Any | None, Any | None]:
-        """Emulated: new ToolState and link poses."""
+        """Emulated: return new ToolState and link poses."""
 
     @abstractmethod
     def close(self) -> None:
-        """Leaves the ROS side."""
+        """Disconnects from the ROS side."""
 
 
 class ZenohPort(LbrPort):
-    """Over zenoh, as rmw_zenoh does."""
+    """Connection over zenoh, with the keys of rmw_zenoh."""
 
     def __init__(self, connection: LbrConnection) -> None:
-        """Joins. Raises BusConfigError."""
+        """Connects. Raises BusConfigError."""
         name = connection.namespace.strip("/")
         self._node = RosNode("palpate_robot.backends.lbr", connection.domain, BusOptions(router=connection.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
@@ -158,29 +159,29 @@ class ZenohPort(LbrPort):
             self._links = self._node.subscription(LINKS_TOPIC, LINKS)
 
     def states(self) -> list[Any]:
-        """LBRState since last time, oldest first."""
+        """Return LBRState messages since the last call, oldest first."""
         return self._states.take()
 
     def wrenches(self) -> list[Any]:
-        """WrenchStamped since last time, oldest first."""
+        """Return WrenchStamped messages since the last call, oldest first."""
         return self._wrenches.take()
 
     def command(self, q: Array, torque: Array) -> None:
-        """The stack's torque controller wants a joint position as well; see docs/real-robot.md on its stiffness."""
+        """Sends both; the stack's torque controller also needs a joint position, see docs/real-robot.md on its stiffness."""
         self._command.publish(LBRTorqueCommand(q, torque))
 
     def rivals(self) -> list[bytes]:
-        """Everyone's commands come back, also this process's: those are left out."""
+        """Return the GIDs of other senders; this process's own commands are left out."""
         return self._commands.others(self._command.gid)
 
     def contact(self, wrench: Any) -> None:
-        """To the emulator."""
+        """Sends the tissue's wrench to the emulator."""
         self._contact.publish(wrench)
 
     def physics(self) -> tuple[Any | None, Any | None]:
-        """From the emulator."""
+        """Return new ToolState and link poses of the emulator."""
         return self._tool.newest(), self._links.newest()
 
     def close(self) -> None:
-        """Leaves the ROS side."""
+        """Disconnects from the ROS side."""
         self._node.close()

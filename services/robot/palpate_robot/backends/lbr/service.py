@@ -1,6 +1,7 @@
-"""The fast loop in the driver's process: whatever service plays control, stepped on every state of the arm.
+"""LBR service: LBRState and F/T readings in, torque overlay out, with the rules of `palpate_robot.driver`.
 
-Between a joint state and the torque that answers it there is then no transport and no other process's timer.
+At level `setpoint` the control service runs in this process and is stepped on every state (`InnerLoop`), so there is neither
+transport nor another timer between a joint state and its torque.
 """
 
 from __future__ import annotations
@@ -40,7 +41,7 @@ SETPOINT: Final = "planning/setpoint"
 
 
 class _Inbox:
-    """Control's inbox: joint states of `t` [ns] from here, the set-points since the state before, all else from the bus."""
+    """Inbox of control: joint states of `t` [ns] and the set-points since the previous state; all else from the bus."""
 
     def __init__(self, t: int, joints: Message, setpoints: list[Message], bus: Inbox) -> None:
         self._t, self._joints, self._bus = t, joints, bus
@@ -60,36 +61,35 @@ class _Inbox:
 
 
 class InnerLoop:
-    """Steps a service of role control."""
+    """Steps a service of role control inside the driver."""
 
     def __init__(self, control: Service) -> None:
         self._control = control
         self._setpoints: list[Message] = []
 
-    def listen(self, inbox: Inbox) -> None:
-        """Keeps the tick's set-points; call it on every tick."""
+    def collect(self, inbox: Inbox) -> None:
+        """Collects set-points; call it on every tick."""
         self._setpoints.extend(inbox.new(SETPOINT))
 
     def command(self, t: int, inbox: Inbox, joints: Message) -> Any | None:
-        """The torque command at `t` [ns] for these joint states."""
+        """Return the torque command at `t` [ns] for these joint states."""
         setpoints, self._setpoints = self._setpoints, []
         return self._control.step(t, _Inbox(t, joints, setpoints, inbox))["control/joint_torque"]
 
 
 def load_control(scenario: Scenario) -> Service:
-    """The control service that the scenario chooses. Raises PluginError when there is none."""
+    """Return the control service of the scenario. Raises PluginError if it does not exist."""
     return implementations.create("control", scenario.services.control, scenario)
 
 
 STATUS_PERIOD = contract().topics["robot/status"].period
 DAMPING = np.array([40.0, 40.0, 20.0, 20.0, 8.0, 8.0, 8.0])
-"""Most joint damping in a hold [N m s/rad] [A]: as an overlay it acts one to three cycles late on a filtered speed. Below the
-arm's own viscous friction (10) that is stable with any delay; more is for the joints with inertia for it."""
+"""Largest joint damping in a hold [N m s/rad] [A]. The overlay acts one to three cycles late on a filtered speed. Below the arm's
+viscous friction (10) it is stable with any delay; joints with enough inertia take more."""
 LINKS_PERIOD = contract().topics["sim/link_poses"].period
 FT_AGE_NS = contract().topics["ft/wrench"].max_age
-"""An F/T reading older than this [ns] counts as none."""
-TAKE_OVER = 100_000_000
-"""For so long after its first command [ns] the driver lets others finish: the watchdog commands until it hears a new driver."""
+TAKE_OVER_NS = 100_000_000
+"""Time after the first command in which commands of others are tolerated: the watchdog sends until it sees the new driver."""
 _NAMES = list(lbr.JOINT_NAMES)
 
 
@@ -98,10 +98,10 @@ class LbrService(Service):
 
     role: ClassVar[str] = "robot"
     catches_up: ClassVar[bool] = False
-    """The arm has moved on: a tick that was missed is never made up for."""
+    """A real arm has moved on: missed ticks are skipped."""
 
     def __init__(self, exam: ExamInput, port: LbrPort, inner: InnerLoop | None = None) -> None:
-        """`inner` is the loop that follows set-points in this process; without it `control/joint_torque` is obeyed."""
+        """`inner` follows set-points in this process; without it `control/joint_torque` is applied."""
         self._robot = exam.robot
         self._port = port
         self._inner = inner
@@ -130,30 +130,29 @@ class LbrService(Service):
         self._peak_torque = np.zeros(7)
 
     def start(self) -> Outbox:
-        """The robot's description."""
+        """Publishes the robot description."""
         return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """One tick: what the arm said, what the driver makes of it, what the arm is to do."""
+        """Runs one tick: arm state, driver, command to the arm."""
         outbox: dict[str, Message] = {}
-        fresh = self._listen(t)
-        self._stop_requests.obey(t, inbox)
+        fresh = self._receive(t)
+        self._stop_requests.apply(t, inbox)
         if self._inner is not None:
-            self._inner.listen(inbox)
-        if self._arm.heard is not None and t - self._arm.heard <= STATE_AGE_NS:
-            joints = JointState(header(self._arm.heard), _NAMES, self._arm.q, self._arm.v, self._applied.copy())
-            outbox["joint_states"] = (
-                joints  # on every tick, as readers count on it: between two states the newest, with its stamp
-            )
+            self._inner.collect(inbox)
+        if self._arm.received is not None and t - self._arm.received <= STATE_AGE_NS:
+            joints = JointState(header(self._arm.received), _NAMES, self._arm.q, self._arm.v, self._applied.copy())
+            outbox["joint_states"] = joints  # on every tick: between two states the newest, with its stamp
             if self._wrench_at is not None and t - self._wrench_at <= FT_AGE_NS:
                 outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
             if fresh:
                 self._drive(t, inbox, joints)
-        if self._arm.heard is not None:
-            self._judge_connection(t)
-            if self._driver.held and t - self._arm.heard > STATE_AGE_NS and self._applied.any():  # an old speed is a push
+        if self._arm.received is not None:
+            self._check_connection(t)
+            # Damping of an old speed would be a constant push. Zero torque is sent once; then the watchdog takes over.
+            if self._driver.held and t - self._arm.received > STATE_AGE_NS and self._applied.any():
                 self._applied = np.zeros(7)
-                self._port.command(self._arm.q, self._applied)  # once: then the watchdog hears nothing, and takes over
+                self._port.command(self._arm.q, self._applied)
         if not t % STATUS_PERIOD:
             outbox["robot/status"] = self._status(t)
         if self._emulated:
@@ -161,8 +160,8 @@ class LbrService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Safe holds, counts, and the largest force and torques; the arm is left damped and without overlay."""
-        if self._arm.heard is not None:
+        """Return safe holds, counts, and the largest force and torques; leaves the arm without overlay."""
+        if self._arm.received is not None:
             self._port.command(self._arm.q, np.zeros(7))
         driver = self._driver
         self._port.close()
@@ -177,11 +176,11 @@ class LbrService(Service):
             "level": "torque" if self._inner is None else "setpoint",
         }
 
-    def _listen(self, t: int) -> bool:
-        """Takes what the ROS side sent; returns whether the joint state is new."""
+    def _receive(self, t: int) -> bool:
+        """Takes messages of the ROS side; returns True if the joint state is new."""
         since = self._commanding_since
-        if self._port.rivals() and since is not None and t - since > TAKE_OVER:
-            self._driver.hold(t, HoldCause.DEVICE, "another process, likely the watchdog, commands the arm")
+        if self._port.rivals() and since is not None and t - since > TAKE_OVER_NS:
+            self._driver.hold(t, HoldCause.DEVICE, "another process (watchdog?) commands the arm")
         fresh = False
         for state in self._port.states():
             fresh = self._arm.update(t, state) or fresh
@@ -199,24 +198,23 @@ class LbrService(Service):
             self._summed += 1
         return fresh
 
-    def _judge_connection(self, t: int) -> str:
-        """Latches a hold when the arm was active and does not take commands any more; returns why it does not."""
-        trouble = self._arm.trouble(t)
-        if not trouble and (self._wrench_at is None or t - self._wrench_at > FT_AGE_NS):
-            trouble = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
-        if trouble and self._driver.mode is DriverMode.ACTIVE:
-            self._driver.hold(t, HoldCause.DEVICE, trouble)
-        return trouble
+    def _check_connection(self, t: int) -> bool:
+        """Return True if the arm accepts commands and the F/T sensor is alive; else an active driver holds."""
+        fault = self._arm.fault(t)
+        if fault is None and (self._wrench_at is None or t - self._wrench_at > FT_AGE_NS):
+            fault = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
+        if fault is not None and self._driver.mode is DriverMode.ACTIVE:
+            self._driver.hold(t, HoldCause.DEVICE, fault)
+        return fault is None
 
     def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
-        """Judges, and answers a state with a command."""
+        """Answers a new state with a command."""
         arm = self._arm
         tool = self._model.at(arm.q)
         weight = self._robot.tool_mass_kg * GRAVITY
         self._force = float(np.linalg.norm(self._wrench[:3] + weight * tool.up_S))
         self._peak_force = max(self._peak_force, self._force)
-        trouble = self._judge_connection(t)
-        command = None if trouble else self._newest_command(t, inbox, joints)
+        command = self._newest_command(t, inbox, joints) if self._check_connection(t) else None
         lost = inbox.lost("control") and self._inner is None
         torque = self._driver.update(t, arm.q, arm.v, tool.gravity, self._force, command, lost=lost)
         if self._driver.mode is not DriverMode.ACTIVE:
@@ -241,17 +239,17 @@ class LbrService(Service):
         if self._summed:
             self._means = self._sums / self._summed
             self._sums, self._summed = np.zeros(20), 0
-        elif self._arm.heard is not None:
-            measured = self._arm.heard  # nothing was measured since
+        elif self._arm.received is not None:
+            measured = self._arm.received  # no new measurement
         means = self._means
-        reason = driver.reason or self._arm.trouble(t)
+        reason = driver.reason or self._arm.fault(t) or ""
         return RobotStatus(
             header(measured), int(driver.mode), int(driver.cause), reason, means[:7], means[7:14], _wrench(means[14:]),
             self._applied.copy(), driver.rejected,
         )  # fmt: skip
 
     def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:
-        """Carries what no sensor knows between the emulator and the simulated tissue and camera."""
+        """Relays exact poses and contact wrenches between the emulator and the simulated tissue and camera."""
         for contact in inbox.new("sim/contact_wrench"):
             self._port.contact(contact)
         tool, links = self._port.physics()
@@ -269,9 +267,9 @@ def _wrench(values: Array) -> Message:
 
 
 def create(scenario: Scenario) -> LbrService:
-    """The driver of a scenario, of which it may know the exam input; it joins the ROS side that `robot.lbr` names."""
+    """Return the driver of a scenario, connected to the ROS side that `robot.lbr` names."""
     if Settings.read().runtime != "wallclock":
-        raise BusConfigError("services.robot = lbr drives hardware, which does not wait for simulated time: run with --wallclock")
+        raise BusConfigError("services.robot = lbr drives hardware and cannot run in simulated time: use --wallclock")
     exam = exam_input(scenario)
     inner = InnerLoop(load_control(scenario)) if exam.robot.lbr.level == "setpoint" else None
     return LbrService(exam, ZenohPort(exam.robot.lbr), inner)

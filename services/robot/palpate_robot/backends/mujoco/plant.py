@@ -1,7 +1,16 @@
-"""Our MuJoCo model of arm, tool, table and base, from the tables in `palpate_models.robot.lbr` that the URDF is written from.
+"""The robot's physics in MuJoCo: an independent plant behind the same driver, sensors and messages.
 
-MuJoCo's own URDF reader is not used: it merges links that are fixed to one another, and with them the F/T sensor's measuring
-face into link 7.
+Differences from the DART plant: the dynamics (composite rigid bodies in generalised coordinates instead of articulated bodies),
+the step (two of 0.5 ms per tick), end stops and contacts (soft constraints with an impedance, solved as a convex problem, instead
+of hard ones as an LCP), and the sensor (constraint wrench of the weld above the measuring face from a Newton-Euler pass).
+
+The friction law is the scenario's and therefore the same: viscous, with a slope f / max(|v|, v_stick) for Coulomb friction.
+MuJoCo's semi-implicit Euler method takes joint damping implicitly, (M + h D) a = M a_0, so neither can chatter. MuJoCo's
+`frictionloss` is not
+used: its solver weighs it with M instead of M + h D, as DART's does.
+
+The model is built from the tables in `palpate_models.robot.lbr`, as the URDF is. MuJoCo's URDF reader merges links that are fixed
+to one another, and with them the F/T sensor's measuring face into link 7.
 """
 
 from __future__ import annotations
@@ -21,14 +30,14 @@ from palpate_models.scenario.schema import Robot
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench
 
 SUBSTEPS: Final = 2
-"""Integration steps a millisecond: another step size than the DART plant's, so that what depends on it shows."""
+"""Integration steps per millisecond: different from the DART plant, so that effects of the step size show."""
 _ARM: Final = 1
 _ENVIRONMENT: Final = 2
-"""Collision groups: the arm's links meet table and base, not one another (planning keeps them apart)."""
+"""Collision groups: links collide with table and base, not with one another (planning avoids that)."""
 _STOP: Final = (2 * DT / SUBSTEPS, 1.0)
-"""Time constant [s] and damping ratio of end stops and contacts: as stiff as MuJoCo takes at this step."""
+"""Time constant [s] and damping ratio of end stops and contacts: the stiffest that MuJoCo allows at this step."""
 _IMPEDANCE: Final = (0.999, 0.999, 0.001, 0.5, 2.0)
-"""How much of the acceleration they take away. MuJoCo's default 0.95 lets 30 N m push A7, 5e-4 kg m^2, 50 mrad into its stop."""
+"""Fraction of the acceleration they remove. With MuJoCo's default 0.95, 30 N m push A7 (5e-4 kg m^2) 50 mrad into its stop."""
 _FIXED: Final = {
     "lbr_link_ee": (0.0, 0.0, lbr.LINK_7_TO_FLANGE_M),
     "ft_sensor": (0.0, 0.0, lbr.FLANGE_TO_FT_M),
@@ -37,7 +46,7 @@ _FIXED: Final = {
 
 
 def _quaternion(rotation: Array) -> Array:
-    """Unit quaternion (w, x, y, z) of a rotation matrix."""
+    """Return the unit quaternion (w, x, y, z) of a rotation matrix."""
     quaternion = np.zeros(4)
     mujoco.mju_mat2Quat(quaternion, np.ascontiguousarray(rotation).ravel())
     return quaternion
@@ -75,9 +84,9 @@ def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
 
 
 def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
-    """The compiled model of the nominal `robot` with an arm that differs from it as `drawn` says.
+    """Return the compiled model of the nominal `robot` with the arm errors `drawn`.
 
-    Bodies are named as in `lbr.LINK_NAMES`; it has seven joints, and force and torque sensors at the measuring face.
+    Bodies are named as in `lbr.LINK_NAMES`; force and torque sensors are at the measuring face.
     """
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
@@ -122,11 +131,12 @@ class MujocoPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
-        """The nominal `robot` with an arm that differs from it as `drawn` says, at rest at joint positions `q` [rad]."""
+        """Creates the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
         self._model = build(robot, drawn)
         self._data = mujoco.MjData(self._model)
         data = self._data
-        self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc  # views, for life: to ask MuJoCo for one costs 1 us
+        # Permanent views: each access through MuJoCo costs 1 us.
+        self._qpos, self._qvel, self._qacc = data.qpos, data.qvel, data.qacc
         self._joint_torque, self._joint_damping = data.qfrc_applied, self._model.dof_damping
         self._force_W = data.xfrc_applied[self._model.body("indenter").id, :3]
         self._moment_W = data.xfrc_applied[self._model.body("indenter").id, 3:]
@@ -135,8 +145,8 @@ class MujocoPlant:
         self._base, self._indenter = self._bodies[0], self._bodies[-1]
         self._weight = GRAVITY * float(self._model.body_subtreemass[self._base])
         self._tool = self._model.body("ft_sensor").id
-        self._forgotten = GRAVITY * robot.tool_mass_kg * (drawn.tool_mass - 1)
-        """Weight of the tool [N] that is not in the controller's load data."""
+        self._uncompensated = GRAVITY * robot.tool_mass_kg * (drawn.tool_mass - 1)
+        """Tool weight missing from the controller's load data [N]."""
         self._viscous = robot.joint_damping_nms * drawn.damping
         self._coulomb = robot.joint_friction_nm * drawn.friction
         self._jacobian = np.zeros((3, 7))
@@ -175,7 +185,7 @@ class MujocoPlant:
             self._joint_damping[:] = viscous + self._coulomb / np.maximum(np.abs(before), STICK_RADPS)
             mujoco.mj_fwdVelocity(model, data)
             mujoco.mj_step2(model, data)
-            # MuJoCo's sensors see the acceleration before damping is taken implicitly; the arm moved with the one after.
+            # MuJoCo's sensors use the acceleration before implicit damping; the arm moved with the one after it.
             np.multiply(v - before, SUBSTEPS / DT, out=self._qacc)
             mujoco.mj_rnePostConstraint(model, data)
             mujoco.mj_sensorAcc(model, data)
@@ -185,25 +195,25 @@ class MujocoPlant:
         self.q, self.v = self._qpos.copy(), v.copy()
 
     def gravity_torque(self) -> Array:
-        """Joint torques that carry the arm's and the nominal tool's weight here [N m], shape (7,).
+        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (7,).
 
-        The weight times how much the centre of mass of it all rises with each joint.
+        The weight times the derivative of the centre of mass's height by each joint.
         """
         mujoco.mj_jacSubtreeCom(self._model, self._data, self._jacobian, self._base)
         torque = np.asarray(self._weight * self._jacobian[2])
-        if self._forgotten:
+        if self._uncompensated:
             mujoco.mj_jacSubtreeCom(self._model, self._data, self._jacobian, self._tool)
-            torque -= self._forgotten * self._jacobian[2]
+            torque -= self._uncompensated * self._jacobian[2]
         return torque
 
     def kinetic_energy(self) -> float:
-        """[J]."""
+        """Return the kinetic energy [J]."""
         product = np.zeros(7)
         mujoco.mj_mulM(self._model, self._data, product, self.v)
         return float(self.v @ product / 2)
 
     def sensor_wrench(self) -> Wrench:
-        """Wrench that what is below the F/T sensor exerts on it: force [N], then moment [N m].
+        """Return the wrench on the F/T sensor from the tool below it: force [N], then moment [N m].
 
         At the sensor's origin, in its axes, in the last half millisecond: contact, weight and inertia of the tool. MuJoCo's
         force and torque sensors read the wrench of the parent on the child.
@@ -212,7 +222,7 @@ class MujocoPlant:
         return -fx, -fy, -fz, -mx, -my, -mz
 
     def tool_motion(self) -> Array:
-        """The indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
+        """Return the indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
@@ -222,10 +232,10 @@ class MujocoPlant:
         return np.concatenate((self._xpos[body], quaternion[1:], quaternion[:1], twist[3:], twist[:3]))
 
     def link_poses(self) -> Array:
-        """Poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Return the poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
         quaternions = self._xquat[self._bodies]  # w first
         return np.column_stack((self._xpos[self._bodies], quaternions[:, 1:], quaternions[:, :1]))
 
     def contacts(self) -> int:
-        """Number of contact points with table or base in the last step."""
+        """Return the number of contact points with table or base in the last step."""
         return self._contacts

@@ -1,4 +1,4 @@
-"""The robot on the bus with MuJoCo behind it; driver, sensor and messages are common to all simulated arms."""
+"""Robot service with MuJoCo physics."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ from palpate_robot.service import RobotService
 
 
 def create(scenario: Scenario) -> RobotService:
-    """The robot of a scenario, of which it may know the equipment."""
+    """Return the robot of a scenario; it uses the plant input only."""
     return RobotService(plant_input(scenario), MujocoPlant)

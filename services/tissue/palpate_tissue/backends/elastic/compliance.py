@@ -1,4 +1,14 @@
-"""What a normal force on the skin of a uniform layer does to the skin: the layer's surface Green's function."""
+"""Skin compliance of a phantom: normal displacement of each free vertex per normal force on each other vertex.
+
+It starts from the Green's function of a uniform layer, exact at any distance. Then the modulus is changed, from uniform to that
+of the healthy body, and by one lesion after another. Each change E -> E' turns S into
+
+    S' = D S D + P M (F' - D F D) M' P'
+
+D scales by the modulus at the skin, (E / E')^(1/2), which is exact for near points. The remainder, from modulus changes along and
+below the skin, comes from finite elements: F and F' are their compliances before and after on one coarse grid, whose local errors
+cancel in the difference; P M interpolates them to the vertices.
+"""
 
 from __future__ import annotations
 
@@ -15,6 +25,7 @@ from scipy.interpolate import CubicSpline, LinearNDInterpolator, NearestNDInterp
 from scipy.spatial.distance import cdist
 from scipy.special import j0
 
+from palpate_errors import UserError
 from palpate_models.numerics.cache import content_key, remembered
 from palpate_models.numerics.frames import Array
 from palpate_models.patient import field
@@ -27,33 +38,33 @@ from palpate_tissue.backends.elastic.solid import NodeGrid, graded_grid, skin_co
 from palpate_tissue.contact import REFERENCE_E, REFERENCE_K_W
 
 SELF_WEIGHT = 3.92
-"""Displacement that a vertex's own pressure adds, over its force / sqrt(area): what makes the sum of 1/r over a lattice equal the
-integral (a corrected trapezoidal rule; Marin, Runborg and Tornberg 2014). Regularised lattice sums (Epstein zeta at 1/2) give
-3.900 on a square lattice and 3.921 on a hexagonal one, so it hardly depends on the mesh."""
+"""Displacement from a vertex's own pressure, over force / sqrt(area), for which the sum of 1/r over a lattice equals the integral
+(corrected trapezoidal rule; Marin, Runborg and Tornberg 2014). Regularised lattice sums (Epstein zeta at 1/2) give 3.900 on a
+square and 3.921 on a hexagonal lattice, so it hardly depends on the mesh."""
 
 _FARTHEST = 12.0
-"""Distance over thickness up to which the layer's function is tabulated; beyond, a layer's skin is at rest."""
+"""Largest tabulated distance over thickness; beyond it the skin of a layer is at rest."""
 
 
 def layer_factor(wave: Array, poisson: float) -> Array:
-    """Compliance of a layer bonded to a rigid base over that of the half-space, for pressure of wave number k = wave / H.
+    """Return the compliance of a layer bonded to a rigid base relative to the half-space, at wave number k = wave / H.
 
     L(u) = (2 c sinh 2u - 4u) / (2 c cosh 2u + 4u^2 + 1 + c^2), c = 3 - 4 nu (Vorovich, Alexandrov and Babeshko 1974;
     Johnson, Contact Mechanics, section 5.8). 1 for short waves, u (1 - 2 nu) / (2 (1 - nu)^2), uniaxial strain, for long ones.
     """
     c = 3 - 4 * poisson
-    fade = np.exp(-2 * wave)  # numerator and denominator are divided by exp(2 u) / 2, which overflows
+    fade = np.exp(-2 * wave)  # numerator and denominator are divided by exp(2 u) / 2 to avoid overflow
     above = 2 * c * (1 - fade**2) - 8 * wave * fade
     below = 2 * c * (1 + fade**2) + 2 * (4 * wave**2 + 1 + c * c) * fade
     return np.asarray(above / below)
 
 
 class LayerKernel:
-    """Normal displacement of the skin by a normal force on it.
+    """Normal displacement of the skin per normal force on it.
 
     u(r) = (1 - nu^2) / (pi E) F k(r),  k(r) = 1/r - g(r/H)/H,  g(s) = int_0^inf (1 - L(u)) J0(u s) du.
 
-    The first term is Boussinesq's half-space, the second the base at depth H below; `thickness_m` = inf leaves it out.
+    The first term is Boussinesq's half-space, the second the base at depth H; `thickness_m` = inf omits it.
     """
 
     def __init__(self, poisson: float = 0.49, thickness_m: float = math.inf) -> None:
@@ -66,16 +77,16 @@ class LayerKernel:
         self._base = _base_term(poisson) if math.isfinite(thickness_m) else None
 
     def factor(self, young_pa: float) -> float:
-        """(1 - nu^2) / (pi E) [1/Pa]."""
+        """Return (1 - nu^2) / (pi E) [1/Pa]."""
         return (1 - self.poisson**2) / (math.pi * young_pa)
 
     def __call__(self, distance: Array) -> Array:
-        """k(r) [1/m] at distances r > 0 [m], any shape."""
+        """Return k(r) [1/m] at distances r > 0 [m], any shape."""
         near = 1 / distance
         return near if self._base is None else near - self._by_base(distance)
 
     def at_own_place(self, area: Array) -> Array:
-        """K at a vertex's own place [1/m], for vertices of `area` [m^2], same shape."""
+        """Return k of a vertex on itself [1/m], for vertices of `area` [m^2], same shape."""
         own = SELF_WEIGHT / np.sqrt(area)
         return own if self._base is None else own - self._by_base(np.zeros_like(area))
 
@@ -83,12 +94,12 @@ class LayerKernel:
         assert self._base is not None
         s = distance / self.thickness_m
         inside = s < _FARTHEST
-        # Far out, the base takes away all of the half-space's displacement.
+        # Far away the base cancels the half-space's displacement.
         return np.where(inside, self._base(np.minimum(s, _FARTHEST)), 1 / np.maximum(s, 1.0)) / self.thickness_m
 
 
 def _base_term(poisson: float) -> CubicSpline:
-    """g(s) for 0 <= s <= _FARTHEST."""
+    """Return g(s) for 0 <= s <= _FARTHEST."""
     wave = np.linspace(0, 20, 8001)
     short = 1 - layer_factor(wave, poisson)
     at = np.concatenate((np.linspace(0, 4, 161), np.linspace(4, _FARTHEST, 121)[1:]))
@@ -96,14 +107,14 @@ def _base_term(poisson: float) -> CubicSpline:
 
 
 YOUNG_OVER_K_W = REFERENCE_E / REFERENCE_K_W
-"""Young's modulus over foundation modulus of a wall that is equally stiff at 10 mm depth [m]."""
+"""Young's modulus over the foundation modulus of an equally stiff wall at 10 mm depth [m]."""
 
 
 class ModulusField:
     """Instantaneous Young's modulus [Pa] at (x, y) of A and depth below the skin.
 
-    The healthy modulus does not change with depth. A lesion with a depth is an ellipsoid whose upper side is there; one
-    without is a column from the skin through the whole body, which is what the surface tier's lesions are.
+    The healthy modulus is constant over depth. A lesion with a depth is an ellipsoid whose top is at that depth; one without is a
+    column through the whole body, as in the Winkler backend.
     """
 
     def __init__(self, model: PhantomModel, lesions: Sequence[Lesion] = ()) -> None:
@@ -117,7 +128,7 @@ class ModulusField:
         self._xy = model.vertices[:, :2]
 
     def healthy(self, xy: Array) -> Array:
-        """Without lesions, at (p, 2) [m]; beyond the front, that of its nearest vertex; shape (p,)."""
+        """Return the modulus without lesions at (p, 2) [m], shape (p,); beyond the front, that of the nearest vertex."""
         value = np.asarray(self._inside(xy))
         gap = np.isnan(value)
         if gap.any():
@@ -125,21 +136,21 @@ class ModulusField:
         return np.asarray(np.exp(value))
 
     def __call__(self, points: Array) -> Array:
-        """At points (x, y, depth) [m], shape (p, 3); shape (p,)."""
-        # Points lie in columns, so the interpolation is done once a column.
+        """Return the modulus at points (x, y, depth) [m], shape (p, 3); shape (p,)."""
+        # Points are in columns, so interpolation is done once per column.
         columns, of_point = np.unique(points[:, :2], axis=0, return_inverse=True)
         return np.asarray(self.healthy(columns)[of_point.ravel()] * lesion_factor(points, self._lesions))
 
     def at_skin(self) -> Array:
-        """At the vertices of the skin, shape (n,)."""
+        """Return the modulus at the skin vertices, shape (n,)."""
         at = np.column_stack((self._xy, np.zeros(len(self._xy))))
         return np.asarray(self._skin * np.where(self._front, lesion_factor(at, self._lesions), 1.0))
 
 
 def lesion_factor(points: Array, lesions: Sequence[Lesion]) -> Array:
-    """Modulus with lesions over modulus without at points (x, y, depth) [m], shape (p, 3); shape (p,).
+    """Return the modulus with lesions over that without at points (x, y, depth) [m], shape (p, 3); shape (p,).
 
-    As on the surface, the contrast rises over `edge_m` centred on the outline, and of overlapping lesions the stronger counts.
+    The contrast rises over `edge_m` centred on the outline; of overlapping lesions the stronger counts.
     """
     factor = np.ones(len(points))
     for lesion in lesions:
@@ -153,7 +164,9 @@ def lesion_factor(points: Array, lesions: Sequence[Lesion]) -> Array:
 
 
 def _ellipsoid_distance(points: Array, lesion: Lesion) -> Array:
-    """Distance [m] from the ellipsoid, to first order, negative inside. Vertical half axis: the smaller of the other two."""
+    """Return the first-order distance [m] from the ellipsoid, negative inside. Vertical half axis: the smaller of the other
+    two.
+    """
     assert lesion.depth_m is not None
     vertical = min(lesion.radii_m)
     radii = np.array((*lesion.radii_m, vertical))
@@ -166,31 +179,27 @@ def _ellipsoid_distance(points: Array, lesion: Lesion) -> Array:
 Array32 = NDArray[np.float32]
 
 PITCH_M = 0.0125
-"""Edge of the finite elements of the healthy body [m]; those of a lesion near the skin are finer."""
+"""Edge of the finite elements of the healthy body; those of a lesion near the skin are finer."""
 GRID_HALF_M = 0.13
-"""They are even over at most this half width and length: 0.1 m of region, and a margin."""
+"""Largest half width of the uniform part of the grid: 0.1 m of region plus a margin."""
 POISSON = 0.49
 MOST_VERTICES = 20_000
 """The matrix of this many vertices takes 1.6 GB."""
 
 _CODE = tuple(Path(file) for file in (__file__, solid.__file__, field.__file__, contact.__file__))
-"""On which the matrices depend."""
-
-
-class SizeError(ValueError):
-    """A mesh for which this method's dense matrix is too large."""
+"""Source files that the cached matrices depend on."""
 
 
 @dataclass(frozen=True)
 class Compliance:
-    """What the step needs to know of an elastic solid."""
+    """Compliance of an elastic solid on its free vertices."""
 
     matrix: Array32
     """S [m/N] on the free vertices, shape (f, f), symmetric and positive definite."""
     free: NDArray[np.intp]
-    """Which vertices those are, ascending, shape (f,)."""
+    """Free vertices, ascending, shape (f,)."""
     young: Array
-    """Instantaneous Young's modulus of the solid there [Pa], shape (f,)."""
+    """Instantaneous Young's modulus at these vertices [Pa], shape (f,)."""
 
 
 def compliance(
@@ -200,16 +209,22 @@ def compliance(
     poisson: float = POISSON,
     pitch_m: float = PITCH_M,
 ) -> Compliance:
-    """The skin compliance of a phantom, from the cache or computed (tens of seconds; well under one when it is uniform).
+    """Return the skin compliance of a phantom, cached or computed (tens of seconds; well under one second if uniform).
 
-    `lesions` replace those in the phantom's own stiffness; `thickness_m` is that of the layer on its rigid base, by default the
-    height of the phantom, and infinite for a half-space, which has to be uniform. `pitch_m` is that of the finite elements.
-    Raises SizeError.
+    Args:
+        model: the phantom.
+        lesions: replace those in the phantom's stiffness.
+        thickness_m: layer on a rigid base, by default the height of the phantom; infinite for a half-space, which must be
+        uniform.
+        poisson: Poisson's ratio.
+        pitch_m: edge of the finite elements.
+
+    Raises UserError for a mesh that is too large.
     """
     free = np.flatnonzero(~model.fixed)
     if len(free) > MOST_VERTICES:
-        raise SizeError(
-            f"services.tissue = elastic: {len(free)} free vertices, at most {MOST_VERTICES} are possible: use a coarser mesh "
+        raise UserError(
+            f"services.tissue = elastic: {len(free)} free vertices, at most {MOST_VERTICES} possible: use a coarser mesh "
             "(phantom.edge_m), or services.tissue = winkler"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
@@ -226,18 +241,18 @@ class _Body:
     pitch: float
 
     def matrix(self, lesions: tuple[Lesion, ...]) -> Array32:
-        """S with these lesions, shape (f, f)."""
+        """Return S with these lesions, shape (f, f)."""
         model = self.model
         if not lesions and np.ptp(model.background) <= 1e-9 * model.background.mean():
             return self.layer().astype(np.float32)
         if not math.isfinite(self.thickness):
-            raise ValueError("a half-space has to be uniform: give the layer a finite thickness_m")
+            raise UserError("a half-space must be uniform: use a finite thickness_m")
         arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
         key = content_key("compliance", _CODE, *arrays, lesions, self.thickness, self.poisson, self.pitch)
         return remembered(key, lambda: self._changed(lesions))
 
     def _changed(self, lesions: tuple[Lesion, ...]) -> Array32:
-        """S with the last of the lesions, from S without it; or of the healthy body, from the uniform layer's."""
+        """Return S with the last lesion from S without it, or S of the healthy body from that of the uniform layer."""
         after = ModulusField(self.model, lesions)
         young = after.at_skin()[self.free]
         if lesions:
@@ -265,11 +280,11 @@ class _Body:
         return base.astype(np.float32)
 
     def uniform(self) -> float:
-        """Young's modulus [Pa] of the uniform layer to begin with."""
+        """Return Young's modulus of the initial uniform layer [Pa]."""
         return YOUNG_OVER_K_W * float(np.median(self.model.background))
 
     def layer(self) -> Array:
-        """S of the uniform layer, shape (f, f)."""
+        """Return S of the uniform layer, shape (f, f)."""
         layer = LayerKernel(self.poisson, self.thickness)
         vertices = self.model.vertices[self.free]
         matrix = cdist(vertices, vertices)
@@ -280,7 +295,7 @@ class _Body:
         return matrix
 
     def _front(self) -> Array:
-        """Half width and length of the body's front, and not more than what is examined [m], shape (2,)."""
+        """Return half width and length of the body's front, at most GRID_HALF_M [m], shape (2,)."""
         front = self.model.vertices[self.model.normals[:, 2] > 0.5, :2]
         return np.asarray(np.minimum(np.abs(front).max(axis=0), GRID_HALF_M))
 
@@ -289,7 +304,7 @@ class _Body:
         return graded_grid(-half, half, self.thickness, self.pitch)
 
     def _grid_about(self, lesion: Lesion) -> NodeGrid:
-        """The shallower a lesion begins, the finer are the elements that show it, and the nearer fades what it does."""
+        """Return a grid about a lesion: finer for shallow lesions, whose effect also decays faster."""
         depth = lesion.depth_m or 0.0
         half = self._front()
         centre = np.clip(np.asarray(lesion.centre_m), -half, half)
@@ -300,10 +315,10 @@ class _Body:
 
 
 def _smoothing(nx: int, ny: int) -> sparse.csr_array:
-    """M: weights (-1, 4, 10, 4, -1) / 16 along x and y, shape (nx ny, nx ny).
+    """Return M: weights (-1, 4, 10, 4, -1) / 16 along x and y, shape (nx ny, nx ny).
 
-    Nodal forces on trilinear elements excite a displacement of alternating sign (nothing finer can answer them). These weights
-    are blind to it, and leave cubic polynomials as they are.
+    Nodal forces on trilinear elements excite a displacement of alternating sign at the grid scale. These weights remove it and
+    preserve cubic polynomials.
     """
 
     def along(n: int) -> sparse.csr_array:
@@ -314,9 +329,10 @@ def _smoothing(nx: int, ny: int) -> sparse.csr_array:
 
 
 def _interpolation(grid: NodeGrid, vertices: Array, normals: Array) -> sparse.csr_array:
-    """P: bilinear weights of the skin's nodes at vertices (f, 3), shape (f, k); fades away at the grid's rim and the flanks.
+    """Return P: bilinear weights of the skin nodes at vertices (f, 3), shape (f, k), fading at the rim of the grid and the
+    flanks.
 
-    Vertices lie over the grid by their x and y. Symmetric use, P (.) P', keeps the matrix positive definite wherever P fades.
+    Vertices map to the grid by x and y. The symmetric use P (.) P' keeps the matrix positive definite where P fades.
     """
     x, y = grid.skin
     pitch = x[1] - x[0]

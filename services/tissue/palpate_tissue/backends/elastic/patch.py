@@ -1,4 +1,4 @@
-"""Unilateral contact of an elastic solid: the forces that keep its skin out of a rigid body."""
+"""The vertices near the sphere: unilateral contact, nonlinear springs, and their step."""
 
 from __future__ import annotations
 
@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
+from palpate_errors import RunError
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.patient import wall
@@ -17,20 +18,16 @@ from palpate_tissue.contact import RIM, Near, Push
 Mask = NDArray[np.bool_]
 
 _GUESSES = 25
-"""Rounds of the quick rule; then the rule that always ends takes over."""
+"""Rounds of the fast rule before the rule that always terminates."""
 _MOST = 20_000
 
 
-class ContactError(RuntimeError):
-    """The contact problem was not solved: the compliance is not positive definite."""
-
-
 class ContactSolver:
-    """Finds f with  A f - b >= 0,  f >= 0,  f (A f - b) = 0  for a positive definite A, beginning with the last contact set.
+    """Solves  A f - b >= 0,  f >= 0,  f (A f - b) = 0  for a positive definite A, starting from the last contact set.
 
-    A contact set is guessed, its forces solved for, and the set corrected where a force pulls or a gap is closed (primal-dual
-    active set; Hintermueller, Ito and Kunisch 2002). If that does not settle, vertices are corrected one at a time, the
-    least first, which ends for every positive definite A (Murty 1974).
+    The forces of a guessed contact set are solved for, and the set is corrected where a force pulls or a gap is violated
+    (primal-dual active set; Hintermueller, Ito and Kunisch 2002). If that does not converge, vertices are corrected one at a
+    time, lowest index first, which terminates for every positive definite A (Murty 1974).
     """
 
     def __init__(self, matrix: Array) -> None:
@@ -43,12 +40,12 @@ class ContactSolver:
         self._columns = np.empty((len(matrix), 0))
 
     def begin_with(self, active: Mask) -> None:
-        """Another contact set to begin with, shape (m,)."""
+        """Sets the initial contact set, shape (m,)."""
         if not np.array_equal(active, self.active):
             self._choose(active)
 
     def solve(self, b: Array) -> tuple[Array, Array]:
-        """Forces f and A f for a right-hand side, each of shape (m,)."""
+        """Return forces f and A f for a right-hand side, shapes (m,). Raises RunError if A is not positive definite."""
         force = np.zeros(len(b))
         if not self.active.any() and (b <= 0).all():
             return force, np.zeros(len(b))
@@ -70,7 +67,7 @@ class ContactSolver:
                 one = np.zeros_like(wrong)
                 one[int(wrong.argmax())] = True
                 self._choose(self.active ^ one)
-        raise ContactError(f"no contact set in {_MOST} rounds on {len(b)} vertices")
+        raise RunError(f"elastic tissue: no contact set in {_MOST} rounds on {len(b)} vertices")
 
     def _choose(self, active: Mask) -> None:
         self.active = active
@@ -80,56 +77,57 @@ class ContactSolver:
             try:
                 factor = cho_factor(self._columns.take(self._index, axis=0), lower=True, check_finite=False)
             except LinAlgError as error:
-                raise ContactError(
-                    "the compliance is not positive definite: the mesh has vertices much nearer to each other than its triangles "
-                    "are wide; remesh it evenly, or services.tissue = winkler"
+                raise RunError(
+                    "elastic tissue: the compliance is not positive definite because mesh vertices are much closer together than "
+                    "their triangles are wide: remesh it evenly, or use services.tissue = winkler"
                 ) from error
             self._inverse = cho_solve(factor, np.eye(len(self._index)), check_finite=False)
 
 
 MUSCLE = 1.06
-"""A muscle's tension over the one that the foundation has (`palpate_models.patient.tension`): the solid spreads the load wider,
-so that the press that defines the ratio of guarding would feel 3 % less. With it that press feels it within 2 %."""
+"""Factor on muscle tension relative to the foundation (`palpate_models.patient.tension`): the solid spreads the load wider, so
+the
+press that defines the guarding ratio would measure 3 % less. With it the ratio is met within 2 %."""
 
 
 @dataclass(frozen=True)
 class VertexSprings:
-    """Elastic springs in parallel with the solid, one a vertex, m of them.
+    """Elastic springs in parallel with the solid, one per vertex, m of them.
 
     q(u) = k_w A [sigma(u) + tension a max(u, 0)]
     """
 
     gain: Array
-    """k_w A [N/m], shape (m,): k_w is what the solid's modulus at the skin makes of it."""
+    """k_w A [N/m], shape (m,), with k_w from the solid's modulus at the skin."""
     stiffening: Array
     """[1/m], shape (m,)."""
     tension: Array
     """[1], shape (m,)."""
 
     def at(self, index: NDArray[np.intp]) -> VertexSprings:
-        """Those of some of the vertices."""
+        """Return the springs of some of the vertices."""
         return VertexSprings(self.gain[index], self.stiffening[index], self.tension[index])
 
     def table(self) -> Array:
-        """What `resistance` takes of them, shape (m, 3)."""
+        """Return the table used by `resistance`, shape (m, 3)."""
         bent = wall.straight_from(self.stiffening)
         return np.column_stack((self.gain * self.stiffening**2, bent, self.gain * self.tension))
 
     def steepest(self, deepest: float) -> Array:
-        """The largest q' [N/m] at any displacement up to `deepest` [m] and any activation, shape (m,)."""
+        """Return the largest q' [N/m] at any displacement up to `deepest` [m] and any activation, shape (m,)."""
         return self.gain * (wall.slope(np.full(len(self.gain), deepest), self.stiffening) + self.tension)
 
     def energy(self, u: Array, activation: float) -> float:
-        """What they store [J]."""
+        """Return the stored energy [J]."""
         pressed = np.maximum(u, 0.0)
         return float(self.gain @ (wall.stored(u, self.stiffening) + 0.5 * activation * self.tension * pressed**2))
 
 
 @compiled
 def resistance(table: Array, u: Array, activation: float) -> Array:
-    """The springs' force q [N], outward, at displacements `u` [m] with muscle contracted by `activation`, shape (m,).
+    """Return the spring force q [N], outward, at displacements `u` [m] and muscle contraction `activation`, shape (m,).
 
-    `table` (m, 3) is `Springs.table`; the stiffening part is `palpate_models.patient.wall.stress`.
+    `table` (m, 3) is `VertexSprings.table`; the stiffening part is `palpate_models.patient.wall.stress`.
     """
     q = np.zeros(len(u))
     for i in range(len(u)):
@@ -141,25 +139,24 @@ def resistance(table: Array, u: Array, activation: float) -> Array:
 
 
 _NOWHERE_M = -1.0
-"""Where a vertex is held that is not under the sphere."""
+"""Displacement bound of a vertex that is not under the sphere."""
 
 
 class ElasticPatch:
-    """Vertices that the sphere might hold while its centre stays near a place; m of them."""
+    """The m vertices that the sphere can hold while its centre stays near a place."""
 
     def __init__(self, near: Near, breathing: Array, state: Array, compliance: Array) -> None:
-        """`breathing` (m,) is their share of the excursion, `compliance` (m, m) displacement by force in a step [m/N]."""
+        """`breathing` (m,): fraction of the excursion; `compliance` (m, m): displacement per force in a step [m/N]."""
         self.near = near
         self.state = state
         """u and y_k of these vertices [m], shape (branches + 1, m)."""
         self.impulse = np.zeros_like(state)
-        """What the forces since the beginning left behind, shape (branches + 1, m) [N]: S times it is displacement."""
+        """Accumulated effect of the forces so far [N], shape (branches + 1, m): S times it is displacement."""
         self.force = np.zeros(len(near.vertex))
         """Contact forces f after the step, along the inward normals [N], shape (m,)."""
         self.vertex = near.vertex
-        """Which vertices these are, shape (m,)."""
         self.within: NDArray[np.intp] = np.arange(len(near.vertex))
-        """Where among them are those that the sphere might hold."""
+        """Positions in `vertex` of those that the sphere can hold."""
         self.deepest = math.inf
         """Displacement [m] up to which the step is passive."""
         self.solver = ContactSolver(compliance)
@@ -169,10 +166,10 @@ class ElasticPatch:
         self._q = self._s = self._c = np.empty(0)
 
     def hold(self, p: Array, excursion: float) -> Array:
-        """Displacement w [m] at which the sphere with its centre at `p` holds each vertex, shape (m,).
+        """Return the displacement w [m] at which the sphere with its centre at `p` holds each vertex, shape (m,).
 
-        A vertex X of outward normal n moves along it; with d = p - X and s = -d.n it meets the sphere's lower side at
-        w = s + c, c^2 = R^2 - |d|^2 + s^2. Breathing lifts the skin by its share of the `excursion` [m].
+        A vertex X with outward normal n moves along it. With d = p - X and s = -d.n it meets the sphere's lower side at w = s +
+        c, c^2 = R^2 - |d|^2 + s^2. Breathing lifts the skin by its fraction of the `excursion` [m].
         """
         n, X, R = self.near.n, self.near.X, self.near.radius
         self._q = q = np.subtract(p, self.near.origin)  # so that d = q - X
@@ -185,27 +182,29 @@ class ElasticPatch:
         return w
 
     def step(self, w: Array, advance: Array, feed: Array, activation: float) -> bool:
-        """One step of the vertices, held out of the sphere: (u, y)+ = M (u, y) + b (S f). Whether the sphere touches any."""
+        """Steps the vertices, (u, y)+ = M (u, y) + b (S f), held by the sphere; returns True if it touches any."""
         free = advance @ self.state
         self.force, moved = self.solver.solve(w - free[0])
         self._finish(advance, feed, free, moved, self.force)
         return bool(self.force.any())
 
     def _finish(self, advance: Array, feed: Array, free: Array, moved: Array, load: Array) -> None:
-        """The state after `free` [m] (branches + 1, m), by what a `load` [N] has `moved` the vertices [m], each (m,)."""
+        """Sets the state from the `free` motion [m], shape (branches + 1, m), and the motion `moved` [m] by a `load` [N],
+        (m,).
+        """
         self.state = free + (feed / feed[0])[:, None] * moved
         self.impulse = advance @ self.impulse + feed[:, None] * load
 
     def spring_energy(self, activation: float) -> float:
-        """What springs beside the solid store [J]: there are none."""
+        """Return the energy of nonlinear springs [J], 0 here."""
         return 0.0
 
     def push(self) -> Push:
-        """What holding the vertices takes.
+        """Return the resultant of the contact forces.
 
-        The frictionless sphere pushes along its own normals, f (n + (d + s n) / c): f is the part along the skin's normal,
-        and the tissue's guidance bears the rest. As f holds the vertex exactly on the sphere, tool and field exchange the
-        same work.
+        The frictionless sphere pushes along its own normals, f (n + (d + s n) / c): f is the component along the skin's normal,
+        and the guidance of the vertex takes the rest. Since f holds the vertex exactly on the sphere, tool and field exchange
+        equal work.
         """
         f, n, X, q, s, c = self.force, self.near.n, self.near.X, self._q, self._s, self._c
         load, g = f.sum(), f / c
@@ -216,7 +215,7 @@ class ElasticPatch:
 
 
 class SprungPatch(ElasticPatch):
-    """The same with springs, on these k vertices and on those beside them; m in all.
+    """A patch with nonlinear springs on the k contact vertices and on those around them, m in all.
 
     (u, y)+ = M (u, y) + b S (f - q),    q = q(u) + d (u+ - u),  d = max q': at the end of the step, as the solid is.
     """
@@ -231,7 +230,7 @@ class SprungPatch(ElasticPatch):
         springs: VertexSprings,
         deepest: float,
     ) -> None:
-        """`breathing` is of the k, the others of all `vertex` (m,). `deepest` [m] is how far they may be displaced."""
+        """`breathing` is of the k, the others of all `vertex` (m,); `deepest`: largest displacement [m]."""
         self._lag = lag = springs.steepest(deepest)
         softened = np.linalg.solve(np.eye(len(lag)) + compliance * lag, compliance)
         self._softened: Array = 0.5 * (softened + softened.T)
@@ -245,7 +244,7 @@ class SprungPatch(ElasticPatch):
         """See `ElasticPatch`."""
         free = advance @ self.state
         u, d = self.state[0], self._lag
-        opposing = resistance(self._table, u, activation) + d * (free[0] - u)  # q if nothing but M moved the vertices
+        opposing = resistance(self._table, u, activation) + d * (free[0] - u)  # q for the free motion
         yielded = self._softened @ opposing
         self.force, _ = self.solver.solve(w - (free[0] - yielded)[self.within])
         moved = self._columns @ self.force - yielded

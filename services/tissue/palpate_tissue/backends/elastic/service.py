@@ -1,31 +1,32 @@
-"""The elastic tissue in the role of the tissue: the same service with other physics behind it."""
+"""Tissue service with the elastic tissue."""
 
 from __future__ import annotations
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service
+from palpate_errors import UserError
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
-from palpate_tissue.backends.elastic.compliance import PITCH_M, SizeError, compliance
+from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
 
 
 def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
-    """The elastic tissue of a scenario. The first time takes half a minute; the result is kept in the user's cache folder.
+    """Return the elastic tissue of a scenario. The first time takes half a minute; the compliance is cached.
 
-    `pitch_m` is that of the finite elements. Raises PluginError for a mesh that this tier cannot take.
+    `pitch_m` is the edge of the finite elements. Raises PluginError for a mesh that is too large.
     """
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
     try:
         body = compliance(model, phantom.lesions, pitch_m=pitch_m)
-    except SizeError as error:
+    except UserError as error:
         raise PluginError(str(error)) from error
     tissue = ElasticTissue(
         model,

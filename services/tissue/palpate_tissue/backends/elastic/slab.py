@@ -1,4 +1,4 @@
-"""A flat slab pressed by a sphere: the elastic tissue where theory has an answer.
+"""A flat slab pressed by a sphere, for comparison of the elastic tissue with theory.
 
 slab = FlatSlab(young_pa=1e4)
 pressed = slab.press(radius_m=0.02, depth_m=0.005)
@@ -26,7 +26,7 @@ Profile = Literal["sphere", "paraboloid"]
 
 
 def hertz_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
-    """Force [N] on a paraboloid of curvature radius R at depth d in a half-space (Hertz 1882).
+    """Return the force [N] on a paraboloid of curvature radius R at depth d in a half-space (Hertz 1882).
 
     4/3 E / (1 - nu^2) sqrt(R) d^(3/2).
     """
@@ -38,17 +38,17 @@ class PressedSlab:
     """A slab at rest under an indenter."""
 
     force_n: float
-    """Along the slab's outward normal, on the indenter."""
+    """Force on the indenter along the slab's outward normal."""
     displacement_m: Array
     """Inward displacement of every vertex, shape (n,)."""
     contact_radius_m: float
-    """Radius of the circle that is as large as the area of the vertices in contact."""
+    """Radius of the circle with the area of the vertices in contact."""
 
 
 class FlatSlab:
     """A flat layer of skin vertices on a hexagonal lattice, elastic and instantaneous; half-space when `thickness_m` is infinite.
 
-    The skin beyond the lattice is there too, but cannot be touched: choose `half_m` larger than the contact's radius.
+    The skin continues beyond the lattice but cannot be touched there: choose `half_m` larger than the contact radius.
     Lesions need a finite thickness.
     """
 
@@ -70,15 +70,15 @@ class FlatSlab:
 
     @property
     def vertices(self) -> Array:
-        """Rest positions [m], shape (n, 3): in z = 0, a vertex at the origin."""
+        """Return rest positions [m], shape (n, 3), in z = 0 with a vertex at the origin."""
         return self.model.vertices
 
     def press(
         self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0.0, 0.0), profile: Profile = "sphere"
     ) -> PressedSlab:
-        """The slab at rest under a sphere whose lowest point is `depth_m` below z = 0, over `xy_m`.
+        """Return the slab at rest under a sphere at `xy_m` whose lowest point is `depth_m` below z = 0.
 
-        `paraboloid` is Hertz's indenter: a sphere to second order.
+        `paraboloid` is Hertz's indenter, a sphere to second order.
         """
         offset = self.vertices[self.compliance.free, :2] - np.asarray(xy_m)
         square = (offset**2).sum(axis=1)
@@ -100,5 +100,5 @@ class FlatSlab:
         return PressedSlab(float(force.sum()), displacement, math.sqrt(area / math.pi))
 
     def tissue(self, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3) -> ElasticTissue:
-        """The same slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
+        """Return the slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
         return ElasticTissue(self.model, self.compliance, stiffness, breathing, dt)

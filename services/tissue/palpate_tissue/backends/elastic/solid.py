@@ -1,7 +1,7 @@
 """Finite elements of a layer of varying modulus, condensed to normal forces and displacements of its skin.
 
-Trilinear bricks on a graded grid. The volumetric strain is the element's mean one (B-bar; Hughes 1980), because trilinear bricks
-of nearly incompressible tissue lock otherwise. Base and sides are fixed.
+Trilinear bricks on a graded grid. The volumetric strain is averaged over the element (B-bar; Hughes 1980), because trilinear
+bricks of nearly incompressible tissue lock otherwise. Base and sides are fixed.
 """
 
 from __future__ import annotations
@@ -27,17 +27,17 @@ class NodeGrid:
     y: Array
     depth: Array
     loaded_x: slice
-    """Nodes of the skin between which it may be loaded."""
+    """Nodes of the skin that may be loaded, along x."""
     loaded_y: slice
 
     @property
     def skin(self) -> tuple[Array, Array]:
-        """Places (x, y) of the skin's nodes that may be loaded [m]; the compliance is ordered with y fastest."""
+        """Return x and y of the loaded skin nodes [m]; the compliance is ordered with y fastest."""
         return self.x[self.loaded_x], self.y[self.loaded_y]
 
 
 def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> NodeGrid:
-    """A grid that is even, of `pitch` [m], between the corners `low` and `high` (2,) [m], and grows coarser beside and below."""
+    """Return a grid uniform with `pitch` [m] between the corners `low` and `high` (2,) [m], coarser outside and below."""
     half = (high - low) / 2
     x, along_x = _axis(float(half[0]), pitch)
     y, along_y = _axis(float(half[1]), pitch)
@@ -53,7 +53,7 @@ def _axis(half: float, pitch: float) -> tuple[Array, slice]:
 
 
 def _layers(thickness: float, pitch: float) -> Array:
-    """Depths of the nodes: cubes at the skin, and each layer 14 % thicker than the last."""
+    """Return the depths of the nodes: cubes at the skin, each layer 14 % thicker than the previous."""
     sizes = pitch * 1.14 ** np.arange(200)
     below = np.cumsum(sizes)
     count = int(np.searchsorted(below, thickness)) + 1
@@ -61,7 +61,7 @@ def _layers(thickness: float, pitch: float) -> Array:
 
 
 def brick_stiffness(size: Array, poisson: float) -> Array:
-    """Stiffness of bricks of unit Young's modulus and edges `size` [m], shape (e, 3): shape (e, 24, 24) [m].
+    """Return the stiffness of bricks of unit Young's modulus and edges `size` [m], shape (e, 3): shape (e, 24, 24) [m].
 
     Nodes in the order of `product((0, 1), repeat=3)` over (x, y, depth), three displacements each.
     """
@@ -88,7 +88,7 @@ def brick_stiffness(size: Array, poisson: float) -> Array:
 
 
 def skin_compliance(grid: NodeGrid, young: Callable[[Array], Array], poisson: float) -> Array:
-    """Normal displacement of the loaded skin nodes by unit normal forces on them [m/N], shape (k, k), symmetric.
+    """Return the normal displacement of the loaded skin nodes per normal force on them [m/N], shape (k, k), symmetric.
 
     `young` gives Young's modulus [Pa], shape (p,), at points (x, y, depth) [m], shape (p, 3). The stiffness matrix is block
     tridiagonal over planes of constant x. With its block Cholesky factor L, the compliance is (L^-1 B)' (L^-1 B).
@@ -121,7 +121,7 @@ def skin_compliance(grid: NodeGrid, young: Callable[[Array], Array], poisson: fl
 
 
 def _slab(grid: NodeGrid, young: Callable[[Array], Array], poisson: float, column: int) -> tuple[Array, Array, Array]:
-    """What the bricks between planes `column` and `column + 1` give to the first plane, to the second, and between them.
+    """Return the stiffness of the bricks between planes `column` and `column + 1`: of the first plane, the second, the coupling.
 
     Dense matrices on the free unknowns of a plane, ordered by y, depth, axis.
     """

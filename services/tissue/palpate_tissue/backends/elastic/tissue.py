@@ -1,21 +1,21 @@
-"""The step of the elastic tissue: implicit, with contact solved exactly.
+"""The elastic tissue: implicit steps with contact solved exactly.
 
-State of every free vertex: displacement u along its inward rest normal [m] and a relaxed part y_k a Prony branch. With S the
+State of each free vertex: displacement u along its inward rest normal [m] and a relaxed part y_k per Prony branch. With S the
 instantaneous compliance,
 
     S (f - q(u)) = u - sum_k y_k + tau_d u',     y_k' = (g_k u - y_k) / tau_k,     f >= 0,  u >= w,  f (u - w) = 0
 
-q is the resistance of springs that stiffen with depth and of contracted muscle, where the model has any (`Springs`).
+q is the resistance of stiffening springs and of contracted muscle, if the model has any (`VertexSprings`).
 
-The coefficients are the same at every vertex, so a step is a small matrix M and a vector b, the same everywhere:
-(u, y_1, ..)+ = M (u, y_1, ..) + b S (f - q). So only the vertices near the sphere are stepped each millisecond, and the others
-follow when they are asked for: by M^N for N steps, and by S times what the forces since then left behind, which the same M
-accumulates.
+The coefficients are equal at all vertices, so a step is one small matrix M and one vector b: (u, y_1, ..)+ = M (u, y_1, ..) + b S
+(f - q). Therefore only the vertices near the sphere are stepped each millisecond. The others are updated on demand: by M^N for N
+steps, and by S times the accumulated effect of the forces since then, which the same M propagates.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,25 +27,33 @@ from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPatch, VertexSprings
-from palpate_tissue.contact import Sphere, VertexSearch, rub, skin
+from palpate_tissue.contact import Sphere, VertexSearch, add_friction, skin
 
-_MARGIN_M = 0.0025
-"""The vertices near the sphere are searched anew when it has moved this far."""
-_BESIDE_M = 0.005
-"""Springs act on the vertices under the sphere and this far beside it: the stiffening of what lies further, where the skin
-sinks in less and its wall is hardly stiffer than at rest, adds less than 1 % to the force."""
-_BESIDE_MUSCLE_M = 0.025
-"""The same where there is muscle, which resists however little it is pressed in."""
-_DEEPER_M = 0.005
-"""How much deeper than now the skin may be pressed before the vertices near the sphere are searched anew."""
-PRESS_STEP_S = 0.02
-"""Step of a standard press: with the service's 1 ms what it reads differs by less than 0.1 %."""
+
+@dataclass(frozen=True)
+class ElasticTuning:
+    """Extent of the stepped vertices, and the step of a standard press."""
+
+    margin_m: float = 0.0025
+    """Motion of the sphere after which the vertices near it are searched again."""
+    deeper_m: float = 0.005
+    """Additional depth after which the vertices near it are searched again."""
+    springs_beyond_m: float = 0.005
+    """Springs act this far beyond the sphere. Further away the wall is hardly stiffer than at rest: less than 1 % of the
+    force."""
+    muscle_beyond_m: float = 0.025
+    """Same with muscle, which resists any displacement."""
+    press_step_s: float = 0.02
+    """Step of a standard press; its reading differs by less than 0.1 % from that with 1 ms."""
+
+
+TUNING = ElasticTuning()
 
 
 def update_rule(stiffness: Stiffness, dt: float) -> tuple[Array, Array]:
-    """M, shape (b + 1, b + 1), and b, shape (b + 1,), of a step `dt` [s].
+    """Return M, shape (b + 1, b + 1), and b, shape (b + 1,), of a step `dt` [s].
 
-    The dashpot by backward Euler, the branches exactly for a displacement that is held over the step.
+    The dashpot is integrated by backward Euler, the branches exactly for a constant displacement over the step.
     """
     drag = stiffness.dashpot_s / dt
     decay = np.exp(-dt / np.array(stiffness.prony_tau_s))
@@ -60,10 +68,9 @@ def update_rule(stiffness: Stiffness, dt: float) -> tuple[Array, Array]:
 
 
 class ElasticTissue(TissueBackend):
-    """A soft solid that a sphere presses."""
+    """A soft solid pressed by a sphere. The step is stable for any mesh."""
 
     substeps = 1
-    """The step is stable for any mesh."""
 
     def __init__(
         self,
@@ -78,7 +85,6 @@ class ElasticTissue(TissueBackend):
         self.compliance = compliance
         self.friction = skin(stiffness.friction, model.background)
         self.disturbed = False
-        """Whether anything has ever moved."""
         self._prony_g, self._stiffness = stiffness.prony_g, stiffness
         self._advance, self._feed = update_rule(stiffness, dt)
         self._excursion = 0.0
@@ -88,10 +94,10 @@ class ElasticTissue(TissueBackend):
             compliance.young / YOUNG_OVER_K_W * model.areas[free], model.stiffening[free], MUSCLE * model.tension[free]
         )
         self._resists = bool(model.stiffening.any() or model.tension.any())
-        self._beside = _BESIDE_MUSCLE_M if model.tension.any() else _BESIDE_M
-        self._search = VertexSearch(model.vertices[free], model.normals[free], breathing.largest_m, _MARGIN_M)
+        self._beyond = TUNING.muscle_beyond_m if model.tension.any() else TUNING.springs_beyond_m
+        self._search = VertexSearch(model.vertices[free], model.normals[free], breathing.largest_m, TUNING.margin_m)
         self._state = np.zeros((len(self._feed), len(free)))
-        """u and y_k of the free vertices as they were `_behind` steps ago."""
+        """u and y_k of the free vertices `_behind` steps ago."""
         self._behind = 0
         self._patch: ElasticPatch | None = None
 
@@ -113,7 +119,7 @@ class ElasticTissue(TissueBackend):
         if len(patch.vertex) and patch.step(w, self._advance, self._feed, self.activation):
             self.touching = self.disturbed = True
             sphere = Sphere(tuple(p), tuple(v_A.tolist()), (0.0, 0.0, 0.0) if w_A is None else tuple(w_A.tolist()), radius)
-            rub(self.friction, sphere, patch.push(), self.dt, wrench)
+            add_friction(self.friction, sphere, patch.push(), self.dt, wrench)
             self.guard(v_A)
         else:
             self._release()
@@ -136,14 +142,14 @@ class ElasticTissue(TissueBackend):
         self.activation = 1.0
 
     def in_steps_of(self, dt: float) -> TissueBackend:
-        """See `TissueBackend`. Its steps are implicit already."""
+        """See `TissueBackend`."""
         return ElasticTissue(self.model, self.compliance, self._stiffness, self.breathing, dt)
 
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
-        """See `TissueBackend`. In steps of PRESS_STEP_S: the step is implicit, and what is read is the end of the hold."""
-        if self.dt >= PRESS_STEP_S:
+        """See `TissueBackend`. Uses long steps: the step is implicit, and the reading is at the end of the hold."""
+        if self.dt >= TUNING.press_step_s:
             return super().press(places, normals, radius)
-        coarse = ElasticTissue(self.model, self.compliance, self._stiffness, dt=PRESS_STEP_S)
+        coarse = ElasticTissue(self.model, self.compliance, self._stiffness, dt=TUNING.press_step_s)
         return coarse.press(places, normals, radius)
 
     def _release(self) -> None:
@@ -152,7 +158,7 @@ class ElasticTissue(TissueBackend):
             self.friction.release()
 
     def _catch_up(self) -> None:
-        """Brings every vertex to the present."""
+        """Advances all vertices to the present."""
         if not self._behind or not self.disturbed:
             self._behind = 0
             return
@@ -165,22 +171,22 @@ class ElasticTissue(TissueBackend):
         if pushed.any():
             rows = self.compliance.matrix[patch.vertex[pushed]]
             self._state += patch.impulse[:, pushed].astype(np.float32) @ rows
-        self._state[:, patch.vertex] = patch.state  # the same but for rounding
+        self._state[:, patch.vertex] = patch.state  # equal except for rounding
         patch.impulse[:] = 0.0
 
     def _gather(self, p: list[float], radius: float) -> ElasticPatch:
-        """The vertices that a sphere near `p` [m] might hold."""
+        """Return the patch of vertices that a sphere near `p` [m] can hold."""
         self._catch_up()
         old = self._patch
         deepest = float(old.state[0].max(initial=0.0)) if old is not None else 0.0
         near = self._search.around(p, radius, deepest)
-        index = self._search.around(p, radius + self._beside, deepest).vertex if self._resists else near.vertex
+        index = self._search.around(p, radius + self._beyond, deepest).vertex if self._resists else near.vertex
         state = self._state[:, index].copy()
         local = self._feed[0] * self.compliance.matrix[np.ix_(index, index)].astype(np.float64)
         breathing = self._breathing[near.vertex]
         if self._resists:
             lowest = radius + float((near.n * near.X).sum(axis=1).max(initial=-radius)) + max(self._excursion, 0.0)
-            deepest = max(deepest, lowest) + _DEEPER_M
+            deepest = max(deepest, lowest) + TUNING.deeper_m
             patch: ElasticPatch = SprungPatch(near, index, breathing, state, local, self._springs.at(index), deepest)
         else:
             patch = ElasticPatch(near, breathing, state, local)
@@ -191,7 +197,7 @@ class ElasticTissue(TissueBackend):
 
     @property
     def displacement(self) -> Array:
-        """Displacement [m] along the inward rest normal of every vertex, shape (n,)."""
+        """Return the displacement of each vertex along its inward rest normal [m], shape (n,)."""
         self._catch_up()
         u = np.zeros(len(self.model.vertices))
         u[self.compliance.free] = self._state[0]
@@ -199,7 +205,7 @@ class ElasticTissue(TissueBackend):
 
     @property
     def contacts(self) -> NDArray[np.intp]:
-        """Vertices in contact after the step, shape (k,)."""
+        """Return the vertices in contact after the step, shape (k,)."""
         patch = self._patch
         if patch is None or not self.touching:
             return np.empty(0, dtype=np.intp)
@@ -207,7 +213,7 @@ class ElasticTissue(TissueBackend):
 
     @property
     def contact_forces(self) -> Array:
-        """Their contact forces f > 0 along their inward normals [N], shape (k,)."""
+        """Return the contact forces f > 0 along the inward normals [N], shape (k,)."""
         patch = self._patch
         if patch is None or not self.touching:
             return np.empty(0)
@@ -224,14 +230,14 @@ class ElasticTissue(TissueBackend):
 
     @property
     def inward(self) -> Array:
-        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+        """See `TissueBackend`."""
         u = self.displacement
         return u - self._excursion * self.model.breathing if self._excursion else u
 
     def energy(self) -> float:
-        """Elastic energy [J] stored in the solid, the Maxwell branches' included, and in the springs near the sphere.
+        """Return the elastic energy [J] of the solid with its Maxwell branches, and of the springs near the sphere.
 
-        Factorises S: not for every step.
+        Expensive: factorises S.
         """
         self._catch_up()
         u, *branches = self._state

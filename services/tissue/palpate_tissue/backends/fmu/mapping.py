@@ -1,4 +1,4 @@
-"""The map of an FMU's variables to topic fields, read from YAML.
+"""Map of an FMU's variables to topic fields, read from YAML.
 
 role: tissue
 frame: abdomen                       # of the FMU's points and vectors
@@ -24,11 +24,11 @@ from palpate_plugins import PluginError
 
 
 class MapError(PluginError):
-    """A map that does not fit the contract or the FMU. Names the entry and what is allowed."""
+    """A map that does not fit the contract or the FMU. Names the entry and the allowed values."""
 
 
 class FrameChange(StrEnum):
-    """How values change with the frame."""
+    """Transformation of values with the frame."""
 
     PLAIN = "plain"
     POINT = "point"
@@ -40,17 +40,17 @@ class _Entry(BaseModel):
 
     kind: FrameChange = FrameChange.PLAIN
     unit: str | None = None
-    """Unit of the topic's field, where the contract does not give one."""
+    """Unit of the topic's field if the contract has none."""
 
 
 class InputEntry(_Entry):
-    """Where an FMU's input or tunable parameter comes from."""
+    """Source of an FMU's input or tunable parameter."""
 
     field: str
 
 
 class OutputEntry(_Entry):
-    """What a topic's field is filled with: a variable, something of the scenario, or a constant."""
+    """Source of a topic's field: a variable, a value of the scenario, or a constant."""
 
     variable: str | None = None
     scenario: str | None = None
@@ -82,7 +82,7 @@ class FmuMap(BaseModel):
 
 
 def load_map(path: Path) -> FmuMap:
-    """A map from a YAML file. Raises MapError naming what is wrong with it."""
+    """Load a map from a YAML file. Raises MapError with the faulty entry."""
     try:
         raw: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
         return FmuMap.model_validate(raw)

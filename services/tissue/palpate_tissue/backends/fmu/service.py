@@ -1,4 +1,4 @@
-"""The FMU service: messages in, a step of the FMU, messages out, whatever the FMU is."""
+"""FMU service: messages in, a step of any FMU, messages out."""
 
 from __future__ import annotations
 
@@ -16,10 +16,10 @@ from palpate_bus.contract import Contract, contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_fmu.compiling import CompileError, native
+from palpate_errors import RunError, UserError
+from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
-from palpate_fmu.instance import FmuError, FmuInstance
-from palpate_fmu.phantom_file import ExportError
+from palpate_fmu.instance import FmuInstance
 from palpate_models.numerics.frames import Array, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import true_pose
@@ -31,11 +31,11 @@ from palpate_tissue.moving import carried
 _log = logging.getLogger("palpate.tissue")
 
 MOST_STEPS = 1000
-"""Steps an FMU of fixed step size may be behind in one call; more is a mistake."""
+"""Largest number of steps that an FMU of fixed step size catches up in one call."""
 
 
 class FmuService(Service):
-    """Hosts an FMU in a role. At tick T the FMU is advanced to T, with the newest inputs; it starts a period before tick 0."""
+    """Hosts an FMU in a role. At tick T the FMU is advanced to T with the newest inputs; it starts one period before tick 0."""
 
     def __init__(
         self,
@@ -47,14 +47,14 @@ class FmuService(Service):
     ) -> None:
         rules = rules or contract()
         if table.role not in rules.roles:
-            raise MapError(f"there is no role {table.role!r}; roles are {', '.join(rules.roles)}")
+            raise MapError(f"unknown role {table.role!r}; roles are {', '.join(rules.roles)}")
         self._period = rules.roles[table.role].period
         self._time = -self._period
         self._fmu = FmuInstance(fmu_file, self._time / NS, table.parameters)
         try:
             self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
         except MapError:
-            self._fmu.close()  # which removes what was unpacked
+            self._fmu.close()  # removes the unpacked files
             raise
         self._latched = tuple(output for output in self._wiring.outputs if output.topic.latched)
         self._running = tuple(output for output in self._wiring.outputs if not output.topic.latched)
@@ -64,11 +64,11 @@ class FmuService(Service):
         _log.info("%s: FMI %s, %d variables", fmu_file.name, self._fmu.description.fmiVersion, len(self._fmu.variables))
 
     def start(self) -> Outbox:
-        """The latched topics."""
+        """Publishes the latched topics."""
         return {output.topic.name: output.message(0) for output in self._latched}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advances the FMU to `t` [ns]. Raises FmuError, with what the FMU says, if it fails."""
+        """Advances the FMU to `t` [ns]. Raises FmuError with the FMU's message if it fails."""
         for source in self._wiring.inputs:
             message = inbox.latest(source.topic.name)
             if message is not None:
@@ -87,16 +87,16 @@ class FmuService(Service):
             self._steps += 1
         else:
             if behind > MOST_STEPS:
-                raise RuntimeError(f"the FMU would have to catch up {behind} periods, at most {MOST_STEPS} are allowed")
+                raise RunError(f"the FMU is {behind} periods behind, at most {MOST_STEPS} can be caught up")
             if rest:
-                raise RuntimeError(f"the FMU takes steps of {self._period / NS} s only, not to {t / NS} s")
+                raise RunError(f"the FMU takes steps of {self._period / NS} s only and cannot step to {t / NS} s")
             for k in range(behind):
                 self._fmu.step((self._time + k * self._period) / NS, self._period / NS)
                 self._steps += 1
         self._time = t
 
     def finish(self) -> Mapping[str, Any]:
-        """What was hosted; frees the FMU."""
+        """Return facts about the FMU, and free it."""
         description = self._fmu.description
         facts = {
             "fmu": self._fmu.path.name,
@@ -110,22 +110,22 @@ class FmuService(Service):
 
 
 def host(role: str, *arguments: Any, **options: Any) -> FmuService:
-    """An FMU service of a role: the arguments are those of FmuService."""
+    """Return an FMU service of a role; arguments as for FmuService."""
     cls = type(f"Fmu{role.title()}Service", (FmuService,), {"role": role})
     service: FmuService = cls(*arguments, **options)
     return service
 
 
 def packaged_map(name: str) -> FmuMap:
-    """A map that comes with this package."""
+    """Return a map of this package."""
     with resources.as_file(resources.files("palpate_tissue.backends.fmu").joinpath("maps", f"{name}.yaml")) as path:
         return load_map(path)
 
 
 def create(scenario: Scenario) -> Service:
-    """The FMU `tissue.fmu` of a scenario, tied to the tissue's topics by the map `tissue.fmu_map`.
+    """Return a service with the FMU `tissue.fmu` of a scenario and the map `tissue.fmu_map`.
 
-    By default the abdomen of the scenario, built here. Raises MapError for an FMU that cannot be built, loaded or tied, and for a
+    By default it builds the abdomen of the scenario. Raises MapError for an FMU that cannot be built, loaded or mapped, and for a
     map of another role: see `hosted`.
     """
     chosen = scenario.tissue
@@ -133,7 +133,7 @@ def create(scenario: Scenario) -> Service:
     if table is not None and table.role != "tissue":
         raise MapError(
             f"tissue.fmu_map = {chosen.fmu_map}: its role is {table.role}, not tissue; "
-            "for another role use `hosted` in a file of your own (--service ROLE=FILE.py)"
+            "for another role call `hosted` in a user-defined service (--service ROLE=FILE.py)"
         )
     try:
         if chosen.fmu:
@@ -141,15 +141,17 @@ def create(scenario: Scenario) -> Service:
         else:
             with tempfile.TemporaryDirectory() as folder:
                 service = hosted(build_scenario_fmu(scenario, Path(folder) / "abdomen.fmu", 3, [native()]), table, scenario)
-    except (FmuError, ExportError, CompileError) as error:
+    except MapError:
+        raise
+    except UserError as error:
         raise MapError(f"services.tissue = fmu: {error}") from error
     return carried(service, scenario)
 
 
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
-    """An FMU in the role of its map, by default the tissue's. Raises MapError, FmuError.
+    """Return a service with an FMU in the role of its map, by default the tissue. Raises MapError, FmuError.
 
-    The frame `abdomen` is the patient's true one for the tissue; the scenario that other roles get has the registered one there.
+    For the tissue the frame `abdomen` is the patient's true frame; for other roles, whose scenario has it, the registered one.
     """
     if not fmu_file.is_file():
         raise MapError(f"FMU {fmu_file}: no such file")

@@ -1,4 +1,9 @@
-"""Units of the contract and of FMUs, compared and converted by their SI base units."""
+"""Connects an FMU to the contract by a map: checked once, then arrays move between messages and FMU variables.
+
+Units are compared and converted by their SI base units. Message fields are addressed by dotted path: to a number (`radius`), an
+array (`vertices`), or a message of numbers only (`pose.position`, a quaternion), whose values are taken in the order of its
+fields.
+"""
 
 from __future__ import annotations
 
@@ -44,12 +49,12 @@ class Unit:
     offset: float = 0.0
 
     def to(self, other: Unit) -> tuple[float, float]:
-        """Factor and offset that convert a value in this unit to `other`."""
+        """Return factor and offset that convert a value in this unit to `other`."""
         return self.factor / other.factor, (self.offset - other.offset) / other.factor
 
 
 def parse_unit(text: str) -> Unit:
-    """A unit of the contract: `m`, `N m`, `N/m^3`, `kg m/s^2`. Raises ValueError if it is none."""
+    """Parse a unit of the contract: `m`, `N m`, `N/m^3`, `kg m/s^2`. Raises ValueError for an unknown unit."""
     exponents = dict.fromkeys(BASES, 0)
     factor = 1.0
     over, _, under = text.partition("/")
@@ -57,7 +62,7 @@ def parse_unit(text: str) -> Unit:
         for word in part.replace(".", " ").replace("*", " ").split():
             name, _, power = word.partition("^")
             if name not in _NAMED:
-                raise ValueError(f"unit {text!r}: {name!r} is not known")
+                raise ValueError(f"unit {text!r}: {name!r} is unknown")
             own, bases = _NAMED[name]
             count = sign * int(power or 1)
             factor *= own**count
@@ -67,7 +72,7 @@ def parse_unit(text: str) -> Unit:
 
 
 def fmu_unit(name: str, description: Any) -> Unit | None:
-    """A unit as the FMU defines it; by its name where it gives no base units; None if neither says anything."""
+    """Return a unit as the FMU defines it, by its name if it has no base units, None if neither is known."""
     for definition in description.unitDefinitions:
         base = definition.baseUnit
         if definition.name == name and base is not None:
@@ -79,7 +84,7 @@ def fmu_unit(name: str, description: Any) -> Unit | None:
 
 
 Values = Mapping[str, Any]
-"""What a message is filled with, by path: an array, a number or a text."""
+"""Field values of a message by path: arrays, numbers or text."""
 Make = Callable[[int, Values], Any]
 
 _HEADER = "std_msgs/msg/Header"
@@ -91,7 +96,7 @@ def _fields(name: str) -> list[tuple[str, Any]]:
 
 
 def _triple(name: str) -> list[str] | None:
-    """The fields of a message that is nothing but numbers."""
+    """Return the fields of a message of numbers only, else None."""
     fields = _fields(name)
     if fields and all(int(kind) == 1 and detail[0] not in ("string", "wstring") for _, (kind, detail) in fields):
         return [field for field, _ in fields]
@@ -99,23 +104,23 @@ def _triple(name: str) -> list[str] | None:
 
 
 def describe(name: str, path: str) -> Any:
-    """The type of a field of a message type. Raises MapError if there is none."""
+    """Return the type of a field of a message type. Raises MapError if it does not exist."""
     here: Any = (_NAME, name)
     for part in path.split("."):
         found = dict(_fields(here[1])) if int(here[0]) == _NAME else {}
         if part not in found:
-            raise MapError(f"{name} has no field {path!r}: at {part!r} there is {', '.join(found) or 'nothing more'}")
+            raise MapError(f"{name} has no field {path!r}: at {part!r} the fields are {', '.join(found) or 'none'}")
         here = found[part]
     return here
 
 
 def size(name: str, path: str) -> int | None:
-    """How many numbers a field holds; None for an array of any length. Raises MapError if it holds none."""
+    """Return the number of values of a field, None for an array of any length. Raises MapError if it is not numeric."""
     kind, detail = describe(name, path)
     if int(kind) == _NAME:
         members = _triple(detail)
         if members is None:
-            raise MapError(f"{name}: field {path!r} is of the type {detail}, which is more than numbers")
+            raise MapError(f"{name}: field {path!r} has type {detail}, which is not numeric")
         return len(members)
     if int(kind) == _SEQUENCE:
         return None
@@ -123,7 +128,7 @@ def size(name: str, path: str) -> int | None:
 
 
 def reader(name: str, path: str) -> Callable[[Message], ArrayLike]:
-    """A function that gives the numbers of a field of a message."""
+    """Return a function that reads the numbers of a field of a message."""
     kind, detail = describe(name, path)
     get = attrgetter(path)
     members = _triple(detail) if int(kind) == _NAME else None
@@ -142,7 +147,7 @@ def _cast(base: str) -> Callable[[Any], Any]:
 
 
 def maker(name: str, frame: str, filled: frozenset[str], prefix: str = "") -> Make:
-    """A function of (t [ns], values by path) that makes a message; fields that are not in `filled` are zero or empty.
+    """Return a function of (t [ns], values by path) that creates a message; fields not in `filled` are zero or empty.
 
     Headers are stamped t, in `frame`.
     """
@@ -172,7 +177,7 @@ def _field_maker(kind: Any, detail: Any, frame: str, filled: frozenset[str], pat
 
 
 def _array_maker(detail: Any, path: str | None, fixed: bool) -> Make:
-    """Numbers in an array; empty or zero without a path. Arrays of messages stay empty."""
+    """Return a function for a numeric array; empty or zero without a path. Arrays of messages stay empty."""
     (inner, item), extent = detail
     if int(inner) != 1 or item[0] == "string":
         return lambda _t, _values: []
@@ -188,7 +193,7 @@ Change = Callable[[Any], Any]
 
 @dataclass(frozen=True)
 class InputTopic:
-    """A topic that the FMU reads."""
+    """A topic read by the FMU."""
 
     topic: Topic
     port: Port
@@ -203,7 +208,7 @@ class InputTopic:
 
 @dataclass(frozen=True)
 class OutputTopic:
-    """A topic that the FMU fills."""
+    """A topic filled by the FMU."""
 
     topic: Topic
     make: Make
@@ -212,7 +217,7 @@ class OutputTopic:
     constants: dict[str, Any] = field(default_factory=dict)
 
     def message(self, t: int) -> Message:
-        """The message of time `t` [ns]."""
+        """Return the message of time `t` [ns]."""
         for port in self.ports:
             port.pull()
         values = dict(self.constants)
@@ -222,7 +227,7 @@ class OutputTopic:
 
 
 class Wiring:
-    """A map, an FMU and the contract, checked against each other. Raises MapError naming the entry that does not fit."""
+    """Checks a map, an FMU and the contract against each other. Raises MapError with the entry that does not fit."""
 
     def __init__(
         self, table: FmuMap, fmu: FmuInstance, rules: Contract, frames: Mapping[str, Array], scenario: Mapping[str, Any]
@@ -302,7 +307,7 @@ class Wiring:
             raise MapError(f"{where}: {room} values of {topic.type} against {variable.size} of the FMU")
 
     def _turn(self, entry: _Entry, topic: Topic, where: str, into_fmu: bool) -> Change:
-        """From the topic's frame to the FMU's, or back. Points and vectors only."""
+        """Return the change of frame from the topic to the FMU, or back, for points and vectors."""
         if entry.kind is FrameChange.PLAIN:
             return _same
         ours, theirs = self._table.frame, topic.frame
@@ -318,7 +323,7 @@ class Wiring:
         return lambda values: np.reshape(values, (-1, 3)) @ turned + moved
 
     def _scale(self, entry: _Entry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Change:
-        """Between the topic's unit and the FMU's."""
+        """Return the conversion between the units of topic and FMU."""
         declared = [unit for key, unit in topic.units.items() if path == key or path.startswith(f"{key}.")]
         text = declared[0] if declared else entry.unit
         if declared and entry.unit not in (None, declared[0]):

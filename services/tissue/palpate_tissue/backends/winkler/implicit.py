@@ -1,14 +1,18 @@
-"""One implicit step of the Winkler-Pasternak tissue, compiled: the equations of the README by backward Euler.
+"""The Winkler-Pasternak tissue in long implicit steps, for fast evaluation without a 1 kHz loop.
+
+The equations of `tissue.py` by backward Euler,
 
     C (u - u0) / h + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,    f >= 0,  u >= w,  f (u - w) = 0
 
-is solved by projected successive over-relaxation, vertex by vertex, with the springs made straight about where a vertex is.
-Far from the sphere nothing moves fast: there the wall goes on by long steps.
+are solved by projected successive over-relaxation, vertex by vertex, with the springs linearised at the present displacement.
+Only the vertices near the sphere are stepped; the others follow every `far_s`, or when the sphere comes near. The README compares
+its forces with those of the explicit steps.
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -25,28 +29,30 @@ from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
-from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, rub, skin
+from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
 
 OVER_RELAXATION = 1.35
-"""Near the best for a footprint of the wall: 2 / (1 + sqrt(1 - rho^2)) with rho = 0.87, that of Jacobi's sweeps at 10 ms."""
+"""Near optimal: 2 / (1 + sqrt(1 - rho^2)) with rho = 0.87, the spectral radius of Jacobi sweeps at 10 ms."""
 
+SWEEPS = 3
+"""Over-relaxation sweeps per step near the sphere."""
 STILL_M = 1e-7
-"""Far from the sphere, sweeps end when no vertex goes further."""
+"""Convergence of sweeps far from the sphere: largest motion of a vertex."""
 
 
 class ImplicitWall(NamedTuple):
-    """The wall: n vertices and b Prony branches. Compiled code takes time to open arrays at every step: so there are few."""
+    """The wall: n vertices and b Prony branches. Few arrays, because each costs time in every call of compiled code."""
 
     u: Array
     """Displacement along the inward normals [m], shape (n,). Changed in place, as are the next three."""
     s: Array
     """Strain u - sum_k y_k [m], shape (n,)."""
     y: Array
-    """What of the displacement has relaxed [m], shape (n, b)."""
+    """Relaxed displacement [m], shape (n, b)."""
     clock: NDArray[np.int64]
-    """To which step each vertex has come, shape (n,); those near the sphere are at the newest."""
+    """Number of the last step of each vertex, shape (n,); vertices near the sphere are at the newest."""
     table: Array
-    """The columns `DRAG` to `TENSION` of each vertex, shape (n, 6)."""
+    """Columns `DRAG` to `TENSION` of each vertex, shape (n, 6)."""
     indptr: NDArray[np.uint32]
     indices: NDArray[np.uint32]
     K: Array
@@ -56,38 +62,39 @@ class ImplicitWall(NamedTuple):
 
 
 DRAG, DIAGONAL, FOUNDATION, BETA2, STRAIGHT_FROM, TENSION = range(6)
-"""Columns of a wall: dashpot over step C / h [N/m], diagonal of K, k_w A [N/m], beta^2 [1/m^2], the displacement from which the
-stiffening spring is straight [m], and a contracted muscle's tension [1]."""
+"""Columns of a wall: C / h [N/m], diagonal of K, k_w A [N/m], beta^2 [1/m^2], displacement above which the stiffening spring is
+linear
+[m], tension of a contracted muscle [1]."""
 
 
 class ImplicitPatch(NamedTuple):
-    """What moves while the sphere's centre stays about where it is: p vertices, of which m might be held."""
+    """The p vertices stepped near the sphere, of which m can be held."""
 
     near: NDArray[np.intp]
-    """Vertices that are stepped, ascending, shape (p,)."""
+    """Stepped vertices, shape (p,)."""
     within: NDArray[np.intp]
-    """Where in `near` those stand that might be held, shape (m,)."""
+    """Positions in `near` of the vertices that can be held, shape (m,)."""
     table: Array
-    """Their outward normal (three), place at rest [m] (three), and share of the breathing excursion, shape (m, 7)."""
+    """Their outward normal (3), rest position [m] (3), and fraction of the breathing excursion, shape (m, 7)."""
     f: Array
     """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
     room: Array
-    """Displacement before the step and the least that the sphere allows [m] of the stepped, shape (p, 2). Changed in place."""
+    """Displacement before the step and least displacement allowed by the sphere [m], shape (p, 2). Changed in place."""
 
 
 class Stride(NamedTuple):
-    """One step of vertices."""
+    """Parameters of one step of vertices."""
 
     length: float
-    """How many of the wall's own steps it has [1]."""
+    """Length in steps of the wall [1]."""
     kept: float
-    """Which part of a displacement is strain at the end of the step; what is missing has relaxed meanwhile [1]."""
+    """Fraction of a displacement that is strain at the end of the step; the rest relaxes during the step [1]."""
     over: float
-    """How far a sweep goes beyond the balance [1]."""
+    """Over-relaxation of a sweep [1]."""
 
 
 OWN = Stride(1.0, 1.0, OVER_RELAXATION)
-"""One of the wall's own steps, in which branches follow afterwards."""
+"""One step of the wall; branches are updated afterwards."""
 
 
 @compiled
@@ -96,15 +103,16 @@ def press(
     patch: ImplicitPatch,
     bristle: Bristle,
     motion: Array,
-    numbers: tuple[float, float, float, float],
-    sweeps: int,
+    radius: float,
+    excursion: float,
+    activation: float,
+    h: float,
 ) -> tuple[bool, Array]:
-    """Steps the vertices near a sphere. Whether it touches, and force [N] and torque about its centre [N m] on it, shape (6,).
+    """Step the vertices near a sphere; return True if it touches, and the force [N] and torque about its centre [N m], shape
+    (6,).
 
-    `motion` (3, 3) has position [m], velocity [m/s] and angular velocity [rad/s] of the sphere as rows. `numbers`: its radius
-    [m], the breathing excursion [m], how far muscles are contracted [1], the step [s].
+    Rows of `motion` (3, 3): position [m], velocity [m/s] and angular velocity [rad/s] of the sphere. `h` is the step [s].
     """
-    radius, excursion, activation, h = numbers
     sphere = Sphere(row(motion, 0), row(motion, 1), row(motion, 2), radius)
     u, near, room, table = wall.u, patch.near, patch.room, patch.table
     for k in range(len(near)):
@@ -115,7 +123,7 @@ def press(
         square = radius * radius - dot(d, d) + along * along
         if square > radius * radius * RIM * RIM:
             room[patch.within[k], 1] = along + sqrt(square) + excursion * table[k, 6]
-    for _ in range(sweeps):
+    for _ in range(SWEEPS):
         sweep(wall, near, room, activation, OWN)
     load = 0.0
     force = normal = moment = (0.0, 0.0, 0.0)
@@ -134,18 +142,18 @@ def press(
         load += f
         normal = add(normal, scale(f, n))
         force = add(force, add(scale(f, n), scale(f / (w - along), add(d, scale(along, n)))))
-        moment = subtract(moment, scale(f, add(d, scale(w, n))))  # as `kernel.hold` has it
+        moment = subtract(moment, scale(f, add(d, scale(w, n))))  # as in `tissue.hold`
     relax(wall, near)
     wrench = np.zeros(6)
     if load <= 0.0:
         return False, wrench
-    rub(bristle, sphere, Push(force, normal, divide(moment, load)), h, wrench)
+    add_friction(bristle, sphere, Push(force, normal, divide(moment, load)), h, wrench)
     return True, wrench
 
 
 @compiled
 def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: float, stride: Stride) -> float:
-    """One sweep over vertices, each to where its forces balance and beyond, but not through its floor. The longest way [m]."""
+    """Sweep once over vertices with over-relaxation, bounded below by the sphere; return the largest motion [m]."""
     u, s, table, indptr, indices, K = wall.u, wall.s, wall.table, wall.indptr, wall.indices, wall.K
     longest = 0.0
     for k in range(len(near)):
@@ -169,7 +177,7 @@ def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: f
 
 @compiled
 def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float, length: float) -> float:
-    """The force that nothing balances at a vertex that was at `before` [m] a step of `length` ago [N], inward."""
+    """Return the residual force [N], inward, at a vertex that was at `before` [m] a step of `length` ago."""
     at = wall.u[i]
     force: float = wall.table[i, DRAG] / length * (before - at)
     for j in range(wall.indptr[i], wall.indptr[i + 1]):
@@ -183,7 +191,7 @@ def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float, len
 
 @compiled
 def relax(wall: ImplicitWall, near: NDArray[np.intp]) -> None:
-    """The Prony branches of vertices that were stepped, exact for a displacement held over the step."""
+    """Update the Prony branches of stepped vertices, exact for a constant displacement over the step."""
     u, s, y, decay = wall.u, wall.s, wall.y, wall.decay
     for k in range(y.shape[1]):
         g, kept = decay[0, k], decay[1, k]
@@ -195,10 +203,10 @@ def relax(wall: ImplicitWall, near: NDArray[np.intp]) -> None:
 
 @compiled
 def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation: float, sweeps: int) -> None:
-    """Brings vertices that nothing touches to step `now`, each by one step of its own length, at most that of `decay`.
+    """Advance vertices without contact to step `now`, each by one step of its own length, at most that of `decay`.
 
-    First each gives way as its branches do, as it would if it were in balance and stayed so; then all go to where their forces
-    balance: where the sphere has just left, that is far, and takes up to `sweeps` sweeps.
+    First each vertex relaxes with its branches as if in equilibrium; then up to `sweeps` sweeps restore equilibrium, which is far
+    away where the sphere has just left.
     """
     u, s, y, clock, decay, table = wall.u, wall.s, wall.y, wall.clock, wall.decay, wall.table
     indptr, indices, K = wall.indptr, wall.indices, wall.K
@@ -237,26 +245,30 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
             return
 
 
-SWEEPS: Final = 3
-"""Sweeps of over-relaxation in a step near the sphere."""
-FAR_SWEEPS: Final = 20
-"""The same in a step of the others, at most."""
-REACHED: Final = 1.5
-"""Vertices within so many Pasternak lengths of the sphere are stepped."""
-FAR_S: Final = 0.15
-"""The others follow so often,"""
-SPRING_S: Final = 0.3
-"""and at every step for so long after the sphere has left them: the wall springs back within the dashpot's 0.05 s."""
-_MARGIN_M: Final = 0.010
-"""The vertices near the sphere are searched anew when it has moved this far."""
-_APART: Final = 7
-"""A sweep takes every so many-th vertex, then those beside them: a processor has several in hand when none waits for the one
-before it."""
+@dataclass(frozen=True)
+class ImplicitTuning:
+    """Accuracy of the implicit steps."""
+
+    far_sweeps: int = 20
+    """Largest number of sweeps per step of the other vertices."""
+    reach_lengths: float = 1.5
+    """Vertices within this many Pasternak lengths of the sphere are stepped."""
+    far_s: float = 0.15
+    """Step of the other vertices."""
+    recovery_s: float = 0.3
+    """Time after the sphere has left in which all vertices take every step: the wall recovers within the dashpot's 0.05 s."""
+    margin_m: float = 0.010
+    """Motion of the sphere after which the vertices near it are searched again."""
+    interleave: int = 7
+    """A sweep visits every n-th vertex, then the next ones: independent neighbours let the processor work in parallel."""
+
+
+TUNING: Final = ImplicitTuning()
 _NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 
 
 class ImplicitTissue(TissueBackend):
-    """A soft surface that a sphere presses, in steps that no stability limits."""
+    """A soft surface pressed by a sphere, in unconditionally stable steps."""
 
     def __init__(
         self,
@@ -268,11 +280,11 @@ class ImplicitTissue(TissueBackend):
         stiffness = stiffness or Stiffness()
         super().__init__(model, breathing, dt)
         self.friction = skin(stiffness.friction, model.background)
-        self._reach_m = REACHED * stiffness.length_m
-        self._every = max(1, round(FAR_S / dt))
+        self._reach_m = TUNING.reach_lengths * stiffness.length_m
+        self._every = max(1, round(TUNING.far_s / dt))
         self._wall = implicit_wall(model, stiffness, dt, self._every)
         self._free = np.flatnonzero(~model.fixed)
-        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
+        self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, TUNING.margin_m)
         self._tree = cKDTree(model.vertices[self._free])
         self._steps = self._sprung = 0
         self._excursion = 0.0
@@ -281,7 +293,7 @@ class ImplicitTissue(TissueBackend):
         self._motion: Array = np.zeros((3, 3))
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """See `TissueBackend`; the wrench is that of the step's end."""
+        """See `TissueBackend`; the wrench is that at the end of the step."""
         p = p_A.tolist()
         if not math.isfinite(sum(p)):
             raise ValueError(f"tissue: the indenter's position is not finite: {p}")
@@ -290,8 +302,9 @@ class ImplicitTissue(TissueBackend):
             self._patch = self._gather(p, radius)
         motion = self._motion
         motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
-        numbers = (radius, self._excursion, self.activation, self.dt)
-        touching, wrench = press(self._wall, self._patch, self.friction, motion, numbers, SWEEPS)
+        touching, wrench = press(
+            self._wall, self._patch, self.friction, motion, radius, self._excursion, self.activation, self.dt
+        )
         if self.touching and not touching:
             self.friction.release()
         self.touching = touching
@@ -320,23 +333,23 @@ class ImplicitTissue(TissueBackend):
         self.activation = 1.0
 
     def _tick(self, t_s: float) -> None:
-        """One step on: now and then, all that is far from the sphere follows."""
+        """Counts a step, and advances the vertices far from the sphere when due."""
         self._excursion = self.excursion(t_s)
         if self._steps % self._every == 0 or self._steps < self._sprung:
             if self._patch is not None:
                 self._wall.clock[self._patch.near] = self._steps
-            follow(self._wall, self._free, self._steps, self.activation, FAR_SWEEPS)
+            follow(self._wall, self._free, self._steps, self.activation, TUNING.far_sweeps)
         self._steps += 1
 
     def _leave(self) -> None:
-        """The sphere is no longer near where it was."""
+        """Ends the stepping of the patch after the sphere has left."""
         if self._patch is not None:
             self._wall.clock[self._patch.near] = self._steps
-            self._sprung = self._steps + round(SPRING_S / self.dt)
+            self._sprung = self._steps + round(TUNING.recovery_s / self.dt)
         self._near = self._patch = None
 
     def _gather(self, p: list[float], radius: float) -> ImplicitPatch:
-        """What is stepped while the sphere is near `p` [m]."""
+        """Return the vertices to step while the sphere is near `p` [m]."""
         model, before = self.model, self._patch
         deepest = 0.0 if before is None else float(self._wall.u[before.near].max(initial=0.0))
         if before is not None:
@@ -344,9 +357,9 @@ class ImplicitTissue(TissueBackend):
         self._near = self._search.around(p, radius, deepest)
         vertex = self._free[self._near.vertex]
         stepped = np.zeros(len(model.vertices), dtype=bool)
-        stepped[vertex] = stepped[self._free[self._tree.query_ball_point(p, 2 * radius + self._reach_m + _MARGIN_M)]] = True
-        near = np.concatenate([np.flatnonzero(stepped)[first::_APART] for first in range(_APART)])
-        follow(self._wall, near, self._steps - 1, self.activation, FAR_SWEEPS)
+        stepped[vertex] = stepped[self._free[self._tree.query_ball_point(p, 2 * radius + self._reach_m + TUNING.margin_m)]] = True
+        near = np.concatenate([np.flatnonzero(stepped)[k :: TUNING.interleave] for k in range(TUNING.interleave)])
+        follow(self._wall, near, self._steps - 1, self.activation, TUNING.far_sweeps)
         table = np.column_stack((model.normals[vertex], model.vertices[vertex], model.breathing[vertex]))
         place = np.empty(len(model.vertices), dtype=np.intp)
         place[near] = np.arange(len(near))
@@ -354,7 +367,7 @@ class ImplicitTissue(TissueBackend):
 
     @property
     def contacts(self) -> NDArray[np.intp]:
-        """Vertices in contact after the step, shape (k,)."""
+        """Return the vertices in contact after the step, shape (k,)."""
         patch = self._patch
         return _NONE if patch is None or not self.touching else patch.near[patch.within[patch.f > 0]]
 
@@ -373,7 +386,7 @@ class ImplicitTissue(TissueBackend):
 
 
 def implicit_wall(model: PhantomModel, stiffness: Stiffness, dt: float, longest: int) -> ImplicitWall:
-    """The wall of a model at rest, for steps of `dt` [s], of which it takes at most `longest` in one."""
+    """Return the wall of a model at rest for steps of `dt` [s], of which one step covers at most `longest`."""
     n, g, tau = len(model.vertices), np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
     K = stiffness_matrix(model, stiffness)
     foundation = model.stiffness * model.areas

@@ -1,4 +1,4 @@
-"""The matrices of the tissue, and the bound within which its explicit step is stable and passive."""
+"""Matrices of the tissue, and the stability bound of its explicit step."""
 
 from __future__ import annotations
 
@@ -9,54 +9,51 @@ import numpy as np
 from scipy import sparse
 from scipy.sparse.linalg import ArpackNoConvergence, eigsh
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient import wall
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 
 STEP_LIMIT = 1.8
-"""Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps and more."""
+"""Largest dt * rate of a step. Energy cannot grow below 2; above 1.8 the finest waves would ring for ten steps or more."""
 MOST_SUBSTEPS = 64
-
-
-class StabilityError(ValueError):
-    """Tissue that this scheme cannot simulate at a bearable cost."""
 
 
 @dataclass(frozen=True)
 class Mechanics:
-    """`C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f` on the vertices, with fixed vertices left out."""
+    """Matrices of `C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f` on the free vertices."""
 
     stiffness: sparse.csr_array
     """K = diag(k_w A) + L[G], instantaneous [N/m], shape (n, n); rows and columns of fixed vertices are empty."""
     damping: Array
     """Diagonal of C [N s/m], shape (n,)."""
     rate: float
-    """Largest eigenvalue of C^-1 K [1/s], with the springs beside the linear wall as stiff as they can get."""
+    """Largest eigenvalue of C^-1 K [1/s], with the nonlinear springs at their largest stiffness."""
     gershgorin: float
-    """Its bound max_i (K_ii + sum_j |K_ij|) / C_i [1/s]."""
+    """Upper bound of `rate`, max_i (K_ii + sum_j |K_ij|) / C_i [1/s]."""
 
     def substeps(self, dt: float) -> int:
-        """How many equal explicit steps a period `dt` [s] must be cut into, so that each is stable and passive.
+        """Return the number of equal explicit steps per period `dt` [s] for which each is stable and passive.
 
-        Raises StabilityError if they are too many.
+        Raises UserError if it exceeds `MOST_SUBSTEPS`.
         """
         count = max(1, math.ceil(dt * self.rate / STEP_LIMIT))
         if count > MOST_SUBSTEPS:
-            raise StabilityError(
-                f"tissue: {count} sub-steps a period of {dt * 1e3:g} ms would be needed (dt * rate = {dt * self.rate:.3g}, "
-                f"limit {STEP_LIMIT}), at most {MOST_SUBSTEPS} are allowed: use a coarser mesh (phantom.edge_m), a shorter "
+            raise UserError(
+                f"tissue: {count} sub-steps per period of {dt * 1e3:g} ms needed (dt * rate = {dt * self.rate:.3g}, "
+                f"limit {STEP_LIMIT}), at most {MOST_SUBSTEPS} allowed: use a coarser mesh (phantom.edge_m), a shorter "
                 "phantom.stiffness.length_m or a larger phantom.stiffness.dashpot_s"
             )
         return count
 
 
 def stiffness_matrix(model: PhantomModel, stiffness: Stiffness) -> sparse.csr_array:
-    """K of a phantom.
+    """Return K of a phantom.
 
-    Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as
-    between cells of a finite-volume scheme: the same shear flows through both halves. It also keeps the bound low at
-    sharp contrasts. Fixed vertices keep u = 0.
+    Pasternak's G = k_w l^2 varies with k_w. An edge between two vertices carries the harmonic mean of their G, as between cells
+    of a finite-volume scheme: both halves carry the same shear. It also keeps the bound low at sharp contrasts. Fixed vertices
+    keep u = 0.
     """
     free = ~model.fixed
     edges = sparse.coo_array(model.laplacian)
@@ -81,7 +78,7 @@ def stiffness_matrix(model: PhantomModel, stiffness: Stiffness) -> sparse.csr_ar
 
 
 def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
-    """The matrices of a phantom."""
+    """Return the matrices of a phantom."""
     matrix = stiffness_matrix(model, stiffness)
     damping = stiffness.dashpot_s * model.stiffness * model.areas
     beside = wall.largest_slope(model.stiffening, model.tension)
@@ -94,10 +91,10 @@ def _gershgorin(matrix: sparse.csr_array, damping: Array) -> float:
 
 
 def _largest_rate(matrix: sparse.csr_array, damping: Array) -> float:
-    """Largest eigenvalue of C^-1 K by Lanczos, with a margin for what it may miss; Gershgorin's bound if it does not converge."""
+    """Return the largest eigenvalue of C^-1 K by Lanczos with a 1 % margin; Gershgorin's bound if it does not converge."""
     scale = sparse.diags_array(1 / np.sqrt(damping))
     try:
-        start = 1 + np.arange(len(damping)) % 7 / 7.0  # a fixed start, so that runs repeat
+        start = 1 + np.arange(len(damping)) % 7 / 7.0  # fixed start: runs repeat
         largest = eigsh(scale @ matrix @ scale, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0]
     except ArpackNoConvergence:
         return _gershgorin(matrix, damping)

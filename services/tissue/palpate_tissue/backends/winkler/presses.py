@@ -1,12 +1,12 @@
-"""Standard presses into the Winkler-Pasternak wall, one after another in compiled code, by few long implicit steps.
+"""Standard presses into the Winkler-Pasternak wall, compiled, with few long implicit steps.
 
-What counts of a press is the force at its end (`scenario.press`). The sphere goes at one speed and is then held, so that
-between two instants every displacement is nearly a straight line: for such a line the branches are exact,
+Only the force at the end of a press counts (`scenario.press`). The sphere moves at one speed and is then held, so displacements
+are nearly linear in time within a step. For a linear displacement the branches are exact,
 
     y = e y0 + g (1 - r) u + g (r - e) u0,    e = exp(-h / tau),    r = tau / h (1 - e),
 
-and the step is backward Euler's only in the dashpot, which is at rest long before the reading. What a press does to guarding
-muscle is the same everywhere: its depth and speed are those of the press.
+and only the dashpot, which is at rest long before the reading, is integrated by backward Euler. The effect of a press on guarding
+muscle depends only on its depth and speed, so it is the same for all presses.
 """
 
 from __future__ import annotations
@@ -25,39 +25,37 @@ from palpate_models.patient.guarding import Activation
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_models.scenario import press
-from palpate_tissue.backends.winkler.implicit import ImplicitWall, Stride, implicit_wall, sweep, unbalanced
+from palpate_tissue.backends.winkler.implicit import TUNING, ImplicitWall, Stride, implicit_wall, sweep, unbalanced
 from palpate_tissue.contact import RIM
 
 ENDS_S: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, press.DURATION_S - 0.5 * press.READ_S)
-"""Ends of the steps, from the touch [s]: at full depth, where the force is greatest, and last in the middle of the reading."""
-REACHED: Final = 3.0
-"""A press reaches so many Pasternak lengths beyond the sphere: the wall gives way as K0(r / l), and what is left there acts back
-by its square."""
+"""Ends of the steps after the touch [s]: full depth, where the force is largest, and last the middle of the reading."""
+REACH_LENGTHS: Final = 3.0
+"""Reach of a press beyond the sphere in Pasternak lengths: displacement decays as K0(r / l) and acts back by its square."""
+# Read by compiled functions.
 OVER_RELAXATION: Final = 1.5
 CLOSE_M: Final = 2e-6
-"""Sweeps end when no vertex goes further."""
+"""Convergence of sweeps: largest motion of a vertex."""
 MOST_SWEEPS: Final = 200
-_APART: Final = 7
-"""As in `implicit`."""
 
 
 class Course(NamedTuple):
-    """What every press does."""
+    """Schedule common to all presses."""
 
     radius: float
     """Radius of the sphere [m]."""
     ends: Array
     """Lengths of the steps [s], shape (n,)."""
     depths: Array
-    """How deep the sphere is then [m], shape (n,)."""
+    """Depth at the ends of the steps [m], shape (n,)."""
     contracted: Array
-    """How far guarding muscle is contracted then [1], shape (n,)."""
+    """Muscle contraction at the ends of the steps [1], shape (n,)."""
     prony: Array
     """g and tau [s] of each branch, shape (b, 2)."""
 
 
 class Skin(NamedTuple):
-    """The skin at rest; v vertices."""
+    """The skin at rest, v vertices."""
 
     vertices: Array
     """[m], shape (v, 3)."""
@@ -65,32 +63,31 @@ class Skin(NamedTuple):
     """Outward unit normals, shape (v, 3)."""
 
 
-def press_in_turn(
-    model: PhantomModel, stiffness: Stiffness, where: tuple[Array, Array, float]
+def standard_presses(
+    model: PhantomModel, stiffness: Stiffness, places: Array, normals: Array, radius: float
 ) -> tuple[Array, NDArray[np.bool_]]:
-    """What `TissueBackend.press` returns. `where`: places [m], normals, each of shape (k, 3), and the sphere's radius [m]."""
-    places, normals, radius = where
+    """Return the result of `TissueBackend.press` at `places` [m] with `normals`, shapes (k, 3), for a sphere of `radius` [m]."""
     ends = np.array(ENDS_S)
     depths = press.depths(ends)
     prony = np.column_stack((stiffness.prony_g, stiffness.prony_tau_s))
     course = Course(radius, ends, depths, contracted(model.voluntary, ends, depths), prony)
-    reached = cKDTree(model.vertices).query_ball_point(places, radius + REACHED * stiffness.length_m)
+    reached = cKDTree(model.vertices).query_ball_point(places, radius + REACH_LENGTHS * stiffness.length_m)
     wall = implicit_wall(model, stiffness, 1.0, 1)
     skin = Skin(model.vertices, model.normals)
     forces = np.empty((len(places), len(ends)))
     for place, normal, vertices, felt in zip(places, normals, reached, forces, strict=True):
         part = np.sort(np.array(vertices, dtype=np.intp))
         part = part[~model.fixed[part]]
-        part = np.concatenate([part[first::_APART] for first in range(_APART)])
+        part = np.concatenate([part[k :: TUNING.interleave] for k in range(TUNING.interleave)])
         press_once(wall, skin, part, np.stack((place, normal)), course, felt)
     limited = forces.max(axis=1, initial=0.0) >= press.LIMIT_N
     return np.where(limited, press.LIMIT_N, forces[:, -1]), limited
 
 
 def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
-    """How far muscle that guards is contracted at the `ends` [s] of a press's steps, where it is `depths` deep [m]; both (n,).
+    """Return the contraction of guarding muscle at the `ends` [s] of steps with `depths` [m], shapes (n,).
 
-    At rest it is contracted wholly, and the press provokes it or lets it fade (`palpate_models.patient.guarding`).
+    At rest it is fully contracted; the press sustains it or lets it fade (`palpate_models.patient.guarding`).
     """
     levels = [1.0]
     for lasted, depth, deeper in zip(np.diff(ends, prepend=0.0), depths, np.diff(depths, prepend=0.0), strict=True):
@@ -100,10 +97,10 @@ def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
 
 @compiled
 def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array, course: Course, forces: Array) -> None:
-    """One frictionless press into a wall at rest, which is at rest afterwards. Only the vertices of `part` move.
+    """Perform one frictionless press into a wall at rest and reset it. Only the vertices of `part` move.
 
-    The wall's own step is 1 s. `at` (2, 3) has the place [m] and the outward normal there as rows; `forces` (n,) gets the forces
-    along it [N] at the ends of the steps.
+    The wall has steps of 1 s. Rows of `at` (2, 3): place [m] and outward normal. `forces` (n,) is set to the forces along the
+    normal [N] at the ends of the steps.
     """
     normal, prony = row(at, 1), course.prony
     u, s, y = wall.u, wall.s, wall.y
@@ -125,7 +122,7 @@ def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array
             relaxed = 0.0
             for b in range(len(prony)):
                 relaxed += e[b] * y[i, b] + prony[b, 0] * (r[b] - e[b]) * u[i]
-            u[i] *= deeper  # about where it will come to
+            u[i] *= deeper  # initial guess
             s[i] = kept * u[i] - relaxed
         stride = Stride(h, kept, OVER_RELAXATION)
         for _ in range(MOST_SWEEPS):
@@ -150,11 +147,11 @@ def floor(
     radius: float,
     normal: tuple[float, float, float],
 ) -> float:
-    """The least displacement of a vertex X of outward normal n that a sphere about p allows [m]: w of `kernel.hold`."""
+    """Return the least displacement [m] that a sphere at p allows a vertex X with outward normal n: w in `tissue.hold`."""
     d = subtract(p, X)
     along = -dot(n, d)
     square = radius * radius - dot(d, d) + along * along
-    if square <= radius * radius * RIM * RIM or dot(n, normal) <= 0.0:  # beside it, or on the far side of something thin
+    if square <= radius * radius * RIM * RIM or dot(n, normal) <= 0.0:  # outside it, or on the far side of a thin body
         return -np.inf
     return along + sqrt(square)
 
@@ -170,7 +167,7 @@ def held(
     p: tuple[float, float, float],
     normal: tuple[float, float, float],
 ) -> float:
-    """The force on a sphere about p along `normal` [N], of all vertices that it holds: as in `kernel.hold`."""
+    """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, as in `tissue.hold`."""
     total = 0.0
     for k in range(len(part)):
         i = part[k]

@@ -1,10 +1,18 @@
-"""One step of the Winkler-Pasternak tissue, compiled: the equations of the README, vertex by vertex.
+"""The Winkler-Pasternak tissue: an explicit field with contact solved exactly, vertex by vertex.
+
+State: displacement u of each vertex along its inward rest normal [m], and one internal variable y_k per Prony branch and vertex.
+
+    C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,     y_k' = (g_k u - y_k) / tau_k
+    f >= 0,  u >= w,  f (u - w) = 0
+
+sigma is the stiffening of `patient.wall`, a the muscle contraction, w(p) the displacement at which the sphere holds a vertex. A
+step is
 
     u* = u - h C^-1 [K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0))]     `move_freely`, `stiffen`
-    u  = max(u*, w),  f = C (u - u*) / h                                             `hold`: w is where the sphere holds a vertex
+    u  = max(u*, w),  f = C (u - u*) / h                                             `hold`
     y_k = e_k y_k + (1 - e_k) g_k u                                                  `relax`
 
-The FMU's C source has the same equations; sigma is `palpate_models.patient.wall.stress`.
+The README has the derivation. The FMU's C source has the same equations.
 """
 
 from __future__ import annotations
@@ -26,13 +34,13 @@ from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import assemble
-from palpate_tissue.backends.winkler.presses import press_in_turn
-from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, rub, skin
+from palpate_tissue.backends.winkler.presses import standard_presses
+from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
-"""Unsigned: a signed index may be negative to numba, and looking each time doubles the cost of the field's step."""
+"""Unsigned: numba checks signed indices for negative values, which doubles the cost of the step."""
 _USUAL = 7
-"""Entries of most rows of the field's matrix: a vertex and its six neighbours."""
+"""Entries of most matrix rows: a vertex and its six neighbours."""
 
 
 class Membrane(NamedTuple):
@@ -41,7 +49,7 @@ class Membrane(NamedTuple):
     u: Array
     """Displacement along the inward normals [m], shape (n,). Changed in place."""
     y: Array
-    """What of it has relaxed [m], shape (b, n). Changed in place."""
+    """Relaxed displacement y_k [m], shape (b, n). Changed in place."""
     indptr: Index
     indices: Index
     rate: Array
@@ -51,31 +59,31 @@ class Membrane(NamedTuple):
     h: float
     """[s]"""
     spring: Array
-    """The springs beside the linear wall: rows `_BETA2`, `_BENT` and `_TENSION`, shape (3, n); (3, 0) where there are none."""
+    """Nonlinear springs: rows `_BETA2`, `_BENT` and `_TENSION`, shape (3, n); (3, 0) if there are none."""
     share: float
-    """h k_w A / C = h / dashpot_s: how far such a spring's pressure over k_w moves a vertex in a step, the same everywhere."""
+    """h k_w A / C = h / dashpot_s: displacement in a step per spring pressure over k_w, equal at all vertices."""
     activation: Array
-    """a, how far muscles are contracted, 0 to 1; shape (1,). Changed in place."""
+    """Muscle contraction a, 0 to 1; shape (1,). Changed in place."""
 
 
 class Patch(NamedTuple):
-    """Vertices that the sphere might hold while its centre stays where it is; m of them.
+    """The m vertices that the sphere can hold near its present position.
 
-    Compiled code takes a tenth of a microsecond to open an array at every step, so what never changes is one table.
+    Constants are one table, because each array argument costs 0.1 us per step.
     """
 
     vertex: NDArray[np.uint32]
-    """Which vertices, shape (m,)."""
+    """Vertex indices, shape (m,)."""
     table: Array
-    """Their columns `_N`, `_X`, `_BETA` and `_GAIN`, shape (m, 8)."""
+    """Columns `_N`, `_X`, `_BETA` and `_GAIN`, shape (m, 8)."""
     f: Array
-    """Their contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
+    """Contact forces along the inward normals after the step [N], shape (m,). Changed in place."""
 
 
 _N, _X, _BETA, _GAIN = 0, 3, 6, 7
-"""Columns of a patch: outward normal (three), position (three) [m], share of the breathing excursion, and C / h [N/m]."""
+"""Columns of a patch: outward normal (3), position (3) [m], fraction of the breathing excursion, C / h [N/m]."""
 _BETA2, _BENT, _TENSION = 0, 1, 2
-"""Rows of the springs: beta^2 [1/m^2], the displacement from which they are straight [m], a contracted muscle's tension [1]."""
+"""Rows of the springs: beta^2 [1/m^2], displacement above which they are linear [m], tension of a contracted muscle [1]."""
 
 
 @compiled
@@ -89,18 +97,18 @@ def step(
     disturbed: bool,
     wrench: Array,
 ) -> bool:
-    """One step at a breathing `excursion` [m]. Whether the sphere touches: then `wrench` (6,) gets force and torque on it.
+    """Advance the wall by one step at a breathing `excursion` [m]; return True if the sphere touches.
 
-    `motion` (3, 3) has the position [m], the velocity [m/s] and the angular velocity [rad/s] of the sphere of `radius` [m] as
-    rows; `wrench` force [N] and torque about the centre [N m], and is left alone out of contact. A wall that was never
-    `disturbed` is at rest exactly, and stays so until it is touched.
+    Rows of `motion` (3, 3): position [m], velocity [m/s] and angular velocity [rad/s] of the sphere of `radius` [m]. In contact
+    `wrench` (6,) is set to the force [N] and the torque about the centre [N m] on the sphere. A wall that was never `disturbed`
+    stays exactly at rest until it is touched.
     """
     sphere = Sphere(row(motion, 0), row(motion, 1), row(motion, 2), radius)
     if disturbed:
         move_freely(wall)
     touching, push = hold(wall, patch, sphere, excursion)
     if touching:
-        rub(bristle, sphere, push, wall.h, wrench)
+        add_friction(bristle, sphere, push, wall.h, wrench)
     if disturbed or touching:
         relax(wall)
     return touching
@@ -108,7 +116,7 @@ def step(
 
 @compiled
 def move_freely(wall: Membrane) -> None:
-    """The wall as it moves by itself: u += A (u - sum_k y_k) - h k_w A / C (sigma(u) + tension a max(u, 0))."""
+    """Advance the wall without contact: u += A (u - sum_k y_k) - h k_w A / C (sigma(u) + tension a max(u, 0))."""
     u, rate, indices = wall.u, wall.rate, wall.indices
     strain = u.copy()
     for k in range(len(wall.y)):
@@ -119,7 +127,7 @@ def move_freely(wall: Membrane) -> None:
     for i in range(len(u)):
         end = wall.indptr[i + 1]
         total = u[i]
-        if end - begin == _USUAL:  # the compiler unrolls it: a quarter faster
+        if end - begin == _USUAL:  # unrolled by the compiler: 25 % faster
             for j in range(_USUAL):
                 total += rate[begin + j] * strain[indices[begin + j]]
         else:
@@ -131,7 +139,7 @@ def move_freely(wall: Membrane) -> None:
 
 @compiled
 def stiffen(wall: Membrane) -> None:
-    """What the springs beside the linear wall do to a displacement in a step. The law is in `palpate_models.patient.wall`."""
+    """Apply the nonlinear springs of `palpate_models.patient.wall` for one step."""
     u, beta2, straight_from, tension = wall.u, wall.spring[_BETA2], wall.spring[_BENT], wall.spring[_TENSION]
     share, activation = wall.share, wall.activation[0]
     for i in range(len(u)):
@@ -143,12 +151,13 @@ def stiffen(wall: Membrane) -> None:
 
 @compiled
 def hold(wall: Membrane, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
-    """Holds the vertices under the sphere on its surface, at a breathing `excursion` [m]. Whether there are any, and the push.
+    """Move the vertices under the sphere onto its surface at a breathing `excursion` [m]; return True and the push if there are
+    any.
 
-    A vertex X of outward normal n moves along it; with d = p - X and s = -d.n it meets the sphere's lower side at
-    w = s + c, c^2 = R^2 - |d|^2 + s^2. The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c):
-    f is the part along n, and the rest is borne by the tissue's guidance. As f holds the vertex exactly on the sphere, tool and
-    field exchange the same work.
+    A vertex X with outward normal n moves along it. With d = p - X and s = -d.n it meets the sphere's lower side at w = s + c,
+    c^2 = R^2 - |d|^2 + s^2. The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c): f is the component
+    along n, and the guidance of the vertex takes the rest. Since f holds the vertex exactly on the sphere, tool and field
+    exchange equal work.
     """
     u, R, table = wall.u, sphere.radius, patch.table
     load = 0.0
@@ -180,7 +189,7 @@ def hold(wall: Membrane, patch: Patch, sphere: Sphere, excursion: float) -> tupl
 
 @compiled
 def relax(wall: Membrane) -> None:
-    """The Prony branches, exact for a displacement held over the step: y_k = e_k y_k + (1 - e_k) g_k u."""
+    """Update the Prony branches, exact for a constant displacement over the step: y_k = e_k y_k + (1 - e_k) g_k u."""
     for k in range(len(wall.y)):
         y, e, feed = wall.y[k], wall.prony[k, 0], wall.prony[k, 1]
         for i in range(len(y)):
@@ -189,11 +198,11 @@ def relax(wall: Membrane) -> None:
 
 _NONE: NDArray[np.intp] = np.empty(0, dtype=np.intp)
 _MARGIN_M = 0.005
-"""The vertices near the sphere are searched anew when it has moved this far."""
+"""Motion of the sphere after which the vertices near it are searched again."""
 
 
 class WinklerTissue(TissueBackend):
-    """A soft surface that a sphere presses. Raises StabilityError if the mesh is too fine for the period."""
+    """A soft surface pressed by a sphere. Raises UserError if the mesh is too fine for the period."""
 
     def __init__(
         self,
@@ -211,9 +220,9 @@ class WinklerTissue(TissueBackend):
         self.displacement: Array = np.zeros(n)
         """u [m] along the inward rest normal, shape (n,)."""
         self.branches: Array = np.zeros((len(stiffness.prony_g), n))
-        """y_k = g_k z_k [m]: what has relaxed, a row (n,) for each Prony branch."""
+        """y_k [m]: relaxed displacement, shape (b, n)."""
         self.disturbed = False
-        """Whether anything has ever moved; until then the field is left at its exact rest."""
+        """True once anything has moved; before, the field is kept exactly at rest."""
         self._stiffness = stiffness
         self._prony_g = stiffness.prony_g
         self._wall = self._wall_of(stiffness, h)
@@ -224,16 +233,16 @@ class WinklerTissue(TissueBackend):
         self._near: Near | None = None
         self._patch = self._nothing = self._patch_of(_NONE)
         self._motion: Array = np.zeros((3, 3))
-        """The sphere's centre [m], velocity [m/s] and angular velocity [rad/s], as rows."""
+        """Rows: the sphere's centre [m], velocity [m/s] and angular velocity [rad/s]."""
         self._last: list[float] | None = None
-        self._press(self._nothing, 0.0, np.zeros(6))  # compiles it before contact
+        self._press(self._nothing, 0.0, np.zeros(6))  # compiles it before the first contact
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """See `TissueBackend`. The period is cut into equal sub-steps, in which the sphere moves on a straight line."""
+        """See `TissueBackend`. The period has equal sub-steps, in which the sphere moves on a straight line."""
         end = p_A.tolist()
         if not math.isfinite(sum(end)):
             raise ValueError(f"tissue: the indenter's position is not finite: {end}")
-        start = self._last or end  # where the sphere was a period ago
+        start = self._last or end  # centre one period ago
         self._last = end
         motion = self._motion
         motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
@@ -272,8 +281,8 @@ class WinklerTissue(TissueBackend):
         return ImplicitTissue(self.model, self._stiffness, self.breathing, dt)
 
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
-        """See `TissueBackend`. In a few long steps, each press into the part of the wall that it reaches."""
-        return press_in_turn(self.model, self._stiffness, (places, normals, radius))
+        """See `TissueBackend`. Uses a few long steps on the part of the wall that each press reaches."""
+        return standard_presses(self.model, self._stiffness, places, normals, radius)
 
     def _substep(self, excursion: float, p: list[float], radius: float, wrench: Array) -> None:
         self._excursion = excursion
@@ -282,7 +291,7 @@ class WinklerTissue(TissueBackend):
         self._press(self._patch, radius, wrench)
 
     def _press(self, patch: Patch, radius: float, wrench: Array) -> None:
-        """One explicit step; `wrench` (6,) gets force [N] and torque [N m] on the sphere, and is left alone out of contact."""
+        """Runs one explicit step; in contact sets `wrench` (6,) to force [N] and torque [N m] on the sphere."""
         self._wall.activation[0] = self.activation
         touching = step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
         if touching:
@@ -292,7 +301,7 @@ class WinklerTissue(TissueBackend):
         self.touching = touching
 
     def _gather(self, p: list[float], radius: float) -> None:
-        """Finds what a sphere near `p` [m] might touch."""
+        """Finds the vertices that a sphere near `p` [m] can touch."""
         deepest = float(self.displacement[self._patch.vertex].max(initial=0.0))
         self._near = self._search.around(p, radius, deepest)
         self._patch = self._patch_of(self._free[self._near.vertex])
@@ -303,11 +312,11 @@ class WinklerTissue(TissueBackend):
         return Patch(index.astype(np.uint32), table, np.zeros(len(index)))
 
     def _wall_of(self, stiffness: Stiffness, h: float) -> Membrane:
-        """The wall with its matrices for steps of `h` [s]."""
+        """Return the wall with its matrices for steps of `h` [s]."""
         A = -h * self.mechanics.stiffness
         A.data /= np.repeat(self.mechanics.damping, np.diff(A.indptr))  # row i by C_i
         indptr, columns = A.indptr.astype(np.uint32), A.indices.astype(np.uint32)
-        if A.shape[0] <= np.iinfo(np.uint16).max:  # the whole field goes through the cache at each step: the less the better
+        if A.shape[0] <= np.iinfo(np.uint16).max:  # less memory traffic per step
             columns = columns.astype(np.uint16)
         decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
@@ -326,7 +335,7 @@ class WinklerTissue(TissueBackend):
         )
 
     def _springs(self) -> Array:
-        """The rows of `Wall.spring`: none where no vertex stiffens or has a muscle."""
+        """Return the rows of `Membrane.spring`; no columns if no vertex stiffens or has a muscle."""
         model = self.model
         if not (model.stiffening.any() or model.tension.any()):
             return np.empty((3, 0))
@@ -336,12 +345,12 @@ class WinklerTissue(TissueBackend):
 
     @property
     def contacts(self) -> NDArray[np.intp]:
-        """Vertices in contact after the step, shape (k,)."""
+        """Return the vertices in contact after the step, shape (k,)."""
         return self._patch.vertex[self._patch.f > 0].astype(np.intp) if self.touching else _NONE
 
     @property
     def contact_forces(self) -> Array:
-        """Their contact forces f > 0 along their inward normals [N], shape (k,)."""
+        """Return the contact forces f > 0 along the inward normals [N], shape (k,)."""
         return self._patch.f[self._patch.f > 0] if self.touching else np.empty(0)
 
     @property
@@ -354,13 +363,13 @@ class WinklerTissue(TissueBackend):
 
     @property
     def inward(self) -> Array:
-        """How far each vertex is from its place at rest [m] along its inward normal, breathing included, shape (n,)."""
+        """See `TissueBackend`."""
         if self._excursion:
             return self.displacement - self._excursion * self.model.breathing
         return self.displacement
 
     def energy(self) -> float:
-        """Elastic energy [J] stored in all springs, those of the Maxwell branches too, and in the sheared skin."""
+        """Return the elastic energy [J] of all springs, including the Maxwell branches, and of the sheared skin."""
         u, K = self.displacement, self.mechanics.stiffness
         stored = 0.5 * (1 - sum(self._prony_g)) * (u @ (K @ u))
         for g, y in zip(self._prony_g, self.branches, strict=True):

@@ -5,17 +5,25 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
+from palpate.check.rig import RigSettings, ServiceRig
+from palpate.check.suites import check
+from palpate_bus.contract import MS
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.robot import lbr
+from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart import plant as in_dart
 from palpate_robot.backends.mujoco.plant import MujocoPlant
+from palpate_robot.backends.mujoco.service import create
 from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import END_STOP_MARGIN_RAD
 
 NOTHING = np.zeros(3)
+
 NO_DAMPING = np.zeros(7)
+
 FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
+
 TURNED = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
 
 
@@ -139,3 +147,19 @@ def test_limp_arm_comes_to_rest_on_the_table_not_in_it() -> None:
         touched = max(touched, plant.contacts())
     assert touched > 0
     assert plant.link_poses()[lbr.LINK_NAMES.index("lbr_link_7"), 2] > 0.73
+
+
+@pytest.mark.slow
+def test_it_conforms_to_the_role_robot() -> None:
+    scenario = load_scenario("clean")
+    report = check(ServiceRig(create(scenario), RigSettings(scenario, 0.0, True)))
+    assert report.passed, [result for result in report.results if result.verdict == "failed"]
+
+
+def test_it_starts_at_home_and_says_what_it_is() -> None:
+    service = create(load_scenario("clean"))
+    assert service.start()["robot_description"].data == lbr.urdf(load_scenario("clean").robot)
+    rig = ServiceRig(service, RigSettings(load_scenario("clean"), 0.0, True))
+    rig.run(0.01, {})
+    assert rig.t > 5 * MS
+    np.testing.assert_allclose(rig.last("joint_states").position, lbr.HOME, atol=1e-4)
