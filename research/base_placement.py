@@ -16,8 +16,7 @@ from palpate_models.robot.lbr import HOME, POSITION_LIMIT
 from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Exam, Robot, Scenario
-from palpate_planning.placement.inverse_kinematics import Mask
-from palpate_planning.placement.redundancy import PRESSING_FORCE_N, PostureSequence, plan_redundancy
+from palpate_planning.placement.redundancy import PRESSING_FORCE_N, Mask, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
 BORDER_M = 0.005

@@ -9,8 +9,7 @@ import pytest
 from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
-from palpate_planning.placement.inverse_kinematics import TASK_TOLERANCE
-from palpate_planning.placement.redundancy import PostureSequence, plan_redundancy, prepare
+from palpate_planning.placement.redundancy import TASK_TOLERANCE, PostureSequence, plan_redundancy, prepare
 from palpate_planning.placement.symbolic import REACH_LENGTH_M, arm, base_of, surface_frames
 
 ROBOT = Robot()

@@ -16,7 +16,7 @@ from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import Cause, Reason
 from palpate_planning.status import PerceptionFailure, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
-from palpate_planning.wall.breath import FORECAST_STEP, JOIN_S, Breath, BreathObservation
+from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
 
 DT = 0.01
 
@@ -49,7 +49,7 @@ def test_a_new_forecast_is_joined_without_a_step() -> None:
     breath.hear(motion(0, 0.002, 0.002), 100 * MS)
     breath.hear(motion(100 * MS, 0.004, 0.004), 200 * MS)
     assert breath.displacement(200 * MS) == pytest.approx(0.002)
-    assert breath.displacement(200 * MS + round(JOIN_S * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
+    assert breath.displacement(200 * MS + round(TUNING.join_s * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
 
 
 def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:

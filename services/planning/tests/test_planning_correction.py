@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.wall.correction import FIELD_LENGTH_M, FIELD_M, OFFSET_M, TILT_RAD, FeltHeight, SurfaceCorrection
+from palpate_planning.wall.correction import PRIOR, FeltHeight, SurfaceCorrection
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
@@ -19,7 +19,7 @@ def tilted(xy: np.ndarray) -> np.ndarray:
 def test_untouched_it_is_nothing_and_unsure() -> None:
     correction = SurfaceCorrection()
     assert correction.height(np.zeros(2)) == 0.0
-    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(OFFSET_M, FIELD_M))
+    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(PRIOR.offset_m, PRIOR.field_m))
 
 
 def test_offset_and_tilt_are_found_in_between() -> None:
@@ -44,8 +44,8 @@ def test_its_errors_are_as_large_as_it_says() -> None:
     rng = np.random.default_rng(3)
     everywhere = np.vstack((PLACES, BETWEEN))
     apart = np.sum((everywhere[:, None] - everywhere) ** 2, axis=-1)
-    covariance = OFFSET_M**2 + TILT_RAD**2 * everywhere @ everywhere.T
-    covariance += FIELD_M**2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2))
+    covariance = PRIOR.offset_m**2 + PRIOR.tilt_rad**2 * everywhere @ everywhere.T
+    covariance += PRIOR.field_m**2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
     scores = []
     for _ in range(50):
         truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
@@ -94,7 +94,9 @@ def test_a_new_look_keeps_what_touches_told_of_offset_and_tilt() -> None:
 def test_of_a_better_surface_the_same_touches_leave_less() -> None:
     rng = np.random.default_rng(5)
     apart = np.sum((PLACES[:, None] - PLACES) ** 2, axis=-1)
-    bent = rng.multivariate_normal(np.zeros(len(PLACES)), (2 * FIELD_M) ** 2 * np.exp(-apart / (2 * FIELD_LENGTH_M**2)))
+    bent = rng.multivariate_normal(
+        np.zeros(len(PLACES)), (2 * PRIOR.field_m) ** 2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
+    )
     correction = SurfaceCorrection()
     for place, field in zip(PLACES, bent, strict=True):
         correction.touch(FeltHeight(place, float(tilted(place) + field), 2e-4))

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_planning.wall.touch import FELT_N, UNFITTED_M, Onset, find_touch
+from palpate_planning.wall.touch import FELT_N, TUNING, Onset, find_touch
 
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
@@ -45,7 +45,7 @@ def test_on_bone_the_skin_is_where_force_begins() -> None:
     rows = np.array([(-0.0003, 0.0), (-0.0002, 0.01), (-0.0001, 0.0), (0.0, 0.0), (0.0001, 1.2)])
     touch = find_touch(rows)
     assert touch.depth == pytest.approx(0.0, abs=1e-9)
-    assert touch.sigma == UNFITTED_M
+    assert touch.sigma == TUNING.unfitted_sd_m
 
 
 def test_a_wall_that_was_not_where_it_was_forecast_moves_the_touch() -> None:

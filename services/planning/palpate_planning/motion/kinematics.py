@@ -13,16 +13,17 @@ from palpate_models.scenario.schema import Limits, Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 TOLERANCE_M = 1e-4
-"""Position error at which inverse kinematics counts as solved."""
+"""Position error at which inverse kinematics is solved."""
 TOLERANCE_RAD = 1e-3
-"""Error of the tool axis at which inverse kinematics counts as solved."""
+"""Error of the tool axis at which inverse kinematics is solved."""
 ELBOW = 3
-"""Index of the joint that alone sets how far the wrist is from the shoulder."""
+"""Index of the joint that determines the distance from shoulder to wrist."""
 STRAIGHT_RAD = 0.2
-"""An elbow that is bent by less is near its singularity: the arm reaches at most 4 mm further, less than what the skin may lie
-deeper than it was seen, and for each metre per second that the wall moves the elbow turns at 25 rad/s and more."""
+"""Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
+perceived
+surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
 TOO_STRAIGHT_RAD = 0.15
-"""In contact it may come nearer, since the skin may lie deeper than it was seen."""
+"""Smallest elbow angle in contact, where the skin may be deeper than perceived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,20 +33,20 @@ class IkSolution:
     q: Array
     """Joint positions [rad], shape (7,)."""
     ok: bool
-    """Whether the pose is met to `TOLERANCE_M` and `TOLERANCE_RAD` within the limits."""
+    """True if the pose is met to `TOLERANCE_M` and `TOLERANCE_RAD` within the limits."""
     error_m: float
-    """Distance of the sphere's centre from the one asked for [m]."""
+    """Position error of the sphere's centre [m]."""
     error_rad: float
-    """Angle of the orientation, or of the tool axis where spin is free, from the one asked for [rad]."""
+    """Orientation error, or error of the tool axis if spin is free [rad]."""
 
 
 def stretched(q: Array, bend: float) -> bool:
-    """Whether the elbow is bent by less than `bend` [rad] at joint positions q [rad]."""
+    """Return True if the elbow is bent by less than `bend` [rad] at joint positions q [rad]."""
     return bool(abs(q[ELBOW]) < bend)
 
 
 class ArmKinematics:
-    """The arm as pinocchio sees it. W: world, I: indenter (origin at the sphere's centre), S: F/T sensor."""
+    """Kinematics of the arm on pinocchio. W: world, I: indenter (origin at the sphere's centre), S: F/T sensor."""
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
         self.model = pin.buildModelFromXML(lbr.urdf(robot))
@@ -53,18 +54,18 @@ class ArmKinematics:
         self._indenter = self.model.getFrameId("indenter")
         self._sensor = self.model.getFrameId("ft_sensor")
         self._R_WS: Array = self.data.oMf[self._sensor].rotation
-        """A view of the pose that pinocchio computed last."""
+        """View of pinocchio's latest result."""
         self.upper: Array = lbr.POSITION_LIMIT - limits.joint_margin_rad
-        """Highest joint positions that planning uses [rad], shape (7,); the lowest are their negatives."""
+        """Upper joint limits used by planning [rad], shape (7,); the lower limits are their negatives."""
 
     def pose(self, q: Array) -> Array:
-        """X_WI, shape (4, 4), at joint positions q [rad]."""
+        """Return X_WI, shape (4, 4), at joint positions q [rad]."""
         pin.forwardKinematics(self.model, self.data, q)
         X_WI: Array = pin.updateFramePlacement(self.model, self.data, self._indenter).homogeneous.copy()
         return X_WI
 
     def poses(self, q: Array) -> tuple[Array, Array]:
-        """X_WI and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3), at joint positions q [rad]."""
+        """Return X_WI and R_WS (orientation of the F/T sensor), shapes (4, 4) and (3, 3), at joint positions q [rad]."""
         model, data = self.model, self.data
         pin.forwardKinematics(model, data, q)
         X_WI: Array = pin.updateFramePlacement(model, data, self._indenter).homogeneous
@@ -72,7 +73,7 @@ class ArmKinematics:
         return X_WI, self._R_WS.copy()
 
     def jacobian(self, q: Array) -> Array:
-        """J with V_WI_W = J qd, rows linear then angular, world axes, of the sphere's centre, shape (6, 7)."""
+        """Return J with V_WI_W = J qd of the sphere's centre, linear rows first, world axes, shape (6, 7)."""
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
@@ -85,11 +86,10 @@ class ArmKinematics:
         spin_free: bool = False,
         iterations: int = 60,
     ) -> IkSolution:
-        """Joint positions that put the indenter at X_WI; with `spin_free` the turn about the tool's axis does not matter.
+        """Return joint positions that put the indenter at X_WI; with `spin_free` the rotation about the tool axis is free.
 
-        Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates, with the null space drawn to
-        `q_rest` (mid-range where None) and joints clipped to the limits with margin. Deterministic; at most `iterations`
-        steps.
+        Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates; the null space tends to `q_rest`
+        (mid-range if None), and joints are clipped to the limits with margin. Deterministic; at most `iterations` steps.
         """
         rest = np.zeros(7) if q_rest is None else q_rest
         q = np.clip(np.asarray(q_seed, dtype=float), -self.upper, self.upper)
@@ -119,7 +119,7 @@ class ArmKinematics:
 
 
 def _turn_of_axis(z_I: Array) -> Array:
-    """Rotation vector, in axes of I, that turns I's z axis onto unit z_I; its z component is zero. Shape (3,)."""
+    """Return the rotation vector, in axes of I, from I's z axis to unit z_I; its z component is zero, shape (3,)."""
     across = np.array((-z_I[1], z_I[0], 0.0))
     size = float(np.linalg.norm(across))
     return across * (float(np.arctan2(size, z_I[2])) / max(size, 1e-12))

@@ -1,8 +1,7 @@
-"""Collision-free joint-space motion: the straight line where it is free, else OMPL's RRT-Connect and shortcuts.
+"""Collision-free joint-space motion: a straight line if it is free, else OMPL's RRT-Connect with shortcuts.
 
-Deterministic: OMPL's seed generator is set anew for each query, so that the planner and sampler built after it draw the
-same numbers whatever was planned before; planning ends on a count of iterations, never on time; shortcuts are greedy, not
-random.
+Deterministic: OMPL's seed is set for each query before planner and sampler are created, so results do not depend on earlier
+queries; planning ends on an iteration count, never on time; shortcuts are greedy, not random.
 """
 
 from __future__ import annotations
@@ -12,6 +11,7 @@ from itertools import pairwise
 import numpy as np
 from ompl import base, geometric, util
 
+from palpate_errors import RunError
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.kinematics import ArmKinematics
@@ -19,22 +19,22 @@ from palpate_planning.motion.scene import STEP_RAD, CollisionScene
 from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, rounded
 
 ITERATIONS = 6000
-"""Iterations of RRT-Connect after which a motion counts as impossible."""
+"""Largest number of RRT-Connect iterations."""
 RANGE_RAD = 0.4
 """Longest extension of the tree."""
 
 BLENDS_RAD = (0.25, 0.1, 0.03)
-"""Lengths by which corners are rounded, tried in turn until the rounded path is free."""
+"""Blend lengths of corners, tried in order until the rounded path is free."""
 
 
-class NoPathError(RuntimeError):
-    """No collision-free motion was found. The message says between which postures and why."""
+class NoPathError(RunError):
+    """No collision-free motion was found between two postures."""
 
 
 def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
-    """A collision-free path from q0 to q1 within +-bound [rad]: returns way points, shape (n, 7), the ends included.
+    """Return way points, shape (n, 7), of a collision-free path from q0 to q1 within +-bound [rad], ends included.
 
-    Raises NoPathError if an end collides or `ITERATIONS` do not suffice.
+    Raises NoPathError if an end collides or after `ITERATIONS`.
     """
     for name, q in (("start", q0), ("goal", q1)):
         if not scene.free(q):
@@ -47,7 +47,7 @@ def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -
 def timed_motion(
     scene: CollisionScene, kinematics: ArmKinematics, limits: Limits, q0: Array, q1: Array, seed: int, period_s: float
 ) -> JointTrajectory:
-    """A collision-free motion from q0 to q1, corners rounded, within all limits, sampled every `period_s`. Raises NoPathError."""
+    """Return a collision-free motion from q0 to q1 within all limits, sampled every `period_s`. Raises NoPathError."""
     points = plan(scene, q0, q1, kinematics.upper, seed)
     for blend in BLENDS_RAD:
         smooth = rounded(points, blend)
@@ -57,8 +57,8 @@ def timed_motion(
 
 
 def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
-    util.noOutputHandler()  # it would complain that numbers were drawn before; all that draw are built below
-    util.RNG.setSeed(seed + 1)  # zero is no seed for OMPL
+    util.noOutputHandler()  # suppresses a warning about the late seed; every sampler is created below
+    util.RNG.setSeed(seed + 1)  # OMPL rejects seed 0
     space = base.RealVectorStateSpace(7)
     bounds = base.RealVectorBounds(7)
     for i in range(7):
@@ -87,7 +87,7 @@ def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed
 
 
 def _shortcut(scene: CollisionScene, path: Array) -> Array:
-    """Greedy shortcuts: from each way point to the farthest that can be reached straight; then with edges halved, again."""
+    """Shorten greedily: from each way point to the farthest reachable in a straight line; repeat with halved edges."""
     for halve in (False, True):
         points = [p for a, b in pairwise(path) for p in ((a, (a + b) / 2) if halve else (a,))] + [path[-1]]
         kept, i = [points[0]], 0

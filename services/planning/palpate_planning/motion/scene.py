@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from itertools import pairwise
 
 import coal
@@ -16,25 +16,36 @@ from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
 MARGIN_M = 0.010
-"""Distance that free motion keeps. More than half of what any point of the arm moves between two checks."""
+"""Clearance of free motion: more than half the motion of any point of the arm between two checks."""
 STEP_RAD = 0.02
-"""Largest joint step between two checks of a motion: at 0.95 m of reach 19 mm at the tool."""
+"""Largest joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
 SELF_APART = 3
-"""Links this many joints apart and more are checked against each other; nearer ones cannot meet within the limits."""
+"""Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits."""
 TOOL_LINKS = ("ft_sensor", "indenter")
-"""Stand-off and sphere: they dip under the rest surface while indenting."""
+"""Stand-off and sphere, which are below the rest surface while indenting."""
 
 
 def _alignment(start: Array, end: Array) -> pin.SE3:
-    """Pose of a capsule's centre with z along its axis, in the link frame."""
+    """Return the pose of a capsule's centre with z along its axis, in the link frame."""
     axis = end - start
     length = float(np.linalg.norm(axis))
     R = np.eye(3) if length == 0 else pin.Quaternion.FromTwoVectors(np.array((0.0, 0.0, 1.0)), axis / length).matrix()
     return pin.SE3(R, (start + end) / 2)
 
 
+def _arm_shapes(model: pin.Model, robot: Robot) -> Iterator[tuple[str, int, pin.SE3, coal.CollisionGeometry]]:
+    """Yield link, parent joint, pose in the joint and shape of each capsule of the arm, base first."""
+    for link, capsules in lbr.capsules(robot).items():
+        frame = model.frames[model.getFrameId(link)]
+        for capsule in capsules:
+            start, end = np.array(capsule.start), np.array(capsule.end)
+            length = float(np.linalg.norm(end - start))
+            shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
+            yield link, frame.parentJoint, frame.placement * _alignment(start, end), shape
+
+
 def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHModelOBBRSS:
-    """A triangle mesh for coal: vertices [m] shape (n, 3), vertex indices shape (m, 3)."""
+    """Return a triangle mesh for coal: vertices [m], shape (n, 3), vertex indices, shape (m, 3)."""
     geometry = coal.BVHModelOBBRSS()
     geometry.beginModel(len(triangles), len(vertices))
     geometry.addVertices(np.ascontiguousarray(vertices, dtype=float))
@@ -45,7 +56,7 @@ def mesh_geometry(vertices: Array, triangles: NDArray[np.int64]) -> coal.BVHMode
 
 
 def with_skirt(vertices: Array, triangles: NDArray[np.int64], floor: float) -> tuple[Array, NDArray[np.int64]]:
-    """The mesh with walls from its border down to height `floor` [m], so that nothing reaches under the surface."""
+    """Return the mesh with walls from its border down to height `floor` [m], which closes the space below the surface."""
     edges = np.concatenate([triangles[:, (0, 1)], triangles[:, (1, 2)], triangles[:, (2, 0)]])
     keys = np.sort(edges, axis=1)
     _, first, counts = np.unique(keys, axis=0, return_index=True, return_counts=True)
@@ -61,7 +72,7 @@ def with_skirt(vertices: Array, triangles: NDArray[np.int64], floor: float) -> t
 
 
 class CollisionScene:
-    """Whether arm postures and motions collide. `abdomen` is (vertices in world, triangles), None before perception."""
+    """Collision checks of arm postures and motions. `abdomen`: (vertices in world, triangles), None before perception."""
 
     def __init__(
         self,
@@ -71,7 +82,7 @@ class CollisionScene:
         tool_may_touch: bool = False,
         margin: float = MARGIN_M,
     ) -> None:
-        """`tool_may_touch` lets stand-off and sphere meet the abdomen, as in the contact phase."""
+        """`tool_may_touch`: allows contact of stand-off and sphere with the abdomen."""
         self._model = kinematics.model
         self._data = self._model.createData()
         self._geometry = pin.GeometryModel()
@@ -96,24 +107,16 @@ class CollisionScene:
         return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))
 
     def _add_arm(self, robot: Robot) -> list[tuple[str, int]]:
-        """Adds the arm's capsules; link name and geometry index of each, base first."""
-        shapes = []
-        for link, capsules in lbr.capsules(robot).items():
-            frame = self._model.frames[self._model.getFrameId(link)]
-            for k, capsule in enumerate(capsules):
-                start, end = np.array(capsule.start), np.array(capsule.end)
-                length = float(np.linalg.norm(end - start))
-                shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
-                placement = frame.placement * _alignment(start, end)
-                shapes.append((link, self._add(f"{link}_{k}", frame.parentJoint, placement, shape)))
-        return shapes
+        """Adds the arm's capsules; returns link name and geometry index of each, base first."""
+        shapes = _arm_shapes(self._model, robot)
+        return [(link, self._add(f"{link}_{k}", joint, pose, shape)) for k, (link, joint, pose, shape) in enumerate(shapes)]
 
     def free(self, q: Array) -> bool:
-        """Whether the arm at q [rad] keeps its margin to everything, itself included."""
+        """Return True if the arm at q [rad] keeps its margin to all obstacles and to itself."""
         return not pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, True)
 
     def collisions(self, q: Array) -> list[str]:
-        """Names of the pairs that are nearer than the margin at q, for messages."""
+        """Return the names of pairs closer than the margin at q, for messages."""
         pin.computeCollisions(self._model, self._data, self._geometry, self._results, q, False)
         found = []
         for pair, result in zip(self._geometry.collisionPairs, self._results.collisionResults, strict=True):
@@ -123,37 +126,30 @@ class CollisionScene:
         return found
 
     def motion_free(self, q0: Array, q1: Array) -> bool:
-        """Whether the straight joint-space motion from q0 to q1 is free, checked every `STEP_RAD`, both ends included."""
+        """Return True if the straight joint-space motion from q0 to q1 is free, checked every `STEP_RAD`, ends included."""
         steps = max(1, int(np.ceil(float(np.abs(q1 - q0).max()) / STEP_RAD)))
-        order = sorted(range(steps + 1), key=lambda k: -(k & -k) if k else -steps)  # coarse first: fails early
+        order = sorted(range(steps + 1), key=lambda k: -(k & -k) if k else -steps)  # coarse first, to fail early
         return all(self.free(q0 + (q1 - q0) * (k / steps)) for k in order)
 
     def path_free(self, path: Iterable[Array]) -> bool:
-        """Whether a polyline of postures is free all along."""
+        """Return True if a polyline of postures is free."""
         points = list(path)
         return all(self.motion_free(a, b) for a, b in pairwise(points))
 
 
 class ViewPyramid:
-    """The pyramid from the camera's centre to the region of interest: the arm must stay out of it for a free view."""
+    """View pyramid from the camera's centre to the region of interest, which the arm must not occlude."""
 
     def __init__(self, kinematics: ArmKinematics, robot: Robot, apex_W: Array, corners_W: Array) -> None:
-        """`corners_W`: the four corners of the region in order round it, shape (4, 3)."""
+        """`corners_W`: the four corners of the region in cyclic order, shape (4, 3)."""
         vertices = np.vstack((apex_W, corners_W))
         triangles = np.array([(0, 1, 2), (0, 2, 3), (0, 3, 4), (0, 4, 1), (1, 3, 2), (1, 4, 3)])
         self._kinematics = kinematics
         self._view = mesh_geometry(vertices, triangles)
-        self._parts = []
-        for link, capsules in lbr.capsules(robot).items():
-            frame = kinematics.model.frames[kinematics.model.getFrameId(link)]
-            for capsule in capsules:
-                start, end = np.array(capsule.start), np.array(capsule.end)
-                length = float(np.linalg.norm(end - start))
-                shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
-                self._parts.append((frame.parentJoint, frame.placement * _alignment(start, end), shape))
+        self._parts = [part[1:] for part in _arm_shapes(kinematics.model, robot)]
 
     def clear(self, q: Array) -> bool:
-        """Whether the arm at q leaves the whole pyramid free."""
+        """Return True if the arm at q is outside the pyramid."""
         model, data = self._kinematics.model, self._kinematics.data
         pin.forwardKinematics(model, data, q)
         request = coal.CollisionRequest()
@@ -167,7 +163,7 @@ class ViewPyramid:
 
 
 def region_corners(X_WA: Array, centre: tuple[float, float], size: tuple[float, float]) -> Array:
-    """Corners of the examined region in world, in order round it, shape (4, 3); heights on A's xy plane."""
+    """Return the corners of the examined region in world in cyclic order, shape (4, 3), on A's xy plane."""
     half = np.array(size) / 2
     signs = ((-1, -1), (1, -1), (1, 1), (-1, 1))
     return apply(X_WA, np.array([(centre[0] + i * half[0], centre[1] + j * half[1], 0.0) for i, j in signs]))

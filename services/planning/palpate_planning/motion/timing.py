@@ -1,4 +1,4 @@
-"""Time parametrisation: smooth speed along a path, by ruckig on one degree of freedom, within limits on joints and tool."""
+"""Time parametrisation: jerk-limited speed along a path by ruckig on one degree of freedom, within joint and tool limits."""
 
 from __future__ import annotations
 
@@ -11,6 +11,7 @@ from typing import Final
 import numpy as np
 import ruckig
 
+from palpate_errors import RunError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits
@@ -20,23 +21,24 @@ from palpate_planning.periods import MS
 JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
 """Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
 RISE_S = 0.15
-"""Time in which acceleration builds up: jerk limit = acceleration / RISE_S."""
+"""Rise time of the acceleration: jerk limit = acceleration / RISE_S."""
 BRAKED_NS = 30 * MS
-"""After this long without a set-point control has braked the arm to a stand (`MAX_EXTRAPOLATION_NS` there)."""
+"""Time without a set-point after which control has stopped the arm (`ReferenceTuning.bridged_periods`)."""
 RESTART_NS = 300 * MS
-"""Time in which a motion that was interrupted comes up to its speed again [A]."""
+"""Time in which an interrupted motion returns to its speed [A]."""
 _FINISHED: Final = ruckig.Result.Finished
 _UNDER_WAY: Final = (ruckig.Result.Working, _FINISHED)
 
 
 class JerkLimitedAxis:
-    """One degree of freedom that moves to a target with bounded speed, acceleration and jerk; limits may change on the way.
+    """One degree of freedom moving to a target with bounded speed, acceleration and jerk; target and speed may change at any
+    time.
 
-    Its position, velocity and acceleration are to be read; `step`, `shift` and `stand` change them.
+    Read position, velocity and acceleration; change them with `step`, `shift` and `stand`.
     """
 
     def __init__(self, position: float, acceleration: float, jerk: float, period_s: float) -> None:
-        """At rest at `position` [m or rad]; moves one `period_s` a step."""
+        """Starts at rest at `position` [m or rad]; each step lasts `period_s`."""
         self._otg = ruckig.Ruckig(1, period_s)
         self._in = ruckig.InputParameter(1)
         self._out = ruckig.OutputParameter(1)
@@ -46,9 +48,9 @@ class JerkLimitedAxis:
         self._target = self._speed = nan
 
     def step(self, target: float, speed: float) -> bool:
-        """Advances one period towards `target` at no more than `speed`, at rest there; returns whether it has arrived.
+        """Advances one period towards rest at `target` with at most `speed`; returns True on arrival.
 
-        Raises RuntimeError if ruckig finds no way, which takes limits that are not positive.
+        Raises RunError if ruckig fails, which requires limits that are not positive.
         """
         given, out = self._in, self._out
         if target != self._target:
@@ -57,31 +59,31 @@ class JerkLimitedAxis:
             given.max_velocity, self._speed = [speed], speed
         result = self._otg.update(given, out)
         if result not in _UNDER_WAY:
-            raise RuntimeError(f"ruckig: {result} from {self.position}, {self.velocity} to {target} at {speed}")
+            raise RunError(f"ruckig: {result} from {self.position}, {self.velocity} to {target} at {speed}")
         out.pass_to_input(given)
         self.position, self.velocity, self.acceleration = out.new_position[0], out.new_velocity[0], out.new_acceleration[0]
         return bool(result == _FINISHED)
 
     def shift(self, change: float) -> None:
-        """Moves the zero of all positions: the present position reads `change` more."""
+        """Shifts the origin: the present position increases by `change`."""
         self.position += change
         self._in.current_position = [self.position]
 
     def stand(self) -> None:
-        """Stands still at once."""
+        """Sets velocity and acceleration to zero."""
         self.velocity = self.acceleration = 0.0
         self._in.current_velocity = self._in.current_acceleration = [0.0]
 
 
 class RestartRamp:
-    """The rate of motions: as planned, or from rest after steps were missed. Nothing is skipped to make up for lost time."""
+    """Playback rate of motions: 1, or a ramp from rest after missed steps. No part of a motion is skipped."""
 
     def __init__(self) -> None:
         self._last: int | None = None
         self._restarted: int | None = None
 
     def step(self, t: int) -> float:
-        """Samples of a trajectory to advance by in the step at `t` [ns]: exactly 1, or less after steps were missed."""
+        """Return the number of trajectory samples to advance at `t` [ns]: exactly 1, or less after missed steps."""
         if self._last is not None and t - self._last > BRAKED_NS:
             self._restarted = t
         self._last = t
@@ -95,10 +97,10 @@ class RestartRamp:
 
 
 class SpeedLimit:
-    """Speed allowed along a path, lowered ahead of slow places so that braking at `acceleration` suffices."""
+    """Speed limit along a path, lowered ahead of slow positions so that braking with `acceleration` suffices."""
 
     def __init__(self, s: Array, speed: Array, acceleration: float) -> None:
-        """Speeds [m/s or rad/s] at increasing path positions s, shape (n,)."""
+        """Takes speeds [m/s or rad/s] at increasing path positions s, shapes (n,)."""
         places, reachable = s.tolist(), speed.tolist()
         for k in range(len(places) - 2, -1, -1):
             reachable[k] = min(reachable[k], sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (places[k + 1] - places[k])))
@@ -106,7 +108,7 @@ class SpeedLimit:
         self._speed: list[float] = reachable
 
     def at(self, s: float) -> float:
-        """Speed allowed at s: what `numpy.interp` gives, which takes ten times as long for one number."""
+        """Return the speed limit at s; equal to `numpy.interp`, which takes ten times as long for one number."""
         places, speed = self._s, self._speed
         k = bisect_right(places, s)
         if not 0 < k < len(places):
@@ -126,7 +128,7 @@ class JointTrajectory:
         return len(self.q)
 
     def at(self, k: float) -> tuple[Array, Array]:
-        """Position and velocity, shapes (7,), at sample `k` within 0..len - 1, between samples interpolated."""
+        """Return position and velocity, shapes (7,), at sample `k` within 0..len - 1, interpolated between samples."""
         i = int(k)
         part = k - i
         if not part:
@@ -136,10 +138,10 @@ class JointTrajectory:
 
 
 def rounded(points: Array, blend: float) -> Array:
-    """A polyline in joint space, shape (n, 7), with its corners replaced by parabolas sampled finely, shape (m, 7).
+    """Return a joint-space polyline, shape (n, 7), with corners replaced by sampled parabolas, shape (m, 7).
 
-    At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola lies in the
-    triangle of the corner and its two ends, at most blend / 4 from the corner.
+    At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola is in the triangle of
+    the corner and its two ends, at most blend / 4 from the corner.
     """
     if len(points) < 3:
         return points
@@ -156,9 +158,9 @@ def rounded(points: Array, blend: float) -> Array:
 
 
 def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, period_s: float) -> JointTrajectory:
-    """Times a joint-space polyline, shape (n, 7), within joint speed, joint acceleration and tool speed limits.
+    """Time a joint-space polyline, shape (n, 7), within joint speed, joint acceleration and tool speed limits.
 
-    The path is q(s) with s its length; s(t) comes from ruckig with a speed limit for each place:
+    The path is q(s) with s its length; s(t) comes from ruckig with a speed limit per position:
     |q'| v <= joint_velocity_scale * limit, |J q'| v <= speed_mps, |q''| v^2 <= half of the acceleration limit; the other
     half is left to |q'| dv/dt.
     """

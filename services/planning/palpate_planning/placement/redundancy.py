@@ -1,10 +1,10 @@
-"""Redundancy and base placement: which postures of the arm carry out a whole scan with the most margin.
+"""Redundancy resolution: postures that perform a whole scan with the most margin.
 
     postures = plan_redundancy(robot, positions_W, normals_W, q_seed)
 
-Position and tool axis take five of seven joints; what is left (elbow swivel and spin about the tool) is chosen by
-optimisation: far from joint limits, little torque at the pressing force, far from singularities, elbow high, smooth
-along the path. `python -m research.base_placement` finds the base placement by the same costs.
+Position and tool axis take five of seven joints. The rest (elbow swivel and spin about the tool) is chosen by optimisation: far
+from joint limits and singularities, little torque at the pressing force, elbow high, smooth along the path.
+`python -m research.base_placement` optimises the base placement with the same costs.
 """
 
 from __future__ import annotations
@@ -21,36 +21,123 @@ from scipy.spatial import cKDTree
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.lbr import POSITION_LIMIT, TORQUE_LIMIT
 from palpate_models.scenario.schema import Robot
-from palpate_planning.placement.inverse_kinematics import PROJECTION_STEPS, Batch, Mask
-from palpate_planning.placement.symbolic import arm, casadi
+from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
+
+Mask = NDArray[np.bool_]
+
+TASK_TOLERANCE = 1e-5
+"""Residual at which a target is reached [m, rad]."""
+PROJECTION_STEPS = 12
+"""Gauss-Newton steps that project a posture onto its target."""
+_IK_STEPS = 40
+_DESCENT = 0.05
+_LARGEST_STEP_RAD = 0.15
+
+
+class Batch:
+    """Targets with their CasADi maps, evaluated for all postures at once. Postures are rows."""
+
+    def __init__(self, robot: Robot, positions: Array, normals: Array, limit: Array, force: float) -> None:
+        n = len(positions)
+        self.robot, self.count, self.limit, self.force = robot, n, limit, force
+        self.base = base_of(robot)
+        self.positions = positions
+        self.frames = surface_frames(normals)
+        self.functions = arm(robot)
+        self._task, self._cost = self.functions.task.map(n), self.functions.cost.map(n)
+        self._base = np.tile(self.base[:, None], (1, n))
+        self._frames = np.hstack(list(self.frames))
+
+    def task(self, q: Array) -> tuple[Array, Array]:
+        """Return residuals (n, 5) and their Jacobians (n, 5, 7)."""
+        residual, jacobian = self._task(q.T, self._base, self.positions.T, self._frames)
+        return np.array(residual).T, np.array(jacobian).reshape(5, self.count, 7).transpose(1, 0, 2)
+
+    def cost(self, q: Array) -> Array:
+        """Return the costs of the postures, shape (n,)."""
+        cost: Array = np.array(self._cost(q.T, self._base, self.force)[0])[0]
+        return cost
+
+    def gradient(self, q: Array) -> Array:
+        """Return the gradients of the costs, shape (n, 7)."""
+        return np.array(self._cost(q.T, self._base, self.force)[1]).T
+
+    def facing(self, q: Array) -> Array:
+        """Return the cosine between tool axis and inward normal, shape (n,)."""
+        cosine: Array = np.array(self.functions.facing.map(self.count)(q.T, self._base, self._frames))[0]
+        return cosine
+
+    def solve(self, q: Array, steps: int, descent: float) -> Array:
+        """Return postures after damped Gauss-Newton steps, shape (n, 7); `descent` scales the cost gradient in the null space."""
+        damping = 1e-6 * np.eye(5)
+        for step in range(steps):
+            residual, J = self.task(q)
+            gram = J @ J.transpose(0, 2, 1) + damping
+            rhs = residual[..., None]
+            if descent:
+                push = -descent * self.gradient(q) * (1 - step / steps)
+                rhs = rhs + J @ push[..., None]
+            move = -(J.transpose(0, 2, 1) @ np.linalg.solve(gram, rhs))[..., 0]
+            if descent:
+                move += push
+            largest = np.abs(move).max(axis=1, keepdims=True)
+            q = q + move * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
+            q = np.clip(q, -self.limit, self.limit)
+        return q
+
+    def part(self, indices: NDArray[np.intp]) -> Batch:
+        """Return a batch with some of the targets."""
+        return Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limit, self.force)
+
+    def search(self, q: Array) -> Array:
+        """Return inverse kinematics from postures `q` with low cost, shape (n, 7)."""
+        return self.solve(self.solve(q, _IK_STEPS, _DESCENT), PROJECTION_STEPS, 0.0)
+
+    def from_one(self, start: Array) -> Array:
+        """Return inverse kinematics of all targets from one posture, shape (n, 7)."""
+        return self.search(np.tile(np.clip(start, -self.limit, self.limit), (self.count, 1)))
+
+    def verdict(self, q: Array) -> tuple[int, float]:
+        """Return a score, lower is better: number of missed targets, then mean cost of the others, rounded for repeatability."""
+        reached = self.reached(q)[1]
+        cost = self.cost(q)
+        return int((~reached).sum()), round(float(cost[reached].mean()), 3) if reached.any() else 0.0
+
+    def reached(self, q: Array) -> tuple[Array, Mask]:
+        """Return the norm of the residual (n,), and True where the target is reached with the right orientation (n,)."""
+        residual = np.linalg.norm(self.task(q)[0], axis=1)
+        facing = self.facing(q)
+        wrong = facing <= 0
+        return np.where(wrong, np.maximum(residual, 1 - facing), residual), (residual < TASK_TOLERANCE) & ~wrong
+
 
 KNOTS = 32
-"""Targets at most that the optimisation moves; postures between them are interpolated and put back on their targets."""
+"""Largest number of optimised targets; postures in between are interpolated and projected onto their targets."""
 SMOOTHNESS = 2.0
 """Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
 PRESSING_FORCE_N = 15.0
-"""Normal force that postures are judged at: the working force limit."""
+"""Normal force in the cost of postures: the working force limit."""
 _IPOPT_STEPS, _SAMPLES = 80, 16
 
 
 @dataclass(frozen=True, slots=True)
 class PostureSequence:
-    """A posture for each target, in the targets' order."""
+    """A posture for each target, in the order of the targets."""
 
     q: Array
-    """Joint positions [rad], shape (n, 7); where not reachable, the posture that comes nearest."""
+    """Joint positions [rad], shape (n, 7); the closest posture where the target is not reachable."""
     reachable: Mask
-    """Whether the target is reached within joint limits less the margin, shape (n,)."""
+    """True where the target is reached within the joint limits minus the margin, shape (n,)."""
     margin: Array
     """Distance to the nearest joint limit [rad], shape (n,)."""
     torque_fraction: Array
-    """Largest joint torque over its limit, gravity and pressing force together [1], shape (n,)."""
+    """Largest joint torque over its limit, from gravity and pressing force [1], shape (n,)."""
     dexterity: Array
     """Distance from singularity, sqrt(det(J J^T)) of the length-scaled Jacobian [1], shape (n,)."""
     residual: Array
-    """What is missing to the target: norm over position [m] and axis [rad], shape (n,)."""
+    """Norm of the error of position [m] and axis [rad], shape (n,)."""
     refined: bool
-    """Whether the optimisation converged; else these are inverse kinematics with a null-space gradient."""
+    """True if the optimisation converged; else the result of inverse kinematics with a null-space gradient."""
 
 
 def plan_redundancy(
@@ -62,19 +149,18 @@ def plan_redundancy(
     joint_margin_rad: float = 0.05,
     force_n: float = PRESSING_FORCE_N,
 ) -> PostureSequence:
-    """Postures that take the indenter along targets with the tool's z axis opposite to the surface normals.
+    """Return postures that move the indenter along targets with the tool's z axis opposite to the surface normals.
 
     Args:
         robot: the robot with its base placement and tool.
         positions_W: origins of the indenter frame (the sphere's centre) in world, in path order [m], shape (n, 3).
         normals_W: outward unit surface normals in world, shape (n, 3).
-        q_seed: a posture to start from, e.g. the present one [rad], shape (7,); it decides between branches
-            that are equally good.
-        joint_margin_rad: kept from every joint limit.
-        force_n: normal force that the postures must press with.
+        q_seed: initial posture, e.g. the present one [rad], shape (7,); it selects among equally good branches.
+        joint_margin_rad: distance kept from each joint limit.
+        force_n: normal force of the postures.
 
-    Targets that cannot be reached are flagged, not dropped. The result depends on the arguments alone.
-    Raises ValueError on arrays of other shapes or values that are not finite.
+    Unreachable targets are flagged, not dropped. The result depends only on the arguments.
+    Raises ValueError for arrays of other shapes or values that are not finite.
     """
     positions, normals = np.asarray(positions_W, dtype=float), np.asarray(normals_W, dtype=float)
     seed = np.asarray(q_seed, dtype=float)
@@ -102,18 +188,18 @@ def plan_redundancy(
 
 
 def prepare(robot: Robot, force_n: float = PRESSING_FORCE_N) -> None:
-    """Makes what `plan_redundancy` needs whatever the targets are, CasADi's functions and the solver, ahead of it."""
+    """Build the CasADi functions and the solver of `plan_redundancy` in advance."""
     arm(robot)
     _program(_at_origin(robot), KNOTS, force_n)
 
 
 def _at_origin(robot: Robot) -> Robot:
-    """The robot as the solver has it: where it stands is a parameter."""
+    """Return the robot with its base at the origin; the solver takes the base as a parameter."""
     return robot.model_copy(update={"base_xy_m": (0.0, 0.0)})
 
 
 def _seeds(batch: Batch, seed: Array) -> list[Array]:
-    """Postures to start inverse kinematics from: the caller's, and elbow-up ones that face the targets' centre."""
+    """Return initial postures: the caller's, and elbow-up ones facing the centre of the targets."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
@@ -122,7 +208,7 @@ def _seeds(batch: Batch, seed: Array) -> list[Array]:
 
 
 def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
-    """A posture for each target, shape (n, 7), from the best seed, then from the nearest neighbour that was reached."""
+    """Return a posture for each target, shape (n, 7), from the best seed, then from the nearest reached neighbour."""
     sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
     best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
     q = batch.from_one(best)
@@ -137,13 +223,13 @@ def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
 
 
 def _path_length(positions: Array) -> Array:
-    """Length along the path at each point [m], strictly increasing, shape (n,)."""
+    """Return the length along the path at each point [m], strictly increasing, shape (n,)."""
     steps = np.linalg.norm(np.diff(positions, axis=0), axis=1)
     return np.concatenate(([0.0], np.cumsum(np.maximum(steps, 1e-6))))
 
 
 def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
-    """Indices of the reachable targets that the optimisation moves: evenly along the path, ends included."""
+    """Return indices of the optimised targets: reachable, evenly spaced along the path, ends included."""
     candidates = np.flatnonzero(reachable)
     s = _path_length(batch.positions)[candidates]
     wanted = np.linspace(s[0], s[-1], min(KNOTS, len(candidates)))
@@ -153,7 +239,7 @@ def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
 
 @lru_cache(maxsize=4)
 def _program(robot: Robot, count: int, force: float) -> Any:
-    """Ipopt on `count` knots. Parameters: base, positions, frames, and the weight of each step between knots."""
+    """Return an Ipopt solver for `count` knots. Parameters: base, positions, frames, weight of each step between knots."""
     ca = casadi()
     functions = arm(robot)
     Q = ca.MX.sym("q", 7, count)
@@ -178,7 +264,7 @@ def _program(robot: Robot, count: int, force: float) -> Any:
 
 
 def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Array, bool]:
-    """Optimal postures at the knots, interpolated, put back on the targets; and whether Ipopt converged."""
+    """Return optimal postures interpolated from the knots and projected onto the targets; True if Ipopt converged."""
     knots = _knots(batch, reachable)
     if len(knots) < 2:
         return q, False
@@ -205,7 +291,7 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
 
 
 def _keep_best(batch: Batch, before: Array, after: Array) -> Array:
-    """The refined postures, but for targets that only inverse kinematics reached."""
+    """Return the refined postures, except for targets that only inverse kinematics reached."""
     lost = batch.reached(before)[1] & ~batch.reached(after)[1]
     return np.where(lost[:, None], before, after)
 

@@ -1,7 +1,7 @@
-"""The arm in CasADi, from the same tables as its URDF: kinematics, gravity torques and what a posture costs.
+"""The arm in CasADi, from the same tables as its URDF: kinematics, gravity torques and cost of a posture.
 
-A task is a position of the indenter's origin and the direction of its z axis: five equations. The spin about that axis
-and the elbow's swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
+A task is a position of the indenter's origin and the direction of its z axis: five equations. The spin about that axis and the
+elbow swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from palpate_models.robot.lbr import (
 from palpate_models.scenario.schema import Robot
 
 ELBOW_CLEARANCE_M = 0.15
-"""The elbow stays at least this far above the indenter, so that upper arm and forearm keep off abdomen and table."""
+"""Least height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
 REACH_LENGTH_M = 0.4
-"""Length that makes linear and angular rows of the Jacobian comparable: upper arm and forearm of the LBR iiwa 7."""
+"""Length scale of linear against angular rows of the Jacobian: upper arm and forearm of the LBR iiwa 7."""
 _RIDGE = 1e-12
-"""Added to the Gram matrix of the Jacobian [1]: no pivot is zero where the arm is singular."""
+"""Added to the Gram matrix of the Jacobian [1], so that no pivot is zero at a singularity."""
 WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
-"""What counts in a posture, each term of order one [A]."""
+"""Weights of the cost terms, each term of order one [A]."""
 
 
 class MissingCasadiError(ImportError):
@@ -42,7 +42,7 @@ class MissingCasadiError(ImportError):
 
 
 def casadi() -> Any:
-    """The CasADi module, imported when first used. Raises MissingCasadiError with what to install."""
+    """Return the CasADi module, imported on first use. Raises MissingCasadiError with what to install."""
     try:
         return import_module("casadi")
     except ImportError as error:
@@ -73,13 +73,13 @@ class ArmFunctions(NamedTuple):
 
 
 def _axis_rotation(ca: Any, axis: tuple[float, float, float], angle: Any) -> Any:
-    """Rotation matrix about a unit vector (Rodrigues)."""
+    """Return the rotation matrix about a unit vector (Rodrigues)."""
     K = ca.skew(ca.DM(axis))
     return ca.DM.eye(3) + ca.sin(angle) * K + (1 - ca.cos(angle)) * ca.mtimes(K, K)
 
 
 def _determinant(ca: Any, A: Any) -> Any:
-    """Determinant of a positive semi-definite matrix by A = L D L': `ca.det`, by cofactors, takes many times the operations."""
+    """Return the determinant of a positive semi-definite matrix by A = L D L'; `ca.det` uses cofactors, many more operations."""
     pivots, _, _ = ca.ldl(A + _RIDGE * ca.DM.eye(A.shape[0]), False)
     determinant = 1
     for pivot in ca.vertsplit(pivots):
@@ -89,7 +89,7 @@ def _determinant(ca: Any, A: Any) -> Any:
 
 @lru_cache(maxsize=8)
 def arm(robot: Robot) -> ArmFunctions:
-    """The functions of an arm with this robot's tool. Its base fields are not used: base is an argument."""
+    """Return the functions of an arm with this robot's tool. The robot's base fields are not used: base is an argument."""
     ca = casadi()
     q, base = ca.SX.sym("q", 7), ca.SX.sym("base", 4)
     target, frame, force = ca.SX.sym("p", 3), ca.SX.sym("frame", 3, 3), ca.SX.sym("force")
@@ -143,7 +143,7 @@ def arm(robot: Robot) -> ArmFunctions:
 
 
 def surface_frames(normals: Array) -> Array:
-    """Frames with columns t1, t2 (tangents) and n for outward unit normals of shape (n, 3); shape (n, 3, 3).
+    """Return frames with columns t1, t2 (tangents) and n for outward unit normals of shape (n, 3); shape (n, 3, 3).
 
     Raises ValueError if a normal is not of unit length.
     """
@@ -159,5 +159,5 @@ def surface_frames(normals: Array) -> Array:
 
 
 def base_of(robot: Robot) -> Array:
-    """The robot's base placement, shape (4,)."""
+    """Return the robot's base placement, shape (4,)."""
     return np.array([*robot.base_xy_m, robot.base_height_m, robot.base_yaw_rad])

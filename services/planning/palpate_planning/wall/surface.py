@@ -1,6 +1,7 @@
-"""Cubic splines at one point, compiled: scipy's evaluation takes ten times as long there, nearly all of it preparation.
+"""The perceived surface as a height field of bicubic splines.
 
-scipy fits the splines and evaluates them at many points; the values here are the same.
+scipy fits the splines and evaluates them at many points. At one point scipy takes ten times as long, mostly for preparation, so
+the single-point functions are compiled; the values are equal.
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ DEGREE = 3
 
 
 class CubicPieces(NamedTuple):
-    """A curve y(s) in m dimensions made of cubic polynomials, as scipy's `CubicSpline` holds it."""
+    """A piecewise cubic curve y(s) in m dimensions, in the format of scipy's `CubicSpline`."""
 
     knots: Array
     """[s], shape (n,)."""
@@ -26,7 +27,7 @@ class CubicPieces(NamedTuple):
 
 
 class BicubicSpline(NamedTuple):
-    """m values over a plane as a tensor product of cubic B-splines."""
+    """A field of m values over a plane: tensor product of cubic B-splines."""
 
     knots_x: Array
     """Shape (nx + 4,)."""
@@ -38,7 +39,7 @@ class BicubicSpline(NamedTuple):
 
 @compiled
 def cubic_at(curve: CubicPieces, s: float) -> tuple[Array, Array]:
-    """Value y and derivative dy/ds at `s`, shapes (m,)."""
+    """Return the value y and derivative dy/ds at `s`, shapes (m,)."""
     knots, c = curve
     i = min(max(int(np.searchsorted(knots, s, side="right")) - 1, 0), len(knots) - 2)
     u = s - knots[i]
@@ -49,7 +50,7 @@ def cubic_at(curve: CubicPieces, s: float) -> tuple[Array, Array]:
 
 @compiled
 def bicubic_at(field: BicubicSpline, x: float, y: float) -> Array:
-    """Values at (x, y), shape (m,). Outside the knots those of the nearest edge hold."""
+    """Return the values at (x, y), shape (m,); outside the knots those of the nearest edge."""
     i, weights_x = _basis(field.knots_x, x)
     j, weights_y = _basis(field.knots_y, y)
     nearby = field.coefficients[i : i + DEGREE + 1, j : j + DEGREE + 1].copy()
@@ -58,7 +59,7 @@ def bicubic_at(field: BicubicSpline, x: float, y: float) -> Array:
 
 @compiled
 def _basis(knots: Array, x: float) -> tuple[int, Array]:
-    """The B-splines that are not zero at x: index of the first, and their values, shape (4,). The recursion of de Boor."""
+    """Return the first B-spline that is nonzero at x and the four values, shape (4,), by de Boor's recursion."""
     x = min(max(x, knots[0]), knots[-1])
     i = min(max(int(np.searchsorted(knots, x, side="right")) - 1, DEGREE), len(knots) - DEGREE - 2)
     values = np.ones(1)
@@ -72,29 +73,30 @@ def _basis(knots: Array, x: float) -> tuple[int, Array]:
 
 
 GRID_M = 0.004
-"""Spacing of the grid on which the splines stand; finer than the perceived detail."""
+"""Spacing of the spline grid; finer than the perceived detail."""
 ITERATIONS = 4
 """Largest number of iterations in the search for the foot of a perpendicular."""
 CONVERGED_M = 1e-6
-"""A foot that would move by less than this has been found."""
 STRIDE_M = 0.02
-"""Longest move of the foot in one iteration."""
+"""Largest motion of the foot in one iteration."""
 STEEPEST = 10.0
-"""Largest slope kept: past this (84 degrees) a height field says nothing."""
+"""Largest slope (84 degrees) that a height field represents."""
 
 
 class BicubicField:
     """Height and slopes over a plane, interpolated by bicubic B-splines (twice continuously differentiable)."""
 
     def __init__(self, x: Array, y: Array, values: Array) -> None:
-        """`values`: height [m], slope along x, slope along y at the grid lines x (nx,) and y (ny,) [m], shape (nx, ny, 3)."""
+        """Takes height [m], slope along x and slope along y at grid lines x (nx,) and y (ny,) [m]: `values`, shape (nx, ny,
+        3).
+        """
         along_x = make_interp_spline(x, values, k=3, bc_type="clamped", axis=0)
         along_xy = make_interp_spline(y, along_x.c, k=3, bc_type="clamped", axis=1)
         self.spline = BicubicSpline(along_x.t, along_xy.t, np.ascontiguousarray(along_xy.c.swapaxes(0, 1)))
         self._low, self._high = np.array((x[0], y[0])), np.array((x[-1], y[-1]))
 
     def __call__(self, xy: Array) -> Array:
-        """Height and slopes, shape (..., 3), at points of shape (..., 2). Outside the grid those of the nearest edge hold."""
+        """Return height and slopes, shape (..., 3), at points of shape (..., 2); outside the grid those of the nearest edge."""
         knots_x, knots_y, coefficients = self.spline
         return np.asarray(NdBSpline((knots_x, knots_y), coefficients, 3)(np.clip(xy, self._low, self._high)))
 
@@ -109,25 +111,30 @@ class Foot(NamedTuple):
     distance: float
     """Signed length of the perpendicular [m], positive outward."""
     xy_A: Array
-    """Where it is in A's xy plane [m], shape (2,)."""
+    """Position in A's xy plane [m], shape (2,)."""
 
 
 class PerceivedSurface:
-    """The perceived surface z = h(x, y) in frame A with outward normals. Points in and out are in W unless named otherwise."""
+    """The perceived surface z = h(x, y) in frame A with outward normals. Points are in W unless named otherwise."""
 
     def __init__(self, X_WA: Array, field: BicubicField, mode: BicubicField | None = None) -> None:
-        """`mode`: see `breathing`, without it nothing moves."""
+        """`mode`: see `breathing`; None for no motion."""
         self._X_WA = X_WA
         self._field, self._mode = field, mode
 
     @staticmethod
     def from_mesh(vertices_W: Array, normals_W: Array | None, X_WA: Array, breathing: Array | None = None) -> PerceivedSurface:
-        """Fits the field to a mesh: vertices [m] shape (n, 3), outward unit normals of the same shape or None, and at each
-        vertex how far breathing moves it, shape (n,), or None where nothing is known to move.
+        """Fit the field to a mesh.
 
-        Slopes come from the normals where they are given (perception smooths them), else from the heights. Outside the
-        mesh the nearest vertex's height and slope hold. Raises ValueError for fewer than four vertices, no extent, or what is not
+        Slopes come from the normals if given (perception smooths them), else from the heights. Outside the mesh the height and
+        slope of the nearest vertex are used. Raises ValueError for fewer than four vertices, no extent, or values that are not
         finite.
+
+        Args:
+            vertices_W: vertices [m], shape (n, 3).
+            normals_W: outward unit normals, shape (n, 3), or None.
+            X_WA: pose of the abdomen frame, shape (4, 4).
+            breathing: relative breathing displacement of each vertex, shape (n,), or None.
         """
         if len(vertices_W) < 4:
             raise ValueError(f"perceived surface has {len(vertices_W)} vertices, at least 4 are needed")
@@ -163,46 +170,46 @@ class PerceivedSurface:
 
     @staticmethod
     def plane(X_WA: Array) -> PerceivedSurface:
-        """The xy plane of A: what is assumed while nothing has been perceived."""
+        """Return the xy plane of A, used before the first perceived surface."""
         line = np.linspace(-1.0, 1.0, 9)
         return PerceivedSurface(X_WA, BicubicField(line, line, np.zeros((9, 9, 3))))
 
     def away_from(self, p_W: Array) -> float:
-        """Median height of this surface above or below points of another one [m], shape (n, 3)."""
+        """Return the median vertical distance [m] to points of another surface, shape (n, 3)."""
         p_A = apply(inverse(self._X_WA), p_W)
         return float(np.median(np.abs(self._field(p_A[:, :2])[:, 0] - p_A[:, 2])))
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
-        """Surface points and outward unit normals over xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
+        """Return surface points [m] and outward unit normals at xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
         p_A, n_A = self.in_A(xy_A)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
     def in_A(self, xy_A: Array) -> tuple[Array, Array]:
-        """The same in frame A."""
+        """Return the same in frame A."""
         values = self._field(xy_A)
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         return np.column_stack((xy_A, values[:, 0])), n_A / np.linalg.norm(n_A, axis=1, keepdims=True)
 
     def xy(self, p_W: Array) -> Array:
-        """Where a point of the surface, shape (3,), is in A's xy plane [m], shape (2,)."""
+        """Return the position in A's xy plane [m], shape (2,), of a point of the surface, shape (3,)."""
         return np.asarray(((p_W - self._X_WA[:3, 3]) @ self._X_WA[:3, :3])[:2])
 
     def breathing(self, xy_A: Array) -> float:
-        """How far the wall moves outward at a place, shape (2,), relative to where breathing moves it most."""
+        """Return the breathing displacement at a position, shape (2,), relative to the point that moves most [1]."""
         return 0.0 if self._mode is None else float(bicubic_at(self._mode.spline, xy_A[0], xy_A[1])[0])
 
     def nearest(self, c_W: Array) -> Foot:
-        """Foot of the perpendicular from c_W, shape (3,).
+        """Return the foot of the perpendicular from c_W, shape (3,).
 
-        Fixed point: slide the foot by the tangential part of what separates it from c. Converges at the rate of distance
-        over radius of curvature, about 0.03 an iteration in contact. Far away (0.2 m and more) it is approximate.
+        Fixed-point iteration: move the foot by the tangential part of the gap to c. The error shrinks by the ratio of distance to
+        radius of curvature, about 0.03 per iteration in contact. The result is approximate far away (0.2 m and more).
         """
         return Foot(*foot(self._field.spline, self._X_WA, np.ascontiguousarray(c_W)))
 
 
 @compiled
 def foot(field: BicubicSpline, X_WA: Array, c_W: Array) -> tuple[Array, Array, float, Array]:
-    """`PerceivedSurface.nearest` from the parts of the surface."""
+    """Return `PerceivedSurface.nearest` for the given spline and pose."""
     R_WA, p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3]
     c_A = (c_W - p_WA) @ R_WA
     xy_A = c_A[:2]

@@ -1,18 +1,19 @@
-"""Where the tissue begins: the place of the skin from the onset of force in a slow descent.
+"""Depth of the skin from the onset of force in a slow descent.
 
-While the indenter sinks at one speed, the normal force over depth d is
+While the indenter descends at constant speed, the normal force over depth d is
 
     F = b + a max(d - d0, 0)^1.3.
 
-The three are fitted together (Levenberg and Marquardt, `scipy.optimize.curve_fit`): b, what is left of the sensor's bias, is seen
-before the skin is touched, d0 is the depth at which it is. Pressed at 14 mm/s, places of persons and of lumps (tuning seeds 0 to
-7) follow the law up to 1 N with exponents of 1.2 to 1.5, 1.8 over a guarded muscle; d0 errs by -0.02 +- 0.15 mm there, and by
-0.2 mm more where the indenter meets the skin between the points of a mesh [C].
+b, a and d0 are fitted together (Levenberg and Marquardt, `scipy.optimize.curve_fit`): b is the remaining sensor bias, d0 the
+depth of the skin. At 14 mm/s, positions on persons and lumps (tuning seeds 0 to 7) follow the law up to 1 N with exponents of 1.2
+to 1.5, and 1.8 over a guarded muscle. There the error of d0 is -0.02 +- 0.15 mm, and 0.2 mm more where the indenter meets the
+skin between mesh points [C].
 """
 
 from __future__ import annotations
 
 import math
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -20,31 +21,43 @@ from scipy.optimize import curve_fit
 
 from palpate_models.numerics.frames import Array
 
-ONSET_EXPONENT = 1.3
 FELT_N = 1.0
-"""At this force the descent has felt enough."""
-BEGUN_N = 0.2
-"""About here the onset is looked for first."""
-WINDOW_M, AIR_M = 0.010, 0.003
-"""So much of the descent is kept, in depth, at least; and so much of the air above the skin, as on a soft wall, where FELT_N is
-felt at a depth of more than 7 mm."""
-_SINCE_BEGUN = 1 - (BEGUN_N / FELT_N) ** (1 / ONSET_EXPONENT)
-"""Part of the way from d0 to FELT_N that is left at BEGUN_N, by the law."""
-SAMPLES_MIN = 8
-METHOD_M, METHOD_SHARE = 0.00025, 0.035
-"""Standard deviation of d0 for what the law leaves out; at least this part of the way from d0 to FELT_N, since another exponent
-errs by a part of it: 0.055 where it is 1.45."""
-UNFITTED_M = 0.001
-"""The same where no law can be fitted, as on bone, where force rises within a few samples: d0 is where force began."""
+"""Force at which the descent has enough samples for the fit."""
+
+
+@dataclass(frozen=True)
+class OnsetTuning:
+    """Fit of the onset law."""
+
+    exponent: float = 1.3
+    begun_n: float = 0.2
+    """Force that gives the initial guess of the onset."""
+    window_m: float = 0.010
+    """Smallest depth range used in the fit."""
+    air_m: float = 0.003
+    """Depth range in air used in the fit, also on a soft wall, where FELT_N is reached at more than 7 mm."""
+    samples_min: int = 8
+    model_sd_m: float = 0.00025
+    """SD of d0 from deviations from the law."""
+    model_sd_fraction: float = 0.035
+    """Least SD of d0 as a fraction of the distance from d0 to FELT_N: a different exponent causes a proportional error (0.055 for
+    1.45)."""
+    unfitted_sd_m: float = 0.001
+    """SD of d0 without a fit, as on bone, where force rises within a few samples: d0 is where the force began."""
+
+
+TUNING = OnsetTuning()
+_SINCE_BEGUN = 1 - (TUNING.begun_n / FELT_N) ** (1 / TUNING.exponent)
+"""Fraction of the distance from d0 to FELT_N that remains at `begun_n`, by the law."""
 
 
 class SkinDepth(NamedTuple):
-    """Where the skin was felt."""
+    """Measured depth of the skin."""
 
     depth: float
-    """d0 [m], in the depth that was counted during the descent."""
+    """d0 [m], in the depth used during the descent."""
     sigma: float
-    """Its standard deviation [m]."""
+    """SD [m]."""
 
 
 class Onset:
@@ -55,45 +68,47 @@ class Onset:
         self._moving: list[tuple[int, float]] = []
 
     def add(self, depth: float, force: float, t: int, displacement: float) -> None:
-        """Takes depth [m] and normal force [N] measured at `t` [ns], and the wall's displacement that is in this depth [m]."""
+        """Adds depth [m] and normal force [N] measured at `t` [ns], and the wall displacement contained in the depth [m]."""
         self._rows.append((depth, force))
         self._moving.append((t, displacement))
 
     def touch(self) -> SkinDepth:
-        """The touch in what was collected."""
+        """Return the touch found in the samples."""
         return find_touch(np.array(self._rows))
 
     @property
     def times(self) -> Array:
-        """When it was collected [ns], shape (n,)."""
+        """Times of the samples [ns], shape (n,)."""
         return np.array([t for t, _ in self._moving])
 
     def touch_again(self, displacement: Array) -> SkinDepth:
-        """The touch, had the wall been displaced as is known by now [m], shape (n,)."""
+        """Return the touch for a different wall displacement [m], shape (n,)."""
         rows = np.array(self._rows)
         rows[:, 0] += displacement - np.array([lifted for _, lifted in self._moving])
         return find_touch(rows)
 
 
 def find_touch(rows: Array) -> SkinDepth:
-    """The touch in a descent's rows of depth [m] and force [N], shape (n, 2), of which the last is the deepest and firmest."""
-    quiet = np.flatnonzero(rows[:, 1] < BEGUN_N)
+    """Return the touch in rows of depth [m] and force [N], shape (n, 2), the last of which is deepest with the largest force."""
+    quiet = np.flatnonzero(rows[:, 1] < TUNING.begun_n)
     begun = float(rows[quiet[-1] if len(quiet) else 0, 0])
-    rows = rows[rows[:, 0] > rows[-1, 0] - max(WINDOW_M, (rows[-1, 0] - begun) / _SINCE_BEGUN + AIR_M)]
+    rows = rows[rows[:, 0] > rows[-1, 0] - max(TUNING.window_m, (rows[-1, 0] - begun) / _SINCE_BEGUN + TUNING.air_m)]
     depth, force = rows.T
-    guess = SkinDepth(begun, UNFITTED_M)
-    if len(rows) < SAMPLES_MIN:
+    guess = SkinDepth(begun, TUNING.unfitted_sd_m)
+    if len(rows) < TUNING.samples_min:
         return guess
-    scale = (force[-1] - force[0]) / max(depth[-1] - begun, 1e-4) ** ONSET_EXPONENT
+    scale = (force[-1] - force[0]) / max(depth[-1] - begun, 1e-4) ** TUNING.exponent
     try:
         (_, slope, d0), covariance = curve_fit(_force, depth, force, (0.0, scale, begun))
     except (RuntimeError, ValueError):
         return guess
     variance = float(covariance[2, 2])
-    if not (slope > 0 and depth[0] < d0 < depth[-1] and variance < UNFITTED_M**2):
+    if not (slope > 0 and depth[0] < d0 < depth[-1] and variance < TUNING.unfitted_sd_m**2):
         return guess
-    return SkinDepth(float(d0), math.hypot(max(METHOD_M, METHOD_SHARE * (depth[-1] - d0)), math.sqrt(variance)))
+    return SkinDepth(
+        float(d0), math.hypot(max(TUNING.model_sd_m, TUNING.model_sd_fraction * (depth[-1] - d0)), math.sqrt(variance))
+    )
 
 
 def _force(depth: Array, bias: float, slope: float, onset: float) -> Array:
-    return np.asarray(bias + slope * np.maximum(depth - onset, 0.0) ** ONSET_EXPONENT)
+    return np.asarray(bias + slope * np.maximum(depth - onset, 0.0) ** TUNING.exponent)

@@ -1,11 +1,10 @@
-"""The wall as planning believes it to be now: the perceived surface, corrected by touch, moved by the breath.
+"""Estimated abdominal wall: the perceived surface, corrected by touches and moved by the breath.
 
-At a place x of A's xy plane the wall lies outward of the perceived surface by
+At a position x in A's xy plane the wall is outward of the perceived surface by
 
-    c(x) + m(x) w(t),
+    c(x) + m(x) w(t)
 
-c the correction (`surface_correction`), m the shape of the breathing motion (`perception/surface`), w how far it moves where m
-is 1 (`breath`).
+with the correction c (`correction`), the breathing mode m (`perception/surface`) and the displacement w where m is 1 (`breath`).
 """
 
 from __future__ import annotations
@@ -25,56 +24,56 @@ from palpate_planning.wall.touch import Onset, SkinDepth
 
 
 class TouchedSkin(NamedTuple):
-    """An observation of the skin, as `exam/touches` tells it."""
+    """One touch of the skin, as published on `exam/touches`."""
 
     p_W: Array
-    """Where, on the perceived surface [m], shape (3,)."""
+    """Point of the perceived surface [m], shape (3,)."""
     stroke: int
     height: float
-    """How far outward of the perceived surface, at the end of expiration, the skin was felt [m]."""
+    """Measured height of the skin above the perceived surface at the end of expiration [m]."""
     sigma: float
-    """Standard deviation of that [m]."""
+    """SD of `height` [m]."""
     expected: float
-    """What was expected before [m] ..."""
+    """Height predicted before the touch [m]."""
     expected_sigma: float
-    """... and the standard deviation of that [m]."""
+    """SD of `expected` [m]."""
 
 
 class WallPlace(NamedTuple):
-    """Where the wall is believed to be at one place, outward of the perceived surface at the end of expiration."""
+    """Estimated wall at one position, outward of the perceived surface at the end of expiration."""
 
     correction: float
-    """How far the skin is from there, as touch has told [m]."""
+    """Correction from touches [m]."""
     displacement: float
-    """How far the breath has moved it from there [m]."""
+    """Displacement by the breath [m]."""
     sigma: float
-    """Standard deviation of both together [m]."""
+    """SD of the sum [m]."""
 
 
 class Wall:
-    """Where the skin is, and how sure that is."""
+    """Estimated position of the skin and its uncertainty."""
 
     def __init__(self, perceived: PerceivedSurface, breath: Breath) -> None:
-        """Uncorrected until it is touched."""
+        """Starts without correction."""
         self.perceived, self.breath = perceived, breath
         self.correction = SurfaceCorrection()
         self.shift_A = np.zeros(2)
-        """How far the body lies from where the first look saw it, along the table in A [m], shape (2,)."""
+        """Shift of the body along the table since the first scan of the surface, in A [m], shape (2,)."""
         self._first = perceived
         self._touched: tuple[Foot, float] | None = None
-        """Where the latest touch was, and the correction there before it [m]."""
+        """Foot of the latest touch and the correction there before it [m]."""
 
     def seen_again(self, perceived: PerceivedSurface) -> Wall:
-        """The wall as a later look sees it; what the touches told of camera and arm holds on."""
+        """Return the wall for a new perceived surface; keeps the offset and tilt learned from touches."""
         wall = Wall(perceived, self.breath)
         wall.correction, wall._first = self.correction, self._first
         wall.correction.blur()
         return wall
 
     def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
-        """How far the skin lies outward of vertices of the perceived surface, and its standard deviation [m], shape (n,) each.
+        """Return the height of the skin above vertices of the perceived surface and its SD [m], shapes (n,).
 
-        By all touches so far, and by how far outward the mean of all images shows the wall there [m], if that is known.
+        Uses all touches, and the height of the mean of all images above these vertices [m] if `averaged` is given.
         """
         xy = np.array([self.perceived.xy(p) for p in vertices_W])
         if averaged is None:
@@ -83,9 +82,9 @@ class Wall:
         return averaged + height, sigma
 
     def skin(self, foot: Foot, correction: float) -> tuple[Array, Array]:
-        """The point of the skin [m] that is now `correction` [m] above `foot`, and its outward normal, shape (3,) each.
+        """Return the skin point `correction` [m] above `foot` and its outward normal, shapes (3,).
 
-        Both as the body lay at the first look, at the end of expiration: there all that is felt is in one frame.
+        Both refer to the body's position at the first scan, at the end of expiration, so that all samples share one frame.
         """
         if not self.shift_A.any():
             return foot.p_W + correction * foot.n_W, foot.n_W
@@ -93,25 +92,25 @@ class Wall:
         return p[0] + correction * n[0], n[0]
 
     def outward(self, p_W: Array, t: int) -> float:
-        """How far the wall lies outward of the perceived surface at its point p_W, shape (3,), at `t` [ns]; in metres."""
+        """Return the height of the wall above the perceived surface [m] at its point p_W, shape (3,), at `t` [ns]."""
         xy = self.perceived.xy(p_W)
         return self.correction.height(xy) + self.displacement(xy, t)
 
     def displacement(self, xy_A: Array, t: int) -> float:
-        """How far the breath has moved the wall at a place, shape (2,), at `t` [ns]; in metres outward."""
+        """Return the outward displacement by the breath [m] at a position, shape (2,), at `t` [ns]."""
         return self.perceived.breathing(xy_A) * self.breath.displacement(t)
 
     def sigma(self, xy_A: Array, t: int) -> float:
-        """Standard deviation of where the wall is [m] at a place, shape (2,), at `t` [ns]."""
+        """Return the SD of the wall's height [m] at a position, shape (2,), at `t` [ns]."""
         return self.at(xy_A, t).sigma
 
     def at(self, xy_A: Array, t: int) -> WallPlace:
-        """The wall at a place, shape (2,), at `t` [ns]."""
+        """Return the wall at a position, shape (2,), at `t` [ns]."""
         (correction, sigma), share = self.correction.at(xy_A), self.perceived.breathing(xy_A)
         return WallPlace(correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t)))
 
     def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[TouchedSkin, float]:
-        """Learns from a touch under `foot` at `t` [ns]; also returns how far the wall there moved outward by it [m]."""
+        """Updates the correction with a touch under `foot` at `t` [ns]; returns the touch and the change in wall height [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
         moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)
         felt = FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
@@ -121,23 +120,24 @@ class Wall:
         return observed, self.correction.height(foot.xy_A) - before
 
     def revise(self, onset: Onset) -> float | None:
-        """Finds the latest touch anew, once the wall's motion in it was seen; how far that moves the wall there outward [m].
+        """Refits the last touch with measured instead of forecast breathing; returns the change in wall height [m].
 
-        None while it has not been seen: by the forecast a touch errs by 0.5 to 1.2 mm, by what is seen by half of that.
+        Returns None while the breathing is not measured. With the forecast the error of a touch is 0.5 to 1.2 mm, with measured
+        breathing half of that.
         """
         seen = self.breath.seen(onset.times)
         if seen is None or self._touched is None:
             return None
         foot, before = self._touched
-        share, reckoned = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
+        share, previous = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
         touch = onset.touch_again(share * seen)
         moved = share * self.breath.seen_uncertainty
         self.correction.revise(FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND))
-        return self.correction.height(foot.xy_A) - reckoned
+        return self.correction.height(foot.xy_A) - previous
 
 
 def plane(X_WA: Array) -> Wall:
-    """The xy plane of A at rest: what is assumed while nothing has been perceived."""
+    """Return the xy plane of A at rest, used before the first perceived surface."""
     wall = Wall(PerceivedSurface.plane(X_WA), Breath())
-    wall.perceived.nearest(np.zeros(3))  # compiles it ahead of any deadline
+    wall.perceived.nearest(np.zeros(3))  # compiles it before the first deadline
     return wall
