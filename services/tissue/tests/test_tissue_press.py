@@ -11,8 +11,10 @@ import pytest
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.guarding import FADING_S
-from palpate_models.patient.phantom import PhantomModel, flat_phantom
+from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.scenario.load import load_scenario
@@ -20,11 +22,14 @@ from palpate_models.scenario.press import LIMIT_N, apparent_stiffness, depths, t
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
+from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.presses import ENDS_S, contracted
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 LESION = Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.015), contrast=4.0)
+
 PLACES = np.array(((0.0, 0.0, 0.0), (0.012, 0.003, 0.0), (-0.04, 0.03, 0.0)))
+
 UP = np.tile((0.0, 0.0, 1.0), (3, 1))
 
 
@@ -140,3 +145,96 @@ def test_what_is_read_is_the_end_of_the_hold_or_the_limit() -> None:
     felt, limited = apparent_stiffness(forces)
     assert felt.tolist() == [3.0, LIMIT_N]
     assert limited.tolist() == [False, True]
+
+
+RADIUS = 0.015
+
+BREATHING = BreathingCurve(Breathing(), 3)
+
+
+def body() -> PhantomModel:
+    return flat_phantom(0.13, 0.006, lesions=(Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.015), contrast=4.0),))
+
+
+def track(model: PhantomModel, breathing: BreathingCurve, dt: float) -> tuple[Array, Array]:
+    """Along a line, back on the next one, and a stand: times [s] and centres [m] of the sphere, each `dt` [s]."""
+    t = dt * np.arange(1, round(6.0 / dt) + 1)
+    s = np.clip(0.03 * (t - 0.5), 0.0, 0.12)
+    x, y = np.where(s < 0.06, s - 0.03, 0.09 - s), np.where(s < 0.06, 0.0, 0.0125)
+    excursion = np.array([breathing.excursion(float(at)) for at in t])
+    depth = np.minimum(0.02 * t, 0.010) + 0.2 * excursion
+    return t, np.column_stack((x, y, RADIUS - depth))
+
+
+def forces(tissue: TissueBackend, breathing: BreathingCurve) -> Array:
+    """Mean force of each 10 ms of the track [N], shape (n, 3)."""
+    t, p = track(tissue.model, breathing, tissue.dt)
+    v = np.gradient(p, tissue.dt, axis=0)
+    felt = np.array([tissue.step(float(at), p[k], v[k], RADIUS)[0] for k, at in enumerate(t)])
+    return felt.reshape(-1, round(0.010 / tissue.dt), 3).mean(axis=1)
+
+
+@pytest.mark.parametrize("breathing", [BreathingCurve(Breathing(kind="none"), 0), BREATHING])
+def test_forces_are_those_of_the_explicit_steps(breathing: BreathingCurve) -> None:
+    model = body()
+    explicit = forces(WinklerTissue(model, breathing=breathing), breathing)
+    implicit = forces(ImplicitTissue(model, breathing=breathing, dt=0.010), breathing)
+    pressed = explicit[:, 2] > 1.0
+    off = implicit[pressed, 2] / explicit[pressed, 2] - 1
+    assert pressed.sum() > 400
+    assert np.sqrt(np.mean(off**2)) < 0.01
+    assert abs(off.mean()) < 0.005
+    sliding = np.r_[100:240, 290:440]  # not where it jumps to the next line and turns
+    assert implicit[sliding, 0] == pytest.approx(explicit[sliding, 0], abs=0.02 * float(explicit[:, 2].max()))
+
+
+def test_a_shorter_step_is_nearer() -> None:
+    model, still = body(), BreathingCurve(Breathing(kind="none"), 0)
+    explicit = forces(WinklerTissue(model), still)[60:, 2]
+    off = [np.abs(forces(ImplicitTissue(model, dt=dt), still)[60:, 2] - explicit).max() for dt in (0.010, 0.005)]
+    assert off[1] < 0.8 * off[0]
+
+
+def test_a_press_feels_the_same() -> None:
+    explicit = WinklerTissue(body())
+    places = np.array(((0.0, 0.0, 0.0), (0.012, 0.003, 0.0), (-0.04, 0.03, 0.0)))
+    up = np.tile((0.0, 0.0, 1.0), (3, 1))
+    wanted, _ = explicit.press(places, up, RADIUS)
+    felt, _ = explicit.in_steps_of(0.010).press(places, up, RADIUS)
+    assert felt == pytest.approx(wanted, rel=5e-3)
+
+
+def test_contracted_muscle_is_felt_as_much() -> None:
+    scenario = load_scenario("rlq_guarding", (), 1)
+    model = build_phantom(scenario.phantom, 1)
+    middle = np.argmin(
+        np.linalg.norm(model.vertices[:, :2] - scenario.phantom.guarding[0].centre_m, axis=1) + (model.normals[:, 2] < 0)
+    )
+    place, normal = model.vertices[[middle]], model.normals[[middle]]
+    explicit = WinklerTissue(model, scenario.phantom.stiffness)
+    wanted, _ = explicit.press(place, normal, RADIUS)
+    felt, _ = explicit.in_steps_of(0.010).press(place, normal, RADIUS)
+    assert felt == pytest.approx(wanted, rel=0.01)
+
+
+def test_it_forgets_as_slowly() -> None:
+    """Ten seconds after a press the skin still lies as deep as by explicit steps, under the sphere and around it."""
+    model = body()
+    left = []
+    for tissue in (WinklerTissue(model), ImplicitTissue(model, dt=0.010)):
+        for k in range(round(1.0 / tissue.dt)):
+            tissue.step(k * tissue.dt, np.array((0.0, 0.0, RADIUS - 0.010)), np.zeros(3), RADIUS)
+        for k in range(round(10.0 / tissue.dt)):
+            tissue.idle(1.0 + k * tissue.dt)
+        left.append(tissue.inward.copy())
+    assert left[0].max() > 5e-5
+    assert np.abs(left[1] - left[0]).max() < 0.05 * left[0].max()
+
+
+def test_settled_it_is_as_new() -> None:
+    tissue = ImplicitTissue(body(), dt=0.010)
+    still = BreathingCurve(Breathing(kind="none"), 0)
+    first = forces(tissue, still)
+    tissue.settle()
+    assert not tissue.inward.any()
+    assert np.array_equal(forces(tissue, still), first)

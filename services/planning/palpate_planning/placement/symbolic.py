@@ -12,6 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.gravity import GRAVITY
 from palpate_models.robot.lbr import (
@@ -37,16 +38,12 @@ WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.
 """Weights of the cost terms, each term of order one [A]."""
 
 
-class MissingCasadiError(ImportError):
-    """CasADi is not installed."""
-
-
 def casadi() -> Any:
-    """Return the CasADi module, imported on first use. Raises MissingCasadiError with what to install."""
+    """Return the CasADi module, imported on first use. Raises UserError if it is not installed."""
     try:
         return import_module("casadi")
     except ImportError as error:
-        raise MissingCasadiError("posture planning needs CasADi: pip install 'palpate[run]'") from error
+        raise UserError("posture planning needs CasADi: pip install 'palpate[run]'") from error
 
 
 class ArmFunctions(NamedTuple):
