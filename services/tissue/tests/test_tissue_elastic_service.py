@@ -5,7 +5,6 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_benchmarks import elastic as bench
 from palpate_bus.contract import MS, contract
 from palpate_bus.implementations import create_for
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
@@ -98,17 +97,3 @@ def test_a_second_start_reads_the_cache(monkeypatch):
     np.testing.assert_array_equal(compliance(model, (lesion,), 0.05, pitch_m=0.02).matrix, first.matrix)
     with pytest.raises(AssertionError, match="computed again"):
         compliance(model, (lesion.model_copy(update={"depth_m": 0.011}),), 0.05, pitch_m=0.02)
-
-
-@pytest.mark.parametrize("tier", ["surface", "elastic"])
-def test_a_size_is_measured_in_contact(tier: str) -> None:
-    figures = bench.measure_size(700, tier, steps=60)
-    assert 500 < figures["vertices"] < 900
-    assert figures["contacts"] > 3
-    assert figures["step_us_mean"] > 0
-    assert figures["substeps"] == 1
-
-
-def test_a_size_that_is_too_large_is_refused_with_a_reason(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_tissue.backends.elastic.compliance.MOST_VERTICES", 500)
-    assert "at most 500" in bench.measure_size(700, "elastic", steps=10)["refused"]
