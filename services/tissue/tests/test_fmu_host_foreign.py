@@ -128,7 +128,7 @@ def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contrac
 @pytest.mark.parametrize(
     ("old", "new", "words"),
     [
-        ("role: lag", "role: tissue", ("no role 'tissue'", "source, lag")),
+        ("role: lag", "role: tissue", ("'tissue'", "source, lag")),
         ("  place:", "  follower:", ("follower", "may place")),
         ("{u: {field", "{v: {field", ("place.pose.position", "no variable 'v'", "u, y")),
         ("u: {field", "y: {field", ("y", "only inputs and tunable parameters")),
