@@ -30,9 +30,8 @@ from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots
 from palpate_dashboard.scene import SceneView, Shaded
 from palpate_dashboard.sinks import Live, open_recording
-from palpate_models.numerics.band import half_width
 from palpate_models.numerics.frames import apply
-from palpate_models.numerics.level_lines import level_lines
+from palpate_models.numerics.maps import half_width, level_lines
 from palpate_models.robot import lbr, table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input

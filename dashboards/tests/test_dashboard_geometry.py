@@ -9,7 +9,7 @@ from dashboard_messages import dome, look
 from palpate_dashboard import arrays, palette
 from palpate_dashboard.geometry import Carry, VertexNormals, shaded
 from palpate_dashboard.sinks import Live
-from palpate_models.numerics.level_lines import level_lines
+from palpate_models.numerics.maps import level_lines
 
 
 def test_normals_of_a_sphere_point_out() -> None:

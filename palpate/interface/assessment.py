@@ -28,8 +28,8 @@ from palpate.run.composed import load_services
 from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
-from palpate_models.numerics.band import half_width
 from palpate_models.numerics.frames import Array, apply
+from palpate_models.numerics.maps import half_width
 from palpate_models.scenario.load import exam_input
 from palpate_planning.contact import CONTACT_ON_N
 

@@ -20,8 +20,8 @@ from matplotlib.tri import Triangulation
 from palpate.report import rows
 from palpate.report.evidence import Samples, map_of
 from palpate.report.scoring import Map, Truth
-from palpate_models.numerics.band import half_width
 from palpate_models.numerics.frames import Array
+from palpate_models.numerics.maps import half_width
 
 INK = "#1b2a33"
 QUIET = "#6b7a83"

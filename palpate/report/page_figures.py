@@ -31,9 +31,8 @@ from palpate.report.figures import (
 )
 from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
-from palpate_models.numerics.band import half_width
 from palpate_models.numerics.frames import Array
-from palpate_models.numerics.level_lines import level_lines
+from palpate_models.numerics.maps import half_width, level_lines
 from palpate_models.patient.mesh import vertex_normals
 
 MEASURED: Final = "#c2410c"

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 Values = NDArray[np.floating[Any]]
 
@@ -26,3 +26,8 @@ def level_lines(vertices: Values, triangles: NDArray[np.integer[Any]], values: V
         share = (level - values[tip]) / (values[other] - values[tip])
         ends.append(vertices[tip] + share[:, None] * (vertices[other] - vertices[tip]))
     return np.stack(ends, axis=1).astype(np.float64)
+
+
+def half_width(lower: ArrayLike, upper: ArrayLike) -> NDArray[np.float64]:
+    """Half width of bands [1], shape (n,): the factor from the middle to either end, less one."""
+    return np.asarray(np.sqrt(np.asarray(upper, dtype=float) / np.maximum(np.asarray(lower, dtype=float), 1e-9)) - 1)
