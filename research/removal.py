@@ -46,7 +46,7 @@ MODULES: dict[str, tuple[str, ...]] = {
         "palpate_planning.wall.surface",
     ),
     "perceived surface": ("palpate_planning.wall.surface", "palpate_planning.wall.surface"),
-    "nearest vertex": ("palpate_models.numerics.nearest",),
+    "nearest vertex": ("palpate_models.numerics.vectors",),
 }
 """Modules whose compiled functions call each other, removed together."""
 INTERVAL = {"tissue's step": 6}

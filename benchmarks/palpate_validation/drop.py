@@ -18,8 +18,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.signal import find_peaks
 
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue

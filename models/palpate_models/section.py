@@ -1,4 +1,4 @@
-"""What all sections of a scenario have in common: frozen, validated, no unknown fields; and the quantities they are made of."""
+"""Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ from pydantic import BaseModel, ConfigDict, Field
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
 Length = Annotated[float, Field(gt=0, le=1)]
-"""[m], of something about a patient: millimetres are refused."""
+"""Length [m] on the patient; the limit rejects values in millimetres."""
 Force = Annotated[float, Field(gt=0, le=100)]
-"""[N]."""
+"""Force [N]."""
 UNITS: Final = {
     "m": "metres",
     "mm": "millimetres",
@@ -19,11 +19,11 @@ UNITS: Final = {
     "rad": "radians",
     "deg": "degrees",
     "s": "seconds",
-    "mps": "metres a second",
+    "mps": "metres per second",
     "kg": "kilograms",
     "px": "pixels",
 }
-"""What the last part of a field's name says of its unit."""
+"""Units by the last part of a field's name."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 
@@ -42,5 +42,5 @@ class Pose(Section):
 
 
 def quadrant(x: float, y: float) -> str:
-    """The quadrant of a point of A [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
+    """Return the quadrant of a point in A [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
     return ("R" if x < 0 else "L") + ("L" if y < 0 else "U") + "Q"

@@ -36,9 +36,9 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
         ("seed: 1\nexam: {region_m: [0.1, 0.1}\n", r"mine\.yaml, line 2, column \d+: not YAML"),
         ("- exam", r"want a mapping of fields, not list"),
         ("exam: {", r"not YAML"),
-        ("exam:\n  depth_m: 0.01\n  depth_m: 0.02\n", r"mine\.yaml: line 3: field depth_m stands twice"),
-        ("seed: 1\nexam: {}\nseed: 2\n", r"mine\.yaml: line 3: field seed stands twice"),
-        ("exam: {depth_m: 0.01, speed_mps: 0.02, depth_m: 0.01}", r"line 1: field depth_m stands twice"),
+        ("exam:\n  depth_m: 0.01\n  depth_m: 0.02\n", r"mine\.yaml: line 3: field depth_m is given twice"),
+        ("seed: 1\nexam: {}\nseed: 2\n", r"mine\.yaml: line 3: field seed is given twice"),
+        ("exam: {depth_m: 0.01, speed_mps: 0.02, depth_m: 0.01}", r"line 1: field depth_m is given twice"),
     ],
 )
 def test_what_cannot_be_is_named(text: str, words: str, tmp_path: Path) -> None:
@@ -76,7 +76,7 @@ def test_a_merged_section_may_be_overridden(tmp_path: Path) -> None:
 
 def test_a_setting_is_read_like_a_file() -> None:
     assert load_scenario("healthy", ["exam.depth_m=8e-3"]).exam.depth_m == 0.008
-    with pytest.raises(ScenarioError, match=r"--set exam=.*: line 1: field depth_m stands twice"):
+    with pytest.raises(ScenarioError, match=r"--set exam=.*: line 1: field depth_m is given twice"):
         load_scenario("healthy", ["exam={depth_m: 0.01, depth_m: 0.02}"])
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from palpate_models.numerics.nearest import nearest_vertex
+from palpate_models.numerics.vectors import nearest_vertex
 
 
 def test_it_is_the_tree_s() -> None:

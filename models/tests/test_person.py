@@ -11,13 +11,12 @@ from scipy.stats import kurtosis
 
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient.abdomen import bone_share
-from palpate_models.patient.anatomy import Anatomy, Muscles, Skeleton, Variation
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.healthy import NaturalField, belly, healthy_wall
 from palpate_models.patient.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, moments, under_fat, wall_statistics
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import fitted
-from palpate_models.patient.schema import Build, Draw, Phantom, Stiffness
+from palpate_models.patient.schema import Anatomy, Build, Draw, Muscles, Phantom, Skeleton, Stiffness, Variation
 from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario
 from palpate_models.scenario.schema import Scenario
 
@@ -268,7 +267,7 @@ def test_guarding_has_a_measured_ratio() -> None:
         ({"kind": "person", "draw": {"radius_m": (5, 40)}}, "radius_m = 5 to 40: want 0.005"),
         ({"kind": "person", "draw": {"contrast": (0.5, 2)}}, "both above 1, or both below"),
         ({"kind": "person", "draw": {"guarding": "voluntary"}, "guarding": [{"centre_m": (0, 0)}]}, "draw.guarding"),
-        ({"lesions": [{"centre_m": (0, 0), "contrast": 1}]}, "contrast = 1 is no lump"),
+        ({"lesions": [{"centre_m": (0, 0), "contrast": 1}]}, "contrast = 1 is not a lump"),
         ({"lesions": [{"centre_m": (0, 0), "contrast": 0.05}]}, "greater than or equal to 0.1"),
     ],
 )

@@ -23,8 +23,7 @@ from palpate.run.roles import OBSERVERS, WORKERS
 from palpate_errors import UserError
 from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
 from palpate_models.scenario.errors import Errors, Level, table
-from palpate_models.scenario.explain import explain
-from palpate_models.scenario.load import ScenarioError, parse_yaml
+from palpate_models.scenario.load import ScenarioError, explain, parse_yaml
 from palpate_models.section import Length, Section
 
 Split = Literal["tune", "test"]

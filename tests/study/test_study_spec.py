@@ -34,7 +34,7 @@ def written(tmp_path: Path, text: str) -> str:
         (PLAIN + "methods: {m: {services: {assesment: x.py}}}", ("methods.m", "assesment", "assessment")),
         (PLAIN + "errors: {bad: awful}", ("errors.bad", "awful", "typical")),
         (PLAIN + "errors: {t: typical}\neach_error: [force.x]\neach_error_at: [poor]", ("force.x", "force.gain")),
-        (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations stands twice")),
+        (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations is given twice")),
         (PLAIN + "tier: quick\nmethods: {m: {runtime: wallclock}}", ("mine.yaml", "wallclock", "tier: whole")),
         (PLAIN + "record: all", ("record", "'all'", "'none'")),
         ("[1, 2]", ("mine.yaml", "mapping")),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Final
+
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
@@ -51,3 +53,7 @@ def look_at(position: Array, target: Array) -> Array:
     X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
     X[:3, 3] = position
     return X
+
+
+GRAVITY: Final = 9.81
+"""Along -z of world [m/s^2]: the value that pinocchio takes of itself, so that plant, controller and planner agree."""

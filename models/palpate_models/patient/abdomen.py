@@ -10,9 +10,9 @@ from numpy.typing import NDArray
 from scipy.spatial import Delaunay
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.anatomy import Anatomy, Skeleton
 from palpate_models.patient.field import smoothstep
 from palpate_models.patient.mesh import orient, vertex_normals
+from palpate_models.patient.schema import Anatomy, Skeleton
 
 COSTAL_EDGE_M = 0.04
 """Distance over which the skin rises to the rib cage, and the wall comes to lie on it."""

@@ -1,4 +1,4 @@
-"""How the wall rises and falls as the patient breathes and coughs: a table of breaths, drawn from the seed.
+"""Breathing and coughing of the patient: a table of breaths, drawn from the seed.
 
 Marks of certainty: [V] read in the source (its abstract), [A] assumed.
 """
@@ -17,52 +17,52 @@ from palpate_models.numerics.frames import Array
 from palpate_models.section import NonNegative, Positive, Section
 
 TABLE_S = 600.0
-"""The breaths are drawn for at least so long [s]; then they repeat."""
+"""Minimum length of the table of breaths [s]; after it the breaths repeat."""
 MOST_M = 0.04
-"""No breath or cough lifts the wall further [m]."""
+"""Maximum displacement by a breath or cough [m]."""
 _DEEP = {"peak_to_peak_m": 0.025, "rate_per_min": 7.4, "depth_cv": 0.1}
-"""What a deep breather has unless the scenario says otherwise. Rate: Ragnarsdottir 2006 [V]; depth: more than three
-times the quiet one (Kaneko and Horie 2012) [V]; its variation [A]."""
+"""Defaults of kind `deep`. Rate: Ragnarsdottir 2006 [V]; depth: more than three times the quiet one (Kaneko and Horie 2012)
+[V]; its variation [A]."""
 _MOST_SHARE = 0.8
-"""Inspiration takes at most this part of a breath's motion."""
+"""Maximum share of inspiration in the motion of a breath."""
 _COUGH_S = (0.15, 0.25, 0.10)
-"""A cough's rise, fall, and rest until the next one of its burst [s] [A]."""
+"""Rise, fall and rest of a cough in a burst [s] [A]."""
 
 Share = Annotated[float, Field(ge=0, lt=1)]
 
 
 class Breathing(Section):
-    """Breathing of the abdominal type. The wall's place at rest is that at the end of expiration."""
+    """Abdominal breathing. The rest position of the wall is the end of expiration."""
 
     kind: Literal["none", "quiet", "deep", "held"] = "quiet"
-    """`deep` has other values where none are given: 25 mm, 7.4 a minute, `depth_cv` 0.1. `held`: quiet, but now and then the
-    breath is held at the end of expiration."""
+    """`deep` has other defaults: 25 mm, 7.4 per minute, `depth_cv` 0.1. `held`: quiet, with holds at the end of
+    expiration."""
     peak_to_peak_m: Annotated[float, Field(gt=0, le=MOST_M)] = 0.008
-    """Mean depth of a breath at the navel: 5 to 12 mm quiet, 25 mm deep [A]; 7.5 mm follow from a tidal volume of 0.5 l."""
+    """Mean depth of a breath at the umbilicus: 5 to 12 mm quiet, 25 mm deep [A]; 7.5 mm follow from a tidal volume of 0.5 l."""
     rate_per_min: Annotated[float, Field(ge=4, le=40)] = 14.0
-    """Breaths a minute, where the breath is not held: 14 at rest, n = 100 (Ragnarsdottir and Kristinsdottir 2006) [V]."""
+    """Breaths per minute while the breath is not held: 14 at rest, n = 100 (Ragnarsdottir and Kristinsdottir 2006) [V]."""
     expiration_ratio: Annotated[float, Field(ge=0.5, le=4)] = 1.2
-    """Mean duration of expiration, its pause apart, over that of inspiration: 1.21 for men, 1.14 for women (the same) [V].
-    Whether they counted the pause is not known."""
+    """Mean duration of expiration without its pause, relative to inspiration: 1.21 for men, 1.14 for women (same source) [V]. The
+    source does not say if it includes the pause."""
     pause: Annotated[float, Field(ge=0, le=0.5)] = 0.1
-    """Share of a breath in which the wall rests after expiration [A]."""
+    """Share of the pause after expiration in a breath [A]."""
     duration_cv: Share = 0.208
-    """Variation of duration from breath to breath, log-normal (Tobin 1988, n = 65: 20.8 +- 11.5 % of the frequency) [V]."""
+    """Variation of duration between breaths, log-normal (Tobin 1988, n = 65: 20.8 +- 11.5 % of the frequency) [V]."""
     depth_cv: Share = 0.33
-    """Variation of depth from breath to breath, log-normal (Tobin 1988: 33 +- 14.9 % of the tidal volume) [V]."""
+    """Variation of depth between breaths, log-normal (Tobin 1988: 33 +- 14.9 % of the tidal volume) [V]."""
     timing_cv: Share = 0.179
     """Variation of inspiration's share of a breath, log-normal (Tobin 1988: 17.9 +- 6.5 %) [V]."""
     memory: Share = 0.28
-    """Correlation of a breath's duration, depth and share of inspiration with those of the breath before (Tobin 1995: 0.26 of
+    """Correlation of duration, depth and share of inspiration with the previous breath (Tobin 1995: 0.26 of
     the expiratory time, 0.30 of the tidal volume, 0.20 of the inspiratory time) [V]."""
     breathes_s: Positive = 40.0
-    """How long a patient who holds the breath breathes between holds (kind: held) [A]."""
+    """Time of breathing between holds (kind: held) [A]."""
     held_s: Annotated[float, Field(gt=0, le=120)] = 20.0
-    """For how long the breath is held each time (kind: held) [A]."""
+    """Duration of each hold (kind: held) [A]."""
     coughs_per_min: Annotated[float, Field(ge=0, le=20)] = 0.0
-    """Bursts of two or three coughs a minute, at moments of their own, each after the breath that is under way."""
+    """Bursts of two or three coughs per minute, at random times, each after the current breath."""
     cough_m: tuple[NonNegative, Annotated[float, Field(le=MOST_M)]] = (0.010, 0.020)
-    """Least and largest rise of the wall in a cough, each equally likely [A]. The tension of the wall in it is not modelled."""
+    """Range of the displacement by a cough, uniform [A]. The tension of the wall during a cough is not modelled."""
 
     @model_validator(mode="before")
     @classmethod
@@ -72,21 +72,21 @@ class Breathing(Section):
     @model_validator(mode="after")
     def _order(self) -> Breathing:
         if self.cough_m[0] > self.cough_m[1]:
-            raise ValueError(f"cough_m {self.cough_m}: want the least rise first, then the largest")
+            raise ValueError(f"cough_m {self.cough_m}: want the smaller value first")
         return self
 
 
 class BreathingCurve:
-    """The breaths of one patient, a function of time: all of it is in `table`.
+    """Breathing of one patient as a function of time, defined by `table`.
 
-    A breath (s, T_i, T_e, T_p, A) that began x = t - s ago has lifted the wall by
+    A breath (s, T_i, T_e, T_p, A) that started x = t - s ago displaces the wall by
 
         A (1 - cos(pi x / T_i)) / 2              for x < T_i
         A (1 + cos(pi (x - T_i) / T_e)) / 2      for T_i <= x < T_i + T_e
         0                                        for T_i + T_e <= x < T_i + T_e + T_p
 
-    (raised cosines [A]), which is continuous with its derivative. At time t the breath is the last one whose start s is not after
-    t - L floor((t - s_0) / L), for the table repeats after `repeats_s`, L. The first start s_0 is before time 0.
+    (raised cosines [A]), continuous with its derivative. The current breath at time t is the last one that starts at or before
+    t - L floor((t - s_0) / L): the table repeats after L = `repeats_s`. The first start s_0 is before time 0.
     """
 
     def __init__(self, breathing: Breathing, seed: int) -> None:
@@ -94,20 +94,17 @@ class BreathingCurve:
         self.table: Array = np.empty((0, 5)) if breathing.kind == "none" else _breaths(breathing, seed)
         """Start [s], inspiration [s], expiration [s], pause [s] and amplitude [m] of each breath or cough, shape (n, 5)."""
         self.largest_m = float(self.table[:, 4].max(initial=0.0))
-        """Largest excursion [m] there will ever be."""
+        """Maximum excursion [m]."""
         self.repeats_s = float(self.table[:, 1:4].sum())
-        """Length of the table [s]; 0 for a patient who does not breathe."""
+        """Length of the table [s]; 0 without breathing."""
         moving = self.table[:, 1:3].sum(axis=1)
         self.mean_m = float(self.table[:, 4] @ moving / 2 / self.repeats_s) if self.repeats_s else 0.0
-        """Mean excursion [m]: half of its amplitude while a breath moves, none in its pause."""
+        """Mean excursion [m]: half of the amplitude during a breath, zero in its pause."""
         self._rows = self.table.tolist()
         self._starts = self.table[:, 0].tolist()
 
     def excursion(self, t_s: float) -> float:
-        """Displacement [m] of the wall at time `t_s` [s] from its place at the end of expiration, where the profile is 1.
-
-        Outward, never negative.
-        """
+        """Return the outward displacement [m], never negative, at time `t_s` [s] where the profile is 1."""
         if not self._rows:
             return 0.0
         t_s -= self.repeats_s * math.floor((t_s - self._starts[0]) / self.repeats_s)
@@ -120,11 +117,11 @@ class BreathingCurve:
 
 
 STILL = BreathingCurve(Breathing(kind="none"), 0)
-"""A patient who does not breathe."""
+"""No breathing."""
 
 
 def _breaths(breathing: Breathing, seed: int) -> Array:
-    """The table of a patient who breathes, shape (n, 5)."""
+    """Return the table of breaths, shape (n, 5)."""
     streams = np.random.SeedSequence([seed, crc32(b"breathing")]).spawn(2)
     breaths, coughs = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     rows: list[tuple[float, float, float, float, float]] = []
@@ -153,11 +150,11 @@ def _breaths(breathing: Breathing, seed: int) -> Array:
 
 
 def _until_next(breathing: Breathing, rng: np.random.Generator) -> float:
-    """Time to the next burst of coughs [s], exponential."""
+    """Draw the time to the next burst of coughs [s], exponential."""
     return float(rng.exponential(60 / breathing.coughs_per_min)) if breathing.coughs_per_min else math.inf
 
 
 def _log_normal(cv: float, z: float) -> float:
-    """A log-normal variable of mean 1 and coefficient of variation `cv`, at the normal score `z`."""
+    """Return a log-normal variable of mean 1 and coefficient of variation `cv` at normal score `z`."""
     variance = math.log1p(cv**2)
     return math.exp(math.sqrt(variance) * z - variance / 2)

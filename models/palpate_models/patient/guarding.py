@@ -1,4 +1,4 @@
-"""Guarding: muscle of the abdominal wall that is contracted over a wide area, and what it does while it is pressed."""
+"""Guarding: a wide area of contracted abdominal muscle, and its response to pressing."""
 
 from __future__ import annotations
 
@@ -10,50 +10,49 @@ from pydantic import Field
 from palpate_models.section import Length, Section, Vec2
 
 GENTLE_DEPTH_M, DEEP_M = 0.012, 0.025
-"""A press up to the first depth provokes nothing, from the second on the whole contraction [m] [assumption]: light palpation is
-said to go 10 to 20 mm deep."""
+"""Depths of no and of full provocation [m] [assumption]: light palpation is described as 10 to 20 mm deep."""
 GENTLE_SPEED_MPS, FAST_MPS = 0.010, 0.050
-"""The same of the speed at which the skin is pushed in [m/s] [assumption]."""
+"""Speeds of no and of full provocation [m/s] [assumption]."""
 CONTRACTION_S = 0.1
-"""Time constant of contracting: nine tenths within 0.23 s [assumption]."""
+"""Time constant of contraction: 90 % within 0.23 s [assumption]."""
 FADING_S = 3.0
-"""Time constant of letting go under gentle pressure [assumption]."""
+"""Time constant of relaxation under gentle pressure [assumption]."""
 
 
 class Guarding(Section):
-    """An area of contracted muscle, of elliptic outline in the abdomen's xy plane, wide and smooth. It is never a lesion."""
+    """An area of contracted muscle with a wide, smooth edge, elliptic in the abdomen's xy plane. It is not a lesion."""
 
     centre_m: Vec2
     """Centre, x to the patient's left and y to the head, from the umbilicus."""
     radii_m: tuple[Length, Length] = (0.06, 0.06)
-    """Half axes of the outline on which the tension is half of the centre's."""
+    """Half axes of the outline, on which the tension is half of that at the centre."""
     ratio: Annotated[float, Field(gt=1, le=6.5)] = 2.6
-    """Force contracted over force relaxed on a sphere of 10 mm radius pressed 10 mm deep at 5 mm/s. People who tense their
-    muscles have a median of 2.6 and 6.2 at most (Remus 2024)."""
+    """Contracted over relaxed force on a sphere of 10 mm radius, pressed 10 mm deep at 5 mm/s. Measured: median 2.6, maximum 6.2
+    (Remus 2024)."""
     kind: Literal["voluntary", "involuntary"] = "involuntary"
-    """Whether it fades under gentle pressure (`Activation`)."""
+    """`voluntary` guarding fades under gentle pressure (`Activation`)."""
     edge_m: Annotated[float, Field(ge=0.02, le=0.3)] = 0.06
     """Width of the smooth edge, centred on the outline."""
 
 
 class Activation:
-    """How the contraction a in [0, 1] of guarding muscle goes on: of first order towards what provokes it.
+    """Contraction a in [0, 1] of guarding muscle, of first order towards its provocation g.
 
         a' = (g - a) / tau,   tau = CONTRACTION_S where g > a, else FADING_S
         g = max(ramp(depth; GENTLE_DEPTH_M, DEEP_M), ramp(speed; GENTLE_SPEED_MPS, FAST_MPS))
 
     A ramp is 0 below the first of its limits and 1 above the second.
-    Involuntary guarding stays at 1. Voluntary guarding does not change without touch. No measurement says how fast
-    guarding comes and goes, so all constants are assumptions.
+    Involuntary guarding stays at 1. Voluntary guarding does not change without touch. These rates were
+    not measured, so all constants are assumptions.
     """
 
     def __init__(self, voluntary: bool, dt: float) -> None:
-        """Guarding that is `voluntary` or not, in periods of `dt` [s]."""
+        """`dt`: period [s]."""
         self.voluntary = voluntary
         self._contracting, self._fading = (1 - math.exp(-dt / tau) for tau in (CONTRACTION_S, FADING_S))
 
     def after(self, level: float, depth_m: float, speed_mps: float) -> float:
-        """a, one period after it was `level`, under a touch that is `depth_m` deep [m] and pushes in at `speed_mps` [m/s]."""
+        """Return a one period after `level`, under a touch `depth_m` deep [m] that moves inward at `speed_mps` [m/s]."""
         if not self.voluntary:
             return level
         provoked = max(_ramp(depth_m, GENTLE_DEPTH_M, DEEP_M), _ramp(speed_mps, GENTLE_SPEED_MPS, FAST_MPS))

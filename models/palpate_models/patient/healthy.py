@@ -16,8 +16,8 @@ import numpy as np
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient.abdomen import bone_share, parametric_surface
-from palpate_models.patient.anatomy import Anatomy, Muscles
 from palpate_models.patient.field import smoothstep
+from palpate_models.patient.schema import Anatomy, Muscles
 
 _FEATURES = 96
 _COMPONENTS = 2

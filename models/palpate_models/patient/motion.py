@@ -1,4 +1,4 @@
-"""How the patient moves on the table in mid-examination: once, and does not move back.
+"""Motion of the patient on the table during an examination: once, without moving back.
 
 Marks of certainty: [A] assumed.
 """
@@ -17,28 +17,28 @@ from palpate_models.numerics.seeds import generator
 from palpate_models.section import NonNegative, Section
 
 _MIDDLE_S = (40.0, 90.0)
-"""Between these times [s] the patient moves, where the scenario names none: within the scan of the default examination."""
+"""Range of the drawn time of motion [s]: within the scan of the default examination."""
 _AXIS_BELOW_M = 0.10
-"""A body turns about its long axis so far below the umbilicus [m] [A]: about the spine."""
+"""Depth of the axis of rotation below the umbilicus [m] [A]: the spine."""
 
 
 class Motion(Section):
-    """The whole body moves, as a rigid one, at one moment. Sizes [A]: a shift of 5 to 20 mm, or a turn of 3 degrees."""
+    """Rigid motion of the whole body at one time. Sizes [A]: a shift of 5 to 20 mm, or a turn of 3 degrees."""
 
     kind: Literal["none", "shift", "turn"] = "none"
     """`shift`: along the table. `turn`: about the long axis. Direction and side are drawn from the seed."""
     shift_m: Annotated[float, Field(gt=0, le=0.02)] = 0.010
-    """How far it shifts."""
+    """Distance of the shift."""
     turn_rad: Annotated[float, Field(gt=0, le=0.2)] = math.radians(3)
-    """By how much it turns."""
+    """Angle of the turn."""
     at_s: NonNegative | None = None
-    """When it begins; None: at a moment drawn from the seed, between 40 and 90 s."""
+    """Start of the motion; None: drawn from the seed, between 40 and 90 s."""
     over_s: Annotated[float, Field(ge=0.1, le=10)] = 0.5
-    """How long it takes."""
+    """Duration of the motion."""
 
 
 class BodyMotion:
-    """Where the body is: A' is the frame of the body that moves, A where it lay before.
+    """Pose of the body over time: A' is the moving frame of the body, A its frame before the motion.
 
     With s(x) = x^2 (3 - 2 x) from 0 to 1 over x = (t - at_s) / over_s, the body is shifted by s d, or turned by s theta about
     the line through p along e. Both are in A.
@@ -49,9 +49,9 @@ class BodyMotion:
         rng = generator(seed, "motion")
         middle, direction, side = rng.uniform(*_MIDDLE_S), rng.uniform(0, 2 * math.pi), rng.choice((-1.0, 1.0))
         self.at_s = float(middle) if motion.at_s is None else motion.at_s
-        """When it begins [s]."""
+        """Start [s]."""
         self.until_s = self.at_s + motion.over_s
-        """When it ends [s]."""
+        """End [s]."""
         self._d = np.zeros(3)
         self._theta = np.zeros(3)
         self._p = np.array((0.0, 0.0, -_AXIS_BELOW_M))
@@ -60,10 +60,10 @@ class BodyMotion:
         elif motion.kind == "turn":
             self._theta = motion.turn_rad * np.array((0.0, side, 0.0))
         self.moves = motion.kind != "none"
-        """Whether it ever does."""
+        """True if there is a motion."""
 
     def pose(self, t_s: float) -> Array:
-        """X_AA' at time `t_s` [s], shape (4, 4): the identity until it begins."""
+        """Return X_AA' at time `t_s` [s], shape (4, 4): the identity before the motion."""
         x = self._part(t_s)
         s = x * x * (3 - 2 * x)
         X = np.eye(4)
@@ -72,7 +72,7 @@ class BodyMotion:
         return X
 
     def on_body(self, t_s: Array, p: Array) -> Array:
-        """Points of A [m], shape (k, 3), at times [s], shape (k,), as points of the body: in A', shape (k, 3)."""
+        """Return points of A [m], shape (k, 3), at times [s], shape (k,), expressed in A', shape (k, 3)."""
         if not self.moves:
             return p
         x = np.clip((t_s - self.at_s) / (self.until_s - self.at_s), 0.0, 1.0)
@@ -80,9 +80,9 @@ class BodyMotion:
         return np.asarray(Rotation.from_rotvec(-s * self._theta).apply(p - s * self._d - self._p) + self._p)
 
     def twist(self, t_s: float) -> tuple[Array, Array]:
-        """The body's velocity at time `t_s` [s], in A: v [m/s] and w [rad/s], shape (3,) each.
+        """Return the body's velocity in A at time `t_s` [s]: v [m/s] and w [rad/s], shape (3,) each.
 
-        A point of the body that is at r moves with v + w x r.
+        A point of the body at r moves with v + w x r.
         """
         x = self._part(t_s)
         rate = 6 * x * (1 - x) / (self.until_s - self.at_s)

@@ -1,9 +1,10 @@
-"""How the wall differs between people and between places, from the walls fitted to what was measured on living people."""
+"""Random persons: body, wall, anatomy, breathing, lumps and guarding, drawn from statistics of living people."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cache
+from math import dist
 from typing import NamedTuple
 
 import numpy as np
@@ -11,42 +12,115 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
-from palpate_models.patient.anatomy import Anatomy, Muscles, Skeleton, Variation
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.guarding import Guarding
-from palpate_models.patient.lumps import drawn_lumps
 from palpate_models.patient.remus2024 import fitted
-from palpate_models.patient.schema import Background, Build, Draw, Phantom, Stiffness
+from palpate_models.patient.schema import (
+    Anatomy,
+    Background,
+    Build,
+    Draw,
+    Lesion,
+    Muscles,
+    Phantom,
+    Range,
+    Skeleton,
+    Stiffness,
+    Variation,
+)
+
+GAP_M = (0.002, 0.020)
+"""Gap between the outlines of a pair."""
+_TRIES = 50
+
+
+def drawn_lumps(draw: Draw, rng: np.random.Generator) -> tuple[Lesion, ...]:
+    """Return the lumps of one person, without overlap as far as the region has room."""
+    count = int(rng.integers(draw.lumps[0], draw.lumps[1] + 1))
+    lumps: list[Lesion] = []
+    while len(lumps) < count:
+        first = _apart(draw, rng, lumps)
+        lumps.append(first)
+        if len(lumps) < count and rng.random() < draw.pairs:
+            lumps.append(_beside(first, _lump(draw, rng, first.centre_m), rng))
+    return tuple(lumps)
+
+
+def _place(draw: Draw, rng: np.random.Generator) -> tuple[float, float]:
+    """Return a centre [m] in the region or on its border."""
+    at = rng.uniform(-1, 1, 2)
+    if draw.place == "edge":
+        at[rng.integers(2)] = rng.choice((-1.0, 1.0))
+    x, y = (at * np.array(draw.region_m) / 2).tolist()
+    return x, y
+
+
+def _lump(draw: Draw, rng: np.random.Generator, centre_m: tuple[float, float]) -> Lesion:
+    small = _between(draw.radius_m, rng)
+    radii = (small, small * float(rng.uniform(*draw.elongation)))
+    return Lesion(
+        centre_m=centre_m,
+        radii_m=radii if rng.random() < 0.5 else radii[::-1],
+        contrast=_between(draw.contrast, rng),
+        depth_m=float(rng.uniform(*draw.depth_m)),
+    )
+
+
+def _between(limits: Range, rng: np.random.Generator) -> float:
+    """Return a log-uniform number."""
+    return float(np.clip(np.exp(rng.uniform(*np.log(limits))), *limits))
+
+
+def _apart(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -> Lesion:
+    """Return a lump that overlaps no other; if no try succeeds, the one farthest from the others."""
+    best, most = _lump(draw, rng, _place(draw, rng)), -np.inf
+    for _ in range(_TRIES):
+        lump = best.model_copy(update={"centre_m": _place(draw, rng)})
+        gap = min((dist(lump.centre_m, one.centre_m) - max(lump.radii_m) - max(one.radii_m) for one in others), default=np.inf)
+        if gap > most:
+            best, most = lump, gap
+        if gap > 0:
+            break
+    return best
+
+
+def _beside(first: Lesion, second: Lesion, rng: np.random.Generator) -> Lesion:
+    """Return the second lump of a pair: in a random direction from the first, a gap away from its outline."""
+    angle = rng.uniform(0, 2 * np.pi)
+    away = np.array((np.cos(angle), np.sin(angle)))
+    reach = sum(1 / np.hypot(*(away / np.array(lump.radii_m))) for lump in (first, second)) + rng.uniform(*GAP_M)
+    x, y = (np.array(first.centre_m) + reach * away).tolist()
+    return second.model_copy(update={"centre_m": (x, y)})
 
 
 @dataclass(frozen=True)
 class WallStatistics:
-    """Moments of a place's ln k_w [N/m^3], ln length [m] and stiffening [1/m], in this order.
+    """Moments of ln k_w [N/m^3], ln length [m] and stiffening [1/m] of a place, in this order.
 
-    Some of the fitted places do not stiffen at all, so the stiffening has no logarithm.
+    Some fitted places do not stiffen, so the stiffening is not a logarithm.
     """
 
     mean: Array
-    """Over people, shape (3,)."""
+    """Mean over people, shape (3,)."""
     between: Array
-    """Covariance between people, of each one's mean over places, shape (3, 3)."""
+    """Covariance between people of their means over places, shape (3, 3)."""
     places: Array
-    """Covariance between the places of one person, of k_w and stiffening at one and the same length, shape (2, 2)."""
+    """Covariance of k_w and stiffening between places of one person, at equal length, shape (2, 2)."""
 
 
 @cache
 def wall_statistics() -> WallStatistics:
-    """The statistics of the measured places, `fitted.csv`."""
+    """Return the statistics of the measured places, `fitted.csv`."""
     walls = [fit.wall for fit in fitted().values()]
     values = np.array([(np.log(wall.k_w_n_per_m3), np.log(wall.length_m), wall.stiffening_per_m) for wall in walls])
     return moments(values, np.array([person for _, person in fitted()]))
 
 
 def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
-    """Moments of `values` (n, 3), each a place of a `person` (n,), by the analysis of variance.
+    """Return the moments of `values` (n, 3), each a place of a `person` (n,), by analysis of variance.
 
-    The covariance of the means over a person's places holds a part of that between places, which is taken away. A person's wall
-    has one length; what the other two vary by at that length is their covariance given the length.
+    The covariance of the persons' means contains a share of the covariance between places, which is subtracted. A person's wall
+    has one length, so the covariance of the other two is conditional on the length.
     """
     people = [values[person == one] for one in np.unique(person)]
     means = np.array([rows.mean(axis=0) for rows in people])
@@ -63,20 +137,20 @@ def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
 Interval = tuple[float, float]
 
 MEASURED_FAT_M = 0.015
-"""Up to this thickness the fat is within what was measured: young men of body mass index 19.5 to 24.6 [A]."""
+"""Fat thickness included in the measurements: young men with a body mass index of 19.5 to 24.6 [A]."""
 FAT_YOUNG_PA = 3000.0
 """Young's modulus of fat [M: 1.6 to 3.3 kPa excised]."""
 BUILDS = (Build.SLIM, Build.MEDIAN, Build.OBESE)
 SHARES = (0.2, 0.5, 0.3)
-"""How many are of each build [A]."""
+"""Share of each build [A]."""
 BREATHS_PER_MIN = (12.0, 14.0, 20.0)
-"""Least, most frequent and largest mean rate of a person's quiet breaths. Most frequent: Ragnarsdottir 2006 [V]; ends [A]."""
+"""Minimum, mode and maximum of a person's mean quiet breathing rate. Mode: Ragnarsdottir 2006 [V]; ends [A]."""
 BREATH_M: Interval = (0.005, 0.012)
-"""Mean depth of a person's quiet breaths at the navel, evenly drawn [A]."""
+"""Range of a person's mean quiet breathing depth at the umbilicus, uniform [A]."""
 
 
 class Figure(NamedTuple):
-    """Ranges of a build's body, evenly drawn [A]."""
+    """Ranges of the body of a build, uniform [A]."""
 
     width_m: Interval
     length_m: Interval
@@ -94,9 +168,9 @@ FIGURES = {
 
 
 def drawn(phantom: Phantom, seed: int) -> Phantom:
-    """The phantom with everything that `kind: person` leaves to the seed; any other, and a drawn person, as it is.
+    """Return the phantom with all random parts of `kind: person` drawn; other phantoms and drawn persons are unchanged.
 
-    Equal settings and seeds give equal persons, and `draw` and `build` change nothing but what they say.
+    Equal settings and seeds give equal persons. `draw` and `build` affect only their own parts.
     """
     if phantom.kind != "person" or phantom.anatomy is not None:
         return phantom
@@ -131,7 +205,7 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
 
 
 def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
-    """The wall of a person whose ln k_w, ln length and stiffening are given; relaxation and friction vary [A]."""
+    """Return a person's wall from ln k_w, ln length and stiffening; relaxation and friction are drawn [A]."""
     usual = Stiffness()
     k_w, length = np.exp(people[:2]).tolist()
     relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))
@@ -149,7 +223,7 @@ def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
 
 
 def under_fat(wall: Stiffness, fat_m: float) -> Stiffness:
-    """The wall under more fat than was measured: two springs in series, k_w and the fat's k_f = E / t [C, of an assumed model].
+    """Return the wall under more fat than in the measurements: k_w and the fat's k_f = E / t in series [C, assumed model].
 
     Both carry the pressure p, so with the shares phi = k_s / k of the displacement and p = k (u + beta^2 u^3 / 3) of each,
     to third order  1 / k_s = 1 / k_w + 1 / k_f,  beta_s^2 = beta_w^2 phi_w^3 + beta_f^2 phi_f^3:  a softer start. The fat itself
@@ -171,13 +245,13 @@ def under_fat(wall: Stiffness, fat_m: float) -> Stiffness:
 
 
 def _breathing(breathing: Breathing, rng: np.random.Generator) -> Breathing:
-    """A person's own mean rate and depth of breath, where the scenario gives none; a deep breather has the deep ones."""
+    """Draw mean rate and depth of breathing where the scenario gives none. Deep breathing keeps its own values."""
     own = {"rate_per_min": rng.triangular(*BREATHS_PER_MIN), "peak_to_peak_m": rng.uniform(*BREATH_M)}
     return breathing.model_copy(update={name: value for name, value in own.items() if name not in breathing.model_fields_set})
 
 
 def _skeleton(rng: np.random.Generator, length: float) -> Skeleton:
-    """Ribs and iliac crests about a body of this length [m]: the lowest ribs lie little above the umbilicus [M, ranges A]."""
+    """Draw ribs and iliac crests of a body of this length [m]: the lowest ribs are just above the umbilicus [M, ranges A]."""
     scale = length / 0.46
     return Skeleton(
         costal_arch_m=scale * rng.uniform(0.16, 0.20),
@@ -187,7 +261,7 @@ def _skeleton(rng: np.random.Generator, length: float) -> Skeleton:
 
 
 def _muscles(rng: np.random.Generator) -> Muscles:
-    """Rectus and linea alba: at rest as stiff as the sides or up to half stiffer [A, within what the measured places allow]."""
+    """Draw rectus and linea alba: at rest 0.9 to 1.4 times as stiff as the sides [A, within the measured variation]."""
     return Muscles(
         linea_alba_m=rng.uniform(0.012, 0.022),
         rectus_m=rng.uniform(0.055, 0.075),
@@ -197,7 +271,7 @@ def _muscles(rng: np.random.Generator) -> Muscles:
 
 
 def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
-    """A contracted area with the ratio of force tensed to force at rest of a measured place [C], place and size [A]."""
+    """Draw a contracted area. Its force ratio is that of a measured place [C]; position and size [A]."""
     if draw.guarding == "none":
         return ()
     ratios = [fit.activated_ratio for fit in fitted().values()]

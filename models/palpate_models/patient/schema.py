@@ -1,4 +1,7 @@
-"""What persons are drawn with, beside their own bodies: lumps within given ranges, and guarding."""
+"""Scenario sections of the patient: anatomy, lumps, wall mechanics, breathing and guarding.
+
+Marks of certainty: [V] read in the source, [C] computed from data, [M] from memory, [A] assumed.
+"""
 
 from __future__ import annotations
 
@@ -7,19 +10,85 @@ from typing import Annotated, Literal, Self
 
 from pydantic import Field, model_validator
 
-from palpate_models.patient.anatomy import Anatomy
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.motion import Motion
 from palpate_models.patient.wall import MEDIAN
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
+Factor = Annotated[float, Field(ge=0.2, le=5)]
+Correlation = Annotated[float, Field(ge=-1, le=1)]
+
+
+class Skeleton(Section):
+    """Bones around the belly: they shape the skin, and the wall over them is stiff."""
+
+    costal_arch_m: Annotated[float, Field(ge=0.08, le=0.4)] = 0.205
+    """Height of the costal arch above the umbilicus on the midline."""
+    costal_slope: Annotated[float, Field(ge=0.1, le=2)] = 0.55
+    """Descent of the costal arch per distance from the midline [1]."""
+    iliac_crest_m: Vec2 = (0.14, -0.175)
+    """Position (x, y) of the left iliac spine; the right one is its mirror image."""
+    iliac_radius_m: Length = 0.025
+    """Standard deviation of the Gaussian rise over the spine."""
+
+
+class Muscles(Section):
+    """The two rectus bands and the linea alba between them [widths M, factors A]."""
+
+    linea_alba_m: Length = 0.018
+    """Width of the linea alba."""
+    rectus_m: Length = 0.065
+    """Width of each rectus band."""
+    linea_alba: Factor = 1.0
+    """Stiffness on the linea alba relative to the sides."""
+    rectus: Factor = 1.0
+    """Stiffness on the rectus bands relative to the sides."""
+
+
+class Variation(Section):
+    """Natural variation of a healthy wall, besides muscles and bones."""
+
+    stiffness: NonNegative = 0.2
+    """Standard deviation of the log foundation modulus over the belly, muscles included [C]."""
+    stiffening_per_m: NonNegative = 30.0
+    """Standard deviation of the stiffening [C]."""
+    correlation: Correlation = 0.0
+    """Correlation of log modulus and stiffening [C]."""
+    length_m: tuple[Length, Length] = (0.010, 0.150)
+    """Shortest and longest correlation length of the variation [A]."""
+
+    @model_validator(mode="after")
+    def _order(self) -> Self:
+        if self.length_m[0] > self.length_m[1]:
+            raise ValueError(f"length_m = {self.length_m}: want the shorter length first")
+        return self
+
+
+class Anatomy(Section):
+    """Body of a person, besides size, wall and lumps."""
+
+    fat_m: Annotated[float, Field(ge=0.001, le=0.1)] = 0.012
+    """Thickness of the fat under the skin. Its effect on the wall is included in `phantom.stiffness`."""
+    dome_m: Annotated[float, Field(ge=-0.03, le=0.08)] = 0.014
+    """Drop of the midline from the umbilicus to both ends of the belly; negative for a sunken belly."""
+    exponent: Annotated[float, Field(ge=1.8, le=4)] = 2.4
+    """Exponent of the superelliptic cross section: 2 is an ellipse, larger is flatter in front."""
+    skeleton: Skeleton = Skeleton()
+    muscles: Muscles = Muscles()
+    variation: Variation = Variation()
+    bone: Positive = 2.0
+    """Stiffness of the wall over bone relative to the wall next to it [A]."""
+    bone_stiffening_per_m: Positive = 600.0
+    """Stiffening of the wall over bone: 16 times the modulus from 6.5 mm [A]."""
+
+
 Range = tuple[float, float]
 MOST_LUMPS = 8
 
 
 class Build(StrEnum):
-    """How a person is built; `drawn` is one of the others."""
+    """Builds of a person; `drawn`: one of the others at random."""
 
     SLIM = "slim"
     MEDIAN = "median"
@@ -28,26 +97,26 @@ class Build(StrEnum):
 
 
 class Draw(Section):
-    """Lumps and guarding of a population. Every range is (least, most)."""
+    """Sampling ranges for lumps and guarding of a person. Every range is (minimum, maximum)."""
 
     lumps: tuple[Annotated[int, Field(ge=0, le=MOST_LUMPS)], Annotated[int, Field(ge=0, le=MOST_LUMPS)]] = (0, 0)
-    """How many lumps, pairs counted as two."""
+    """Number of lumps; a pair counts as two."""
     radius_m: Range = (0.005, 0.040)
-    """The smaller half axis, evenly drawn by its logarithm."""
+    """Smaller half axis, log-uniform."""
     elongation: Range = (1.0, 1.5)
-    """The longer half axis over the smaller; a ridge has 3 or more."""
+    """Ratio of the half axes, uniform; a ridge has 3 or more."""
     depth_m: Range = (0.0, 0.040)
-    """How far below the skin a lump begins, evenly drawn."""
+    """Depth of the lump's top below the skin, uniform."""
     contrast: Range = (2.0, 10.0)
-    """Evenly drawn by its logarithm; on one side of 1."""
+    """Contrast, log-uniform; both limits above 1 or both below."""
     pairs: Annotated[float, Field(ge=0, le=1)] = 0.0
-    """How probably a lump is followed by another close to it."""
+    """Probability that a lump has a second one next to it."""
     place: Literal["inside", "edge"] = "inside"
-    """`edge`: centres lie on the border of the region."""
+    """`edge`: centres are on the border of the region."""
     region_m: tuple[Length, Length] = (0.20, 0.20)
-    """Width and height of the region about the umbilicus in which the centres lie."""
+    """Width and height of the region of the centres, around the umbilicus."""
     guarding: Literal["none", "voluntary", "involuntary"] = "none"
-    """Whether a muscle is contracted, with a ratio that was measured on living people."""
+    """Kind of guarding; its force ratio is drawn from measurements on living people."""
 
     @model_validator(mode="after")
     def _ranges(self) -> Self:
@@ -61,7 +130,7 @@ class Draw(Section):
         for name, (lowest, highest) in within.items():
             low, high = getattr(self, name)
             if not lowest <= low <= high <= highest:
-                raise ValueError(f"{name} = {low:g} to {high:g}: want {lowest:g} <= least <= most <= {highest:g}")
+                raise ValueError(f"{name} = {low:g} to {high:g}: want {lowest:g} <= minimum <= maximum <= {highest:g}")
         if self.contrast[0] <= 1 <= self.contrast[1]:
             raise ValueError(f"contrast = {self.contrast[0]:g} to {self.contrast[1]:g}: want both above 1, or both below")
         return self
@@ -75,17 +144,17 @@ class Lesion(Section):
     radii_m: tuple[Length, Length] = (0.03, 0.03)
     """Half axes of the half-contrast outline."""
     contrast: Annotated[float, Field(ge=0.1, le=20)] = 4.0
-    """Stiffness at its centre over the stiffness without it; below 1 it is softer than its surroundings. Not 1."""
+    """Stiffness at the centre relative to the stiffness without the lump; below 1 it is softer. Not 1."""
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
-    """How far below the skin it begins: an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface tier has
-    the factor that this ellipsoid gives to the skin (`palpate_models.patient.field`). None: it reaches from the skin inward."""
+    """Depth of the lump's top below the skin, for an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface
+    tier uses its equivalent factor at the skin (`palpate_models.patient.field`). None: the lump reaches from the skin inward."""
 
     @model_validator(mode="after")
     def _contrast(self) -> Self:
         if self.contrast == 1:
-            raise ValueError("contrast = 1 is no lump; want 0.1 to 20 and not 1")
+            raise ValueError("contrast = 1 is not a lump; want 0.1 to 20 and not 1")
         return self
 
 
@@ -97,22 +166,22 @@ class Background(Section):
     correlation_m: Annotated[float, Field(ge=0.01, le=0.5)] = 0.05
     """Correlation length."""
     margins: Annotated[float, Field(ge=1, le=4)] = 1.5
-    """How much stiffer the wall is at the costal margin and at the pelvis."""
+    """Stiffness at the costal margin and the pelvis relative to the middle."""
 
 
 class Stiffness(Section):
-    """Mechanics of the healthy wall: that of the median person (`patient.wall`), with Prony weights after liver."""
+    """Mechanics of the healthy wall. Defaults: the median person (`patient.wall`), with Prony weights of liver."""
 
     k_w_n_per_m3: Annotated[float, Field(ge=1e3, le=1e8)] = MEDIAN.k_w_n_per_m3
     """Instantaneous Winkler foundation modulus."""
     length_m: Annotated[float, Field(ge=0.002, le=0.1)] = MEDIAN.length_m
     """Pasternak length l = sqrt(G / k_w)."""
     stiffening_per_m: NonNegative = MEDIAN.stiffening_per_m
-    """How fast the modulus rises with depth: at a displacement u it is k_w (1 + (stiffening_per_m u)^2), see `wall.py`."""
+    """Stiffening beta: at displacement u the modulus is k_w (1 + (beta u)^2), see `wall.py`."""
     prony_g: tuple[NonNegative, ...] = (0.3, 0.2)
     """Relaxing fractions of the instantaneous modulus."""
     prony_tau_s: tuple[Positive, ...] = (1.86, 51.3)
-    """Their time constants."""
+    """Time constants of `prony_g`."""
     dashpot_s: Annotated[float, Field(gt=0, le=1)] = 0.05
     """Dashpot over foundation modulus, C = dashpot_s * k_w."""
     friction: Annotated[float, Field(ge=0, le=2)] = 0.3
@@ -121,23 +190,24 @@ class Stiffness(Section):
     @model_validator(mode="after")
     def _prony(self) -> Self:
         if len(self.prony_g) != len(self.prony_tau_s):
-            raise ValueError("prony_g and prony_tau_s need as many entries as each other")
+            raise ValueError("prony_g and prony_tau_s need equal numbers of entries")
         if sum(self.prony_g) >= 1:
             raise ValueError(f"prony_g must sum to less than 1, not {sum(self.prony_g)}")
         return self
 
 
 class Phantom(Section):
-    """The abdomen. Reaches only tissue and scoring."""
+    """The abdomen. Only the tissue and scoring get this section."""
 
     kind: Literal["parametric", "person", "mesh"] = "parametric"
-    """`person`: size, wall and anatomy are drawn from the scenario's seed as living people vary (`patient.person`)."""
+    """`parametric`: set below. `person`: size, wall and anatomy are drawn from the seed by the statistics of living people.
+    `mesh`: the surface is read from a file."""
     build: Build = Build.DRAWN
-    """How a person is built (kind: person)."""
+    """Build of the person (kind: person)."""
     draw: Draw = Draw()
-    """Lumps and guarding that are drawn, beside those of `lesions` and `guarding` (kind: person)."""
+    """Random lumps and guarding, in addition to `lesions` and `guarding` (kind: person)."""
     anatomy: Anatomy | None = None
-    """What was drawn (kind: person). With it the phantom is whole, and nothing is drawn any more."""
+    """The drawn anatomy (kind: person). If it is set, nothing is drawn."""
     mesh: str | None = None
     """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
     size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
@@ -149,14 +219,14 @@ class Phantom(Section):
     lesions: tuple[Lesion, ...] = ()
     """Lumps, stiffer or softer than their surroundings."""
     guarding: tuple[Guarding, ...] = ()
-    """Contracted muscles: wide and smooth."""
+    """Areas of contracted muscle."""
     breathing: Breathing = Breathing()
     motion: Motion = Motion()
 
     @model_validator(mode="after")
     def _guarding(self) -> Self:
         if len({area.kind for area in self.guarding}) > 1:
-            raise ValueError("guarding: all areas of a patient are of one kind, voluntary or involuntary")
+            raise ValueError("guarding: all areas of a patient must be of one kind, voluntary or involuntary")
         return self
 
     @model_validator(mode="after")

@@ -1,32 +1,115 @@
-"""Scenarios from YAML, by name or file, with `--set a.b=c`. Errors name file, field, value and what is allowed."""
+"""Loads scenarios from YAML, by name or file, with `--set a.b=c`, and gives each role its view.
+
+Errors name file, line, field, value and what is allowed.
+"""
 
 from __future__ import annotations
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
+from difflib import get_close_matches
 from importlib import resources
 from pathlib import Path
 from typing import Any, Literal
 
 import yaml
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
-from palpate_models.scenario.explain import did_you_mean, explain
 from palpate_models.scenario.schema import ExamInput, PlantInput, Scenario
-from palpate_models.section import Pose
+from palpate_models.section import UNITS, Pose
+
+
+def did_you_mean(word: str, known: Collection[str]) -> str:
+    """Return the most similar known word as a sentence; empty if there is none."""
+    near = get_close_matches(word, known, n=1)
+    return f". Did you mean {near[0]}?" if near else ""
+
+
+def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel], error: ValidationError) -> str:
+    """Return a line per invalid value of the scenario `name`, given as YAML in `text` and changed by `a.b=c` settings."""
+    lines = []
+    for item in error.errors():
+        field = [str(part) for part in item["loc"]]
+        what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "want ")
+        if item["type"] == "extra_forbidden":
+            what = f"there is no such field{did_you_mean(field[-1], _fields(model.model_json_schema()))}"
+        elif item["type"] in _NO_SECTION:
+            what = "want a section, a mapping of fields"
+        elif item["type"] == "missing":
+            last = field.pop()
+            what = f"want at least {int(last) + 1} values" if last.isdigit() else f"lacks {last}"
+        elif item["type"] == "tuple_type":
+            what = "want a list of values in square brackets"
+        elif item["type"] == "too_long":
+            what = f"want at most {item['ctx']['max_length']} values"
+        elif item["type"] in _NUMBERS and (unit := _unit(field)):
+            what += f" (in {unit})"
+        path = ".".join(field) or "scenario"
+        lines.append(f"{_origin(name, text, settings, field)}: {path} = {item['input']!r}: {what}")
+    return "\n".join(lines)
+
+
+_NO_SECTION = frozenset(("model_type", "model_attributes_type", "dict_type"))
+"""pydantic's error types for a value in place of a section."""
+
+
+_NUMBERS = frozenset(("greater_than", "greater_than_equal", "less_than", "less_than_equal", "float_parsing", "float_type"))
+"""pydantic's error types for a number out of bounds and for a value that is not a number."""
+
+
+def _unit(field: Sequence[str]) -> str | None:
+    """Return the unit at the end of a field's name: metres for `exam.region_m.0`."""
+    name = next((part for part in reversed(field) if not part.isdigit()), "")
+    return UNITS.get(name.rpartition("_")[2]) if "_" in name else None
+
+
+def _fields(schema: dict[str, Any]) -> set[str]:
+    """Return the names of all fields of a model and its nested models."""
+    return {field for part in (schema, *schema.get("$defs", {}).values()) for field in part.get("properties", ())}
+
+
+def _origin(name: str, text: str, settings: Sequence[str], field: Sequence[str]) -> str:
+    """Return the source of a field's value: the last setting that wrote it, else file and line."""
+    written = [setting.partition("=")[0].split(".") for setting in reversed(settings)]
+    to_it = [words for words in written if words == list(field[: len(words)])]
+    within = [
+        words for words in written if field and words[: len(field)] == list(field)
+    ]  # of a section that is invalid as a whole
+    for words in (*to_it, *within):
+        return f"--set {'.'.join(words)}"
+    line = _line(yaml.compose(text, yaml.SafeLoader), field)
+    return name if line is None else f"{name}, line {line}"
+
+
+def _line(node: yaml.Node | None, field: Iterable[str]) -> int | None:
+    """Return the line of a field, counted from 1; None if the document does not have it."""
+    line = None
+    for word in field:
+        if isinstance(node, yaml.MappingNode):
+            found = [(key, value) for key, value in node.value if key.value == word]
+        elif isinstance(node, yaml.SequenceNode) and word.isdigit() and int(word) < len(node.value):
+            found = [(node.value[int(word)],) * 2]
+        else:
+            found = []
+        if not found:
+            return line  # the path of a validator may be deeper than the document
+        key, node = found[0]
+        line = key.start_mark.line + 1
+    return line
+
 
 View = Literal["scenario", "plant", "exam"]
-"""How much of a scenario a role is given; a run's folder has a file of each kind."""
+"""Views of a scenario; a run's folder has a file of each."""
 _PATIENT: dict[str, Any] = {"name": True, "description": True, "phantom": True, "tissue": True, "services": {"tissue"}}
 HIDDEN: Mapping[View, dict[str, Any]] = {
     "scenario": {},
     "plant": _PATIENT,
     "exam": {**_PATIENT, "seed": True, "errors": True},
 }
-"""What is left out: of the plant's view what tells of the patient, of the exam's also what the truth could be drawn from."""
+"""Fields left out of each view: the patient for the plant; also seed and errors for the examination."""
 _VIEWS: Mapping[str, View] = {
     "tissue": "scenario",
     "dashboard": "scenario",
@@ -42,31 +125,31 @@ class ScenarioError(UserError):
 
 
 class _TwiceError(ValueError):
-    """A field that a mapping has twice."""
+    """A mapping has a field twice."""
 
 
 class _Loader(yaml.SafeLoader):
-    """YAML in which a field stands once; PyYAML would take the last of two and say nothing."""
+    """YAML loader that rejects duplicate fields; PyYAML would silently use the last one."""
 
     def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """The mapping. Raises _TwiceError naming line and field."""
+        """Return the mapping. Raises _TwiceError that names line and field."""
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
                 if key.value in seen:
-                    raise _TwiceError(f"line {key.start_mark.line + 1}: field {key.value} stands twice; want it once")
+                    raise _TwiceError(f"line {key.start_mark.line + 1}: field {key.value} is given twice")
                 seen.add(key.value)
         return super().construct_mapping(node, deep)
 
 
 def scenario_names() -> tuple[str, ...]:
-    """Names of the scenarios that come with the package."""
+    """Return the names of the built-in scenarios."""
     folder = resources.files("palpate_models").joinpath("scenarios")
     return tuple(sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".yaml")))
 
 
 def _read(source: str) -> tuple[str, str]:
-    """Text and display name of a scenario given by name or by file."""
+    """Return text and display name of a scenario given by name or file."""
     if source in scenario_names():
         name = f"{source}.yaml"
         return resources.files("palpate_models").joinpath("scenarios", name).read_text(encoding="utf-8"), name
@@ -87,7 +170,7 @@ def _read(source: str) -> tuple[str, str]:
 
 
 def _override(raw: dict[str, Any], setting: str) -> None:
-    """Applies one `a.b=c` to nested mappings; the value is YAML."""
+    """Apply one `a.b=c` to nested mappings; the value is YAML."""
     field, separator, value = setting.partition("=")
     if not separator or not field:
         raise ScenarioError(f"--set {setting}: want field.path=value, e.g. exam.depth_m=0.008")
@@ -101,14 +184,14 @@ def _override(raw: dict[str, Any], setting: str) -> None:
 
 
 def _index(items: list[Any], word: str, setting: str) -> int:
-    """The index of an item that is there."""
+    """Return the index of an existing item."""
     if not (word.isascii() and word.isdigit() and int(word) < len(items)):
-        raise ScenarioError(f"--set {setting}: {word!r} is no item; there are {len(items)}, counted from 0")
+        raise ScenarioError(f"--set {setting}: {word!r} is not an item; there are {len(items)}, counted from 0")
     return int(word)
 
 
 def parse_yaml(text: str, name: str) -> Any:
-    """YAML as Python values. Raises ScenarioError naming the file `name` and what is wrong."""
+    """Return YAML as Python values. Raises ScenarioError that names the file `name` and the problem."""
     try:
         return yaml.load(text, _Loader)
     except _TwiceError as error:
@@ -123,17 +206,14 @@ def parse_yaml(text: str, name: str) -> Any:
 
 
 def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = None) -> Scenario:
-    """A scenario by name or YAML file, with overrides `a.b=c` applied in order.
-
-    Raises ScenarioError naming file, field, value and what is allowed.
-    """
+    """Return a scenario by name or YAML file, with overrides `a.b=c` applied in order. Raises ScenarioError."""
     text, name = _read(source)
     raw = parse_yaml(text, name) or {}
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)
     for setting in settings:
-        if isinstance(raw.get("errors"), str):  # a level's name is short for a mapping with it alone
+        if isinstance(raw.get("errors"), str):  # a level's name stands for a mapping with only the level
             raw["errors"] = {"level": raw["errors"]}
         _override(raw, setting)
     if seed is not None:
@@ -145,10 +225,7 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
 
 
 def as_settings(fields: Mapping[str, Any]) -> list[str]:
-    """Overrides `a.b=c` of fields by their path, each with its value: what `load_scenario` takes.
-
-    Raises ScenarioError for a value that no scenario can have.
-    """
+    """Return fields by path as overrides `a.b=c` for `load_scenario`. Raises ScenarioError for values that YAML cannot hold."""
     try:
         return [f"{path}={json.dumps(value)}" for path, value in fields.items()]
     except (TypeError, ValueError) as error:
@@ -156,9 +233,9 @@ def as_settings(fields: Mapping[str, Any]) -> list[str]:
 
 
 def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Scenario:
-    """A scenario by name or YAML file, or one that is there already, which has a seed of its own.
+    """Return a scenario by name or YAML file, or a loaded one unchanged.
 
-    Raises ScenarioError as `load_scenario` does, and for a seed that is given with a scenario of another.
+    Raises ScenarioError as `load_scenario` does, and if `seed` differs from that of a loaded scenario.
     """
     if not isinstance(source, Scenario):
         return load_scenario(str(source), seed=seed)
@@ -170,28 +247,28 @@ def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Sc
 
 
 def view_of(role: str) -> View:
-    """What a role is given: observers and the tissue all, what stands for equipment its errors, everybody else the exam."""
+    """Return the view of a role: everything for observers and tissue, errors for simulated hardware, else the examination."""
     return _VIEWS.get(role, "exam")
 
 
 def seen(scenario: Scenario, view: View) -> Scenario:
-    """The scenario as that view has it: what is hidden is as in a scenario that does not mention it."""
+    """Return the scenario in a view: hidden fields have their defaults."""
     return Scenario.model_validate(scenario.model_dump(exclude=HIDDEN[view]))
 
 
 def dump_scenario(scenario: Scenario, view: View = "scenario") -> str:
-    """A view of the scenario as YAML, which `load_scenario` reads back to what `seen` returns, but for the name."""
+    """Return a view of the scenario as YAML; `load_scenario` reads it back as `seen` returns it, except for the name."""
     given = scenario.model_dump(mode="json", exclude=HIDDEN[view])
     return str(yaml.safe_dump(given, sort_keys=False, allow_unicode=True))
 
 
 def exam_input(scenario: Scenario) -> ExamInput:
-    """What every role may know."""
+    """Return the inputs of every role."""
     return ExamInput(**_exam(scenario))
 
 
 def plant_input(scenario: Scenario) -> PlantInput:
-    """What the simulated robot and camera may know."""
+    """Return the inputs of the simulated robot and camera."""
     return PlantInput(**_exam(scenario), seed=scenario.seed, errors=scenario.errors)
 
 
@@ -206,8 +283,8 @@ def _exam(scenario: Scenario) -> dict[str, Any]:
 
 
 def true_pose(scenario: Scenario) -> Pose:
-    """X_WA: where the patient truly is, the registered pose composed with what registration got wrong.
+    """Return the true X_WA: the registered pose composed with the error of registration.
 
-    For the tissue and scoring; a scenario of which the errors are hidden does not know it.
+    For tissue and scoring only: it needs a scenario with its errors.
     """
     return pose_of(matrix(scenario.exam.pose) @ draw_errors(scenario.errors, scenario.seed).X_AAt)

@@ -1,4 +1,4 @@
-"""A scenario: everything that a run is made of, as one frozen, validated model. YAML overlays its defaults.
+"""A scenario: all inputs of a run as one frozen, validated model. YAML overrides its defaults.
 
 Field names carry their unit. Angles are in radians, lengths in metres, unless the name says otherwise.
 World frame W: origin on the floor under the robot, z up, x towards the table. Abdomen frame A: origin at the umbilicus,
@@ -34,115 +34,116 @@ def _known_pattern(choice: str) -> str:
 
 
 class Mode(StrEnum):
-    """Indentation while covering."""
+    """Modes of indentation during the scan."""
 
     CONTINUOUS = "continuous"
     POINT = "point"
 
 
 class Following(StrEnum):
-    """What is done about the wall's breathing."""
+    """Responses to the breathing motion of the wall."""
 
     FOLLOW = "follow"
     """The indenter follows the wall."""
     GATE = "gate"
-    """It follows, and samples are taken at the end of expiration alone."""
+    """The indenter follows; samples are taken only at the end of expiration."""
     IGNORE = "ignore"
-    """It does not follow, as if the patient did not breathe."""
+    """The indenter does not follow."""
 
 
 class SearchBudget(Section):
-    """How much a search may take."""
+    """Budget of a search."""
 
     presses: Annotated[int, Field(ge=1, le=1000)] = 60
+    """Maximum number of presses."""
     seconds: Annotated[float, Field(gt=0, le=3600)] = 300.0
-    """From its first request on."""
+    """Maximum duration [s] from the first request."""
 
 
 class Search(Section):
-    """How a search presses, and when it is over. It takes part where `exam.pattern` is `search`."""
+    """Policy and end of a search. Used if `exam.pattern` is `search`."""
 
     policy: str = "informed"
-    """What chooses the next press: `informed`, `raster`, `random`, `latin-hypercube`, `expected-improvement`,
+    """Policy that chooses the next press: `informed`, `raster`, `random`, `latin-hypercube`, `expected-improvement`,
     `upper-confidence-bound`, `straddle`, `garg-2016`, `yan-pan-2021`, `ppo`, or a Python file with
     `next_press(posterior, budget)`."""
     missed: Annotated[float, Field(gt=0, lt=1)] = 0.05
-    """It is over when a lump that was not found is less probable than this, or the budget is spent."""
+    """The search ends when the probability of an undetected lump falls below this value, or the budget is spent."""
 
 
 class Exam(Section):
-    """What is examined, and how."""
+    """Region, pattern and mode of the examination."""
 
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Seed of what the examination itself draws, such as motion planning; the patient's seed is a secret."""
+    """Seed of random choices of the examination, such as motion planning. It does not depend on the patient's seed."""
     pose: Pose = Pose(xyz_m=(0.56, 0.0, 0.93))
     """X_WA: registered pose of the abdomen in world. The true one differs by `errors.registration`."""
     pattern: Annotated[str, AfterValidator(_known_pattern)] = "lines"
-    """`lines`: there and back, every second line first, lifted at each line's end; `raster`: every line from the feet to the
-    head; `snake`: there and back, line ends joined in contact; `search`: presses where the role `search` asks for them; or a
-    pattern of your own: the path of a Python file that has `scan(exam, surface)`."""
+    """`lines`: alternating directions, every second line first, lifted at each line's end; `raster`: all lines from feet to head;
+    `snake`: alternating directions, line ends joined in contact; `search`: presses requested by the role `search`; or a
+    user-defined pattern: the path of a Python file that has `scan(exam, surface)`."""
     mode: Mode = Mode.CONTINUOUS
     """`continuous`: slides at depth; `point`: presses, holds and lifts at each point."""
     breathing: Following = Following.FOLLOW
-    """`follow`: the indenter follows the wall; `gate`: it follows, and samples are taken at the end of expiration alone;
-    `ignore`: it does not follow, as if the patient did not breathe."""
+    """`follow`: the indenter follows the breathing motion; `gate`: it follows, with samples only at the end of expiration;
+    `ignore`: it does not follow."""
     depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
-    """Indentation along the inward normal from where the skin is touched."""
+    """Indentation along the inward normal, from the touched skin."""
     spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
-    """Distance of scan lines, and of points on a line."""
+    """Distance between scan lines, and between points on a line."""
     speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03
     """Tangential speed in contact."""
     region_m: tuple[Length, Length] = (0.20, 0.20)
-    """Width (x) and height (y) of the examined region about `centre_m`."""
+    """Width (x) and height (y) of the examined region around `centre_m`."""
     centre_m: Vec2 = (0.0, 0.0)
     """Centre of the region in the abdomen frame."""
     budget: SearchBudget = SearchBudget()
-    """How much a search may take."""
+    """Budget of a search."""
     false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
-    """The operating point: how probable a finding may be in a healthy examination. Less of it misses more."""
+    """Operating point: probability of a finding in a healthy examination. A smaller value misses more lumps."""
 
     @property
     def searched(self) -> bool:
-        """Whether the role `search` says what is pressed."""
+        """True if the role `search` chooses the presses."""
         return self.pattern == SEARCH
 
 
 class LbrConnection(Section):
-    """Where a real LBR is and how it is commanded: the ROS side, lbr_fri_ros2_stack over rmw_zenoh."""
+    """Connection to a real LBR: lbr_fri_ros2_stack over rmw_zenoh."""
 
     router: str = "tcp/127.0.0.1:7447"
-    """zenoh endpoint of the ROS side: its rmw_zenohd, or the emulator."""
+    """zenoh endpoint of the ROS system: its rmw_zenohd, or the emulator."""
     domain: Annotated[int, Field(ge=0, le=232)] = 0
-    """Its ROS domain."""
+    """ROS domain of the ROS system."""
     namespace: str = "lbr"
-    """The stack's `robot_name`, which is its namespace too."""
+    """`robot_name` of the stack, which is also its namespace."""
     ft_topic: str = "ft_sensor/wrench"
     """Topic of the F/T sensor's driver, geometry_msgs/WrenchStamped."""
     ft_sign: Literal[1, -1] = 1
-    """-1 when that driver reports what the sensor exerts on the tool."""
+    """-1 if the driver reports the wrench of the sensor on the tool."""
     ft_yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
-    """How far the sensor's x axis is turned about the flange's z."""
+    """Rotation of the sensor's x axis about the flange's z axis."""
     level: Literal["torque", "setpoint"] = "torque"
-    """`setpoint`: the control law runs in the driver's process, and `control/joint_torque` is not read."""
+    """`setpoint`: the control law runs in the driver's process and `control/joint_torque` is not used."""
     emulated: bool = False
-    """Whether the arm is the emulator: then what only physics knows is exchanged with it, for simulated tissue and camera."""
+    """True if the arm is the emulator. It then exchanges the `sim/` topics with simulated tissue and camera."""
 
 
 class RosCamera(Section):
-    """Where a depth camera of a ROS 2 system is, over rmw_zenoh."""
+    """Connection to a depth camera of a ROS 2 system over rmw_zenoh."""
 
     router: str = "tcp/127.0.0.1:7447"
-    """zenoh endpoint of the ROS side, its rmw_zenohd."""
+    """zenoh endpoint of the ROS system, its rmw_zenohd."""
     domain: Annotated[int, Field(ge=0, le=232)] = 0
-    """Its ROS domain."""
+    """ROS domain of the ROS system."""
     image: str = "camera/depth/image_rect_raw"
-    """Topic of the depth images, 16UC1 [mm] or 32FC1 [m]; they count as rectified when its last part has `rect` in it."""
+    """Topic of the depth images, 16UC1 [mm] or 32FC1 [m]. `rect` in its last part marks rectified images."""
     info: str = "camera/depth/camera_info"
     """Topic of the intrinsics."""
     frame: str = "camera_depth_optical_frame"
     """The camera's optical frame."""
     world: str = "world"
-    """The ROS frame that is our world: on the floor under the robot, z up, x towards the table."""
+    """ROS frame that corresponds to world: on the floor under the robot, z up, x towards the table."""
 
 
 class Robot(Section):
@@ -150,19 +151,19 @@ class Robot(Section):
 
     lbr: LbrConnection = LbrConnection()
     indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
-    """Radius of the sphere that presses."""
+    """Radius of the spherical indenter."""
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Nominal mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
-    """Height of the base. The three defaults of its placement are what `python -m research.base_placement` finds best."""
+    """Height of the base. The three defaults of its placement are the optimum of `python -m research.base_placement`."""
     base_xy_m: Vec2 = (0.03, 0.02)
-    """Where the base stands in world."""
+    """Position of the base in world."""
     base_yaw_rad: float = 0.0
-    """How it is turned about the vertical."""
+    """Rotation of the base about the vertical."""
     joint_friction_nm: NonNegative = 0.1
     """Nominal Coulomb friction (lbr_fri_ros2_stack's URDF)."""
     joint_damping_nms: NonNegative = 10.0
-    """Nominal viscous friction (the same)."""
+    """Nominal viscous friction (same source)."""
 
 
 class Camera(Section):
@@ -170,11 +171,11 @@ class Camera(Section):
 
     ros: RosCamera = RosCamera()
     recording: str | None = None
-    """A run's folder, a rosbag2 folder or an MCAP file whose frames `services.camera: replay` shows."""
+    """Source of the frames of `services.camera: replay`: a run's folder, a rosbag2 folder or an MCAP file."""
     position_m: Vec3 = (0.95, -0.45, 1.85)
-    """Optical centre in world, as calibrated. The true pose differs by `errors.hand_eye`."""
+    """Calibrated optical centre in world. The true pose differs by `errors.hand_eye`."""
     look_at_m: Vec3 = (0.56, 0.0, 0.90)
-    """Point in world at the centre of its picture."""
+    """Point in world at the centre of the image."""
     width_px: Annotated[int, Field(ge=64, le=1920)] = 640
     """Columns of a depth image."""
     height_px: Annotated[int, Field(ge=48, le=1080)] = 480
@@ -182,7 +183,7 @@ class Camera(Section):
     focal_px: Positive = 585.0
     """Focal length."""
     frames: Annotated[int, Field(ge=1, le=200)] = 20
-    """Frames fused for a perceived surface."""
+    """Number of frames fused for a perceived surface."""
 
     @model_validator(mode="after")
     def _apart(self) -> Camera:
@@ -194,30 +195,30 @@ class Camera(Section):
 
 
 class Limits(Section):
-    """Operating limits that we set (no claim of compliance with ISO/TS 15066)."""
+    """Operating limits (no claim of compliance with ISO/TS 15066)."""
 
     force_working_n: Force = 15.0
-    """At this force depth yields."""
+    """Above this force the depth is reduced."""
     force_soft_stop_n: Force = 25.0
-    """The exam retreats along the normal."""
+    """Above this force the arm retreats along the normal."""
     force_emergency_n: Force = 40.0
-    """The driver holds safely."""
+    """Above this force the driver holds safely."""
     depth_m: Annotated[float, Field(gt=0, le=0.05)] = 0.020
-    """Greatest indentation: the exam commands no more, and beyond it the supervisor stops."""
+    """Maximum indentation: limit of the commanded depth, and of the measured depth before a stop."""
     joint_margin_rad: Annotated[float, Field(ge=0, le=0.5)] = 0.05
-    """Distance that is kept from the ends of each joint's range."""
+    """Distance from the ends of each joint's range."""
     speed_mps: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Speed of the tool in free motion."""
+    """Maximum speed of the tool in free motion."""
     contact_speed_mps: Annotated[float, Field(gt=0, le=0.5)] = 0.25
-    """Speed of the tool while it presses: at this the supervisor stops."""
+    """Maximum speed of the tool in contact; above it the supervisor stops."""
     workspace_min_m: Vec3 = (-0.7, -0.6, -0.1)
-    """Least x, y, z of the tool in the abdomen frame ..."""
+    """Lower workspace bound (x, y, z) of the tool in the abdomen frame."""
     workspace_max_m: Vec3 = (0.7, 0.6, 1.2)
-    """... and largest."""
+    """Upper workspace bound."""
     release_patience_s: NonNegative = 60.0
-    """How long a stopped exam waits for an operator's release before it ends."""
+    """Time that a stopped examination waits for release before it ends."""
     joint_velocity_scale: Annotated[float, Field(gt=0, le=1)] = 0.5
-    """Fraction of the joint velocity limits used in free motion."""
+    """Share of the joint velocity limits used in free motion."""
 
     @model_validator(mode="after")
     def _order(self) -> Limits:
@@ -232,28 +233,27 @@ class Limits(Section):
 
 
 class TissueChoice(Section):
-    """What the tissue is made from."""
+    """Files of the tissue."""
 
     fmu: str | None = None
-    """File of a co-simulation FMU for `services.tissue: fmu`; built from the phantom when empty."""
+    """Co-simulation FMU for `services.tissue: fmu`; without it, it is built from the phantom."""
     fmu_map: str | None = None
-    """File of the map of its variables to topic fields (YAML); that of the abdomen FMU when empty."""
+    """Map of the FMU's variables to topic fields (YAML); without it, the map of the abdomen FMU."""
 
 
 class Services(Section):
-    """Which implementation plays each role: the name of an entry point in the group `palpate.<role>`, or the path of a Python
-    file that has `create(scenario)`. A role that the contract has besides these is a field, too, by default `default`.
+    """Implementation of each role: an entry point in the group `palpate.<role>`, or the path of a Python file that has
+    `create(scenario)`. Further roles of the contract are fields too, with default `default`.
     """
 
     model_config = ConfigDict(extra="allow")
 
     robot: str = "dart"
-    """`dart`, `mujoco`, or `lbr` for the real arm (wall clock only)."""
+    """`dart`, `mujoco`, or `lbr` for the real arm (wall-clock mode only)."""
     tissue: str = "winkler"
-    """`winkler`, `elastic` or `fmu`; `none` where what the arm touches is real: then no tissue is simulated, no truth is known,
-    and nothing is scored (wall clock only)."""
+    """`winkler`, `elastic` or `fmu`; `none` for a real object: then there is no truth and no score (wall-clock mode only)."""
     camera: str = "kinect"
-    """`kinect`, `replay`, or `ros` for a real camera (wall clock only)."""
+    """`kinect`, `replay`, or `ros` for a real camera (wall-clock mode only)."""
     perception: str = "default"
     planning: str = "default"
     control: str = "default"
@@ -265,14 +265,14 @@ class Services(Section):
 
 
 class Scenario(Section):
-    """All of a run. `palpate_models.scenario.load.seen` gives the part that a role may know."""
+    """All inputs of a run."""
 
     name: str = "unnamed"
-    """Names the run's results; by default the file's name."""
+    """Name of the results; default: the file's name."""
     description: str = ""
-    """A sentence for people."""
+    """Description, for readers."""
     seed: Annotated[int, Field(ge=0, lt=2**32)] = 0
-    """Patient and equipment are drawn from it, and noise: equal seeds give equal runs."""
+    """Seed of patient, equipment and noise: equal seeds give equal runs."""
     phantom: Phantom = Phantom()
     errors: Errors = Errors()
     exam: Exam = Exam()
@@ -286,7 +286,7 @@ class Scenario(Section):
     @field_validator("phantom")
     @classmethod
     def _drawn(cls, phantom: Phantom, info: ValidationInfo) -> Phantom:
-        """A person as the seed draws it: a scenario has no phantom that is not whole."""
+        """Draw a person from the seed, so that every scenario has a complete phantom."""
         seed = info.data.get("seed")
         return phantom if seed is None else drawn(phantom, seed)
 
@@ -302,7 +302,7 @@ class Scenario(Section):
 
 
 class ExamInput(Section):
-    """What every role may know: how the examination is to be, with the nominal equipment and the registered pose."""
+    """Inputs of every role: examination, nominal equipment, registered pose."""
 
     X_WA: tuple[tuple[float, float, float, float], ...]
     """Registered pose of the abdomen in world, homogeneous 4 x 4."""
@@ -313,7 +313,7 @@ class ExamInput(Section):
 
 
 class PlantInput(ExamInput):
-    """What the simulated robot and camera may know besides: their own errors, which `draw_errors` draws from the seed."""
+    """Inputs of the simulated robot and camera: also their errors, drawn from the seed by `draw_errors`."""
 
     seed: int
     errors: Errors

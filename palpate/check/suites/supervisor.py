@@ -13,8 +13,7 @@ from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
 from palpate_bus.messages.stamps import header
-from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
 from palpate_models.robot import lbr
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.load import exam_input

@@ -10,8 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics

@@ -30,8 +30,7 @@ from palpate_bus.messages import (
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput

@@ -9,8 +9,7 @@ import pytest
 from lbr_bench import Rig
 
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors

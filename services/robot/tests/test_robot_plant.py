@@ -7,7 +7,7 @@ import pinocchio as pin
 import pytest
 from scipy.spatial.transform import Rotation
 
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant

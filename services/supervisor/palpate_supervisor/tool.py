@@ -8,9 +8,8 @@ from typing import NamedTuple
 import numpy as np
 import pinocchio as pin
 
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
-from palpate_models.numerics.nearest import nearest_vertex
+from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.numerics.vectors import nearest_vertex
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 

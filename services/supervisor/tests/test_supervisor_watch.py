@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import MS
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Limits

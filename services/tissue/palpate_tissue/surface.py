@@ -10,8 +10,7 @@ from scipy import sparse
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.numerics.nearest import nearest_vertex
-from palpate_models.numerics.vectors import Vector, add, dot, row, scale, subtract
+from palpate_models.numerics.vectors import Vector, add, dot, nearest_vertex, row, scale, subtract
 from palpate_models.patient.phantom import PhantomModel
 
 _FAR_M = 0.15

@@ -26,8 +26,7 @@ from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario

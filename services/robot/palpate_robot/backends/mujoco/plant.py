@@ -21,8 +21,7 @@ from typing import Any, Final
 import mujoco
 import numpy as np
 
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
