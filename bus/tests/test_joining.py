@@ -33,9 +33,9 @@ def _announced(*runs: Run) -> Iterator[None]:
 
 
 def test_nothing_to_join() -> None:
-    with pytest.raises(NoBus, match="no run is on"):
+    with pytest.raises(NoBus, match="no active run"):
         find()
-    with pytest.raises(NoBus, match="no run 'healthy' is on; on are: none"):
+    with pytest.raises(NoBus, match="no active run 'healthy'; active: none"):
         find(chosen="healthy")
 
 
@@ -59,7 +59,7 @@ def test_the_one_run() -> None:
 
 def test_several_runs_are_named_unless_all_are_meant() -> None:
     with _announced(Run("healthy", ENDPOINTS, pid=1), Run("two_lesions", ENDPOINTS, pid=2)):
-        with pytest.raises(NoBus, match=r"2 runs are on: healthy \(process 1\), two_lesions \(process 2\)"):
+        with pytest.raises(NoBus, match=r"2 runs are active: healthy \(process 1\), two_lesions \(process 2\)"):
             find()
         assert {target.title for target in find_all()} == {"healthy", "two_lesions"}
         assert find(chosen="two").title == "two_lesions"

@@ -1,10 +1,9 @@
-"""Little-endian CDR of the messages of the control loop, written out with `struct`. `codec` uses rosbags for all others.
+"""Little-endian CDR of the 1 kHz messages with `struct`. `codec` uses rosbags for all others.
 
-These are the types of the 1 kHz topics. All of them begin with a header, whose `frame_id` has any length, so that what follows it
-is aligned anew and then has a fixed layout.
+All these types start with a header. Its `frame_id` has any length; the rest is aligned after it and has a fixed layout.
 
-The encoders raise whatever goes wrong with a field, the decoders whatever goes wrong with the bytes; `codec` makes it a
-CodecError. A decoder returns the message and the position of its end.
+Encoders and decoders raise any exception for unsuitable fields or bytes; `codec` converts it to CodecError. A decoder returns the
+message and the position of its end.
 """
 
 from __future__ import annotations
@@ -40,10 +39,10 @@ _JOINTS = {gap: Struct(f"<I{gap}x56sI4x56sI4x56s") for gap in (0, 4)}  # positio
 
 
 def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDArray[Any]:
-    """`value` as a contiguous array of `dtype`, shape (length,), or of any length where that is None.
+    """Return `value` as a contiguous array of `dtype`, shape (length,), or of any length if that is None.
 
-    Raises ValueError that names the field if the shape is another, or if numbers would lose their meaning (text, complex numbers,
-    fractions for an integer field).
+    Raises ValueError that names the field for another shape, or for an unsafe conversion (text, complex numbers, fractions for an
+    integer field).
     """
     array: NDArray[Any]
     if value.__class__ is np.ndarray and value.dtype == dtype and value.flags.c_contiguous:
@@ -59,20 +58,20 @@ def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> 
 
 
 def encode_wrench_stamped(message: WrenchStamped) -> bytes:
-    """`geometry_msgs/WrenchStamped`."""
+    """Convert `geometry_msgs/WrenchStamped`."""
     force, torque = message.wrench.force, message.wrench.torque
     return pack_header(message.header, 8) + _WRENCH.pack(force.x, force.y, force.z, torque.x, torque.y, torque.z)
 
 
 def decode_wrench_stamped(data: bytes) -> tuple[WrenchStamped, int]:
-    """`geometry_msgs/WrenchStamped`."""
+    """Convert `geometry_msgs/WrenchStamped`."""
     header, start = read_header(data, 8)
     fx, fy, fz, tx, ty, tz = _WRENCH.unpack_from(data, start)
     return WrenchStamped(header, Wrench(Vector3(fx, fy, fz), Vector3(tx, ty, tz))), start + _WRENCH.size
 
 
 def encode_tool_state(message: ToolState) -> bytes:
-    """`palpation_msgs/ToolState`."""
+    """Convert `palpation_msgs/ToolState`."""
     p, q = message.pose.position, message.pose.orientation
     v, w = message.twist.linear, message.twist.angular
     return pack_header(message.header, 8) + _TOOL.pack(
@@ -81,7 +80,7 @@ def encode_tool_state(message: ToolState) -> bytes:
 
 
 def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
-    """`palpation_msgs/ToolState`."""
+    """Convert `palpation_msgs/ToolState`."""
     header, start = read_header(data, 8)
     px, py, pz, qx, qy, qz, qw, vx, vy, vz, wx, wy, wz, radius = _TOOL.unpack_from(data, start)
     pose = Pose(Point(px, py, pz), Quaternion(qx, qy, qz, qw))
@@ -89,7 +88,7 @@ def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
 
 
 def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
-    """`palpation_msgs/JointTorqueCommand`."""
+    """Convert `palpation_msgs/JointTorqueCommand`."""
     torque = fitted(message.torque, _FLOAT64, 7, "torque").tobytes()
     problem = message.problem.encode() + b"\0"
     valid_for = message.valid_for
@@ -97,7 +96,7 @@ def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
 
 
 def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
-    """`palpation_msgs/JointTorqueCommand`."""
+    """Convert `palpation_msgs/JointTorqueCommand`."""
     header, start = read_header(data, 8)
     torque, sec, nanosec, length = _COMMAND.unpack_from(data, start)
     problem, end = read_characters(data, start + _COMMAND.size, length)
@@ -105,7 +104,7 @@ def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
 
 
 def encode_joint_state(message: JointState) -> bytes:
-    """`sensor_msgs/JointState`."""
+    """Convert `sensor_msgs/JointState`."""
     data = pack_header(message.header, 4) + _pack_names(tuple(message.name))
     position = fitted(message.position, _FLOAT64, None, "position")
     velocity = fitted(message.velocity, _FLOAT64, None, "velocity")
@@ -123,7 +122,7 @@ def encode_joint_state(message: JointState) -> bytes:
 
 
 def decode_joint_state(data: bytes) -> tuple[JointState, int]:
-    """`sensor_msgs/JointState`."""
+    """Convert `sensor_msgs/JointState`."""
     header, start = read_header(data, 4)
     names, start = _read_names(data, start)
     joints = _JOINTS[padding(start + LENGTH.size, 8)]
@@ -140,7 +139,7 @@ def decode_joint_state(data: bytes) -> tuple[JointState, int]:
 
 @lru_cache(maxsize=64)
 def _pack_names(names: tuple[str, ...]) -> bytes:
-    """A sequence of strings that begins where a number of four bytes may stand, padded for another one."""
+    """Return a sequence of strings, from one four-byte boundary to another."""
     data = bytearray(LENGTH.pack(len(names)))
     for name in names:
         data += pack_text(name)
@@ -149,13 +148,13 @@ def _pack_names(names: tuple[str, ...]) -> bytes:
 
 
 class _NamesReader:
-    """Reads a sequence of strings. Joint names do not change, so those of the message before are known again by their bytes."""
+    """Reads a sequence of strings. Joint names rarely change, so the previous bytes and names are cached."""
 
     def __init__(self) -> None:
         self._last: tuple[bytes, list[str]] = (b"", [])
 
     def __call__(self, data: bytes, start: int) -> tuple[list[str], int]:
-        """The strings of the sequence at `start`, and the position of the number of four bytes that follows."""
+        """Return the strings of the sequence at `start`, and the position of the next four-byte number."""
         block, last_names = self._last
         if block and data.startswith(block, start):
             return last_names.copy(), start + len(block)
@@ -175,7 +174,7 @@ _read_names = _NamesReader()
 
 
 def _read_array(data: bytes, start: int) -> tuple[NDArray[np.float64], int]:
-    """The float64 sequence at `start`, and its end."""
+    """Return the float64 sequence at `start`, and its end."""
     (count,) = LENGTH.unpack_from(data, start)
     begin = start + LENGTH.size
     if count:

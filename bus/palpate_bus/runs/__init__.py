@@ -1,1 +1,1 @@
-"""The runs of this machine: how they are announced, found and operated from other terminals."""
+"""Announcing, finding and operating the runs of this machine."""

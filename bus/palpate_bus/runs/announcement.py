@@ -1,7 +1,7 @@
-"""Where the runs of this machine are, so that a tool in another terminal finds the bus of a run without guessing.
+"""Announcements of runs on this machine, so that tools in other terminals find the bus of a run.
 
-Whoever starts a run announces it by a small JSON file in `folder()`, which only its user can read. The file is locked as long
-as its writer lives, so a run that was killed leaves a file that nobody holds; `live` removes those.
+The process that starts a run writes a JSON file to `folder()`, readable only by its user. The file is locked while the process
+lives; `live` removes the unlocked files of killed runs.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
 
 PACKAGES = ("palpate", "eclipse-zenoh", "rosbags", "numpy")
-"""Whose versions both sides of a bus should agree on."""
+"""Packages whose versions should match on both sides of a bus."""
 
 
 def versions() -> dict[str, str]:
-    """Versions of the packages that make the wire, by name; an absent one is left out."""
+    """Return the versions of the packages that affect the wire format, by name, without missing ones."""
     found = {}
     for name in PACKAGES:
         with suppress(PackageNotFoundError):
@@ -37,12 +37,12 @@ def versions() -> dict[str, str]:
 
 @dataclass(frozen=True)
 class Run:
-    """A run in progress: the process that started it, and how to join its bus."""
+    """A run in progress: the process that started it, and its bus."""
 
     name: str
     """The scenario."""
     endpoints: Mapping[str, str]
-    """Where each role and the conductor listen, by role."""
+    """Endpoint of each role and the conductor, by role."""
     domain: int = 0
     """ROS domain."""
     runtime: str = "lockstep"
@@ -51,16 +51,16 @@ class Run:
     out: str = ""
     """The results folder."""
     keys: str | None = None
-    """The folder of all certificates, for a secure run."""
+    """Folder of all certificates, in a secure run."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
     versions: Mapping[str, str] = field(default_factory=versions)
     rate: float | None = None
-    """By the wall clock: simulated seconds a second."""
+    """Simulated seconds per second in wall-clock mode."""
 
     def options(self, member: str = "viewer") -> BusOptions:
-        """How a tool joins: as a peer of everyone, listening nowhere; in a secure run as its router's client, as that member."""
+        """Return the options of a tool: a peer of every role without a listener; in a secure run a client with `member`'s key."""
         if self.keys is not None:
             router = next(iter(self.endpoints.values()))
             return BusOptions(mode="client", router=router, tls=Path(self.keys) / member, shared_memory=False)
@@ -68,10 +68,10 @@ class Run:
 
 
 class Announcement:
-    """Keeps a run announced until `withdraw`, or until the process ends in whatever way."""
+    """Announces a run until `withdraw` or the end of the process."""
 
     def __init__(self, run: Run) -> None:
-        """Writes the file of `run`. Raises OSError when the folder cannot be made or is another user's."""
+        """Write the file. Raises OSError if the folder cannot be created or belongs to another user."""
         self.path = folder() / f"{run.pid}-{time.time_ns()}.json"
         draft = self.path.with_suffix(".new")
         draft.touch(mode=0o600)
@@ -82,13 +82,13 @@ class Announcement:
         draft.rename(self.path)
 
     def withdraw(self) -> None:
-        """Removes the file; further calls do nothing."""
+        """Remove the file. Further calls have no effect."""
         self.path.unlink(missing_ok=True)
         self._file.close()
 
 
 def folder() -> Path:
-    """The folder of announcements, made when it is not there. Raises OSError when it is another user's."""
+    """Return the folder of announcements; create it if needed. Raises OSError if it belongs to another user."""
     named = Settings.read().runs
     runtime = os.environ.get("XDG_RUNTIME_DIR")
     if named:
@@ -99,25 +99,25 @@ def folder() -> Path:
         path = Path(tempfile.gettempdir()) / f"palpate-{os.getuid()}"
     path.mkdir(mode=0o700, parents=True, exist_ok=True)
     if path.stat().st_uid != os.getuid():
-        raise PermissionError(f"{path} belongs to another user; set PALPATE_RUNS to a folder of yours")
+        raise PermissionError(f"{path} belongs to another user; set PALPATE_RUNS to your own folder")
     return path
 
 
 def matching(chosen: str | None) -> list[Run]:
-    """The live runs that a user means by a process id or a part of a name, oldest first; all of them for None."""
+    """Return the live runs that match a process id or a part of a name, oldest first; all runs for None."""
     return [run for run in live() if chosen is None or chosen == str(run.pid) or chosen in run.name]
 
 
-def _is_ours(path: Path) -> bool:
-    """Whether it is named as an announcement is: PALPATE_RUNS may name a folder in which something else lies, too."""
+def _is_announcement(path: Path) -> bool:
+    """True if the name is that of an announcement: a folder of PALPATE_RUNS may contain other files."""
     return re.fullmatch(r"\d+-\d+\.json", path.name) is not None
 
 
 def live() -> list[Run]:
-    """The runs of this user on this machine that are on, oldest first. What killed runs left is removed."""
+    """Return the active runs of this user on this machine, oldest first. Removes files of killed runs."""
     remove_leftovers()
     runs = []
-    for path in filter(_is_ours, folder().iterdir()):
+    for path in filter(_is_announcement, folder().iterdir()):
         with suppress(OSError, ValueError, TypeError), path.open(encoding="utf-8") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

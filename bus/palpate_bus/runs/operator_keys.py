@@ -1,12 +1,12 @@
-"""Single keys by which an operator stops or releases a run, in the terminal that shows it.
+"""Keys to stop or release a run in the terminal that displays it.
 
 | key | |
 |---|---|
 | s | soft stop: the arm retreats along the normal and waits |
 | e | emergency stop: the driver holds the arm safely |
-| r | release: the examination goes on where it was |
+| r | release: the examination resumes |
 
-Keys are read only if standard input is a terminal and this process is in its foreground.
+Keys are read only if standard input is a terminal with this process in the foreground.
 """
 
 from __future__ import annotations
@@ -21,12 +21,12 @@ from types import TracebackType
 from typing import Any, Self
 
 KEYS = {"s": "soft-stop", "e": "stop", "r": "release"}
-"""Words of `operator_requests` by key."""
+"""Requests of `operator_requests` by key."""
 HINT = "keys: s soft stop, e emergency stop, r release"
 
 
 class OperatorKeys:
-    """Reads keys without waiting for them, inside a `with`; the terminal is left as it was found."""
+    """Context manager that reads keys without blocking, and restores the terminal."""
 
     def __init__(self) -> None:
         self._fd = -1
@@ -34,15 +34,15 @@ class OperatorKeys:
 
     @property
     def attached(self) -> bool:
-        """Whether there is a terminal to read from."""
+        """True if there is a terminal to read from."""
         return bool(self._before)
 
     def __enter__(self) -> Self:
-        # A job in the background that touched its terminal would be stopped by it.
+        # The terminal would stop a background job that uses it.
         if sys.stdin is not None and sys.stdin.isatty() and os.tcgetpgrp(sys.stdin.fileno()) == os.getpgrp():
             self._fd = sys.stdin.fileno()
             self._before = termios.tcgetattr(self._fd)
-            tty.setcbreak(self._fd)  # keys come at once and are not shown; Ctrl+C works as always
+            tty.setcbreak(self._fd)  # no echo, no line buffer; Ctrl+C still works
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
@@ -52,7 +52,7 @@ class OperatorKeys:
             self._before = []
 
     def pressed(self) -> list[str]:
-        """The words of the keys pressed since last time."""
+        """Return the requests of the keys pressed since the last call."""
         words = []
         while self._before and select([self._fd], [], [], 0)[0]:
             key = os.read(self._fd, 64)

@@ -1,6 +1,6 @@
-"""An operator's request to a run: a query that its conductor answers once the supervisor confirms it.
+"""Operator requests to a run: queries that its conductor answers after confirmation by the supervisor.
 
-Asked by `palpate stop`, `release`, `pause`, `resume` and `step`, and by the keys of `palpate dashboard` and `palpate run`.
+Sent by `palpate stop`, `release`, `pause`, `resume` and `step`, and by the keys of `palpate dashboard` and `palpate run`.
 """
 
 from __future__ import annotations
@@ -13,20 +13,20 @@ from palpate_bus.messages import OperatorRequest
 from palpate_errors import RunError
 
 CONFIRM_S = 2.0
-"""How long a confirmation is waited for, by wall clock."""
+"""Timeout of a confirmation, wall time."""
 WORDS = {
     "stop": OperatorRequest.STOP,
     "soft-stop": OperatorRequest.SOFT_STOP,
     "release": OperatorRequest.RELEASE,
     "end": OperatorRequest.END,
 }
-"""What can be asked of the examination, with the request it is passed on as."""
+"""Requests to the examination and the message constant of each."""
 TIME_REQUESTS = ("pause", "resume", "step")
-"""What can be asked of the conductor of a lockstep run: to grant no more time, to grant it again, to grant a little."""
+"""Requests to the conductor of a lockstep run: stop, continue, or briefly continue granting time."""
 
 
 class NotAnswered(RunError):
-    """No run answered the request, or it was refused. The message says which."""
+    """No run answered the request, or the run refused it."""
 
 
 class NoConductorError(NotAnswered):
@@ -34,14 +34,14 @@ class NoConductorError(NotAnswered):
 
 
 def request_key(domain: int) -> str:
-    """The key of the query."""
+    """Return the key of the query."""
     return f"{domain}/palpate/operator"
 
 
 def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
-    """Sends a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; returns its answer, and when it was confirmed [ms].
+    """Send a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; return its answer and confirmation time [ms].
 
-    `ms` is for `step`: the simulated time to grant. Raises NotAnswered.
+    `ms`: simulated time to grant, for `step`. Raises NotAnswered.
     """
     payload = json.dumps({"word": word, "reason": reason, "ms": ms})
     for reply in session.get(request_key(domain), payload=payload, timeout=2 * CONFIRM_S):
@@ -55,7 +55,7 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
 
 
 def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:
-    """As `ask`, but returns a sentence on the result to show to the operator, also when there was no answer."""
+    """Send a request as `ask` does; return text for the operator, also without an answer."""
     try:
         answer, after_ms = ask(session, domain, word, reason)
     except NotAnswered as error:

@@ -1,7 +1,6 @@
-"""The name of a run: `run.json` of a results folder holds it, and every result in the folder repeats it.
+"""Name of a run, stored in `run.json` of the results folder and repeated in every result.
 
-A file that was copied out of its folder, or into another one, is so known by the run that made it. The name is random, since
-scenario, seed and time may tell of the patient.
+It identifies the run of a copied file. It is random, since scenario, seed and time could reveal the patient.
 """
 
 from __future__ import annotations
@@ -17,12 +16,12 @@ from uuid import uuid4
 
 FILE: Final = "run.json"
 LOCK: Final = "run.lock"
-"""The file of a results folder whose lock its run holds; it names the process. The kernel drops the lock when that ends."""
+"""File in a results folder that the run locks; it contains the process id. The kernel releases the lock at the end."""
 _LENGTH: Final = 12
 
 
 def name_run(folder: Path) -> str:
-    """Names a new run and writes `run.json` into its results folder; returns the name, hexadecimal. Raises OSError."""
+    """Name a new run and write `run.json` to its results folder; return the name, hexadecimal. Raises OSError."""
     name = uuid4().hex[:_LENGTH]
     began = datetime.now(UTC).isoformat(timespec="seconds")
     facts = {"run": name, "began": began, "palpate": version("palpate")}
@@ -31,7 +30,7 @@ def name_run(folder: Path) -> str:
 
 
 def in_use(folder: Path) -> bool:
-    """Whether a run still writes into a results folder. Raises OSError for one that cannot be looked into."""
+    """True if a run still writes to a results folder. Raises OSError if the folder cannot be read."""
     with suppress(FileNotFoundError), (folder / LOCK).open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
@@ -41,7 +40,7 @@ def in_use(folder: Path) -> bool:
 
 
 def run_of(folder: Path) -> str:
-    """The name of the run that a results folder belongs to; empty where it has none."""
+    """Return the name of the run of a results folder; empty if it has none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         return str(json.loads((folder / FILE).read_text(encoding="utf-8"))["run"])
     return ""

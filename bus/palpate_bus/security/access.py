@@ -1,8 +1,8 @@
-"""zenoh's access control for a router, from the contract: a role may send what it produces and get what it reads, no more.
+"""zenoh's access control for a router, from the contract: a role may send its outputs and receive its inputs, nothing else.
 
     python -m palpate_bus.security.access > access.json5      # the `access_control` part of zenohd's configuration
 
-A member is known by the common name of its certificate (`keys.py`), or with `--users` by its zenoh user name
+A member is identified by the common name of its certificate (`keys.py`), or with `--users` by its zenoh user name
 (`transport/auth/usrpwd` with a dictionary file; keep that file out of the repository). Peers that talk directly do not pass the
 router, so services are clients of it (`PALPATE_MODE=client`) where this must hold: `palpate run --secure`.
 
@@ -24,18 +24,18 @@ from palpate_bus.wire.liveliness import ADMIN_SPACE
 from palpate_bus.wire.rmw import hello_key
 
 VIEWER = "viewer"
-"""A member who may read every public topic and send nothing: a guest's RViz or Foxglove, or `palpate doctor`."""
+"""A member that may read every public topic and send nothing: RViz, Foxglove, or `palpate doctor`."""
 OPERATOR = "operator"
-"""A viewer who may also stop and release: `palpate stop` asks the conductor, who alone passes it on."""
+"""A viewer that may also stop and release: `palpate stop` asks the conductor, which forwards the request."""
 WATCHER = "conductor"
-"""The role that watches over the contract in a run: it hears every public topic, as a viewer does."""
+"""The role that monitors the contract in a run. It receives every public topic, like a viewer."""
 ROUTER = "router"
-"""The router's own certificate; it may send and get nothing."""
+"""Certificate of the router; it may send and receive nothing."""
 OPERATOR_REQUESTS = "*/palpate/operator"
-"""Where the conductor is asked to stop or release, in any domain."""
+"""Key of operator requests to the conductor, in any domain."""
 
 _VIEWED = ("palpate/control", "palpate/report/*")
-"""Messages of the runtime that a viewer may see: how far each service is."""
+"""Messages of the runtime that a viewer may receive: progress of the services."""
 
 _PUT = ["put", "delete", "reply", "declare_queryable"]
 _GET = ["declare_subscriber", "query"]
@@ -44,17 +44,17 @@ _WATCH = ["liveliness_query", "declare_liveliness_subscriber"]
 
 
 class _Rules:
-    """Collects rules and the members that they are for."""
+    """Collects rules and the members that they apply to."""
 
     def __init__(self) -> None:
         self.rules: list[dict[str, Any]] = []
         self.policies: dict[str, list[str]] = {}
 
     def allow(self, who: str, what: str, keys: Sequence[str], sends: bool, messages: tuple[list[str], list[str]]) -> None:
-        """Lets `who` send on `keys`, or else get from them.
+        """Allow `who` to send on `keys`, or to receive from them.
 
-        To the router a message that a member sends is an ingress and one that it gets an egress; for a declared subscription or
-        a query it is the other way round.
+        For the router, a message sent by a member is an ingress and a received one an egress; for subscriptions and queries it
+        is the reverse.
         """
         if not keys:
             return
@@ -67,13 +67,13 @@ class _Rules:
 
 
 def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, Any]:
-    """The value of `access_control` in a router's configuration.
+    """Return the value of `access_control` in a router's configuration.
 
-    `by` is the attribute by which zenoh knows a member: `cert_common_names` or `usernames`.
+    `by`: the attribute that identifies a member in zenoh, `cert_common_names` or `usernames`.
     """
     made = _Rules()
     presence = (_TOKEN, _WATCH)
-    data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher shows itself by a token below its key
+    data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher has a token below its key
     for role in rules.roles:
         sends = [key for topic in rules.outputs(role) for key in _keys(topic.name)]
         sends += [key for row in rules.internal.values() for key in _internal_sent(row, role)]
@@ -100,39 +100,39 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
 
 
 def watched(rules: Contract) -> list[str]:
-    """Topics that the contract's monitor of a run may hear, in the contract's order."""
+    """Return the topics that the monitor of a run may receive, in the contract's order."""
     own = {topic.name for topic, _ in rules.inputs(WATCHER)}
     shown = set(public(rules))
     return [name for name in rules.topics if name in own or name in shown]
 
 
 def public(rules: Contract) -> list[str]:
-    """Topics that everyone may hear, in the contract's order."""
+    """Return the public topics, in the contract's order."""
     return [topic.name for topic in rules.topics.values() if topic.visibility is Visibility.PUBLIC]
 
 
 def _keys(topic: str) -> list[str]:
-    """Keys of a topic in any domain: of its messages, of hellos, and of what zenoh's advanced publishers add for latched ones."""
+    """Return the keys of a topic in any domain: messages, hellos, and additions of zenoh's advanced publishers."""
     key = f"*/{topic}/*/*"
     return [key, hello_key(key), f"{key}/@adv/**"]
 
 
 def _internal_sent(row: Internal, role: str) -> list[str]:
-    """Keys of a message of the runtime that `role` may send: its own."""
+    """Return the keys of a runtime message that `role` may send."""
     if row.producer not in ("any", role):
         return []
     return _keys(row.name.replace("<role>", role))
 
 
 def _internal_got(row: Internal, role: str) -> list[str]:
-    """Keys of a message of the runtime that `role` may get, from any sender."""
+    """Return the keys of a runtime message that `role` may receive, from any sender."""
     if row.readers not in ("any", role):
         return []
     return _keys(row.name.replace("<role>", "*"))
 
 
 def _tokens(role: str) -> list[str]:
-    """Liveliness tokens of a role's node and of its publishers and subscriptions (see `liveliness`)."""
+    """Return the liveliness tokens of a role's node, publishers and subscriptions (see `liveliness`)."""
     return [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]
 
 

@@ -1,10 +1,10 @@
-"""Certificates for a bus of known members: a certificate authority, and one certificate a name.
+"""Certificates for a bus of known members: a certificate authority and one certificate per name.
 
-    <folder>/ca.pem, ca.key                     the authority; its key only signs: keep it off the machines of a run
-    <folder>/<name>/ca.pem, cert.pem, key.pem   what one member needs, and all that it is given (PALPATE_TLS=<folder>/<name>)
+    <folder>/ca.pem, ca.key                     the authority; its key only signs: do not store it on the machines of a run
+    <folder>/<name>/ca.pem, cert.pem, key.pem   files of one member (PALPATE_TLS=<folder>/<name>)
 
 Keys are ECDSA on P-256 (RFC 5480), certificates X.509 version 3 (RFC 5280). The name is the subject's common name, by which a
-router knows its members (`access.py`). Needs the `cryptography` package: `pip install 'palpate[run]'`.
+router identifies its members (`access.py`). Needs the `cryptography` package: `pip install 'palpate[run]'`.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ CA, CERTIFICATE, KEY = "ca.pem", "cert.pem", "key.pem"
 CA_KEY = "ca.key"
 CA_YEARS = 10
 DAYS = 825
-"""Days that a certificate holds unless said otherwise."""
+"""Default validity of a certificate [days]."""
 HOSTS = ("localhost", "127.0.0.1", "::1")
-"""Names under which a router is always known; others are given."""
+"""Names that every router certificate contains."""
 _SKEW = timedelta(minutes=5)
-"""Clocks may be this far apart."""
+"""Tolerated clock difference."""
 
 
 class KeysError(UserError):
-    """Keys that cannot be made or read. Names the file and what to do."""
+    """Keys that cannot be created or read. Names the file and what to do."""
 
 
 @dataclass(frozen=True)
 class Certificate:
-    """The contents of a certificate."""
+    """Contents of a certificate."""
 
     name: str
     path: Path
@@ -51,25 +51,24 @@ class Certificate:
     fingerprint: str
     """SHA-256, hexadecimal."""
     hosts: tuple[str, ...]
-    """Names and addresses under which its owner is known."""
+    """Names and addresses of its owner."""
 
     @property
     def expired(self) -> bool:
-        """Whether it no longer holds."""
+        """True if the certificate has expired."""
         return datetime.now(UTC) >= self.until
 
 
 def members() -> tuple[str, ...]:
-    """The names that get a certificate: all roles, the router, a viewer (may only read) and an operator (may also stop)."""
+    """Return the names with a certificate: all roles, the router, a viewer (may only read) and an operator (may also stop)."""
     return (*contract().roles, ROUTER, VIEWER, OPERATOR)
 
 
 def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), days: int = DAYS) -> list[Certificate]:
-    """Makes what is missing in `folder`: the authority, and a certificate for each of `names` (by default `members()`).
+    """Create what is missing in `folder`: the authority, and a certificate for each of `names` (default `members()`).
 
-    `hosts` are further names and addresses of the router. Certificates that still hold are kept; those expired are made anew, and
-    so is the router's where it lacks one of `hosts`. Returns the new ones. Raises KeysError when the folder holds half an
-    authority.
+    `hosts`: further names and addresses of the router. Valid certificates are kept. Expired ones, and the router's if it lacks
+    one of `hosts`, are replaced. Returns the new certificates. Raises KeysError if the authority is incomplete.
     """
     folder.mkdir(parents=True, exist_ok=True, mode=0o700)
     authority, signer = _authority(folder)
@@ -93,11 +92,11 @@ def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), day
 
 
 def read(path: Path) -> Certificate:
-    """Reads the certificate in a PEM file. Raises KeysError."""
+    """Return the certificate in a PEM file. Raises KeysError."""
     try:
         loaded = x509.load_pem_x509_certificate(path.read_bytes())
     except (OSError, ValueError) as error:
-        raise KeysError(f"{path}: no certificate: {error}; palpate keys init makes them") from error
+        raise KeysError(f"{path}: not a certificate: {error}; create it with palpate keys init") from error
     name = str(loaded.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value)
     hosts: tuple[str, ...] = ()
     with suppress(x509.ExtensionNotFound):
@@ -107,7 +106,7 @@ def read(path: Path) -> Certificate:
 
 
 def certificates(folder: Path) -> list[Certificate]:
-    """All certificates in a folder made by `init`, the authority's first."""
+    """Return all certificates in a folder of `init`, the authority's first."""
     return [read(path) for path in (folder / CA, *sorted(folder.glob(f"*/{CERTIFICATE}")))]
 
 
@@ -115,7 +114,7 @@ def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
     certificate, key_file = folder / CA, folder / CA_KEY
     if certificate.exists() != key_file.exists():
         lacking = key_file if certificate.exists() else certificate
-        raise KeysError(f"{lacking}: missing, so nothing can be signed; fetch it, or choose another folder")
+        raise KeysError(f"{lacking}: missing, so certificates cannot be signed; restore it, or choose another folder")
     if certificate.exists():
         key = serialization.load_pem_private_key(key_file.read_bytes(), None)
         if not isinstance(key, ec.EllipticCurvePrivateKey):
@@ -174,7 +173,7 @@ def _host(host: str) -> x509.GeneralName:
 
 
 def _write_key(path: Path, key: ec.EllipticCurvePrivateKey) -> None:
-    """Writes a private key that only its owner may read, from the first byte on."""
+    """Write a private key to a file that is created with owner-only permissions."""
     path.unlink(missing_ok=True)
     text = key.private_bytes(serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption())
     with os.fdopen(os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as file:

@@ -86,7 +86,7 @@ def _units(root: ET.Element) -> None:
 def _common(root: ET.Element) -> None:
     _units(root)
     categories = ET.SubElement(root, "LogCategories")
-    ET.SubElement(categories, "Category", name="logStatusError", description="Why a call failed")
+    ET.SubElement(categories, "Category", name="logStatusError", description="Reason of a failed call")
     ET.SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="1.0", stepSize=repr(STEP_S))
 
 

@@ -1,4 +1,4 @@
-"""The phantom as the FMU reads it: `resources/phantom.bin`, little-endian, laid out as src/phantom.c says."""
+"""The phantom as the FMU reads it: `resources/phantom.bin`, little-endian, in the layout of src/phantom.c."""
 
 from __future__ import annotations
 

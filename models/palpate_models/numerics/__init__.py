@@ -1,1 +1,1 @@
-"""Arrays, frames, compiled functions and caches, without any knowledge of palpation."""
+"""Frames, vectors, compiled functions and caches."""

@@ -1,4 +1,4 @@
-"""Results that take seconds to compute, kept in the user's cache folder under the hash of what they depend on."""
+"""Cache of slow computations in the user's cache folder, keyed by a hash of their inputs."""
 
 from __future__ import annotations
 
@@ -15,24 +15,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 MOST_BYTES = 2_000_000_000
-"""Beyond this, what was not used for longest is removed."""
+"""Size limit; the least recently used results are removed."""
 
 _PARTIAL = ".part"
 _STALE_S = 3600.0
-"""A partial file that is so much older than the newest result was left by a process that was killed [s]."""
+"""Partial files older than the newest result by this time [s] were left by killed processes."""
 
 
 def folder() -> Path:
-    """Where results are kept: `palpate/computed` in XDG_CACHE_HOME or ~/.cache."""
+    """Return the cache folder: `palpate/computed` in XDG_CACHE_HOME or ~/.cache."""
     root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache")
     return Path(root) / "palpate" / "computed"
 
 
 def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
-    """A name for a result: a hash of its kind, of the source files that make it, and of what it depends on (arrays by bytes).
-
-    A change of one of the files of `code` makes results anew.
-    """
+    """Return a key for a result: a hash of its kind, the source files `code`, and its inputs `parts` (arrays by bytes)."""
     key = hashlib.sha256(f"{kind} numpy {metadata.version('numpy')} scipy {metadata.version('scipy')}".encode())
     for path in code:
         key.update(path.read_bytes())
@@ -45,9 +42,9 @@ def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
 
 
 def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """The array under `key`, computed when it is not there (or not readable); mapped into memory, read-only.
+    """Return the array under `key`, memory-mapped and read-only; compute it if it is missing or unreadable.
 
-    A cache folder that cannot be written is no error: the array is then computed each time.
+    If the cache folder cannot be written, the array is computed each time.
     """
     path = folder() / f"{key}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):

@@ -1,11 +1,11 @@
-"""Functions of numbers and arrays, compiled by numba: for loops that numpy cannot express without making arrays.
+"""Functions compiled by numba, for loops that numpy cannot express without temporary arrays.
 
-Compiled code is kept beside its source, or in NUMBA_CACHE_DIR, or in the user's cache; where none can be written to it is made
-anew by every process. A function compiles at its first call, so a caller with a deadline calls it once beforehand.
+Compiled code is cached next to its source, in NUMBA_CACHE_DIR, or in the user's cache; without a writable folder every process
+compiles again. A function compiles at its first call, so callers with a deadline call it once in advance.
 
-numba compiles a function anew when its own file has changed. What it calls is compiled into it, and may stand in another file of
-the package; so here all that is kept for a folder goes when any file of its package, sub-packages included, has changed. A
-compiled function must not call one of another package, save those of `vectors.py`, which count as sources of every package.
+numba recompiles a function if its own file has changed, but not if a function that it calls has. Therefore the cache of a package
+is cleared if any of its files has changed. A compiled function must not call one of another package, except `vectors.py`, which
+counts as a source of every package.
 """
 
 from __future__ import annotations
@@ -21,24 +21,24 @@ import numba
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 STAMP = "palpate.stamp"
-"""Beside the compiled code: which sources it was made of."""
+"""File next to the compiled code with the digest of its sources."""
 _SHARED = Path(__file__).with_name("vectors.py")
 
 
 def compiled(function: _F) -> _F:
-    """Decorator. No fast math: the same inputs give the same bits. Division by zero gives infinity, as numpy does."""
+    """Compile a function. No fast math: equal inputs give equal bits. Division by zero gives infinity, as in numpy."""
     try:
         dispatcher = numba.njit(cache=True, error_model="numpy")(function)
-    except RuntimeError:  # numba found no folder to keep the code in
+    except RuntimeError:  # numba found no writable cache folder
         return cast("_F", numba.njit(error_model="numpy")(function))
-    if dispatcher is not function:  # which it is where NUMBA_DISABLE_JIT is set
+    if dispatcher is not function:  # the same object if NUMBA_DISABLE_JIT is set
         with suppress(OSError):
             _renew(_package(Path(function.__code__.co_filename)), Path(str(dispatcher.stats.cache_path)))
     return cast("_F", dispatcher)
 
 
 def _package(file: Path) -> Path:
-    """The folder of the top package that a file belongs to; the file's own where it belongs to none."""
+    """Return the folder of a file's top-level package, or the file's folder if it is in none."""
     folder = file.parent
     while (folder.parent / "__init__.py").is_file():
         folder = folder.parent
@@ -47,7 +47,7 @@ def _package(file: Path) -> Path:
 
 @cache
 def _renew(package: Path, kept: Path) -> None:
-    """Removes what is kept of a package unless it was made of its sources as they are."""
+    """Clear the cache of a package if its sources have changed."""
     digest = sha256()
     for path in (*sorted(package.rglob("*.py")), _SHARED):
         digest.update(path.name.encode() + path.read_bytes())

@@ -14,7 +14,7 @@ Array = NDArray[np.float64]
 
 
 def matrix(pose: Pose) -> Array:
-    """Homogeneous matrix, shape (4, 4), of a scenario pose (fixed-axis roll, pitch, yaw)."""
+    """Return the homogeneous matrix, shape (4, 4), of a scenario pose (fixed-axis roll, pitch, yaw)."""
     X = np.eye(4)
     X[:3, :3] = Rotation.from_euler("xyz", pose.rpy_rad).as_matrix()
     X[:3, 3] = pose.xyz_m
@@ -22,14 +22,14 @@ def matrix(pose: Pose) -> Array:
 
 
 def pose_of(X: Array) -> Pose:
-    """The scenario pose of a homogeneous matrix, shape (4, 4): the inverse of `matrix`."""
+    """Return the scenario pose of a homogeneous matrix, shape (4, 4): the inverse of `matrix`."""
     roll, pitch, yaw = Rotation.from_matrix(X[:3, :3]).as_euler("xyz")
     x, y, z = X[:3, 3]
     return Pose(xyz_m=(float(x), float(y), float(z)), rpy_rad=(float(roll), float(pitch), float(yaw)))
 
 
 def inverse(X_AB: Array) -> Array:
-    """X_BA, shape (4, 4)."""
+    """Return X_BA, shape (4, 4)."""
     X_BA = np.eye(4)
     X_BA[:3, :3] = X_AB[:3, :3].T
     X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
@@ -37,12 +37,12 @@ def inverse(X_AB: Array) -> Array:
 
 
 def apply(X_AB: Array, p_B: Array) -> Array:
-    """Points given in B, shape (n, 3), expressed in A."""
+    """Return points of B, shape (n, 3), expressed in A."""
     return np.asarray(p_B @ X_AB[:3, :3].T + X_AB[:3, 3])
 
 
 def look_at(position: Array, target: Array) -> Array:
-    """Pose of a camera's optical frame (z forward, x right, y down) that looks from `position` at `target`, shape (4, 4)."""
+    """Return the pose of an optical frame (z forward, x right, y down) looking from `position` at `target`, shape (4, 4)."""
     z = target - position
     z = z / np.linalg.norm(z)
     x = np.cross(z, (0.0, 0.0, 1.0))
@@ -56,4 +56,4 @@ def look_at(position: Array, target: Array) -> Array:
 
 
 GRAVITY: Final = 9.81
-"""Along -z of world [m/s^2]: the value that pinocchio takes of itself, so that plant, controller and planner agree."""
+"""Gravity along -z of world [m/s^2]: pinocchio's default, so that plant, controller and planner agree."""

@@ -1,4 +1,4 @@
-"""Random numbers of a patient: one stream for each purpose, so that none depends on how many another has used."""
+"""Random streams of a patient, one for each purpose, so that they are independent."""
 
 from __future__ import annotations
 
@@ -8,5 +8,5 @@ import numpy as np
 
 
 def generator(seed: int, purpose: str) -> np.random.Generator:
-    """PCG64 of the patient's seed and the name of a purpose."""
+    """Return a PCG64 generator for the patient's seed and a purpose."""
     return np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, zlib.crc32(purpose.encode())])))

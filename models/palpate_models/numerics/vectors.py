@@ -1,4 +1,4 @@
-"""Vectors of three numbers as tuples: inside compiled code they live in registers, while small arrays would be allocated."""
+"""Compiled functions of 3-vectors as tuples, which stay in registers where small arrays would be allocated."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ Vector = tuple[float, float, float]
 
 @compiled
 def row(table: Array, k: int, first: int = 0) -> Vector:
-    """Three numbers of row `k` of an array, from column `first` on."""
+    """Return three numbers of row `k` of an array, from column `first`."""
     return table[k, first], table[k, first + 1], table[k, first + 2]
 
 
@@ -68,9 +68,9 @@ def velocity_at(v: Vector, w: Vector, r: Vector) -> Vector:
 
 @compiled
 def nearest_vertex(p: Array, vertices: Array) -> tuple[float, int]:
-    """Distance [m] and index of the vertex, among some of shape (n, 3), that is nearest to `p`, shape (3,); the first of equals.
+    """Return distance [m] and index of the vertex, shape (n, 3), nearest to `p`, shape (3,); the first of equals.
 
-    It looks at all: for one point and some thousand vertices that takes a fifth of a call of scipy's tree.
+    Linear search: for one point and some thousand vertices five times as fast as a call of scipy's tree.
     """
     least, best = np.inf, 0
     x, y, z = p[0], p[1], p[2]

@@ -1,4 +1,4 @@
-"""Where the bones under the skin are, seen from in front: costal arch and iliac crests."""
+"""Parametric surface of the abdomen, with costal arch and iliac crests."""
 
 from __future__ import annotations
 
@@ -15,33 +15,33 @@ from palpate_models.patient.mesh import orient, vertex_normals
 from palpate_models.patient.schema import Anatomy, Skeleton
 
 COSTAL_EDGE_M = 0.04
-"""Distance over which the skin rises to the rib cage, and the wall comes to lie on it."""
+"""Width of the transition from belly to rib cage."""
 
 
 def above_costal_arch(x: Array, y: Array, skeleton: Skeleton) -> Array:
-    """Height [m] of points over the costal arch, negative on the belly, shape as theirs."""
+    """Return the height [m] of points above the costal arch, negative on the belly."""
     return np.asarray(y - skeleton.costal_arch_m + skeleton.costal_slope * np.abs(x))
 
 
 def iliac_bump(x: Array, y: Array, skeleton: Skeleton) -> Array:
-    """The rise over the iliac spines, 1 on each, shape as the points'."""
+    """Return the relative rise over the iliac spines, 1 at each."""
     across, along = skeleton.iliac_crest_m
     square = (np.abs(x) - across) ** 2 + (y - along) ** 2
     return np.asarray(np.exp(-square / (2 * skeleton.iliac_radius_m**2)))
 
 
 def bone_share(x: Array, y: Array, skeleton: Skeleton) -> Array:
-    """How far the wall lies on bone, from 0 on the belly to 1, shape as the points'."""
+    """Return the share of bone under the wall, from 0 on the belly to 1."""
     ribs = smoothstep(above_costal_arch(x, y, skeleton) / COSTAL_EDGE_M)
     return np.maximum(ribs, smoothstep(2 * iliac_bump(x, y, skeleton) - 0.5))
 
 
 UMBILICUS_M = (0.0015, 0.009)
-"""Depth and radius (standard deviation) of the umbilicus: an indenter follows it (radius of curvature 54 mm)."""
+"""Depth and radius (standard deviation) of the umbilicus; its radius of curvature is 54 mm."""
 COSTAL_RISE_M = 0.004
-"""The rib cage stands out above the costal arch."""
+"""Rise of the rib cage above the costal arch."""
 ILIAC_RISE_M = 0.005
-"""The iliac crests stand out."""
+"""Rise of the iliac crests."""
 EXAMINED_HALF_M = 0.106
 """Half width and length of the finely meshed region: 0.10 m and a margin."""
 _GROWTH = 0.23
@@ -178,7 +178,7 @@ def _ordinary(length: float) -> Anatomy:
     """The default anatomy of a body of this length [m]."""
     usual, scale = Skeleton(), length / 0.46
     across, along = usual.iliac_crest_m
-    skeleton = Skeleton.model_construct(  # a body that is no person's may be beyond a person's limits
+    skeleton = Skeleton.model_construct(  # without validation: a parametric body may exceed the limits of a person
         costal_arch_m=scale * usual.costal_arch_m,
         iliac_crest_m=(scale * across, scale * along),
         iliac_radius_m=scale * usual.iliac_radius_m,

@@ -1,4 +1,4 @@
-"""The natural variation of a person's wall: fields of families that no prior of the assessment has.
+"""Natural variation of a person's wall: random fields outside the model class of the assessment.
 
 A field is a weighted sum of two components. Each has a family, a length, an anisotropy and a direction of its own, and none is
 Gaussian: ridges have crests, patches have borders, hills are log-normal, and waves have heavy-tailed frequencies and weights.
@@ -24,7 +24,7 @@ _COMPONENTS = 2
 _MOST_ANISOTROPIC = 3.0
 """Largest ratio of the lengths along and across a component's direction [A]."""
 _MOST = 3.0
-"""A field comes hardly further from its mean than this many standard deviations: one healthy place is not another tissue."""
+"""Bound of a field in standard deviations: healthy tissue has no extreme places."""
 
 
 Family = Callable[[Array], Array]
@@ -70,16 +70,16 @@ def _hills(g: Array) -> Array:
     return np.exp(0.8 * g)
 
 
-def _as_they_are(g: Array) -> Array:
+def _unchanged(g: Array) -> Array:
     return g
 
 
-_FAMILIES: tuple[Family, ...] = (_ridges, _patches, _hills, _as_they_are)
-"""What is made of waves; the last ones are heavy-tailed."""
+_FAMILIES: tuple[Family, ...] = (_ridges, _patches, _hills, _unchanged)
+"""Transformations of waves; the last one keeps heavy-tailed waves."""
 
 
 class _Component(NamedTuple):
-    """Waves that are made into what the family has; its mean and deviation over the reference points, and its weight."""
+    """Transformed waves with their mean and deviation over the reference points, and their weight."""
 
     waves: _Waves
     family: Family
@@ -92,12 +92,12 @@ class _Component(NamedTuple):
 
 
 def _component(rng: np.random.Generator, length_m: tuple[float, float], share: float, reference: Array) -> _Component:
-    """A component whose family, lengths and direction are drawn, and which has this share of the field's variance."""
+    """Draw a component with this share of the field's variance: family, lengths and direction."""
     family = _FAMILIES[int(rng.integers(len(_FAMILIES)))]
     length = np.exp(rng.uniform(*np.log(length_m)))
     longer = np.exp(rng.uniform(0, np.log(_MOST_ANISOTROPIC)))
     lengths = np.array((min(length * longer, length_m[1]), length, length))
-    part = _Component(_waves(rng, lengths, heavy=family is _as_they_are), family, float(np.sqrt(share)))
+    part = _Component(_waves(rng, lengths, heavy=family is _unchanged), family, float(np.sqrt(share)))
     values = part(reference)
     return part._replace(mean=float(values.mean()), sd=float(values.std()))
 
@@ -124,20 +124,20 @@ class NaturalField:
         return np.tanh((self._sum(points) - self._middle) / self._reach)
 
     def __call__(self, points: Array) -> Array:
-        """At points (n, 3) of A [m], shape (n,)."""
+        """Return the field at points (n, 3) of A [m], shape (n,)."""
         return np.asarray((self._bounded(points) - self._mean) / self._sd)
 
 
 _MUSCLE_EDGE_M = 0.010
-"""Width over which one band passes into the next [A]."""
+"""Width of the transition between bands [A]."""
 _LEAST_RANDOM = 0.3
-"""Least part of the variation that muscles do not account for."""
+"""Minimum share of the random variation next to muscles."""
 _COARSE_M = 0.02
 _BELLY_HALF_M = 0.10
 
 
 class HealthyWall(NamedTuple):
-    """A person's wall over the wall's mean, at n points."""
+    """Wall of a person relative to its mean, at n points."""
 
     stiffness: Array
     """Factor on the foundation modulus [1], shape (n,)."""
@@ -146,7 +146,7 @@ class HealthyWall(NamedTuple):
 
 
 def belly(size_m: tuple[float, float, float], anatomy: Anatomy) -> Array:
-    """Places that stand for the belly of a body [m], shape (m, 3): its front within 0.1 m of the umbilicus, bones excepted."""
+    """Return reference points on the belly [m], shape (m, 3): the front within 0.1 m of the umbilicus, without bones."""
     shape = parametric_surface(size_m, _COARSE_M, anatomy)
     x, y, _ = shape.vertices.T
     near = (np.abs(x) <= _BELLY_HALF_M) & (np.abs(y) <= _BELLY_HALF_M) & (shape.normals[:, 2] > 0.5)
@@ -154,7 +154,7 @@ def belly(size_m: tuple[float, float, float], anatomy: Anatomy) -> Array:
 
 
 def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
-    """Stiffness over that at the sides, shape as the points' [m]; the linea alba narrows below the umbilicus."""
+    """Return the stiffness relative to the sides at points [m]. The linea alba narrows below the umbilicus."""
     middle = muscles.linea_alba_m / 2 * (0.75 + 0.25 * np.tanh(y / 0.03))
     away = np.abs(x)
     alba = smoothstep(0.5 - (away - middle) / _MUSCLE_EDGE_M)
@@ -165,10 +165,10 @@ def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
 def healthy_wall(
     points: Array, size_m: tuple[float, float, float], anatomy: Anatomy, stiffening: float, seed: int
 ) -> HealthyWall:
-    """The wall of a person at points (n, 3) of A [m], whose mean `stiffening` [1/m] is given.
+    """Return the wall of a person with mean `stiffening` [1/m] at points (n, 3) of A [m].
 
-    Over the belly the logarithm of the first has the mean 0, and both have the deviations and the correlation that
-    `anatomy.variation` says: what the muscles do not account for is a random field. The wall over bone comes on top.
+    Over the belly the log factor has mean 0, and both fields have the deviations and the correlation of `anatomy.variation`. The
+    part that muscles do not explain is a random field. The effect of bone is added after that.
     """
     variation = anatomy.variation
     reference = belly(size_m, anatomy)

@@ -1,4 +1,4 @@
-"""Triangle meshes from files: checked, oriented, refined where examined. Errors say what is wrong and where."""
+"""Triangle meshes from files: validated, oriented, refined in the examined region."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def _split_triangles(triangles: IntArray, middle: IntArray) -> IntArray:
 
 
 def boundary_vertices(n: int, triangles: IntArray) -> NDArray[np.bool_]:
-    """Which of `n` vertices lie on an open border, shape (n,)."""
+    """Return True for each of `n` vertices on an open border, shape (n,)."""
     unique, count = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_counts=True)
     border = np.zeros(n, dtype=np.bool_)
     border[unique[count == 1].ravel()] = True

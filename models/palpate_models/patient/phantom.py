@@ -46,9 +46,9 @@ class PhantomModel:
     background: Array
     """The same without lesions, shape (n,)."""
     stiffening: Array
-    """How fast the modulus rises with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
+    """Stiffening with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
     tension: Array
-    """What a contracted muscle adds to the modulus, over k_w [1], shape (n,); 0 where nothing is guarded."""
+    """Additional modulus of contracted muscle relative to k_w [1], shape (n,); 0 without guarding."""
     lesion: IntArray
     """Index of the lesion in whose half-contrast outline the vertex lies, -1 elsewhere, shape (n,)."""
     fixed: NDArray[np.bool_]
@@ -56,11 +56,11 @@ class PhantomModel:
     breathing: Array
     """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
     voluntary: bool = False
-    """Whether the tension fades under gentle pressure: see `palpate_models.patient.guarding.Activation`."""
+    """The tension fades under gentle pressure: see `palpate_models.patient.guarding.Activation`."""
 
 
 def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
-    """The phantom of a scenario, a person drawn if need be. The same seed gives the same wall, whatever the mesh's resolution.
+    """Return the phantom of a scenario; a person is drawn first. Equal seeds give equal walls at any mesh resolution.
 
     Raises MeshError if a user's mesh or a lesion cannot be used.
     """

@@ -19,11 +19,11 @@ from palpate_models.patient.wall import WallParameters
 
 FOLDER = Path(__file__).parents[1] / "data" / "remus2024"
 RADIUS_M = 0.010
-"""The hemisphere they pressed with."""
+"""Radius of the measurement's hemisphere."""
 SPEED_MPS = 0.005
-"""How fast they pressed: 5 mm/s, within 1 mm/s."""
+"""Speed of the measurement: 5 mm/s, within 1 mm/s."""
 PLACES = ("1", "2", "3", "4", "5")
-"""The places in front and on the sides; 6 is most probably the back."""
+"""Places in front and on the sides; 6 is probably the back."""
 PEOPLE = tuple(f"P{k:02d}" for k in range(1, 11))
 
 
@@ -94,7 +94,7 @@ class Fit:
 
     wall: WallParameters
     zero_offset_m: float
-    """How far the skin is already pressed where the file's depth is zero."""
+    """Indentation at the zero of the file's depth."""
     rms_percent: float
     """Error of the force, of the force at the same depth, from 1 to 20 mm."""
     activated_ratio: float

@@ -1,7 +1,7 @@
-"""The tension of guarding muscle over the skin, and how much of it makes the force ratio that a scenario asks for.
+"""Tension field of guarding muscle, and the tension that gives a force ratio.
 
-The ratio is one of forces, as it was measured on people. The tension acts on the foundation alone, not on what ties it to its
-neighbours, so it has to be larger than the ratio says: it is solved for on a flat uniform wall with the scenario's own mechanics.
+The ratio of a scenario is one of forces, as measured on people. The tension acts on the foundation alone, not on the shear layer,
+so it exceeds the ratio; it is solved for on a flat uniform wall with the scenario's mechanics.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ _MOST_ROUNDS = 200
 
 
 def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, front: NDArray[np.bool_]) -> Array:
-    """Tension over k_w [1] of contracted muscle at points (n, 2) of A [m], shape (n,); 0 where `front` is false.
+    """Return the tension over k_w [1] of contracted muscle at points (n, 2) of A [m], shape (n,); 0 where `front` is false.
 
-    It rises over `edge_m`, centred on the outline. Where areas overlap, the tenser one counts. Raises MeshError if an area is
-    beside the points.
+    It rises over `edge_m`, centred on the outline. The larger tension counts where areas overlap. Raises MeshError if an area
+    contains none of the points.
     """
     tension = np.zeros(len(xy))
     for index, area in enumerate(areas):
@@ -47,7 +47,7 @@ def tension_field(xy: Array, areas: Sequence[Guarding], stiffness: Stiffness, fr
 
 @lru_cache(maxsize=64)
 def tension_of_ratio(ratio: float, stiffness: Stiffness) -> float:
-    """The tension over k_w [1] with which the force of the press that defines the ratio is `ratio` times that without."""
+    """Return the tension relative to k_w [1] at which the force of the defining press is `ratio` times the relaxed one."""
     relaxed = pressed_force(stiffness, 0.0)
     most = 2.0
     while pressed_force(stiffness, most) < ratio * relaxed:
@@ -56,13 +56,12 @@ def tension_of_ratio(ratio: float, stiffness: Stiffness) -> float:
 
 
 def pressed_force(stiffness: Stiffness, tension: float, depth_m: float = DEPTH_M) -> float:
-    """Force [N] on the sphere at the end of that press, or of one to `depth_m` [m], on a flat wall of the nominal stiffness.
+    """Return the force [N] on the sphere at the end of the defining press, or one to `depth_m` [m], on a flat nominal wall.
 
         left (u - l^2 lap u) + drag u + sigma(u) + tension u = p / k_w,   p >= 0,  u >= w,  p (u - w) = 0
 
-    is solved on rings about the axis. `left` is what has not relaxed after a displacement that rose evenly for
-    depth / SPEED_MPS, `drag` the dashpot's share. Contact by a primal-dual active set in which
-    sigma is linearised anew each round (Newton).
+    is solved on rings around the axis. `left` is the unrelaxed share after a linear ramp of duration depth / SPEED_MPS, `drag` the
+    share of the dashpot. Contact: primal-dual active set, with sigma linearised in each iteration (Newton).
     """
     seconds = depth_m / SPEED_MPS
     g, tau = np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)

@@ -1,4 +1,4 @@
-"""The stiffening wall: what pressure a foundation spring bears beside its linear viscoelastic part.
+"""The stiffening wall: pressure of a foundation spring in addition to its linear viscoelastic part.
 
 The pressure on skin displaced inward by u, of which y_k has relaxed, is
 
@@ -6,7 +6,7 @@ The pressure on skin displaced inward by u, of which y_k has relaxed, is
 
 beta is `PhantomModel.stiffening` [1/m]: the modulus grows to k_w (1 + (beta u)^2), and no further than by MOST_STIFFENING k_w.
 `PhantomModel.tension` is what a wholly contracted muscle adds, and a in [0, 1] how far it is contracted. Both are elastic springs
-beside the linear wall: each element is passive, so their sum is (while a is constant: a muscle does work).
+parallel to the linear wall: each element is passive, so their sum is (while a is constant: a muscle does work).
 
 The power of the law is the one with which the pressed wall behaves as living people's (`remus2024`): sigma' as the
 square of the depth reproduces all 48 places within 5 % and both exponents of their force, sigma' as the depth itself does not.
@@ -58,7 +58,7 @@ def largest_slope(stiffening: Array, tension: Array) -> Array:
 
 
 class WallParameters(NamedTuple):
-    """What the wall of a healthy place is made of, but for its relaxation."""
+    """Parameters of the wall at a healthy place, without relaxation."""
 
     k_w_n_per_m3: float
     """Instantaneous foundation modulus."""

@@ -1,1 +1,1 @@
-"""The arm: kinematics, inertias, shape and table."""
+"""Arm and table: kinematics, inertias, shapes."""

@@ -63,7 +63,7 @@ def box(centre: Point, size: Point, rounding: float) -> Field:
 
 
 def half_space(axis: Point, offset: float) -> Field:
-    """Where `axis . p < offset`."""
+    """Return the half space `axis . p < offset`."""
     u = np.asarray(axis, float)
     return lambda p: np.asarray(p @ u - offset)
 
@@ -83,12 +83,12 @@ def blend(width: float, *fields: Field) -> Field:
 
 
 def inverse(field: Field) -> Field:
-    """What lies outside `field`."""
+    """Return the complement of `field`."""
     return lambda p: -field(p)
 
 
 def cut(width: float, field: Field, *limits: Field) -> Field:
-    """What of `field` lies inside all `limits`, the edges rounded over about `width` [m]."""
+    """Return the intersection of `field` with all `limits`, edges rounded over about `width` [m]."""
     return inverse(blend(width, inverse(field), *(inverse(limit) for limit in limits)))
 
 

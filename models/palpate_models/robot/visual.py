@@ -1,4 +1,4 @@
-"""How the robot looks: triangle meshes by link, of our own making, with the proportions of an LBR iiwa 7 R800."""
+"""Visual meshes of the robot by link, with the proportions of an LBR iiwa 7 R800."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ TUBE_M: Final = 0.066
 BULB_M: Final = 0.071
 """Radius of the joint bulbs of A2 and A4."""
 BULB_END_M: Final = 0.084
-"""How far a bulb's half reaches from the joint's middle plane."""
+"""Half length of a bulb from the joint's middle plane."""
 SEAM_M: Final = 0.002
 """Half of the gap between two housings at a joint."""
 
@@ -124,7 +124,7 @@ def _forearm() -> Field:
 
 
 def _wrist() -> Field:
-    """Link 6: the bulb of A6 and the short tube of A7. Its frame is 70.7 mm beside the arm's axis."""
+    """Link 6: the bulb of A6 and the short tube of A7. Its frame is 70.7 mm from the arm's axis."""
     bulb = cylinder(Y, (0.0, 0.0707 - 0.061, 0.0), 0.128, 0.061, 0.038)
     tube = cone((0.0, 0.0707, 0.02), (0.0, 0.0707, 0.10), 0.052, 0.044)
     sides = half_space((0.0, -1.0, 0.0), -(0.0707 - 0.060)), half_space(Y, 0.0707 + 0.064)

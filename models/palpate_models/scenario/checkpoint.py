@@ -1,4 +1,4 @@
-"""What an examination that ended early hands on to the one that goes on with it: nothing but what was measured."""
+"""Checkpoint of an interrupted examination: its measurements, for the run that resumes it."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class FeltSoFar:
     """Samples of the assessment, m of them, in the abdomen frame A."""
 
     time: Array
-    """[s], shape (m,); below zero: before the examination that goes on."""
+    """[s], shape (m,); negative: before the resumed run."""
     position: Array
     """[m], shape (m, 3)."""
     normal: Array
@@ -39,7 +39,7 @@ class FeltSoFar:
     time_in_contact: Array
     """[s]"""
     force_limited: NDArray[np.bool_]
-    """Whether depth yielded to the force limit."""
+    """Depth was reduced by the force limit."""
     stroke: NDArray[np.int64]
     """Number of the descent."""
     depth_uncertainty: Array
@@ -48,30 +48,30 @@ class FeltSoFar:
 
 @dataclass(frozen=True)
 class Checkpoint:
-    """Where an examination stood when it ended."""
+    """State of an examination at its interruption."""
 
     felt: FeltSoFar
     left: Array
-    """Places of the targets that it had not reached, in A [m], shape (k, 2)."""
+    """Targets that were not reached, in A [m], shape (k, 2)."""
     surface: Array
-    """Vertices of the wall that it had perceived, in A [m], shape (n, 3)."""
+    """Vertices of the perceived surface, in A [m], shape (n, 3)."""
     strokes: int
-    """Descents that it had made."""
+    """Number of descents."""
 
     def wanted(self, targets: Array, spacing: float) -> frozenset[int]:
-        """Which targets of a new look, in A [m], shape (j, 2), are those that were left: nearer than half a `spacing` [m]."""
+        """Return the indices of new targets, in A [m], shape (j, 2), within half a `spacing` [m] of a remaining one."""
         away = np.linalg.norm(targets[:, None] - self.left, axis=-1)
         return frozenset(np.flatnonzero((away < spacing / 2).any(axis=1)).tolist())
 
     def bytes(self) -> bytes:
-        """As a file."""
+        """Return the content of the file."""
         file = io.BytesIO()
         np.savez_compressed(file, left=self.left, surface=self.surface, strokes=np.array(self.strokes), **vars(self.felt))
         return file.getvalue()
 
 
 def read_checkpoint(path: Path | None) -> Checkpoint | None:
-    """The checkpoint in a file; None where there is no file to be read. Raises CheckpointError."""
+    """Return the checkpoint in a file; None without a path. Raises CheckpointError."""
     if path is None:
         return None
     try:
@@ -80,4 +80,4 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
         left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
         return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
     except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
-        raise CheckpointError(f"{path}: is no checkpoint of this version: {error}") from error
+        raise CheckpointError(f"{path}: not a checkpoint of this version: {error}") from error

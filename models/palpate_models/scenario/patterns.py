@@ -1,4 +1,4 @@
-"""What a scan pattern is: a function from what is to be examined, and the surface as it is seen, to lines of points to feel."""
+"""Scan patterns: functions of examination and perceived surface that return lines of targets."""
 
 from __future__ import annotations
 
@@ -14,22 +14,22 @@ from palpate_models.scenario.schema import PATTERN, Exam
 from palpate_plugins import PluginError
 
 Surface = Callable[[Array], tuple[Array, Array]]
-"""The surface as it is seen: of xy in A [m], shape (n, 2), the points [m] and the outward unit normals, both (n, 3), in A."""
+"""Perceived surface: maps xy in A [m], shape (n, 2), to points [m] and outward unit normals, both (n, 3), in A."""
 LARGEST: Final = 20_000
-"""More targets than this take hours."""
+"""Maximum number of targets, which already take hours."""
 OUTSIDE_M: Final = 0.001
-"""Targets may lie so far outside of the region, which alone the camera is asked to see."""
+"""Tolerance of targets outside of the examined region."""
 
 
 @dataclass(frozen=True)
 class Scan:
-    """The lines of a scan, in their order."""
+    """Lines of a scan, in order."""
 
     lines: Sequence[Array]
-    """Targets of each line in the abdomen frame A [m], shape (k, 2), in the order in which they are visited. The indenter slides
-    along a smooth curve through them, at depth, and lifts at the end; in mode `point` each target is pressed by itself."""
+    """Targets of each line in the abdomen frame A [m], shape (k, 2), in visiting order. The indenter slides along a smooth
+    curve through them, at depth, and lifts at the end; in mode `point` each target is pressed separately."""
     joined: bool = False
-    """Whether it stays in contact from the end of a line to the beginning of the next, where these are near each other."""
+    """Stay in contact between the end of a line and the start of the next if they are close."""
 
     @property
     def targets(self) -> Array:
@@ -43,7 +43,7 @@ class Scan:
 
 
 def scan_of(exam: Exam, surface: Surface) -> Scan:
-    """The scan that the examination's pattern makes. Raises PluginError for one that cannot be used, with what is wrong."""
+    """Return the scan of the examination's pattern. Raises PluginError if it is unusable."""
     function = PATTERN.load(exam.pattern)
     try:
         made = function(exam, surface)
@@ -66,7 +66,7 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
 
 
 TOUCHES_M: Final = 0.07
-"""Largest distance of these touches: they fix offset, tilt and field of the perceived surface."""
+"""Maximum spacing of the first touches, which determine offset, tilt and field of the surface correction."""
 
 
 def touch_centres(targets: Array) -> Array:
@@ -84,10 +84,9 @@ def touch_centres(targets: Array) -> Array:
 
 
 def lines(exam: Exam, surface: Surface) -> Scan:
-    """Lines there and back, every second one first; the tool lifts at their ends, so that each has a touch and a tare of its own.
+    """Lines in alternating directions, every second one first. The tool lifts at their ends, for a touch and a tare per line.
 
-    Skin that was pressed takes a while to come back, and a touch beside it would find it too deep: what lies between two lines is
-    pressed a minute after them.
+    Pressed skin recovers slowly, and a touch next to it would be too deep: the lines in between are pressed a minute later.
     """
     del surface
     along = _upward(exam)
@@ -101,13 +100,13 @@ def raster(exam: Exam, surface: Surface) -> Scan:
 
 
 def snake(exam: Exam, surface: Surface) -> Scan:
-    """Lines there and back, joined in contact by arcs."""
+    """Lines in alternating directions, joined in contact by arcs."""
     del surface
     return Scan(_there_and_back(_upward(exam)), joined=True)
 
 
 def search(exam: Exam, surface: Surface) -> Scan:
-    """The places that a search may ask for."""
+    """All targets that a search may request."""
     del surface
     return Scan(_there_and_back(_upward(exam)))
 
