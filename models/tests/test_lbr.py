@@ -1,12 +1,17 @@
-"""The URDF against the published figures, read back by pinocchio, and against itself."""
+"""Tables of the arm against its URDF, kinematics, and table boxes."""
+
+from __future__ import annotations
 
 from xml.etree import ElementTree
 
 import numpy as np
+import pinocchio
 import pinocchio as pin
 import pytest
 
 from palpate_models.robot import lbr
+from palpate_models.robot.kinematics import link_transforms, tool_jacobian, tool_pose
+from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.schema import Robot
 
 
@@ -111,3 +116,60 @@ def test_collision_primitives_are_the_capsules(model: pin.Model) -> None:
 def test_shared_tables_cannot_be_changed() -> None:
     with pytest.raises(ValueError, match="read-only"):
         lbr.HOME[0] = 1.0
+
+
+ROBOT = Robot(base_yaw_rad=0.3)
+POSES = [lbr.HOME, np.linspace(-1, 1, 7), np.full(7, 0.4)]
+
+
+@pytest.mark.parametrize("q", POSES)
+def test_every_link_is_where_the_urdf_has_it(q: np.ndarray) -> None:
+    model = pinocchio.buildModelFromXML(lbr.urdf(ROBOT))
+    data = model.createData()
+    pinocchio.framesForwardKinematics(model, data, q)
+    X = np.eye(4)
+    for parent, child, X_PC in link_transforms(q, ROBOT):
+        assert parent == "world" or model.existFrame(parent)
+        X = X @ X_PC
+        np.testing.assert_allclose(X, data.oMf[model.getFrameId(child)].homogeneous, atol=1e-9)
+    np.testing.assert_allclose(X, tool_pose(q, ROBOT))
+
+
+@pytest.mark.parametrize("q", POSES)
+def test_the_jacobian_is_the_derivative_of_the_pose(q: np.ndarray) -> None:
+    J = tool_jacobian(q, ROBOT)
+    for joint, step in enumerate(np.eye(7) * 1e-6):
+        slope = (tool_pose(q + step, ROBOT)[:3, 3] - tool_pose(q - step, ROBOT)[:3, 3]) / 2e-6
+        np.testing.assert_allclose(J[:3, joint], slope, atol=1e-6)
+
+
+def _corners(box: Box) -> np.ndarray:
+    signs = np.array(np.meshgrid(*[(-0.5, 0.5)] * 3)).reshape(3, -1).T
+    return signs * box.size @ box.X_WB[:3, :3].T + box.X_WB[:3, 3]
+
+
+@pytest.fixture
+def named() -> dict[str, Box]:
+    return {box.name: box for box in boxes(Robot())}
+
+
+def test_table_top_spans_what_the_scene_says(named: dict[str, Box]) -> None:
+    corners = _corners(named["table_top"])
+    np.testing.assert_allclose(corners.max(axis=0), [0.835, 1.0, 0.73])
+    np.testing.assert_allclose(corners.min(axis=0)[:2], [0.285, -1.0])
+
+
+def test_table_stands_on_the_floor_in_one_piece(named: dict[str, Box]) -> None:
+    column, top = _corners(named["table_column"]), _corners(named["table_top"])
+    assert column[:, 2].min() == pytest.approx(0.0)
+    assert column[:, 2].max() == pytest.approx(top[:, 2].min())
+
+
+def test_base_carries_the_robot_and_clears_the_table() -> None:
+    robot = Robot(base_xy_m=(0.02, 0.3), base_height_m=0.6, base_yaw_rad=0.1)
+    base = next(box for box in boxes(robot) if box.name == "robot_base")
+    corners = _corners(base)
+    assert corners[:, 2].min() == pytest.approx(0.0)
+    assert corners[:, 2].max() == pytest.approx(robot.base_height_m)
+    np.testing.assert_allclose(corners.mean(axis=0)[:2], robot.base_xy_m)
+    assert corners[:, 0].max() < 0.285

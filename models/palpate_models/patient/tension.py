@@ -60,8 +60,8 @@ def pressed_force(stiffness: Stiffness, tension: float, depth_m: float = DEPTH_M
 
         left (u - l^2 lap u) + drag u + sigma(u) + tension u = p / k_w,   p >= 0,  u >= w,  p (u - w) = 0
 
-    is solved on rings around the axis. `left` is the unrelaxed share after a linear ramp of duration depth / SPEED_MPS, `drag` the
-    share of the dashpot. Contact: primal-dual active set, with sigma linearised in each iteration (Newton).
+    is solved on rings around the axis. `left` is the unrelaxed share after a linear ramp of duration depth / SPEED_MPS, `drag`
+    the share of the dashpot. Contact: primal-dual active set, with sigma linearised in each iteration (Newton).
     """
     seconds = depth_m / SPEED_MPS
     g, tau = np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)

@@ -1,11 +1,66 @@
-"""Results kept in the user's cache folder."""
+"""Compiled functions, the nearest vertex and the cache of computed arrays."""
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
+from pathlib import Path
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from palpate_models.numerics import cache
 from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.vectors import nearest_vertex
+
+CALLER = """
+from inner import inner
+from palpate_models.numerics.compiled import compiled
+
+@compiled
+def outer(x):
+    return inner(x) + 1.0
+
+print(outer(1.0))
+"""
+INNER = """
+from palpate_models.numerics.compiled import compiled
+
+@compiled
+def inner(x):
+    return x * {factor}
+"""
+
+
+def _run(folder: Path) -> float:
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(folder / "kept")}
+    done = subprocess.run([sys.executable, "caller.py"], cwd=folder, env=environment, check=True, capture_output=True, text=True)
+    return float(done.stdout)
+
+
+def test_a_change_in_what_a_function_calls_is_not_missed(tmp_path: Path) -> None:
+    (tmp_path / "caller.py").write_text(CALLER)
+    (tmp_path / "inner.py").write_text(INNER.format(factor=2.0))
+    assert _run(tmp_path) == 3.0
+    kept = sorted(tmp_path.glob("kept/**/*.nbi"))
+    assert _run(tmp_path) == 3.0
+    assert kept == sorted(tmp_path.glob("kept/**/*.nbi")) != []
+    (tmp_path / "inner.py").write_text(INNER.format(factor=4.0))
+    os.utime(tmp_path / "inner.py", (0, 0))  # as from an archive
+    assert _run(tmp_path) == 5.0
+
+
+def test_it_is_the_tree_s() -> None:
+    rng = np.random.default_rng(2)
+    vertices = rng.uniform(-0.2, 0.2, size=(3000, 3))
+    tree = cKDTree(vertices)
+    for p in rng.uniform(-0.3, 0.3, size=(500, 3)):
+        assert nearest_vertex(p, vertices) == tree.query(p)
+
+
+def test_of_equals_it_is_the_first() -> None:
+    assert nearest_vertex(np.zeros(3), np.array(((2.0, 0.0, 0.0), (0.0, 1.0, 0.0), (0.0, -1.0, 0.0)))) == (1.0, 1)
 
 
 def test_a_result_is_named_by_what_it_depends_on_and_by_the_code_that_makes_it(tmp_path):

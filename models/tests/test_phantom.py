@@ -1,0 +1,216 @@
+"""Surface and stiffness of the phantom, and buried lumps as felt at the skin."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from palpate_models.patient.abdomen import parametric_surface
+from palpate_models.patient.field import at_skin, background_factor, edge_distance, gaussian_field, lesion_field
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.schema import Background, Lesion, Phantom
+from palpate_models.section import quadrant
+
+
+def edges_of(triangles):
+    pairs = np.concatenate((triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]))
+    return np.unique(np.sort(pairs, axis=1), axis=0, return_counts=True)
+
+
+@pytest.fixture(scope="module")
+def model():
+    return build_phantom(Phantom(), seed=0)
+
+
+def test_about_three_thousand_vertices(model):
+    assert 2700 <= len(model.vertices) <= 3400
+
+
+def test_edges_in_the_examined_region_are_at_most_edge_m(model):
+    examined = (np.abs(model.vertices[:, :2]) <= 0.10).all(axis=1) & (model.normals[:, 2] > 0)
+    pairs, _ = edges_of(model.triangles)
+    pairs = pairs[examined[pairs].all(axis=1)]
+    lengths = np.linalg.norm(model.vertices[pairs[:, 0]] - model.vertices[pairs[:, 1]], axis=1)
+    assert lengths.max() <= 0.005
+    assert lengths.min() > 0.003
+
+
+@pytest.mark.parametrize("edge", [0.0025, 0.004, 0.008, 0.02])
+@pytest.mark.parametrize("size", [(0.36, 0.46, 0.20), (0.28, 0.36, 0.16), (0.5, 0.6, 0.26)])
+def test_surface_is_closed_and_outward_at_every_size(edge, size):
+    shape = parametric_surface(size, edge)
+    _, count = edges_of(shape.triangles)
+    assert (count == 2).all()
+    corners = shape.vertices[shape.triangles]
+    volume = np.einsum("ij,ij->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
+    assert 0.6 * np.prod(size) < volume < np.prod(size)
+    assert np.isin(np.arange(len(shape.vertices)), shape.triangles).all()
+
+
+def test_umbilicus_is_the_origin_and_the_back_is_on_the_table(model):
+    assert np.linalg.norm(model.vertices, axis=1).min() == 0.0
+    assert model.vertices[:, 2].min() == pytest.approx(-0.20)
+    assert model.vertices[:, 2].max() < 0.006  # the crown is nearly level
+
+
+def test_examined_region_is_gently_curved(model):
+    examined = (np.abs(model.vertices[:, :2]) <= 0.10).all(axis=1) & (model.normals[:, 2] > 0)
+    tilt = np.degrees(np.arccos(model.normals[examined, 2]))
+    assert tilt.max() < 25
+
+
+def test_normals_are_unit_and_areas_add_up(model):
+    np.testing.assert_allclose(np.linalg.norm(model.normals, axis=1), 1, atol=1e-12)
+    corners = model.vertices[model.triangles]
+    area = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1).sum() / 2
+    assert model.areas.sum() == pytest.approx(area, rel=1e-6)
+    assert (model.areas > 0).all()
+
+
+def test_laplacian_is_safe(model):
+    dense = model.laplacian.tocoo()
+    off = dense.data[dense.coords[0] != dense.coords[1]]
+    assert off.max() <= 1e-9  # no edge pulls its ends apart
+    np.testing.assert_allclose(model.laplacian @ np.ones(len(model.vertices)), 0, atol=1e-9)
+    assert abs(model.laplacian - model.laplacian.T).max() < 1e-9
+
+
+def test_fixed_vertices_neither_breathe_nor_lie_in_the_examined_region(model):
+    assert (model.breathing[model.fixed] == 0).all()
+    assert np.abs(model.vertices[model.fixed, :2]).max(axis=1).min() > 0.11
+    assert model.breathing.max() == pytest.approx(1, abs=0.05)
+    assert (model.breathing >= 0).all()
+
+
+@pytest.mark.parametrize(
+    ("x", "y", "name"), [(-0.05, 0.05, "RUQ"), (0.05, 0.05, "LUQ"), (-0.05, -0.05, "RLQ"), (0.05, -0.05, "LLQ")]
+)
+def test_quadrants_are_the_patients(x, y, name):
+    assert quadrant(x, y) == name
+
+
+def test_the_same_phantom_twice_is_the_same():
+    first, second = build_phantom(Phantom(), 7), build_phantom(Phantom(), 7)
+    np.testing.assert_array_equal(first.vertices, second.vertices)
+    np.testing.assert_array_equal(first.stiffness, second.stiffness)
+    assert not np.array_equal(first.stiffness, build_phantom(Phantom(), 8).stiffness)
+
+
+def test_background_has_the_asked_mean_variation_and_correlation():
+    rng = np.random.default_rng(0)
+    points = np.column_stack((rng.uniform(-0.1, 0.1, (40, 2)), np.zeros(40)))
+    shifted = points + np.array([0.05, 0.0, 0.0])
+    background = Background(cv=0.2, correlation_m=0.05, margins=1.0)
+    factors = np.array([background_factor(points, background, 0.23, seed) for seed in range(200)])
+    assert factors.mean() == pytest.approx(1.0, abs=0.02)
+    assert factors.std() == pytest.approx(0.2, abs=0.015)
+    here = np.array([gaussian_field(points, 0.05, seed) for seed in range(200)])
+    there = np.array([gaussian_field(shifted, 0.05, seed) for seed in range(200)])
+    assert (here * there).mean() == pytest.approx(np.exp(-0.5), abs=0.05)
+
+
+def test_background_without_variation_is_nominal_in_the_middle():
+    phantom = Phantom(background=Background(cv=0.0, margins=1.5))
+    model = build_phantom(phantom, 0)
+    middle = (np.abs(model.vertices[:, :2]) < 0.03).all(axis=1) & (model.normals[:, 2] > 0)
+    np.testing.assert_allclose(model.stiffness[middle], phantom.stiffness.k_w_n_per_m3)
+    head = np.argmax(model.vertices[:, 1])
+    assert model.stiffness[head] == pytest.approx(1.5 * phantom.stiffness.k_w_n_per_m3, rel=0.01)
+
+
+def test_background_does_not_depend_on_the_mesh():
+    coarse, fine = (build_phantom(Phantom(edge_m=edge), 3) for edge in (0.008, 0.005))
+    at = [np.argmin(np.linalg.norm(model.vertices, axis=1)) for model in (coarse, fine)]
+    assert coarse.stiffness[at[0]] == pytest.approx(fine.stiffness[at[1]], rel=1e-9)
+
+
+def test_lesion_rises_from_one_to_its_contrast_through_half_at_its_outline():
+    lesion = Lesion(centre_m=(0.01, -0.02), radii_m=(0.03, 0.02), contrast=5.0, edge_m=0.008)
+    xy = np.array([[0.01, -0.02], [0.04, -0.02], [0.01, 0.0], [0.01 + 0.0345, -0.02], [0.2, 0.2]])
+    factor, label = lesion_field(xy, (lesion,))
+    np.testing.assert_allclose(factor, [5, 3, 3, 1, 1], atol=0.02)
+    assert label.tolist()[0] == 0
+    assert label.tolist()[3:] == [-1, -1]
+
+
+def test_edge_distance_is_exact_for_a_circle():
+    lesion = Lesion(centre_m=(0.0, 0.0), radii_m=(0.03, 0.03))
+    xy = np.random.default_rng(1).uniform(-0.06, 0.06, (50, 2))
+    np.testing.assert_allclose(edge_distance(xy, lesion), np.linalg.norm(xy, axis=1) - 0.03, atol=1e-12)
+
+
+def test_lesion_label_covers_the_half_contrast_area():
+    lesion = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030))
+    model = build_phantom(Phantom(lesions=(lesion,)), 0)
+    area = model.areas[model.lesion == 0].sum()
+    assert area == pytest.approx(np.pi * 0.035 * 0.030, rel=0.06)
+    ratio = model.stiffness / model.background
+    assert ratio[model.lesion == 0].min() >= 2.49
+    assert ratio[model.lesion == -1].max() <= 2.51
+
+
+def test_where_lesions_overlap_the_stiffer_counts():
+    soft = Lesion(centre_m=(0.0, 0.0), radii_m=(0.03, 0.03), contrast=2.0)
+    hard = Lesion(centre_m=(0.02, 0.0), radii_m=(0.03, 0.03), contrast=6.0)
+    for order in ((soft, hard), (hard, soft)):
+        factor, label = lesion_field(np.array([[0.01, 0.0], [-0.02, 0.0]]), order)
+        np.testing.assert_allclose(factor, [6, 2])
+        assert [order[k] for k in label] == [hard, soft]
+
+
+def test_a_lesion_does_not_reach_through_to_the_back():
+    model = build_phantom(Phantom(lesions=(Lesion(centre_m=(0.0, 0.0), radii_m=(0.15, 0.15)),)), 0)
+    assert (model.normals[model.lesion >= 0, 2] > 0).all()
+
+
+radius = st.floats(0.005, 0.040)
+depth = st.floats(0.0, 0.040)
+contrast = st.one_of(st.floats(0.1, 0.99), st.floats(1.01, 20))
+
+
+def lump(radii: tuple[float, float], c: float, d: float | None) -> Lesion:
+    return Lesion(centre_m=(0.0, 0.0), radii_m=radii, contrast=c, depth_m=d)
+
+
+def test_a_lesion_from_the_skin_inward_is_as_it_is() -> None:
+    lesion = lump((0.02, 0.03), 4.0, None)
+    assert at_skin(lesion) == lesion
+
+
+@given(radius, radius, depth, contrast)
+def test_a_lump_below_the_skin_is_felt_as_less_and_to_the_same_side(a: float, b: float, d: float, c: float) -> None:
+    felt = at_skin(lump((a, b), c, d)).contrast
+    assert min(1, c) < felt < max(1, c)
+    assert felt > 0.1
+
+
+@given(radius, st.floats(0, 0.035), st.floats(0.001, 0.005), contrast)
+def test_the_deeper_the_weaker_and_the_wider(r: float, d: float, more: float, c: float) -> None:
+    shallow, deep = at_skin(lump((r, r), c, d)), at_skin(lump((r, r), c, d + more))
+    assert abs(np.log(deep.contrast)) < abs(np.log(shallow.contrast))
+    assert deep.radii_m[0] > shallow.radii_m[0]
+
+
+@given(st.floats(0.005, 0.035), st.floats(0.001, 0.005), depth, st.floats(1.05, 19))
+def test_the_larger_and_the_stronger_the_more(r: float, more: float, d: float, c: float) -> None:
+    small, large = (abs(np.log(at_skin(lump((size, size), c, d)).contrast)) for size in (r, r + more))
+    assert large > small
+    assert abs(np.log(at_skin(lump((r, r), c * 1.05, d)).contrast)) > small
+
+
+def test_the_field_has_the_felt_lump() -> None:
+    buried = lump((0.02, 0.02), 6.0, 0.010)
+    xy = np.random.default_rng(0).uniform(-0.06, 0.06, (200, 2))
+    factor, label = lesion_field(xy, (buried,))
+    expected, _ = lesion_field(xy, (at_skin(buried),))
+    assert np.array_equal(factor, expected)
+    assert 1.3 < factor.max() < 2.5
+    assert (label >= 0).any()
+
+
+def test_a_soft_lump_softens() -> None:
+    model = build_phantom(Phantom(lesions=(lump((0.02, 0.02), 0.25, None),)), 0)
+    assert (model.stiffness / model.background).min() == pytest.approx(0.25, abs=0.01)
+    assert (model.lesion == 0).any()
