@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY
 from palpate_models.scenario.schema import Robot
 from palpate_planning.contact import ToolWeight
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
