@@ -8,7 +8,7 @@ import pytest
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate_bus.contract import MS
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot

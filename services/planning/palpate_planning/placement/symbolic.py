@@ -13,8 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.lbr import (
     FLANGE_TO_FT_M,
     FT_TO_INDENTER_M,

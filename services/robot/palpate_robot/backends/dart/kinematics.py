@@ -18,8 +18,7 @@ from typing import Final
 import numpy as np
 
 from palpate_models.numerics.compiled import compiled
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import Vector, add, cross, dot, row, scale, subtract
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot

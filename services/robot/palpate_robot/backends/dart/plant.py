@@ -24,8 +24,7 @@ import dartpy as dart
 import numpy as np
 
 from palpate_errors import RunError
-from palpate_models.numerics.frames import Array
-from palpate_models.numerics.gravity import GRAVITY
+from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.robot.lbr import Capsule
 from palpate_models.robot.table import Box, boxes
