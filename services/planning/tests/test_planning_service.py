@@ -28,6 +28,7 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Exam, Scenario
+from palpate_planning.reasons import Reason
 from palpate_planning.service import PlanningService, create
 from palpate_planning.status import ExamStep, Phase
 
@@ -175,8 +176,16 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     else:
         inbox.gone.add("robot")
     state = sent(service.step(20_000_000, inbox))["exam/state"]
-    words = {"hold": "force 41 N", "unready": "MONITORING", "operator": "enough", "soft": "depth 27 mm", "robot": "lost robot"}
-    assert words[cause] in state.message
+    assert (
+        state.reason
+        == {
+            "hold": Reason.ROBOT_HOLD,
+            "unready": Reason.ROBOT_NOT_READY,
+            "operator": Reason.OPERATOR_STOP,
+            "soft": Reason.SOFT_STOP,
+            "robot": Reason.SERVICE_LOST,
+        }[cause]
+    )
     if cause == "robot":
         assert state.phase == Phase.ABORTED
         assert state.end_tick == 1_020_000_000
