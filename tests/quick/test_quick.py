@@ -88,8 +88,8 @@ def test_smooth_errors_are_as_large_and_as_slow_as_they_are_said_to_be(name: str
     assert np.corrcoef(values[lag:], values[:-lag])[0, 1] == pytest.approx(0.5, abs=0.06)
 
 
-def test_what_was_not_studied_is_refused_by_name() -> None:
-    with pytest.raises(UnknownLoopError, match=r"errors\.camera is of no level"):
+def test_a_user_defined_level_without_fitted_errors_is_refused() -> None:
+    with pytest.raises(UnknownLoopError, match=r"errors\.camera"):
         loop_errors(scenario(1, settings=(*SMALL, "errors.camera.offset_m=0.05")))
 
 
