@@ -140,7 +140,7 @@ def test_a_frozen_service_ends_the_run_and_is_blamed() -> None:
     told: list[str] = []
     outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=60.0, frozen=1.0))
     assert_failed(outcome, FailureCode.FROZEN, "tissue")
-    assert told == [str(outcome.failure)], "the user gets the message once"
+    assert told.count(str(outcome.failure)) == 1
     assert outcome.lost.keys() == {"tissue"}
 
 
