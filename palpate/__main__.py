@@ -1,7 +1,7 @@
 """Entry point of the `palpate` command: fixes the environment that makes results repeatable, then runs the command.
 
-Where the environment does not have the values of `FIXED` yet, the interpreter is started again with them, before anything heavy
-is imported. Ctrl-C while that goes on is kept until the command can tell of it.
+If the environment lacks the values of `FIXED`, the interpreter is restarted with them before anything heavy is imported. Ctrl-C
+during this time is kept until the command can report it.
 """
 
 from __future__ import annotations
@@ -14,10 +14,10 @@ from types import FrameType
 from palpate.environment import FIXED
 
 EXIT_INTERRUPTED = 130
-"""What a shell makes of a command that SIGINT ended, and what Typer leaves with then."""
+"""Exit status after SIGINT, of shells and of Typer."""
 
 TERMINALS = [number for number in (0, 1, 2) if os.isatty(number)]
-"""Which of standard input, output and error are terminals."""
+"""Those of standard input, output and error that are terminals."""
 
 
 def main() -> None:
@@ -25,7 +25,7 @@ def main() -> None:
     if any(os.environ.get(name) != value for name, value in FIXED.items()):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # until the interpreter is up again
         os.execve(sys.executable, [sys.executable, "-m", "palpate", *sys.argv[1:]], {**os.environ, **FIXED})
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: what Ctrl-C does
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # `docker stop`, systemd: as Ctrl-C
     if signal.getsignal(signal.SIGHUP) is not signal.SIG_IGN:  # nohup
         signal.signal(signal.SIGHUP, _hung_up)
     try:
@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def _hung_up(number: int, frame: FrameType | None) -> None:
-    """The terminal was closed, which is what Ctrl-C is; nothing is to fail because there is nobody to read."""
+    """Treats a closed terminal as Ctrl-C, and redirects output so that writing does not fail."""
     for terminal in TERMINALS:
         if not os.isatty(terminal):
             os.dup2(os.open(os.devnull, os.O_RDWR), terminal)

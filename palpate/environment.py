@@ -1,4 +1,4 @@
-"""What the environment of every process of a run must fix so that its results can be repeated.
+"""Environment variables that make the results of a run repeatable.
 
 Results must not depend on how many threads a BLAS uses, nor on the kernels that it chooses for a processor, nor on Python's hash
 seed. All of these are read when the interpreter and the libraries start.
@@ -24,7 +24,7 @@ FIXED = {
 
 @contextmanager
 def given(variables: Mapping[str, str]) -> Iterator[None]:
-    """Gives what is made meanwhile, and nothing else, these variables of the environment."""
+    """Temporarily sets environment variables."""
     before = {name: os.environ.get(name) for name in variables}
     os.environ.update(variables)
     try:

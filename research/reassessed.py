@@ -22,7 +22,7 @@ import numpy as np
 from scipy.stats import binomtest, bootstrap
 
 from palpate.quick.case import assess
-from palpate.report.broken_off import collect
+from palpate.report.archive import collect
 from palpate.report.evidence import found_of, map_of
 from palpate.report.results import Known, truth_of_run
 from palpate.report.scoring import Scores, score

@@ -15,7 +15,7 @@ import pytest
 from examination import SHORT, Finished, command, palpate_run
 from scipy.spatial import KDTree
 
-from palpate.report.resumption import FOLDER
+from palpate.report.recovery import FOLDER
 from palpate_bus.messages.geometry import Array
 from palpate_bus.recordings import open_recording
 from palpate_recorder.recover import recover

@@ -74,7 +74,7 @@ def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:
     """Return the ways to run the scenario: composed; distributed, with the 1 kHz loop in one process, and with observers."""
     from palpate.run.composed import run_composed
     from palpate.run.distributed import run_distributed
-    from palpate.run.placement import placement
+    from palpate.run.group import placement
     from palpate.run.roles import OBSERVERS, workers
 
     loop = ["robot,tissue,control"]

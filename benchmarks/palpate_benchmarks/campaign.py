@@ -19,7 +19,7 @@ from typing import Any, Final, NamedTuple
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
-from palpate.run.placement import Groups, apart
+from palpate.run.group import Groups, apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.fault_kinds import MESSAGE_KINDS, PROCESS_KINDS

@@ -26,7 +26,7 @@ import psutil
 
 from palpate.environment import FIXED
 from palpate.report.evidence import peak_force
-from palpate.run.placement import apart
+from palpate.run.group import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.secure import SecureBus

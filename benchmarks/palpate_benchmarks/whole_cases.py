@@ -19,7 +19,7 @@ from typing import Any, Final
 import psutil
 
 from palpate.report.archive import EvidenceError
-from palpate.report.recover import recovered
+from palpate.report.recovery import recovered
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.campaign import CaseOutcome, FaultCase, FaultFinding, mentioned
 from palpate_benchmarks.fault_kinds import SCARCE_KINDS

@@ -8,7 +8,7 @@ the service gives on the rounded inputs, so on one platform a reference differs 
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -82,8 +82,13 @@ def _round(values: Any) -> Any:
     return (np.ascontiguousarray(values).view(np.int64) & DROPPED_BITS).view(np.float64)
 
 
-def write_reference(path: Path, rules: Contract, messages: Iterable[RecordedMessage], scenario: str) -> None:
-    """Writes a reference file; an old one is replaced only when the new one is complete."""
+def write_recording(
+    path: Path, rules: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
+) -> None:
+    """Writes messages to an MCAP file; an old file is replaced only when the new one is complete.
+
+    `attachments`: media type and content by name.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     part = path.with_suffix(".part")
     with part.open("wb") as stream:
@@ -94,7 +99,8 @@ def write_reference(path: Path, rules: Contract, messages: Iterable[RecordedMess
             if message.topic not in channels:
                 channels[message.topic] = _register(writer, rules.topics[message.topic])
             writer.add_message(channels[message.topic], message.stamp, message.payload, message.stamp, message.sequence)
-        writer.add_attachment(0, 0, SCENARIO, "application/yaml", scenario.encode())
+        for name, (kind, data) in attachments.items():
+            writer.add_attachment(0, 0, name, kind, data)
         writer.finish()
     part.replace(path)
 
@@ -201,7 +207,8 @@ def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
     given = list(cut(case.recording, case.rules, case.inputs, begin, end))
     last = (end - begin) // period * period
     answered = rerun(case.service, case.rules, iter(given), last)
-    write_reference(path, case.rules, chain(given, _rounded(answered, case.rules)), case.scenario)
+    messages = chain(given, _rounded(answered, case.rules))
+    write_recording(path, case.rules, messages, {SCENARIO: ("application/yaml", case.scenario.encode())})
 
 
 def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[RecordedMessage]:

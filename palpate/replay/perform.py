@@ -12,10 +12,10 @@ from typing import Any
 from rich.console import Console
 from rich.table import Table
 
-from palpate.console import TimeLeft, fail, refuse
+from palpate.console import TimeLeft, fail
 from palpate.replay.compare import RELATIVE, Tolerance, TopicResult
 from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_service
-from palpate.replay.play import Player, PlayError
+from palpate.replay.play import Player
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordingError, open_recording
@@ -56,47 +56,35 @@ def play(file: Path, part: Passage, how: Playing) -> None:
     """Plays a recording on the bus. Ends the command where that cannot be done."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     console = Console(stderr=True)
-    try:
-        recording = open_recording(file)
-        with Player(recording, how.rate, how.topics, how.listen, how.drive) as player:
-            console.print(f"playing {file} at {how.rate:g} x {player.where}; Ctrl-C ends", highlight=False)
-            try:
-                end = min(part.end(None) or recording.last, recording.last)
-                with TimeLeft("playing", part.start, end) as bar:
-                    player.play(part.start, part.end(None), bar.reach)
-                console.print(
-                    f"played {player.sent} messages up to {player.now / NS:.3f} s, {player.lag_ms:.1f} ms late at worst"
-                )
-                if how.hold:
-                    console.print("holding; Ctrl-C ends")
-                    player.hold()
-            except KeyboardInterrupt:
-                console.print(f"ended at {player.now / NS:.3f} s after {player.sent} messages")
-    except (RecordingError, PlayError, BusConfigError, OSError) as error:
-        refuse(error)
+    recording = open_recording(file)
+    with Player(recording, how.rate, how.topics, how.listen, how.drive) as player:
+        console.print(f"playing {file} at {how.rate:g} x {player.where}; Ctrl-C ends", highlight=False)
+        try:
+            end = min(part.end(None) or recording.last, recording.last)
+            with TimeLeft("playing", part.start, end) as bar:
+                player.play(part.start, part.end(None), bar.reach)
+            console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, {player.lag_ms:.1f} ms late at worst")
+            if how.hold:
+                console.print("holding; Ctrl-C ends")
+                player.hold()
+        except KeyboardInterrupt:
+            console.print(f"ended at {player.now / NS:.3f} s after {player.sent} messages")
 
 
 def write_reference(file: Path, service: str, scenario: Path | None, part: Passage, target: Path) -> None:
     """Writes the reference of a service, cut from a recording. Ends the command where that cannot be done."""
-    try:
-        case = prepare(file, service, scenario)
-        end = part.end(case.end)
-        make_reference(case, target, part.start, case.end if end is None else end)
-    except (RecordingError, PluginError, ScenarioError, OSError) as error:
-        refuse(error)
+    case = prepare(file, service, scenario)
+    end = part.end(case.end)
+    make_reference(case, target, part.start, case.end if end is None else end)
     Console(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
 
 
 def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:
     """Runs a service again on what it was sent, and compares. Ends the command where it no longer agrees."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    try:
-        case = prepare(file, service, scenario)
-        allowed = parse_tolerance(tolerance)
-        with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
-            results = replay_service(case, allowed, bar.reach)
-    except (RecordingError, PluginError, ScenarioError, OSError) as error:
-        refuse(error)
+    case = prepare(file, service, scenario)
+    with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
+        results = replay_service(case, parse_tolerance(tolerance), bar.reach)
     if as_json:
         print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
     else:

@@ -26,10 +26,6 @@ CLOCK = "clock"
 CLOCK_PERIOD = 10 * MS
 
 
-class PlayError(UserError):
-    """A recording that must not or cannot be played on this bus."""
-
-
 class Player:
     """Plays a recording. Every role that it speaks for shows in the ROS graph; use it as a context manager."""
 
@@ -43,7 +39,7 @@ class Player:
     ) -> None:
         """Joins the bus.
 
-        Raises PlayError when a living service sends what would be played, or would act on it without `drive`.
+        Raises UserError when a living service sends what would be played, or would act on it without `drive`.
         """
         self._recording = recording
         self._rate = rate
@@ -84,7 +80,7 @@ class Player:
         """How late a message left, at worst."""
 
     def _look(self) -> None:
-        """Raises PlayError when a living service of someone else forbids what is played."""
+        """Raises UserError when a living service of someone else forbids what is played."""
         self._graph.changes()
         own = str(self._session.zid())
         alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
@@ -92,19 +88,19 @@ class Player:
         for name in self.topics if alive else ():
             row = rules.topics[name]
             if row.producer in alive:
-                raise PlayError(
+                raise UserError(
                     f"{row.producer} lives on this bus and sends {name} itself; play on another bus (--listen) or other topics"
                 )
             acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
             if acting and not self._drive:
-                raise PlayError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
+                raise UserError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
 
     def play(self, start: int = 0, until: int | None = None, tell: Callable[[int], None] = lambda _: None) -> None:
         """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first.
 
         `tell` hears how far it is [ns], with each message.
 
-        Raises PlayError when a service comes alive that must not meet what is played.
+        Raises UserError when a service comes alive that must not meet what is played.
         """
         self.now = start
         self._next_clock = start
@@ -162,11 +158,11 @@ class Player:
 def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | None) -> tuple[str, ...]:
     for name in topics or ():
         if name.strip("/") not in recording.types:
-            raise PlayError(f"--topic {name}: {recording.path} has {', '.join(sorted(recording.types))}")
+            raise UserError(f"--topic {name}: {recording.path} has {', '.join(sorted(recording.types))}")
     wanted = [name.strip("/") for name in topics] if topics else list(recording.types)
     unknown = [name for name in wanted if name not in rules.topics]
     if unknown and topics:
-        raise PlayError(f"--topic {', '.join(unknown)}: not in the contract")
+        raise UserError(f"--topic {', '.join(unknown)}: not in the contract")
     return tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
 
 

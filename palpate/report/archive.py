@@ -1,65 +1,98 @@
-"""evidence.npz: what a report needs of a run, so that it can be made again from the folder without simulating it again.
+"""A run as its results folder keeps it.
 
-Columns over time are arrays in SI units. The final map, findings and phantom are kept as they were on the bus, in CDR.
+evidence.mcap has the messages that the conductor collected, as any recording has them, and as an attachment what is known of the
+truth. A report is made from it, with or without a recording of the whole run. A run that was killed has no evidence.mcap: then
+the same messages are read from its recording.
 """
 
 from __future__ import annotations
 
+import io
 import json
-import zlib
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from itertools import pairwise
 from operator import attrgetter
 from pathlib import Path
+from time import sleep, time
 from typing import Any, Final
-from zipfile import BadZipFile, is_zipfile
+from zipfile import BadZipFile
 
 import numpy as np
+from mcap.exceptions import McapError
+from mcap.reader import make_reader
 from numpy.typing import NDArray
 
+from palpate.replay.golden import write_recording
+from palpate.replay.rerun import rerun
 from palpate.report.evidence import columns_of, xyz
-from palpate.report.files import drafted
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
 from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
+from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_conductor.collector import Collected
+from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
+from palpate_bus.runs.announcement import live
+from palpate_bus.runs.run_name import in_use
+from palpate_bus.settings import RECORDING
+from palpate_conductor.collector import Collected, Collector
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import ScenarioError, load_scenario
+from palpate_models.scenario.schema import Scenario
+from palpate_recorder.recover import salvage
 
-FILE: Final = "evidence.npz"
-_MESSAGES: Final = {
-    "stiffness_map": "palpation_msgs/msg/StiffnessMap",
-    "findings": "palpation_msgs/msg/Findings",
-    "phantom": "palpation_msgs/msg/PhantomTruth",
-    "targets": "palpation_msgs/msg/PalpationTargets",
+FILE: Final = "evidence.mcap"
+_TRUTH: Final = "truth.npz"
+"""Attachment: name of the run, where the tool touched the skin, forces of the pressed copy of the patient."""
+_TOPICS: Final = {
+    "exam_states": "exam/state",
+    "indentation": "truth/indentation",
+    "motions": "perception/motion",
+    "samples": "assessment/samples",
+    "status_changes": "robot/status",
+    "supervisor": "supervisor/state",
+    "phantom": "truth/phantom",
+    "surface": "perception/surface",
+    "correction": "exam/correction",
+    "targets": "perception/targets",
+    "stiffness_map": "assessment/map",
+    "findings": "assessment/findings",
 }
+"""Topic of each field of `Collected`."""
+_MAGIC: Final = b"\x89MCAP0\r\n"
+"""First and last bytes of a complete file."""
+_STILL_S: Final = 3.0
+"""A recording that has not grown for this long is complete: its recorder writes every simulated second."""
 
 Mask = NDArray[np.bool_]
 
 
 class EvidenceError(UserError):
-    """A folder without readable evidence. Names the file and what to do."""
+    """A folder without a readable run. Names the file and what to do."""
+
+
+class NothingRecordedError(EvidenceError):
+    """An interrupted run of which nothing was recorded."""
 
 
 @dataclass(frozen=True)
 class Event:
-    """Something that a reader of the report should know of."""
+    """A message of the examination or a change of the driver, for the reader of a report."""
 
     time_s: float
     """Simulated."""
     source: str
     """exam or driver."""
-    words: str
+    text: str
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """A run as its report sees it; n exam states and m true contacts, in order of time."""
+    """The columns of a run for its report; n exam states and m true contacts, in order of time."""
 
     time: Array
     """Times of the exam states [s], shape (n,)."""
@@ -68,9 +101,9 @@ class Evidence:
     depth: Array
     """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
     depth_known: Array
-    """The same as the assessment has it in the end [m]: by the breath that was seen, from the skin as all of it tells."""
+    """Final estimate of the assessment [m]: with the observed breathing, from the corrected surface."""
     uncertainty: Array
-    """Standard deviation of that, as it is told [m]."""
+    """Its reported standard deviation [m]."""
     setpoint: Array
     """[m]"""
     force: Array
@@ -79,9 +112,9 @@ class Evidence:
     steady: Mask
     force_limited: Mask
     visited: NDArray[np.uint32]
-    """Targets reached so far."""
+    """Targets reached."""
     skipped: NDArray[np.uint32]
-    """Targets given up so far."""
+    """Targets skipped."""
     target_count: int
     true_time: Array
     """Times of the true contact [s], shape (m,)."""
@@ -97,60 +130,139 @@ class Evidence:
     touched: Touched
     """Where the tool was believed to touch the skin, and where it did."""
     pressed: Pressed | None
-    """What a copy of the patient feels like; None where none can be made."""
+    """Forces of a pressed copy of the patient; None if none can be made."""
     run: str = ""
     """Name of the run."""
 
     def phases(self) -> list[tuple[int, float, float]]:
-        """Phase, begin and end [s], in order."""
+        """Return phase, begin and end [s] of each phase, in order."""
         starts = [0, *(np.flatnonzero(np.diff(self.phase.astype(int))) + 1), len(self.phase)]
         return [(int(self.phase[a]), float(self.time[a]), float(self.time[b - 1])) for a, b in pairwise(starts) if b > a]
-
-
-def _events(collected: Collected) -> list[Event]:
-    """Every new sentence of the examination, and every change of the driver."""
-    events = []
-    before = ""
-    for state in collected.exam_states:
-        if state.message and state.message != before:
-            before = state.message
-            events.append(Event(nanoseconds(state.header.stamp) / NS, "exam", state.message))
-    for status in collected.status_changes:
-        words = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
-        events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", words))
-    return sorted(events, key=lambda event: event.time_s)
 
 
 def write_evidence(
     path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
 ) -> None:
-    """Writes what was collected of the run called `run`, complete or not, and what is known of its truth."""
+    """Writes the messages that were collected of the run called `run`, complete or not, and what is known of its truth."""
+    known: dict[str, Any] = {"run": np.array(run)}
+    if touched is not None:
+        known |= {"touched_believed": touched.believed, "touched_true": touched.true}
+    if pressed is not None:
+        known |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
+    truth = io.BytesIO()
+    np.savez_compressed(truth, **known)
+    messages = sorted(_messages(c), key=attrgetter("stamp"))
+    write_recording(path, contract(), messages, {_TRUTH: ("application/octet-stream", truth.getvalue())})
+
+
+def _messages(c: Collected) -> Iterator[RecordedMessage]:
+    """Yields everything that was collected, topic by topic."""
+    for field, topic in _TOPICS.items():
+        encode = codec.encoder(contract().topics[topic].type)
+        kept = getattr(c, field)
+        messages = () if kept is None else kept if field in _SEQUENCES else (kept,)
+        for number, message in enumerate(messages, start=1):
+            # the phantom is sent once, at the start; samples of a resumed run are stamped before it
+            stamp = max(nanoseconds(message.header.stamp), 0) if hasattr(message, "header") else 0
+            yield RecordedMessage(stamp, topic, encode(message), number)
+
+
+_SEQUENCES: Final = ("exam_states", "indentation", "motions", "samples", "status_changes")
+
+
+def _collected(evidence: Recording) -> Collected:
+    """Return what `_messages` wrote."""
+    fields = {topic: field for field, topic in _TOPICS.items()}
+    kept: dict[str, Any] = {field: [] for field in _SEQUENCES}
+    for message in evidence.messages(list(evidence.types)):
+        field = fields[message.topic]
+        decoded = codec.decode(message.payload, contract().topics[message.topic].type)
+        if field in _SEQUENCES:
+            kept[field].append(decoded)
+        else:
+            kept[field] = decoded
+    return Collected(**kept)
+
+
+def collect(recording: Recording) -> Collected:
+    """Return what the conductor would have collected, or has. Raises RecordingError."""
+    collector = Collector()
+    end = tick_after(recording.last, collector.role)
+    for _ in rerun(collector, contract(), inputs(recording, collector.role), end):
+        pass
+    return collector.collected
+
+
+def tick_after(t: int, role: str) -> int:
+    """Return the first tick [ns] of a role after `t` [ns]."""
+    period = contract().roles[role].period
+    return t - t % period + period
+
+
+def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
+    """Yields the recorded inputs of a role, in order. Raises RecordingError."""
+    rules = contract()
+    topics = [topic.name for topic, _ in rules.inputs(role) if topic.name in recording.types]
+    recording.check(rules, topics)
+    return recording.messages(topics)
+
+
+def read_evidence(folder: Path) -> Evidence:
+    """Return the evidence of the run in `folder`. Raises EvidenceError."""
+    path = folder / FILE
+    if not path.is_file():
+        raise EvidenceError(
+            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
+        )
+    try:
+        with path.open("rb") as stream:
+            reader = make_reader(stream)
+            attached = {a.name: a.data for a in reader.iter_attachments()}
+            summary = reader.get_summary()
+        with np.load(io.BytesIO(attached[_TRUTH]), allow_pickle=False) as stored:
+            known = {name: stored[name] for name in stored.files}
+        collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
+    except KeyError as error:
+        raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
+    except (OSError, ValueError, EOFError, BadZipFile, McapError) as error:
+        raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
+    nowhere = np.empty((0, 3))
+    touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
+    pressed = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
+    return evidence_of(collected, touched, Pressed(**pressed) if pressed else None, str(known["run"]))
+
+
+def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: str) -> Evidence:
+    """Return the columns of what was collected of the run called `run`."""
     states = _columns(c.exam_states)
     contacts = columns_of(((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in c.indentation), _CONTACT)
-    events = _events(c)
     known, uncertainty = _depth_known(c, states)
-    columns: dict[str, Any] = {
-        "run": np.array(run),
-        **{name: states[name] for name in ("time", "phase", *_FLAGS, "visited", "skipped")},
-        **{name: states[name].astype(np.float32) for name in ("depth", "setpoint", "force")},
-        "depth_known": known.astype(np.float32),
-        "uncertainty": uncertainty.astype(np.float32),
-        "target_count": states["target_count"].max(initial=0),
+    return Evidence(
+        **{name: states[name] for name in ("time", "phase", "depth", "setpoint", "force", *_FLAGS, "visited", "skipped")},
         **contacts,
-        "event_time": np.array([event.time_s for event in events]),
-        "event_source": np.array([event.source for event in events], dtype=np.str_),
-        "event_words": np.array([event.words for event in events], dtype=np.str_),
-    }
-    for name, kind in _MESSAGES.items():
-        message = getattr(c, name)
-        if message is not None:
-            columns[name] = np.frombuffer(codec.encode(message, kind), dtype=np.uint8)
-    if touched is not None:
-        columns |= {"touched_believed": touched.believed, "touched_true": touched.true}
-    if pressed is not None:
-        columns |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
-    with drafted(path) as draft, draft.open("wb") as file:
-        np.savez_compressed(file, **columns)
+        depth_known=known,
+        uncertainty=uncertainty,
+        target_count=int(states["target_count"].max(initial=0)),
+        events=tuple(_events(c)),
+        **{name: getattr(c, name) for name in ("stiffness_map", "findings", "phantom", "targets")},
+        touched=touched,
+        pressed=pressed,
+        run=run,
+    )
+
+
+def _events(c: Collected) -> list[Event]:
+    """Return every new message of the examination and every change of the driver, in order of time."""
+    events = []
+    before = ""
+    for state in c.exam_states:
+        if state.message and state.message != before:
+            before = state.message
+            events.append(Event(nanoseconds(state.header.stamp) / NS, "exam", state.message))
+    for status in c.status_changes:
+        text = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
+        events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", text))
+    return sorted(events, key=lambda event: event.time_s)
 
 
 _FLAGS: Final = ("in_contact", "steady", "force_limited")
@@ -166,30 +278,30 @@ _FIELDS: Final = {
     "skipped": ("targets_skipped", "u4"),
     "target_count": ("target_count", "u4"),
 }
-"""Columns made of the exam states: field and type."""
-_told: Final = attrgetter(*(field for field, _ in _FIELDS.values()))
-_CONTACT: Final = np.dtype([("true_time", "f8"), ("true_depth", "f4"), ("true_force", "f4")])
+"""Columns of the exam states: field and type."""
+_values: Final = attrgetter(*(field for field, _ in _FIELDS.values()))
+_CONTACT: Final = np.dtype([("true_time", "f8"), ("true_depth", "f8"), ("true_force", "f8")])
 
 
 def _columns(exam_states: Iterable[Any]) -> dict[str, Array]:
-    """The columns `_FIELDS`, and beside them time [s], place and normal of the skin under the indenter in world, shape (n, 3)."""
+    """Return the columns `_FIELDS`, time [s], and point and normal of the skin under the indenter in world, shape (n, 3)."""
     kinds = [("time", "f8"), *((name, kind) for name, (_, kind) in _FIELDS.items()), ("place", "f8", 3), ("normal", "f8", 3)]
-    rows = ((nanoseconds(s.header.stamp) / NS, *_told(s), xyz(s.surface_point), xyz(s.surface_normal)) for s in exam_states)
+    rows = ((nanoseconds(s.header.stamp) / NS, *_values(s), xyz(s.surface_point), xyz(s.surface_normal)) for s in exam_states)
     return columns_of(rows, np.dtype(kinds))
 
 
 def _depth_known(c: Collected, states: dict[str, Array]) -> tuple[Array, Array]:
-    """Depths of the exam states as they are known in the end, and their standard deviations [m], shape (n,) each."""
-    depth, told = _depth_seen(c, states), states["uncertainty"]
+    """Return the final depths of the exam states and their standard deviations [m], shape (n,) each."""
+    depth, reported = _depth_seen(c, states), states["uncertainty"]
     skin = None if c.surface is None or c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
     if skin is None:
-        return depth, told
+        return depth, reported
     deeper, sigma = skin.deeper(states["time"], states["place"], states["normal"])
-    return depth + np.nan_to_num(deeper), np.where(np.isnan(sigma), told, sigma)
+    return depth + np.nan_to_num(deeper), np.where(np.isnan(sigma), reported, sigma)
 
 
 def _depth_seen(c: Collected, states: dict[str, Array]) -> Array:
-    """Depths of the exam states by the breath that was seen [m], shape (n,)."""
+    """Return the depths of the exam states corrected by the observed breathing [m], shape (n,)."""
     time, depth, followed, places = (states[name] for name in ("time", "depth", "followed", "place"))
     motions = [m for m in c.motions if m.state in SEEN]
     if c.surface is None or not motions:
@@ -200,47 +312,63 @@ def _depth_seen(c: Collected, states: dict[str, Array]) -> Array:
 
 
 def read_figures(folder: Path) -> dict[str, Any]:
-    """report.json of the run in `folder`, as it stands. Raises OSError or ValueError."""
+    """Return report.json of the run in `folder`, unchecked. Raises OSError or ValueError."""
     report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
     return report
 
 
 def completed(folder: Path) -> dict[str, Any] | None:
-    """report.json of a completed run with its evidence; None where there is none."""
+    """Return report.json of a completed run with its evidence; None if there is none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         report = read_figures(folder)
-        return report if report["failure"] is None and is_zipfile(folder / FILE) else None
+        with (folder / FILE).open("rb") as file:
+            file.seek(-len(_MAGIC), io.SEEK_END)
+            return report if report["failure"] is None and file.read() == _MAGIC else None
     return None
 
 
-def read_evidence(folder: Path) -> Evidence:
-    """The evidence of the run in `folder`. Raises EvidenceError."""
-    path = folder / FILE
+@dataclass(frozen=True)
+class InterruptedRun:
+    """A run without results, or with those of a failure, as its recorder or its conductor left it."""
+
+    folder: Path
+    scenario: Scenario
+    recording: Recording
+    collected: Collected
+
+
+def interrupted_run(folder: Path) -> InterruptedRun:
+    """Reads the folder of a run.
+
+    Raises EvidenceError if the run is still on or its files cannot be read, NothingRecordedError if it has no recording.
+    """
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            held = {name: stored[name] for name in stored.files}
-    except FileNotFoundError as error:
-        raise EvidenceError(
-            f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
-        ) from error
-    except (OSError, ValueError, EOFError, BadZipFile, zlib.error) as error:
-        raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
+        if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live()):
+            raise EvidenceError(f"{folder}: its run is still on; stop that first")
+    except OSError as error:
+        raise EvidenceError(f"{folder}: cannot be read: {error}") from error
     try:
-        times, sources, words = (held.pop(f"event_{name}").tolist() for name in ("time", "source", "words"))
-        events = tuple(map(Event, times, sources, words))
-        messages: dict[str, Any] = {
-            name: codec.decode(held.pop(name).tobytes(), kind) if name in held else None for name, kind in _MESSAGES.items()
-        }
-        nowhere = np.empty((0, 3))
-        touched = Touched(held.pop("touched_believed", nowhere), held.pop("touched_true", nowhere))
-        felt = {name: held.pop(f"pressed_{name}") for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in held}
-        columns: dict[str, Any] = {k: v.astype(np.float64) if v.dtype == np.float32 else v for k, v in held.items()}
-        count = int(columns.pop("target_count"))
-        known: dict[str, Any] = {
-            "run": str(columns.pop("run", "")),
-            "touched": touched,
-            "pressed": Pressed(**felt) if felt else None,
-        }
-        return Evidence(**columns, **known, target_count=count, events=events, **messages)
-    except (KeyError, TypeError, ValueError) as error:
-        raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
+        scenario = load_scenario(str(folder / "scenario.yaml"))
+        recording = _recording(folder)
+        collected = _collected(recording) if recording.path.name == FILE else collect(recording)
+        return InterruptedRun(folder, scenario, recording, collected)
+    except (RecordingError, ScenarioError) as error:
+        raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
+
+
+def _recording(run: Path) -> Recording:
+    """Return the recording of a run, as far as it was written, or else its evidence."""
+    folder = run / RECORDING
+    parts = sorted(folder.glob("*.mcap"))
+    if not parts:
+        if (run / FILE).is_file():
+            return open_recording(run / FILE)
+        raise NothingRecordedError(f"{run}: nothing can be recovered: it has no recording and no {FILE}")
+    while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < _STILL_S:
+        sleep(0.1)  # the recorder outlives the conductor by some seconds
+    if (folder / "metadata.yaml").is_file():
+        return open_recording(folder)
+    try:
+        return salvage(folder, [topic.name for role in ("conductor", "assessment") for topic, _ in contract().inputs(role)])
+    except (OSError, ValueError) as error:
+        raise NothingRecordedError(f"{folder}: nothing can be recovered: {error}") from error

@@ -1,4 +1,4 @@
-"""A page printed to PDF, by a browser that is installed."""
+"""`palpate report`: builds the page of a run again from its folder, also as PDF."""
 
 from __future__ import annotations
 
@@ -13,22 +13,17 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from palpate.console import refuse
 from palpate_errors import UserError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
 
 
-class PrintError(UserError):
-    """A page that no browser could print. Says what to do."""
-
-
 def write_pdf(page: Path) -> Path:
-    """Prints report.html to report.pdf beside it, with a Chromium browser. Raises PrintError."""
+    """Prints report.html to report.pdf in the same folder with a Chromium browser. Raises UserError."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
-        raise PrintError(f"--pdf needs a Chromium browser ({', '.join(BROWSERS)}): none is on the PATH; {page} prints as well")
+        raise UserError(f"--pdf needs a Chromium browser ({', '.join(BROWSERS)}): none is on the PATH; {page} prints as well")
     target = page.with_suffix(".pdf")
     target.unlink(missing_ok=True)
     with tempfile.TemporaryDirectory(prefix="palpate-print-") as profile:
@@ -38,9 +33,9 @@ def write_pdf(page: Path) -> Path:
         try:
             done = subprocess.run(command, capture_output=True, text=True, timeout=PRINT_TIMEOUT_S, check=False)
         except subprocess.TimeoutExpired as error:
-            raise PrintError(f"{browser} did not print {page} within {PRINT_TIMEOUT_S} s") from error
+            raise UserError(f"{browser} did not print {page} within {PRINT_TIMEOUT_S} s") from error
     if done.returncode or not target.is_file():
-        raise PrintError(f"{browser} could not print {page} (status {done.returncode}): {done.stderr.strip()[-300:]}")
+        raise UserError(f"{browser} could not print {page} (status {done.returncode}): {done.stderr.strip()[-300:]}")
     return target
 
 
@@ -54,26 +49,20 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
-    from palpate.report.archive import EvidenceError
-    from palpate.report.recover import recovered
+    from palpate.report.recovery import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
 
     console = Console(stderr=True)
-    try:
-        with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
-            if recover:
-                scenario, result = recovered(folder)
-                shown = Console(stderr=as_json)
-                print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # at once: the truth takes longer
-                print_scores(shown, write_results(folder, scenario, result))
-            from palpate.report.page import write_page
+    with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
+        if recover:
+            scenario, result = recovered(folder)
+            shown = Console(stderr=as_json)
+            print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # at once: the truth takes longer
+            print_scores(shown, write_results(folder, scenario, result))
+        from palpate.report.page import write_page
 
-            page = write_page(folder)
-            paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
-    except (EvidenceError, PrintError) as error:
-        refuse(error)
-    except OSError as error:  # of a full disk it names no file
-        refuse(f"{error.filename or folder}: {error.strerror or error}")
+        page = write_page(folder)
+        paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     if as_json:
         print(json.dumps({kind: str(path) for kind, path in paths.items()}))
     elif not quiet:

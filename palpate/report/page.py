@@ -174,6 +174,6 @@ def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dic
 
 def _safety(report: Report, evidence: Evidence) -> list[tuple[float, str, str]]:
     """Time [s], source and words of what a safety review wants to see: changes of the driver, losses, rejected commands."""
-    rows = [(event.time_s, event.source, event.words) for event in evidence.events if event.source == "driver"]
+    rows = [(event.time_s, event.source, event.text) for event in evidence.events if event.source == "driver"]
     rows += [(t, role, "lost: it fell silent") for role, t in report.lost.items()]
     return sorted(rows)

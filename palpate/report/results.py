@@ -1,4 +1,4 @@
-"""What a run leaves in its folder for people and programs: report.json, samples.csv, map.png, evidence.npz."""
+"""What a run leaves in its folder for people and programs: report.json, samples.csv, map.png, evidence.mcap."""
 
 from __future__ import annotations
 
@@ -132,7 +132,7 @@ def _draws_no_map(c: Collected) -> bool:
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
-    """Writes samples.csv, evidence.npz, report.json and, when there is a map, map.png into a run's folder; returns the report."""
+    """Writes samples.csv, evidence.mcap, report.json and, if there is a map, map.png into a run's folder."""
     c = result.collected
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)

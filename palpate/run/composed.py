@@ -1,4 +1,4 @@
-"""One run with all its services in this process."""
+"""A run with all services in this process."""
 
 from __future__ import annotations
 
@@ -24,10 +24,7 @@ from palpate_models.scenario.schema import Scenario
 
 
 def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
-    """The services of `roles` in this process, as the scenario chooses them.
-
-    Raises PluginError for one that there is not, or that lacks its libraries.
-    """
+    """Return the services of `roles` as the scenario chooses them. Raises PluginError for a missing one or missing libraries."""
     return [create(role, choice(scenario, role), seen(scenario, view_of(role))) for role in roles]
 
 
@@ -36,8 +33,8 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     begin = perf_counter()
     write_scenario_files(scenario, out)
     collector = Collector(tree=FrameTree(exam_input(scenario)))
-    told = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
-    with given(told):  # the others are not told the results folder: its name may tell of the patient
+    observer_settings = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
+    with given(observer_settings):  # only observers: the name of the results folder may reveal the patient
         observing = load_services(scenario, observers)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
@@ -66,7 +63,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         failure = replace(error.failure, text=f"{error.role} lost at {error.t / NS:.3f} s: {error.failure}")
         lost = {error.role: error.t}
         last = error.t
-    except (Exception, KeyboardInterrupt, SystemExit) as error:  # whatever it is, what was measured is to be told
+    except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report still needs what was measured
         interrupted = isinstance(error, KeyboardInterrupt)
         failure, last = failure_of(error, run.t), run.t
     all_is_measured()

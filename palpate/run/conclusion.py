@@ -1,4 +1,4 @@
-"""The end of an examination: its results are written, its findings printed, and the command leaves with its status."""
+"""The end of an examination: writes the results, prints the findings, sets the exit status."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ def conclude(
     quiet: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Writes the results and prints the findings. Raises typer.Exit with status 3 when the run failed or its folder took none."""
+    """Writes the results and prints the findings. Raises typer.Exit(3) if the run failed or its folder is not writable."""
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
-        report, page, trouble = _written(folder, scenario, result)
+        report, page, trouble = _write(folder, scenario, result)
     if as_json:
         print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
     else:
         print_findings(SteadyConsole(), report)
-    for sentence in _unfit(result):
+    for sentence in _contract_violations(result):
         say(f"{sentence}; see docs/topics.md, and palpate check assessment")
     if page is not None and (trouble or not quiet):
         megabytes = megabytes_of(page.parent)
@@ -52,41 +52,41 @@ def conclude(
     if trouble:
         say(trouble)
     if result.failure:
-        say(f"the run failed: {result.failure} (logs in {folder / 'logs'}){_held(result)}")
+        say(f"the run failed: {result.failure} (logs in {folder / 'logs'}){_hold_text(result)}")
         if (folder / RECORDING).is_dir() and not quiet:
-            console.print(f"to examine what is left: palpate run --resume {folder}", highlight=False, soft_wrap=True)
+            console.print(f"to examine the remaining targets: palpate run --resume {folder}", highlight=False, soft_wrap=True)
     if result.failure or trouble:
         raise typer.Exit(EXIT_FAILED)
 
 
-def _held(result: RunResult) -> str:
-    """That the arm was held at last, and why, where the failure does not tell it."""
+def _hold_text(result: RunResult) -> str:
+    """Return since when and why the arm is held, if the failure does not say it."""
     changes = result.collected.status_changes
     if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in str(result.failure or ""):
         return ""
     return f"; the arm has been held since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
 
 
-def _unfit(result: RunResult) -> list[str]:
-    """What in the last map and findings is not as the contract has it, such as a confidence of 80, a sentence each."""
+def _contract_violations(result: RunResult) -> list[str]:
+    """Return a sentence for each violation of the contract in the last map and findings, such as a confidence of 80."""
     topics, collected = contract().topics, result.collected
     last = {"assessment/map": collected.stiffness_map, "assessment/findings": collected.findings}
     return [fault for name, message in last.items() if message is not None for fault in violations(topics[name], message)]
 
 
-def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
-    """Writes the results into a folder, or into another where that takes none: the report, its page, and what went wrong.
+def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
+    """Writes the results into a folder, or into another if that fails; returns the report, its page, and what went wrong.
 
-    Where no folder takes them there is no page, and the report is all the same.
+    If no folder is writable, there is no page.
     """
     try:
-        return _kept(folder, scenario, result)
+        return _write_into(folder, scenario, result)
     except OSError as error:
         trouble = f"{folder}: the results cannot be written there ({error.strerror})"
     try:
         other = another_folder()
         write_scenario_files(scenario, other)
-        report, page, why = _kept(other, scenario, result)
+        report, page, why = _write_into(other, scenario, result)
         return report, page, f"{trouble}; they are in {other}" + (f"; {why}" if why else "")
     except OSError as error:
         report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
@@ -97,13 +97,13 @@ def _written(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Repor
         )
 
 
-def _kept(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:
-    """Writes the results into a folder, without the map where it cannot be drawn, and why. Raises OSError."""
+def _write_into(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:
+    """Writes the results into a folder, without a map that cannot be drawn; returns report, page and why. Raises OSError."""
     try:
         return write_results(folder, scenario, result), write_page(folder), ""
     except OSError:
         raise
-    except Exception as error:  # an assessment of the user's own may tell of triangles that there are not
+    except Exception as error:  # a user-defined assessment may send a map with invalid triangles
         log.exception("the map cannot be used")
         result.collected.stiffness_map = None
         why = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"

@@ -1,23 +1,23 @@
-"""What `palpate conduct` does: conducts services that others start, such as containers.
+"""Conducts services that are started by others, such as containers (`palpate conduct`).
 
-It is all that the conductor's image has to import, so nothing of a role, of a recording or of resuming is imported here.
+The conductor's image imports only this: no role, no resuming.
 """
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from palpate.console import SteadyConsole, refuse
+from palpate.console import SteadyConsole
 from palpate.run.conclusion import conclude
 from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
-from palpate_bus.settings import BusConfigError
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.outcome import Timing
-from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
+from palpate_errors import UserError
+from palpate_models.scenario.load import exam_input, load_scenario
 
 NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait: run with --wallclock"
 
@@ -27,14 +27,11 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     console = SteadyConsole(stderr=True)
     for name in observers:
         if name not in OBSERVERS:
-            refuse(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
-    try:
-        chosen = load_scenario(str(out / "scenario.yaml"))
-        if chosen.services.tissue == NONE and not wallclock:
-            refuse(NEEDS_WALLCLOCK)
-        session = open_session()
-    except (ScenarioError, BusConfigError) as error:
-        refuse(error)
+            raise UserError(f"--observers {name}: allowed are {', '.join(OBSERVERS)}")
+    chosen = load_scenario(str(out / "scenario.yaml"))
+    if chosen.services.tissue == NONE and not wallclock:
+        raise UserError(NEEDS_WALLCLOCK)
+    session = open_session()
     roles = (*workers(chosen), *observers)
     with results_first():
         with RunDisplay(console, quiet, chosen.exam) as display:

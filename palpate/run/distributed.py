@@ -1,4 +1,4 @@
-"""One run of processes on the bus: its start and its end."""
+"""A run with a process for each service or group of services."""
 
 from __future__ import annotations
 
@@ -6,8 +6,8 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
+from palpate.run.group import Groups, UserError, apart
 from palpate.run.interrupts import all_is_measured
-from palpate.run.placement import Groups, PlacementError, apart
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
 from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
@@ -34,10 +34,9 @@ def run_distributed(
 ) -> RunResult:
     """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
-    The user starts the roles of `absent`; `groups` are the roles of each process, by default one each.
+    The user starts the roles of `absent`. `groups`: roles of each process, by default one each.
 
-    Raises ProcessListError when the compose file cannot be used, PluginError when a service cannot, PlacementError when it cannot
-    share a process, BusConfigError when the certificates cannot; later failures are in the result.
+    Raises UserError if compose file, services, groups or certificates cannot be used; later failures are in the result.
     """
     begin = perf_counter()
     timing = timing or Timing()
@@ -55,7 +54,7 @@ def run_distributed(
     local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
     begun = False
 
-    def told(progress: RunProgress) -> None:
+    def report_progress(progress: RunProgress) -> None:
         nonlocal begun
         begun = True
         tell(progress)
@@ -81,7 +80,7 @@ def run_distributed(
         try:
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, told, local.ended, timing, patience, begin, tree)
+                result = conduct(session, roles, report_progress, local.ended, timing, patience, begin, tree)
                 all_is_measured()
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
@@ -93,7 +92,7 @@ def run_distributed(
 
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:
-    """Raises PluginError when what plays a role cannot be started here. A program that is none of ours is not looked at."""
+    """Raises PluginError if the implementation of a role cannot be started here. Other programs are not checked."""
     if process.words is not None:
         name = process.words[0] if process.words else choice(scenario, process.role)
         implementations.check(process.role, name)
@@ -101,7 +100,7 @@ def _check(process: ServiceProcess, scenario: Scenario) -> None:
 
 
 def _check_shares(process: ServiceProcess, absent: Absent) -> None:
-    """Raises PlacementError for a service that cannot share a process."""
+    """Raises UserError for a service that cannot share a process."""
     if process.role in absent.roles:
-        raise PlacementError(f"--without {process.role}: who starts it places it; leave it out of --group and --processes")
+        raise UserError(f"--without {process.role}: you start it in its own process; leave it out of --group and --processes")
     process.shared_words()

@@ -1,7 +1,6 @@
-"""Service processes forked from one that has imported everything: a campaign of many short runs pays for the imports once.
+"""Service processes forked from one that has imported everything, so that a campaign of many short runs imports once.
 
-They are separate processes like any other, with their own session, log and signals; only who did the imports differs from a
-fresh start. A single run starts fresh ones: there it would save nothing.
+Each has its own session, log and signals, as a process started afresh. A single run would save nothing and does not use this.
 """
 
 from __future__ import annotations
@@ -20,28 +19,28 @@ from palpate_bus.contract import contract
 
 
 class Child(Protocol):
-    """What is asked of a service's process, as of `subprocess.Popen`."""
+    """The part of the interface of `subprocess.Popen` that is used."""
 
     pid: int
 
     def poll(self) -> int | None:
-        """Its exit status, a signal's number as negative; None while it runs."""
+        """Return the exit status, negative for a signal; None while it runs."""
 
     def send_signal(self, sig: int) -> None:
-        """Sends it a signal, if it still runs."""
+        """Sends a signal if it still runs."""
 
     def kill(self) -> None:
-        """Ends it."""
+        """Kills it."""
 
     def wait(self, timeout: float | None = None) -> int:
-        """Its exit status, once it has ended. Raises subprocess.TimeoutExpired."""
+        """Waits for its end; returns the exit status. Raises subprocess.TimeoutExpired."""
 
 
 class Forked:
     """A forked process, as a `Child`."""
 
     def __init__(self, process: ForkServerProcess) -> None:
-        """A process that was started."""
+        """`process` has been started."""
         assert process.pid is not None
         self._process = process
         self.pid = process.pid
@@ -72,7 +71,7 @@ class Forks:
     """Starts `python -m PACKAGE [WORD]` by forking."""
 
     def __init__(self, modules: Iterable[str]) -> None:
-        """`modules` are imported once, by the fork server, which starts with the first process."""
+        """The fork server, which starts with the first process, imports `modules` once."""
         self._context = get_context("forkserver")
         self._context.set_forkserver_preload(["palpate.service", *modules])
 
@@ -91,7 +90,7 @@ class Forks:
 
 
 def _become(words: Sequence[str], environment: Mapping[str, str], log: str) -> None:
-    """In the child: what the shell and the interpreter would have done for `python -m WORDS > log`."""
+    """Acts in the child as shell and interpreter for `python -m WORDS > log`."""
     os.setpgid(0, 0)
     os.environ.clear()
     os.environ.update(environment)

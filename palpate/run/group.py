@@ -1,7 +1,7 @@
-"""`python -m palpate.run.group FILE`: the services of several roles in one process, as `palpate run` places them.
+"""Services that share a process: `palpate run --group robot,tissue,control`, or `--processes N`.
 
-FILE is JSON: by role, the words after `python -m palpate.service ROLE` and its own environment: each service is made with
-the scenario file of its own view, and joins a secure bus with its own certificate.
+`python -m palpate.run.group FILE` runs such a process. FILE is JSON: by role, the words after `python -m palpate.service ROLE`
+and the environment of that role alone, such as the scenario file of its view and its certificate on a secure bus.
 """
 
 from __future__ import annotations
@@ -13,28 +13,81 @@ from pathlib import Path
 from typing import NamedTuple
 
 from palpate.environment import given
+from palpate_bus.contract import contract
 from palpate_bus.run import Hosted, chosen, host
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
+
+Groups = tuple[tuple[str, ...], ...]
+"""The roles of each process."""
+
+
+def apart(roles: Sequence[str]) -> Groups:
+    """Return the groups with each role in its own process."""
+    return tuple((role,) for role in roles)
+
+
+def placement(roles: Sequence[str], groups: Sequence[str], processes: int | None) -> Groups:
+    """Return the roles of each process: first those of the `groups` ("robot,tissue"), or of the `processes`; then one for each
+    other role, observers too.
+
+    Raises UserError.
+    """
+    workers = [role for role in roles if not contract().roles[role].observer]
+    if groups and processes is not None:
+        raise UserError("--group and --processes both say who shares a process: give one of them")
+    together = _in_groups(workers, groups) if processes is None else _in_processes(workers, processes)
+    placed = [role for group in together for role in group]
+    return (*together, *apart([role for role in roles if role not in placed]))
+
+
+def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
+    together = tuple(tuple(word.strip() for word in text.split(",")) for text in groups)
+    placed: list[str] = []
+    for group, text in zip(together, groups, strict=True):
+        for role in group:
+            if role not in workers:
+                why = "an observer has its own process" if role in contract().roles else f"there is no role {role!r}"
+                raise UserError(f"--group {text}: {why}; allowed are {', '.join(workers)}")
+            if role in placed:
+                raise UserError(f"--group {text}: {role} is in another group already")
+            placed.append(role)
+    return together
+
+
+def _in_processes(workers: Sequence[str], number: int) -> Groups:
+    """Return the workers by period, split first where it changes, to separate the fast loop, then from the slow end."""
+    if not 1 <= number <= len(workers):
+        raise UserError(f"--processes {number}: this run has {len(workers)} services to place; allowed are 1 to {len(workers)}")
+    period = {role: contract().roles[role].period for role in workers}
+    row = sorted(workers, key=period.__getitem__)
+
+    def turn(place: int) -> tuple[bool, int]:
+        within = period[row[place - 1]] == period[row[place]]
+        return within, -place if within else place
+
+    cuts = sorted(sorted(range(1, len(row)), key=turn)[: number - 1])
+    return tuple(tuple(row[begin:end]) for begin, end in zip([0, *cuts], [*cuts, len(row)], strict=True))
 
 
 class GroupMember(NamedTuple):
-    """A service among those of a process."""
+    """A service of a shared process."""
 
     words: tuple[str, ...]
     environment: Mapping[str, str]
 
 
-def command(file: Path, hosted: Mapping[str, GroupMember]) -> tuple[str, ...]:
-    """Writes the file of a group and returns the command that runs it."""
+def group_command(file: Path, hosted: Mapping[str, GroupMember]) -> tuple[str, ...]:
+    """Writes the file of a group and returns the command of its process."""
     file.write_text(json.dumps({role: member._asdict() for role, member in hosted.items()}), encoding="utf-8")
     return ("python", "-m", "palpate.run.group", str(file))
 
 
-def members(file: Path) -> dict[str, GroupMember]:
-    """The services of a group, from its file. Raises OSError."""
+def group_members(file: Path) -> dict[str, GroupMember]:
+    """Return the services of a group from its file. Raises OSError."""
     rows = json.loads(file.read_text(encoding="utf-8"))
     return {role: GroupMember(tuple(row["words"]), row["environment"]) for role, row in rows.items()}
 
@@ -50,7 +103,7 @@ def _hosted(role: str, member: GroupMember) -> Hosted:
 
 def main(arguments: Sequence[str]) -> None:
     """Runs the group to its end and leaves with status 0, or 3 when the run failed or was aborted."""
-    hosted = members(Path(arguments[0]))
+    hosted = group_members(Path(arguments[0]))
     host(lambda: [_hosted(role, member) for role, member in hosted.items()], "+".join(hosted))
 
 

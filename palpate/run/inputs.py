@@ -1,4 +1,4 @@
-"""The scan of a scenario laid over the body as it truly is: before an examination starts, it is looked at here."""
+"""Checks of a scenario before an examination starts: its phantom, its scan on the true body, its services."""
 
 from __future__ import annotations
 
@@ -7,24 +7,24 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.console import refuse
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
+from palpate_errors import UserError
 from palpate_models.patient.mesh import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
-from palpate_models.scenario.load import ScenarioError, load_scenario
+from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.patterns import Scan, scan_of
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError, is_file
 
 
 def surface_of(phantom: PhantomModel) -> TrueSurface:
-    """The front of a body at rest, in its own frame A."""
+    """Return the front of a body at rest, in its own frame A."""
     return TrueSurface(TrueBody(phantom.vertices, phantom.triangles, np.eye(4)))
 
 
 def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
-    """The scan of the scenario's pattern. Raises PluginError for one that cannot be used, and for a region off the body."""
+    """Return the scan of the scenario's pattern. Raises PluginError for an unusable pattern or a region off the body."""
     surface = surface_of(phantom)
     scan = scan_of(scenario.exam, surface.points)
     off = ~np.isfinite(surface.height(scan.targets))
@@ -41,7 +41,7 @@ def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
 
 
 def with_whole_path(scenario: Scenario) -> Scenario:
-    """The scenario with a pattern's file by its absolute path: services have other working directories."""
+    """Return the scenario with an absolute path of its pattern file: services have other working directories."""
     pattern = scenario.exam.pattern
     if not is_file(pattern):
         return scenario
@@ -56,24 +56,21 @@ def usable(
     services: Sequence[str] | None = None,
     elsewhere: bool = False,
 ) -> Scenario:
-    """A scenario whose phantom can be made and whose services there are. Ends the command for any other.
+    """Return a scenario whose phantom can be made and whose services exist. Raises UserError for any other.
 
-    `services` are choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines, so that they
-    are not looked for here.
+    `services`: choices ROLE=NAME_OR_FILE. With `elsewhere` the services run in containers or on other machines and are not
+    checked here.
     """
     try:
         return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
     except MeshError as error:
-        refuse(f"{name}: {error}")
-    except (ScenarioError, PluginError) as error:
-        refuse(error)
+        raise UserError(f"{name}: {error}") from error
 
 
 def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
-    """The scenario, after its phantom could be made and its services were found, unless they run `elsewhere`.
+    """Return the scenario after its phantom, its scan and, unless they run `elsewhere`, its services were checked.
 
-    Raises MeshError for a phantom that cannot be made, PluginError for a scan that cannot be made or leaves the body,
-    PluginError for a service that there is not.
+    Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service.
     """
     scenario = with_whole_path(scenario)
     if scenario.services.tissue != NONE:

@@ -1,4 +1,4 @@
-"""Ctrl-C in an examination: the first one ends it, the next is answered, since what would be lost is what was measured."""
+"""Ctrl-C in an examination: the first ends it and writes the results, the second prints a warning, the third exits at once."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ from types import FrameType
 from typing import Final
 
 SIGNALS: Final = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
-ANSWER: Final = b"\npalpate: it is ending and writes its results, which takes some seconds; Ctrl-C once more, and they are lost\n"
+ANSWER: Final = b"\npalpate: ending and writing the results, which takes some seconds; another Ctrl-C discards them\n"
 
 
 @dataclass
 class Ending:
-    """How far the end of an examination is."""
+    """State of the end of an examination."""
 
     measured: bool = False
-    """Whether all is measured: from then on no Ctrl-C is the one that ends it."""
+    """True once all is measured: no Ctrl-C ends the examination any more."""
     asked: bool = False
-    """Whether somebody asked for the end."""
+    """True once an interruption was requested."""
     answered: bool = False
 
 
@@ -31,7 +31,7 @@ _CURRENT: Final[ContextVar[Ending | None]] = ContextVar("_CURRENT", default=None
 
 
 def all_is_measured() -> None:
-    """Says that what is left is to end and to write; does nothing outside `results_first`."""
+    """Marks the measurement as finished; does nothing outside `results_first`."""
     if (ending := _CURRENT.get()) is not None:
         ending.measured = True
 
@@ -40,8 +40,8 @@ def all_is_measured() -> None:
 def results_first() -> Iterator[Ending]:
     """Within it, the first Ctrl-C, SIGTERM or SIGHUP raises KeyboardInterrupt, until `all_is_measured`.
 
-    After either, one is answered with a sentence, and the next raises KeyboardInterrupt. What was done on a
-    signal besides raising that is still done. Signals that do not interrupt, such as SIGHUP under nohup, stay as they are.
+    After either, the next one prints a warning, and the one after raises KeyboardInterrupt. Other effects of the handlers are
+    kept. Signals that do not interrupt, such as SIGHUP under nohup, stay as they are.
     """
     ending = Ending()
 
@@ -54,9 +54,9 @@ def results_first() -> Iterator[Ending]:
                 raise
             ending.answered = True
             with suppress(OSError):
-                os.write(2, ANSWER)  # by no library: whatever it interrupts may hold a lock, and the reader may be gone
+                os.write(2, ANSWER)  # without a library: the interrupted code may hold a lock, and standard error may be closed
 
-    here = current_thread() is main_thread()  # no other may set a handler, and none but it is interrupted
+    here = current_thread() is main_thread()  # only the main thread may set a handler, and only it is interrupted
     handlers = {number: signal.getsignal(number) for number in SIGNALS if here}
     before = {number: handler for number, handler in handlers.items() if callable(handler)}
     for number in before:

@@ -1,4 +1,4 @@
-"""What an examination will be: how long it takes, how often it touches the skin before, what it presses."""
+"""Estimates of an examination before it starts: duration, touches, presses."""
 
 from __future__ import annotations
 
@@ -11,54 +11,59 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.patterns import Scan, scan_of, touch_centres
 from palpate_models.scenario.schema import Exam, Mode
 
-_BEFORE_AND_AFTER_S = 12.0
-"""What an examination takes before its first descent and after its last."""
-_TOUCH_S = 2.7
-"""A touch before the scan."""
-_DESCENT_S = 3.0
-"""From one line to the next: lifting, going there, touching the skin and pressing."""
-_POINT_S = 2.8
-"""A point that is pressed by itself."""
-_SEARCHED_S = 4.0
-"""A press of a search, which goes further for it."""
-_WAY_MPS = 0.17
-"""Above the skin, from the end of a line to the beginning of the next."""
-_MINUTE_S = 60.0
+
+@dataclass(frozen=True)
+class ExamTiming:
+    """Durations in simulated time."""
+
+    approach_and_return_s: float = 12.0
+    """Before the first descent and after the last."""
+    touch_s: float = 2.7
+    line_change_s: float = 3.0
+    """Lift, transfer, touch and press between two lines."""
+    point_s: float = 2.8
+    """One point of a point-wise scan."""
+    searched_press_s: float = 4.0
+    """One press of a search, which moves further."""
+    transfer_mps: float = 0.17
+    """Speed above the skin between two lines."""
+
+
+TIMING = ExamTiming()
 
 
 @dataclass(frozen=True)
 class Outlook:
-    """What is expected of an examination before it starts."""
+    """Expected duration, touches, lines and presses."""
 
     duration_s: float
-    """About how long it takes, in simulated time [s]; of a search, which ends when it is sure, the longest."""
+    """Simulated time; of a search, an upper limit."""
     touches: int
-    """How often the skin is touched before the scan."""
+    """Touches of the skin before the scan."""
     lines: int
-    """Scan lines."""
     presses: int
-    """Targets that are pressed; of a search, the most presses that it may make."""
+    """Pressed targets; of a search, an upper limit."""
 
     @staticmethod
     def of(exam: Exam) -> Outlook:
-        """That of an examination: the duration is a fit to examinations of several sizes."""
+        """Return the estimates for an examination; the duration is a fit to examinations of several sizes."""
         scan = scan_of(exam, _flat)
         touches = len(touch_centres(scan.targets))
         presses = exam.budget.presses if exam.searched else len(scan.targets)
-        duration = _BEFORE_AND_AFTER_S + _TOUCH_S * touches + _pressing_s(exam, scan)
+        duration = TIMING.approach_and_return_s + TIMING.touch_s * touches + _pressing_s(exam, scan)
         return Outlook(duration, touches, len(scan.lines), presses)
 
 
 def _pressing_s(exam: Exam, scan: Scan) -> float:
     if exam.searched:
-        return min(_SEARCHED_S * exam.budget.presses, exam.budget.seconds)
+        return min(TIMING.searched_press_s * exam.budget.presses, exam.budget.seconds)
     if exam.mode is Mode.POINT:
-        return _POINT_S * len(scan.targets)
+        return TIMING.point_s * len(scan.targets)
     slide = sum(_length(line) for line in scan.lines)
     between = sum(_length(np.vstack((a[-1], b[0]))) for a, b in pairwise(scan.lines))
     if scan.joined:
-        return (slide + between) / exam.speed_mps + _DESCENT_S
-    return slide / exam.speed_mps + between / _WAY_MPS + _DESCENT_S * len(scan.lines)
+        return (slide + between) / exam.speed_mps + TIMING.line_change_s
+    return slide / exam.speed_mps + between / TIMING.transfer_mps + TIMING.line_change_s * len(scan.lines)
 
 
 def _length(points: Array) -> float:
@@ -66,10 +71,10 @@ def _length(points: Array) -> float:
 
 
 def _flat(xy: Array) -> tuple[Array, Array]:
-    """A surface without heights: a scan's length hardly depends on them."""
+    """Return a flat surface: the length of a scan hardly depends on heights."""
     return np.column_stack((xy, np.zeros(len(xy)))), np.tile((0.0, 0.0, 1.0), (len(xy), 1))
 
 
-def in_words(seconds: float) -> str:
-    """A duration as one says it: `40 s`, `3 min`."""
-    return f"{seconds / _MINUTE_S:.0f} min" if seconds > 2 * _MINUTE_S else f"{seconds:.0f} s"
+def duration_text(seconds: float) -> str:
+    """Return a duration as text: `40 s`, `3 min`."""
+    return f"{seconds / 60:.0f} min" if seconds > 120 else f"{seconds:.0f} s"

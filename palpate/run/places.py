@@ -1,8 +1,8 @@
-"""Processes of a run that its user starts: one that the run was told to leave out (`palpate run --without ROLE`, `palpate join`),
-and one that takes the place of a service that was stopped (`palpate run --wallclock --handover`, `palpate takeover`).
+"""`palpate join` and `palpate takeover`: processes of a run that its user starts.
 
-The run writes places.json, with the command and the environment of each such role; a command of this module reads it and becomes
-that process. A debugger, or a program in another language, can do the same.
+A role can be left out at the start (`palpate run --without ROLE`) or replaced after a stop (`--wallclock --handover`). The
+run writes places.json with the command and the environment of each such role; the commands here read it and become that process.
+A debugger, or a program in another language, can do the same.
 """
 
 from __future__ import annotations
@@ -17,24 +17,19 @@ from typing import Annotated, NamedTuple, NoReturn
 
 import typer
 
-from palpate.console import refuse
 from palpate.service import command as service_command
 from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run
-from palpate_bus.runs.joining import NoBus, named_runs
+from palpate_bus.runs.joining import named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
 from palpate_errors import UserError
-from palpate_plugins import PluginError, is_file
+from palpate_plugins import is_file
 
 FILE = "places.json"
 """In the results folder of a run."""
-
-
-class PlaceError(UserError):
-    """A place that cannot be left out, joined or taken. Says why, and what can be done."""
 
 
 class ServicePlace(NamedTuple):
@@ -42,9 +37,9 @@ class ServicePlace(NamedTuple):
 
     command: tuple[str, ...]
     environment: Mapping[str, str]
-    """What it is given beyond the environment of its user."""
+    """Added to the environment of the user."""
     awaited: bool
-    """Whether the run was told to leave it out; otherwise its place is kept when it stops."""
+    """True if the run left it out; else its slot is kept when it stops."""
 
 
 @dataclass
@@ -53,25 +48,25 @@ class Absent:
 
     roles: tuple[str, ...]
     wait_s: float
-    """How long the run waits, by the wall clock, after all others are there."""
+    """Wall-clock time that the run waits for them after all others have answered."""
     tell: Callable[[str], None]
-    """Hears where each is awaited and what joins it."""
+    """Called with the text that says where a role is awaited."""
     _sentences: dict[str, str] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         known = [name for name in contract().roles if name != "conductor"]
         for role in self.roles:
             if role not in known:
-                raise PlaceError(f"--without {role}: allowed are {', '.join(known)}")
+                raise UserError(f"--without {role}: allowed are {', '.join(known)}")
 
     def check(self, roles: Collection[str]) -> None:
-        """Raises PlaceError for one that this run does not have."""
+        """Raises UserError for a role that this run does not have."""
         for role in self.roles:
             if role not in roles:
-                raise PlaceError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
+                raise UserError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
 
     def call(self, out: Path, places: Mapping[str, ServicePlace]) -> None:
-        """Says who is awaited."""
+        """Prints where each role is awaited."""
         for role in self.roles:
             given = places[role].environment
             where = given.get("PALPATE_LISTEN") or given.get("PALPATE_ROUTER", "")
@@ -95,39 +90,43 @@ def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
 
 
 def read_places(run: Run) -> dict[str, ServicePlace]:
-    """The places of a run; none when it started all its services itself and keeps no place."""
+    """Return the places of a run; none if it started all services itself and keeps no slot."""
     file = Path(run.out) / FILE
     rows = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
     return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
 
 
 def place_to_join(role: str, run: Run) -> ServicePlace:
-    """The place of a role that `run` was told to leave out. Raises PlaceError when it was not."""
+    """Return the place of a role that `run` left out. Raises UserError if it did not."""
     awaited = {name: place for name, place in read_places(run).items() if place.awaited}
     if not awaited:
-        raise PlaceError(f"run {run.name} started all its services itself; start one with `palpate run --without {role}`")
+        raise UserError(f"run {run.name} started all its services itself; start one with `palpate run --without {role}`")
     if role not in awaited:
-        raise PlaceError(f"run {run.name} does not wait for {role!r}, but for {', '.join(awaited)}")
+        raise UserError(f"run {run.name} does not wait for {role!r}, but for {', '.join(awaited)}")
     return awaited[role]
 
 
 def place_to_take(role: str, run: Run) -> ServicePlace:
-    """The place of a service of `run` that may change hands. Raises PlaceError when it may not."""
+    """Return the place of a service of `run` that can be replaced. Raises UserError if it cannot."""
     if role not in ROLES:
-        raise PlaceError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
+        raise UserError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
     if run.runtime != "wallclock":
-        raise PlaceError(f"run {run.name} is in {run.runtime}: services change hands in wall-clock runs only")
+        raise UserError(f"run {run.name} is in {run.runtime}: services change hands in wall-clock runs only")
     kept = {name: place for name, place in read_places(run).items() if not place.awaited}
     if role not in kept:
-        raise PlaceError(f"run {run.name} keeps no places: start it with `palpate run --wallclock --handover 60`")
+        raise UserError(f"run {run.name} keeps no places: start it with `palpate run --wallclock --handover 60`")
     others = tuple(endpoint for name, endpoint in run.endpoints.items() if name != role)
     bus = BusOptions(connect=others, router=run.router) if run.keys is None else run.options(role)
-    environment = {**kept[role].environment, **bus.to_env(), "ROS_DOMAIN_ID": str(run.domain)}  # it listens at a place of its own
+    environment = {
+        **kept[role].environment,
+        **bus.to_env(),
+        "ROS_DOMAIN_ID": str(run.domain),
+    }
     return kept[role]._replace(environment=environment)
 
 
 def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[str, ...]:
-    """The words that start the process: those of the run, or those of the chosen implementation. Raises PluginError."""
+    """Return the command of the process: that of the run, or of the chosen implementation. Raises PluginError."""
     if service is None:
         return place.command
     implementations.check(role, service)
@@ -136,19 +135,15 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
 
 
 def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
-    """Replaces this process by another program; `environment` is added to this process's own."""
+    """Replaces this process by another program; `environment` is added to that of this process."""
     program = sys.executable if command[0] == "python" else command[0]
     os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
 
 
 def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
-    """Becomes the process of the place that `find` finds in the run. Raises typer.Exit where there is none."""
-    try:
-        place = find(role, named_runs(run)[-1])
-        command = command_for(role, place, service)
-    except (NoBus, PlaceError, PluginError) as error:
-        refuse(error)
-    become(command, place.environment)
+    """Becomes the process of the place that `find` returns for the run."""
+    place = find(role, named_runs(run)[-1])
+    become(command_for(role, place, service), place.environment)
 
 
 NameOrFile = Annotated[

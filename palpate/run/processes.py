@@ -1,4 +1,4 @@
-"""The process list: docker-compose.yml, read for local processes too, so that there is one list."""
+"""Local processes of a run. The list of processes is docker-compose.yml, as for containers."""
 
 from __future__ import annotations
 
@@ -20,10 +20,8 @@ import yaml
 
 from palpate.environment import FIXED, given
 from palpate.run.forks import Child, Forks
-from palpate.run.group import GroupMember
-from palpate.run.group import command as group_command
+from palpate.run.group import GroupMember, Groups, group_command
 from palpate.run.options import Record
-from palpate.run.placement import Groups, PlacementError
 from palpate.run.secure import SecureBus
 from palpate.service import command as service_command
 from palpate_bus.contract import contract
@@ -40,11 +38,7 @@ COMPOSE = "docker-compose.yml"
 OBSERVERS = frozenset(name for name, role in contract().roles.items() if role.observer)
 """Roles that write into the results folder."""
 BARRIER = frozenset(("robot", "control", "tissue"))
-"""The roles of the 1 kHz loop: processes of no others talk over the low-latency transport (see palpate_bus.wire.zenoh_config)."""
-
-
-class ProcessListError(UserError):
-    """The compose file cannot be used. Names file, service and field."""
+"""Roles of the 1 kHz loop. Processes with only these use the low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
 
 @dataclass(frozen=True)
@@ -57,40 +51,37 @@ class ServiceProcess:
 
     @property
     def words(self) -> tuple[str, ...] | None:
-        """What follows `python -m palpate.service ROLE`; None for another program."""
+        """Return the words after `python -m palpate.service ROLE`; None for another program."""
         ours = service_command(self.role)
         return self.command[len(ours) :] if self.command[: len(ours)] == ours else None
 
     def shared_words(self) -> tuple[str, ...]:
-        """`words`, for a process that is to be shared. Raises PlacementError for a program that cannot share one."""
+        """Return `words` for a shared process. Raises UserError for a program that cannot share one."""
         if self.words is None:
-            raise PlacementError(f"{self.role} is played by `{' '.join(self.command)}`, which shares no process with others")
+            raise UserError(f"{self.role} is played by `{' '.join(self.command)}`, which cannot share a process")
         return self.words
 
 
 def override_files() -> tuple[Path, ...]:
-    """The overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
+    """Return the overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
     return Settings.read().compose[1:]
 
 
 def compose_file() -> Path:
-    """The compose file: PALPATE_COMPOSE, or that of the checkout, or the one that is installed with this package.
-
-    Raises ProcessListError when there is none.
-    """
+    """Return the compose file: PALPATE_COMPOSE, else that of the checkout or of the installed package. Raises UserError."""
     package = Path(__file__).resolve().parents[1]
     candidates = Settings.read().compose[:1] or (package.parent / COMPOSE, package / COMPOSE)
     for path in candidates:
         if path.is_file():
             return path
-    raise ProcessListError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates))}. Set PALPATE_COMPOSE")
+    raise UserError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates))}. Set PALPATE_COMPOSE")
 
 
 def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] = ()) -> dict[str, ServiceProcess]:
-    """The processes of `roles`, in that order, from a compose file and overrides, merged as `docker compose -f -f` merges them:
-    a later file's command stands in place of the earlier one, its environment is added.
+    """Return the processes of `roles`, in that order, from a compose file and overrides, merged as by `docker compose -f -f`:
+    a later file replaces the command and adds to the environment.
 
-    Raises ProcessListError naming what is missing or malformed.
+    Raises UserError naming what is missing or malformed.
     """
     found: dict[str, ServiceProcess] = {}
     for file in (path, *overrides):
@@ -98,7 +89,7 @@ def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path]
         for role in roles:
             service = services.get(role)
             if service is None and role not in found:
-                raise ProcessListError(f"{file}: no service {role!r}; it has {', '.join(services)}")
+                raise UserError(f"{file}: no service {role!r}; it has {', '.join(services)}")
             if service is not None:
                 found[role] = _merged(file, role, service, found.get(role))
     return found
@@ -108,44 +99,44 @@ def _services(path: Path) -> dict[str, Any]:
     try:
         document = yaml.safe_load(path.read_text(encoding="utf-8"))
     except (OSError, yaml.YAMLError) as error:
-        raise ProcessListError(f"{path}: cannot be read: {error}") from error
+        raise UserError(f"{path}: cannot be read: {error}") from error
     services = document.get("services") if isinstance(document, dict) else None
     if not isinstance(services, dict):
-        raise ProcessListError(f"{path}: services: want a mapping")
+        raise UserError(f"{path}: services: want a mapping")
     return services
 
 
 def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceProcess | None) -> ServiceProcess:
     if not isinstance(service, dict):
-        raise ProcessListError(f"{path}: services.{role} = {service!r}: want a mapping")
+        raise UserError(f"{path}: services.{role} = {service!r}: want a mapping")
     command = service.get("command", None if earlier is None else list(earlier.command))
     if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
-        raise ProcessListError(f"{path}: services.{role}.command = {command!r}: want a list of words")
+        raise UserError(f"{path}: services.{role}.command = {command!r}: want a list of words")
     environment = service.get("environment") or {}
     if not isinstance(environment, dict):
-        raise ProcessListError(f"{path}: services.{role}.environment: want a mapping")
+        raise UserError(f"{path}: services.{role}.environment: want a mapping")
     before = {} if earlier is None else earlier.environment
     return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
 
 
 _LOGGED = re.compile(r"^\d{4}-\d\d-\d\d [\d:,.]+ \S+ [A-Z]+ ")
-"""What a service's log puts before a sentence: time, role and level."""
+"""Time, role and level before a message in a service's log."""
 
 
 def how(code: int, log: Path) -> str:
-    """How a process ended, in words: its signal, or its exit status `code` and the last line of its log."""
+    """Return how a process ended as text: its signal, or its exit status `code` and the last line of its log."""
     if code < 0:
         return f"killed by signal {-code}"
     lines: list[str] = []
     with suppress(OSError):
         lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
     hint = "" if code else ": does it call palpate_bus.run.run_service?"
-    said = next((_LOGGED.sub("", line.strip()) for line in reversed(lines) if line.strip()), f"it said nothing{hint}")
+    said = next((_LOGGED.sub("", line.strip()) for line in reversed(lines) if line.strip()), f"its log is empty{hint}")
     return f"left with status {code}: {said}"
 
 
 class LocalProcesses:
-    """Service processes on this machine, each with its log file; unix sockets in a folder of their own carry the bus."""
+    """Service processes on this machine, each with its log file. The bus uses unix sockets in a private folder."""
 
     def __init__(
         self,
@@ -157,10 +148,16 @@ class LocalProcesses:
         secure: SecureBus | None = None,
         forks: Forks | None = None,
     ) -> None:
-        """`groups` gives the roles of each process, `scenario_files` the scenario that each role may see; with `secure` all are
-        clients of its router.
+        """Prepares the processes.
 
-        `record` says what the run's recorder keeps; `forks` starts the processes in place of a fresh interpreter each.
+        Args:
+            groups: roles of each process.
+            out: results folder.
+            scenario_files: the scenario file that each role may see.
+            timing: how time passes.
+            record: what the run's recorder keeps.
+            secure: router of which all processes are clients.
+            forks: starts the processes instead of a new interpreter each.
         """
         settings = Settings.read()
         taking_part = {role for group in groups for role in group}
@@ -171,21 +168,21 @@ class LocalProcesses:
         remove_leftovers()
         self._own = RunFolder()
         self.folder = self._own.path
-        """Of its sockets and its key, removed at its end."""
+        """Folder of sockets and key, removed at the end."""
         key = settings.key
         if key is None and settings.tags is not False:
             key = make_key(self.folder / "run.key")
         self._given["key"] = key
         self._given["rate"] = timing.rate if timing.wallclock else None
         self._scenario_files = {
-            role: file if view_of(role) == "scenario" else self._apart(file) for role, file in scenario_files.items()
+            role: file if view_of(role) == "scenario" else self._copy(file) for role, file in scenario_files.items()
         }
         router = secure.endpoint if secure else settings.router
         processes = {group[0]: group for group in (("conductor",), *groups)}
         quick = [name for name, roles in processes.items() if BARRIER.issuperset(roles)]
         bus = mesh(tuple(processes), self.folder, lowlatency=quick)
         self.bus = {role: replace(bus[name], router=router) for name, roles in processes.items() for role in roles}
-        """How each role and the conductor join the bus: over unix sockets, and through a router if PALPATE_ROUTER names one."""
+        """Bus options of each role and the conductor: unix sockets, and a router if PALPATE_ROUTER names one."""
         endpoints = {role: options.listen[0] for role, options in self.bus.items()}
         if secure is not None:
             self.bus = {role: secure.options(role) for role in self.bus}
@@ -205,18 +202,18 @@ class LocalProcesses:
         )
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, Child] = {}
-        """By role; those that share a process have the same."""
+        """By role; roles of one group share a process."""
         self._log_files: dict[str, Path] = {}
         self._ends: dict[str, str] = {}
 
-    def _apart(self, file: Path) -> Path:
-        """A copy of a scenario file, alone in a folder whose name says nothing: that of the results may tell of the patient."""
+    def _copy(self, file: Path) -> Path:
+        """Copies a scenario file into a neutral folder: the name of the results folder may reveal the patient."""
         folder = self.folder / file.stem
         folder.mkdir(exist_ok=True)
         return Path(shutil.copy(file, folder))
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
-        """What a service is given beyond the environment of this process."""
+        """Return the environment of a service beyond that of this process."""
         settings = Settings.read({**os.environ, **process.environment})
         return {
             **process.environment,
@@ -230,11 +227,11 @@ class LocalProcesses:
         }
 
     def as_conductor(self) -> AbstractContextManager[None]:
-        """Gives what this process makes meanwhile the run's key, as the services have it."""
+        """Sets the run's key in the environment of this process within a `with` block."""
         return given({variable("key"): str(self._given["key"] or "")})
 
     def start(self, *processes: ServiceProcess) -> None:
-        """Starts a service, or several that share a process. Raises PlacementError for a program that cannot share one."""
+        """Starts a service, or several in one process. Raises UserError for a program that cannot share one."""
         roles = [process.role for process in processes]
         for role in roles:
             self._ends.pop(role, None)
@@ -246,7 +243,7 @@ class LocalProcesses:
         self.running |= dict.fromkeys(roles, self._started(command, {**os.environ, **given}, path))
 
     def _group(self, processes: Sequence[ServiceProcess]) -> tuple[tuple[str, ...], dict[str, str]]:
-        """Command and environment of services that share a process: what they do not have in common goes with each."""
+        """Return command and common environment of services in one process. The group's file has the rest of each environment."""
         environments = {process.role: self.environment(process) for process in processes}
         common = dict(set.intersection(*(set(environment.items()) for environment in environments.values())))
         members = {}
@@ -266,21 +263,21 @@ class LocalProcesses:
             stdout=log,
             stderr=subprocess.STDOUT,
             pass_fds=(self._own.lock,),
-            process_group=0,  # Ctrl-C is the conductor's to hear: it ends the run, and the recorder closes its files
+            process_group=0,  # only the conductor receives Ctrl-C: it ends the run, and the recorder closes its files
         )
 
     def ended(self) -> dict[str, str]:
-        """How each process that has ended did so, by role: by a signal, or with a status and the last line of its log."""
+        """Return how each ended process did so, by role: by a signal, or with a status and the last line of its log."""
         for role, child in self.running.items():
             if role not in self._ends and (code := child.poll()) is not None:
                 self._ends[role] = how(code, self._log_files[role])
         return dict(self._ends)
 
     def stop(self, patience_s: float = 5.0, *, at_once: bool = False) -> None:
-        """Gives the processes that long to leave, then ends those that are left, gently first; removes the sockets.
+        """Waits for the processes to exit, then ends the remaining ones with SIGTERM and SIGKILL; removes the sockets.
 
-        One that somebody stopped is woken: it hears that the run is over, and leaves as the others do.
-        `at_once`: they have nothing to complete, and many are still importing, so that they do not hear the bus.
+        Suspended processes are resumed, so that they receive the end of the run. `at_once`: kills without waiting; for a run that
+        has not begun, whose services have nothing to complete and may still be importing.
         """
         steps: tuple[signal.Signals | None, ...] = (None, signal.SIGTERM, signal.SIGKILL)
         try:
@@ -295,7 +292,7 @@ class LocalProcesses:
                 for child in left:
                     with suppress(subprocess.TimeoutExpired):
                         child.wait(timeout=max(0.0, deadline - monotonic()))
-        finally:  # Ctrl-C, too, leaves nothing behind
+        finally:  # after Ctrl-C, too
             for child in self._left():
                 child.send_signal(signal.SIGKILL)
             for log in self._logs:
@@ -304,5 +301,5 @@ class LocalProcesses:
             self._own.remove()
 
     def _left(self) -> list[Child]:
-        """The processes that have not ended."""
+        """Return the processes that have not ended."""
         return [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]

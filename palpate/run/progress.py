@@ -1,6 +1,4 @@
-"""What the arm does and why, in words for who runs an examination: made of `exam/state`, a line for each part of it, not for
-each stroke.
-"""
+"""The console of a run: what the arm does and why, progress and remaining time, and an operator's keys."""
 
 from __future__ import annotations
 
@@ -11,7 +9,7 @@ from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 
-from palpate.run.outlook import Outlook, in_words
+from palpate.run.outlook import Outlook, duration_text
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator_keys import HINT, OperatorKeys
@@ -25,99 +23,98 @@ PHASES: Final = {
 }
 """Phase names by value."""
 STROKE: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
-"""The phases that every stroke goes through."""
+"""The phases of every stroke."""
 WHY: Final = {
-    ExamState.PHASE_LOOK: ", to see where the skin lies and how it moves with the breath",
-    ExamState.PHASE_PLAN: ": ways on which the arm meets nothing else",
+    ExamState.PHASE_LOOK: ", to see where the skin is and how it moves with the breath",
+    ExamState.PHASE_PLAN: ": paths on which the arm meets nothing else",
 }
-"""What a phase is for, where its message does not say so."""
+"""Purpose of a phase, printed when it begins."""
+PRINT_EVERY: Final = 0.1
+"""Without a terminal, a line is printed after each such part of the scan."""
 
 
 class Narration:
-    """Follows one examination, state by state."""
+    """Turns the states of one examination into a line for each part of it, not for each stroke."""
 
     def __init__(self, exam: Exam) -> None:
-        """`exam`: what is examined, and how."""
         self._exam, self._outlook = exam, Outlook.of(exam)
-        self._before = 0
-        """Strokes until the arm last came to the patient."""
+        self._strokes_before = 0
+        """Strokes before the latest approach."""
         self._scanning = False
-        self._told: tuple[str, str] = ("", "")
+        self._last: tuple[Any, ...] = ("", 0, "")
 
     def part(self, state: Any) -> str:
-        """What goes on, in a word or two: `plan`, `touch 2/9`, `scan`."""
+        """Return the current part in a word or two: `plan`, `touch 2/9`, `scan`."""
         if state.phase not in STROKE:
             return PHASES[state.phase]
         if self._touching(state):
-            return f"touch {max(state.stroke - self._before, 1)}/{self._outlook.touches}"
+            return f"touch {max(state.stroke - self._strokes_before, 1)}/{self._outlook.touches}"
         return "search" if self._exam.searched else "scan"
 
     def done(self, state: Any) -> float:
-        """The part of the presses that are over, 0 to 1; a touch before them is at one of their targets too."""
+        """Return the share of finished presses, 0 to 1. The touches before the scan do not count."""
         if state.phase in STROKE and self._touching(state):
             return 0.0
         whole = self._outlook.presses if self._exam.searched else state.target_count
         return min(1.0, state.target_index / whole) if whole else 0.0
 
     def news(self, state: Any) -> tuple[str, str] | None:
-        """The name of a part of the examination and a sentence about it, when it begins or something happens in it."""
-        if state.phase not in STROKE and state.phase != ExamState.PHASE_HELD:
-            self._before, self._scanning = state.stroke, False
+        """Return the name of a part and a sentence when it begins, or when a stroke ends for a reason; else None."""
+        in_stroke = state.phase in STROKE
+        if not in_stroke and state.phase != ExamState.PHASE_HELD:
+            self._strokes_before, self._scanning = state.stroke, False
         self._scanning = self._scanning or state.phase == ExamState.PHASE_SCAN
         name = self.part(state).partition(" ")[0]
-        if state.phase not in STROKE:
-            sentence = str(state.message) + ("" if self._told[0] == name else WHY.get(state.phase, ""))
+        began = self._last[0] != name
+        if not in_stroke:
+            sentence = str(state.message) + (WHY.get(state.phase, "") if began else "")
         elif state.reason != ExamState.REASON_NONE:
             sentence = str(state.message)
-        elif self._told[0] == name or not (self._touching(state) or self._scanning):
+        elif not began or not (self._touching(state) or self._scanning):
             return None  # the first descent after the touches ends them; the scan begins at depth
         else:
-            sentence = self._touching_words() if name == "touch" else self._scanning_words(state)
-        if (name, str(state.message)) == self._told:
+            sentence = self._touching_text() if name == "touch" else self._scanning_text(state)
+        now = (name, int(state.reason), "" if in_stroke else str(state.message))
+        if now == self._last:
             return None
-        self._told = (name, str(state.message))
+        self._last = now
         return name, sentence
 
     def _touching(self, state: Any) -> bool:
-        """Whether this stroke is one of the touches before the scan."""
-        return not self._scanning and state.stroke - self._before <= self._outlook.touches
+        """True if this stroke is one of the touches before the scan."""
+        return not self._scanning and state.stroke - self._strokes_before <= self._outlook.touches
 
-    def _touching_words(self) -> str:
+    def _touching_text(self) -> str:
         count = self._outlook.touches
         places = "a place" if count == 1 else f"{count} places"
-        return f"touching the skin at {places} to find exactly where it lies, since the camera errs by some millimetres"
+        return f"touching the skin at {places} to correct its position, which the camera measures to some millimetres"
 
-    def _scanning_words(self, state: Any) -> str:
+    def _scanning_text(self, state: Any) -> str:
         depth = f"{1e3 * self._exam.depth_m:.0f} mm deep"
         if self._exam.searched:
-            return f"pressing where most is to be learned, until it is sure, at most {self._outlook.presses} times"
+            return f"pressing where it is most informative until the result is certain, at most {self._outlook.presses} times"
         if self._exam.mode is Mode.POINT:
-            return f"pressing {depth} at {state.target_count} points, each touched first: from there the depth counts"
+            return f"pressing {depth} at {state.target_count} points; each is touched first, and depth counts from there"
         lines = "one line" if self._outlook.lines == 1 else f"{self._outlook.lines} lines"
-        return f"sliding {depth} along {lines}; the skin is touched before each descent: from there the depth counts"
-
-
-EVERY = 0.1
-"""Where there is no terminal, a line is printed each time that so much of the scan is done."""
+        return f"sliding {depth} along {lines}; the skin is touched before each descent, and depth counts from there"
 
 
 class RunDisplay:
-    """What the arm does and why, a line for each part of the examination, and in a terminal progress and an operator's keys.
+    """Prints a line for each part of the examination and, in a terminal, shows progress and takes an operator's keys.
 
-    Nothing when quiet.
+    Prints nothing when quiet.
     """
 
     def __init__(self, console: Console, quiet: bool, exam: Exam) -> None:
-        """`exam`: from how long it should take follows the time that is left."""
         self._expected_s = Outlook.of(exam).duration_s
         self._most = "at most" if exam.searched else "about"
         self._narration = Narration(exam)
         self._console = console
         self._quiet = quiet
         self.begun = False
-        """Whether the examination was heard of."""
-        self._told = 0.0
-        self._troubles = 0
+        """True once a state of the examination was received."""
+        self._printed = 0.0
+        self._troubles_shown = 0
         self._stopped = ""
         self._keys = OperatorKeys()
         self._bar = Progress(
@@ -147,11 +144,11 @@ class RunDisplay:
         self._bar.stop()
 
     def tell(self, progress: RunProgress) -> None:
-        """Shows where the run stands."""
-        for sentence in progress.trouble[self._troubles :]:
+        """Shows the state of the run."""
+        for sentence in progress.trouble[self._troubles_shown :]:
             self._console.print(f"[bold red]{escape(sentence)}[/]", highlight=False, soft_wrap=True)
-        self._troubles = len(progress.trouble)
-        self._obey(progress)
+        self._troubles_shown = len(progress.trouble)
+        self._pass_requests(progress)
         exam = progress.collected.exam
         if exam is None:
             return
@@ -166,22 +163,22 @@ class RunDisplay:
             return
         if news is not None:
             self._say(progress, *news)
-        elif not self._console.is_terminal and self._narration.done(exam) >= self._told + EVERY:
-            self._told = self._narration.done(exam)
-            self._say(progress, part, f"{self._told:.0%} done, {left}")
+        elif not self._console.is_terminal and self._narration.done(exam) >= self._printed + PRINT_EVERY:
+            self._printed = self._narration.done(exam)
+            self._say(progress, part, f"{self._printed:.0%} done, {left}")
 
     def _say(self, progress: RunProgress, part: str, sentence: str) -> None:
         self._console.print(f"[dim]{progress.t / NS:8.2f} s[/dim]  {part:<9} {escape(sentence)}", highlight=False, soft_wrap=True)
 
     def _left(self, progress: RunProgress) -> str:
-        """About how long the run takes still, by the clock."""
+        """Return about how long the run still takes, in wall-clock time."""
         if progress.real_time_factor <= 0:
             return ""
         left = max(0.0, self._expected_s - progress.t / NS) / progress.real_time_factor
-        return f"{self._most} {in_words(left)} left"
+        return f"{self._most} {duration_text(left)} left"
 
-    def _obey(self, progress: RunProgress) -> None:
-        """Passes on what an operator's keys say, and shows what the supervisor makes of it."""
+    def _pass_requests(self, progress: RunProgress) -> None:
+        """Passes on an operator's keys and shows when the supervisor stops or releases the arm."""
         if self._bar.disable or progress.request is None:
             return
         if not self.begun and not self._keys.attached and self._keys.__enter__().attached:

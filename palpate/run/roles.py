@@ -1,4 +1,4 @@
-"""The roles of a run, which implementation the scenario chooses for each, and what each may know of the scenario."""
+"""Roles of a run, the implementation of each, and the scenario files that they may read."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or r
 """The roles of every examination."""
 OBSERVERS = tuple(name for name, role in _ROLES.items() if role.observer)
 NONE = "none"
-"""`services.tissue: none`: nothing plays the tissue, since what is examined is real."""
+"""`services.tissue: none`: there is no tissue service, since the tissue is real."""
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
-    """The roles that a run of this scenario cannot do without: the search where one is made, no tissue where it is real."""
+    """Return the roles that a run of this scenario needs: with the search if it searches, without the tissue if that is real."""
     searching = ("search",) if scenario.exam.searched else ()
     return (*(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE), *searching)
 
 
 def kept(observers: Sequence[str]) -> Record:
-    """What the recorder of a run keeps, if it has one: what the settings say, and unless they do, `normal`."""
+    """Return what the recorder of a run keeps: the setting, by default `normal`; `none` without a recorder."""
     if "recorder" not in observers:
         return "none"
     said = Settings.read().record
@@ -40,12 +40,12 @@ def kept(observers: Sequence[str]) -> Record:
 
 
 def choice(scenario: Scenario, role: str) -> str:
-    """The implementation that the scenario names for a role."""
+    """Return the implementation that the scenario names for a role."""
     return str(getattr(scenario.services, role, "default"))
 
 
 def settings_of(options: Sequence[str]) -> list[str]:
-    """What `--service ROLE=NAME_OR_FILE` is short for. Raises PluginError for an option that names no role."""
+    """Return the settings for `--service ROLE=NAME_OR_FILE`. Raises PluginError for an unknown role."""
     settings = []
     for option in options:
         role, equals, name = option.partition("=")
@@ -57,7 +57,7 @@ def settings_of(options: Sequence[str]) -> list[str]:
 
 
 def checked(scenario: Scenario) -> Scenario:
-    """The scenario with files of your own by their absolute path, after all its choices were found to exist.
+    """Return the scenario with absolute paths of user-defined services, after all its choices were checked.
 
     Raises PluginError that names the scenario, the field, its value and what is allowed.
     """
@@ -88,7 +88,7 @@ def checked(scenario: Scenario) -> Scenario:
 
 
 def _check_fmu(scenario: Scenario) -> None:
-    """Raises PluginError for an FMU, or a map of its variables, that is not there, or a file that is no FMU."""
+    """Raises PluginError if an FMU or a map of its variables is missing, or the file is not an FMU."""
     for field, given in (("fmu", scenario.tissue.fmu), ("fmu_map", scenario.tissue.fmu_map)):
         if given and not Path(given).is_file():
             raise PluginError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
@@ -106,9 +106,9 @@ def _is_fmu(path: Path) -> bool:
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
-    """Makes the results folder, names its run, and writes a scenario file of each view; returns the file that each role may see.
+    """Makes the results folder, names its run and writes its scenario files; returns the file that each role may read.
 
-    Only scenario.yaml names the run: what the examination is given shall be the same whenever the examination is.
+    Only scenario.yaml names the run, so that the inputs of the examination do not depend on its time.
     """
     (out / "logs").mkdir(parents=True, exist_ok=True)
     named = f"# run {name_run(out)}\n"

@@ -1,4 +1,4 @@
-"""The secure mode of a local run: every process is a client of one router, over mutual TLS, and may do what its row allows."""
+"""Secure mode of a local run: every process is a client of one router over mutual TLS, with the rights of its contract row."""
 
 from __future__ import annotations
 
@@ -17,25 +17,22 @@ class SecureBus:
     """A secure router for one run; use it as a context manager."""
 
     def __init__(self, keys: Path | None = None) -> None:
-        """`keys`: a folder made by `palpate keys init`; without it, keys are made for this run alone.
-
-        Raises BusConfigError when the folder lacks a member or a certificate has expired.
-        """
+        """`keys`: a folder made by `palpate keys init`; by default keys are made for this run alone."""
         self._own: RunFolder | None = None
-        if keys is None:  # a folder that is removed even where this process is killed, by the next command
+        if keys is None:  # if this process is killed, the next command removes the folder
             self._own = RunFolder()
             keys = self._own.path / "keys"
         self.keys = keys.resolve()
         self.endpoint = f"tls/127.0.0.1:{free_port()}"
 
     def options(self, role: str) -> BusOptions:
-        """How a role joins."""
+        """Return the bus options of a role. Raises BusConfigError if its certificate is missing, expired or of another role."""
         options = BusOptions(mode="client", router=self.endpoint, tls=self.keys / role, shared_memory=False)
         certificate = read(self.keys / role / "cert.pem")
         if certificate.expired or certificate.name != role:
             raise BusConfigError(
-                f"{certificate.path}: is of {certificate.name!r}, holds until {certificate.until:%Y-%m-%d}; "
-                f"want one of {role!r} that holds: palpate keys init {self.keys}"
+                f"{certificate.path}: is of {certificate.name!r}, valid until {certificate.until:%Y-%m-%d}; "
+                f"want a valid one of {role!r}: palpate keys init {self.keys}"
             )
         return options
 
@@ -47,15 +44,15 @@ class SecureBus:
             options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
             self._router = open_session(options, access_control(contract()))
         except BaseException:
-            self._throw_away()
+            self._remove_own_keys()
             raise
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         close_session(self._router)
-        self._throw_away()
+        self._remove_own_keys()
 
-    def _throw_away(self) -> None:
+    def _remove_own_keys(self) -> None:
         """Removes keys that were made for this run alone."""
         if self._own is not None:
             self._own.remove()

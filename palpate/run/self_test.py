@@ -1,9 +1,9 @@
-"""What a machine can keep by the wall clock, measured before a run: three processes of a second that do as the 1 kHz services do.
+"""Measures before a wall-clock run which rate a machine can keep: three processes that work like the 1 kHz services.
 
-    python -m palpate.run.self_test START     one of them: begins at START [ns] of the monotonic clock, prints its figures as JSON
+    python -m palpate.run.self_test START     one process: starts at START [ns] of the monotonic clock, prints its figures as JSON
 
-Each wakes every millisecond, works for most of one and says how late it woke. A run whose time passes at `rate` has 1/rate
-milliseconds for a tick, and ages and deadlines are stretched alike.
+For a second each wakes every millisecond, works for 0.8 ms and measures how late it woke. A run at `rate` has 1/rate
+milliseconds for a tick; ages and deadlines are stretched alike.
 """
 
 from __future__ import annotations
@@ -18,46 +18,46 @@ from typing import Final, NamedTuple
 MS: Final = 1_000_000
 TICKS: Final = 1000
 WORK_NS: Final = 800_000
-"""A third of what all services take of a millisecond: an examination of 50 s takes 161 s of processor time, of which start and
-report are some 40 (README)."""
+"""A third of what all services take per millisecond: an examination of 50 s takes 161 s of processor time, about 40 of them for
+start and report."""
 LATE_MS: Final = 10.0
-"""Half of the age at which joint states are stale: who wakes this late has lost half of what the contract allows."""
+"""Half of the age at which joint states are stale."""
 RATES: Final = (1.0, 0.5, 0.25, 0.1)
-"""What a run may choose, simulated seconds a second."""
+"""Allowed rates, simulated seconds per second."""
 STARTS_WITHIN_NS: Final = 1500 * MS
 
 
-class Kept(NamedTuple):
-    """What the worst of the three processes did."""
+class TimingResult(NamedTuple):
+    """Figures of the worst of the three processes."""
 
     ticks: float
-    """Share of the ticks that it woke for; the others had passed before it came."""
+    """Share of the ticks for which it woke in time."""
     late_ms: float
-    """How late it woke: of a thousand ticks all but one were earlier [ms]."""
+    """Lateness that one tick in a thousand exceeds."""
 
     @property
     def rate(self) -> float | None:
-        """The greatest of `RATES` that the machine can keep; None when it can keep none."""
+        """Return the greatest of `RATES` that the machine can keep, None if there is none."""
         possible = min(self.ticks, LATE_MS / max(self.late_ms, 1e-3))
         return next((rate for rate in RATES if rate <= possible), None)
 
     @property
-    def words(self) -> str:
-        """What was measured, for a user."""
+    def summary(self) -> str:
+        """Return the figures as text."""
         return f"in a second three processes woke for {100 * self.ticks:.0f} % of their ticks, up to {self.late_ms:.0f} ms late"
 
 
-def measure() -> Kept:
+def measure() -> TimingResult:
     """Measures for a second; takes about two and a half."""
     start = monotonic_ns() + STARTS_WITHIN_NS
     command = [sys.executable, str(Path(__file__)), str(start)]
     children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
     figures = [json.loads(child.communicate()[0]) for child in children]
-    return Kept(min(ticks for ticks, _ in figures), max(late for _, late in figures))
+    return TimingResult(min(ticks for ticks, _ in figures), max(late for _, late in figures))
 
 
 def _tick(start: int) -> tuple[float, float]:
-    """Wakes at each tick that has not passed: the share of ticks, and the lateness [ms] that one in a thousand exceeds."""
+    """Wakes at each tick; returns the share of ticks in time, and the lateness [ms] that one in a thousand exceeds."""
     late: list[int] = []
     tick = max(0, (monotonic_ns() - start) // MS)
     while tick < TICKS:

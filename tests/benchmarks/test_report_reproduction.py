@@ -11,8 +11,9 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from palpate.report.archive import Evidence, completed
+from palpate.report.archive import Evidence, completed, write_evidence
 from palpate.truth.touched import Touched
+from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
 from palpate_reproduction.render import BACKGROUND, Body, Viewpoint, picture
 from palpate_reproduction.reproduction import chosen_moments
@@ -79,13 +80,13 @@ def test_the_moments_are_of_their_phases() -> None:
 
 def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
     assert completed(tmp_path) is None
-    np.savez(tmp_path / "evidence.npz", time=np.zeros(3))
+    write_evidence(tmp_path / "evidence.mcap", Collected())
     (tmp_path / "report.json").write_text('{"failure": "robot lost"}', encoding="utf-8")
     assert completed(tmp_path) is None
     (tmp_path / "report.json").write_text('{"failure": null}', encoding="utf-8")
     assert completed(tmp_path) is not None
-    whole = (tmp_path / "evidence.npz").read_bytes()
-    (tmp_path / "evidence.npz").write_bytes(whole[: len(whole) // 2])
+    whole = (tmp_path / "evidence.mcap").read_bytes()
+    (tmp_path / "evidence.mcap").write_bytes(whole[: len(whole) // 2])
     assert completed(tmp_path) is None, "killed while it was written"
 
 

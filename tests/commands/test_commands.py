@@ -20,6 +20,7 @@ from palpate import commands
 from palpate.commands import COMMANDS, app_for, main
 from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
+from palpate.run.options import RunOptions
 from palpate_models.scenario.load import load_scenario
 from palpate_plugins import PluginError
 
@@ -98,12 +99,12 @@ def test_a_run_does_without_the_dashboard_where_its_libraries_are_not(monkeypatc
     def lacking(role: str, choice: str) -> None:
         raise PluginError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
 
-    how = examine.How(None, False, True, (), None, False, False, 0.0, (), 1.0, "normal", False, None, False, False, None)
-    assert examine._observers(load_scenario("clean"), how) == ("dashboard", "recorder")
+    options = RunOptions(composed=True)
+    assert examine._observers(load_scenario("clean"), options) == ("dashboard", "recorder")
     monkeypatch.setattr(examine, "check_libraries", lacking)
-    assert examine._observers(load_scenario("clean"), how) == ("recorder",)
-    assert "pip install 'palpate[dashboard]'" in examine._dashboard_lacks(load_scenario("clean"))
-    assert examine._observers(load_scenario("clean"), replace(how, record="none")) == ()
+    assert examine._observers(load_scenario("clean"), options) == ("recorder",)
+    assert "pip install 'palpate[dashboard]'" in examine._missing_for_dashboard(load_scenario("clean"))
+    assert examine._observers(load_scenario("clean"), replace(options, record="none")) == ()
 
 
 def test_the_version_is_that_of_the_package() -> None:

@@ -52,4 +52,4 @@ def test_a_map_that_cannot_be_drawn_costs_the_map_alone(tmp_path: Path, capsys: 
         conclude(Console(quiet=True), tmp_path, scenario, result(gathered), quiet=True)
     assert left.value.exit_code == 3
     assert "assessment/map cannot be used" in " ".join(capsys.readouterr().err.split())
-    assert {path.name for path in tmp_path.iterdir()} >= {"report.json", "evidence.npz", "samples.csv", "report.html"}
+    assert {path.name for path in tmp_path.iterdir()} >= {"report.json", "evidence.mcap", "samples.csv", "report.html"}

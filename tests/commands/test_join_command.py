@@ -7,9 +7,10 @@ from pathlib import Path
 import pytest
 
 from palpate import service
-from palpate.run.places import Absent, PlaceError, ServicePlace, command_for, place_to_join, place_to_take, write_places
+from palpate.run.places import Absent, ServicePlace, command_for, place_to_join, place_to_take, write_places
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_errors import UserError
 from palpate_plugins import PluginError
 
 ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
@@ -38,12 +39,12 @@ def test_it_says_who_is_awaited_where_and_what_joins(tmp_path: Path) -> None:
 def test_a_process_that_joins_is_given_what_the_run_would_have_given_it(tmp_path: Path) -> None:
     absent(tmp_path)
     assert place_to_join("control", run(tmp_path)) == PLACE
-    with pytest.raises(PlaceError, match="does not wait for 'robot', but for control"):
+    with pytest.raises(UserError, match="does not wait for 'robot', but for control"):
         place_to_join("robot", run(tmp_path))
 
 
 def test_a_run_that_lacks_nobody_says_how_one_is_started(tmp_path: Path) -> None:
-    with pytest.raises(PlaceError, match="palpate run --without robot"):
+    with pytest.raises(UserError, match="palpate run --without robot"):
         place_to_join("robot", run(tmp_path))
 
 
@@ -55,7 +56,7 @@ def test_only_a_failure_for_want_of_an_answer_is_explained(tmp_path: Path) -> No
 
 
 def test_unknown_roles_and_implementations_are_answered_with_the_known_ones(tmp_path: Path) -> None:
-    with pytest.raises(PlaceError, match="--without arm: allowed are robot"):
+    with pytest.raises(UserError, match="--without arm: allowed are robot"):
         Absent(("arm",), 1.0, print)
     with pytest.raises(PluginError, match=r"services\.robot = 'bullet': want one of dart"):
         command_for("robot", PLACE, "bullet")
@@ -69,11 +70,11 @@ def test_a_place_is_entered_by_what_was_there_or_by_what_is_named() -> None:
 
 
 def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
-    with pytest.raises(PlaceError, match="robot: only assessment, camera can change hands"):
+    with pytest.raises(UserError, match="robot: only assessment, camera can change hands"):
         place_to_take("robot", run(tmp_path, "wallclock"))
-    with pytest.raises(PlaceError, match="in wall-clock runs only"):
+    with pytest.raises(UserError, match="in wall-clock runs only"):
         place_to_take("camera", run(tmp_path))
-    with pytest.raises(PlaceError, match="--handover 60"):
+    with pytest.raises(UserError, match="--handover 60"):
         place_to_take("camera", run(tmp_path, "wallclock"))
     write_places(tmp_path, {"camera": PLACE._replace(awaited=False)})
     environment = place_to_take("camera", run(tmp_path, "wallclock")).environment

@@ -15,13 +15,14 @@ from palpate import service
 from palpate.commands import app_for
 from palpate.console import EXIT_BAD_INPUT
 from palpate.environment import given
-from palpate.run.placement import PlacementError, placement
+from palpate.run.group import placement
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.runtime.group import Group
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_conductor.outcome import Timing
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 
 ROLES = (*WORKERS, *OBSERVERS)
@@ -66,7 +67,7 @@ def test_what_cannot_be_placed_is_refused_by_name(options: list[str], words: str
 
 
 def test_a_program_that_is_none_of_ours_shares_no_process() -> None:
-    with pytest.raises(PlacementError, match=r"tissue is played by `\./my_tissue`"):
+    with pytest.raises(UserError, match=r"tissue is played by `\./my_tissue`"):
         ServiceProcess("tissue", ("./my_tissue",), {}).shared_words()
     assert ServiceProcess("tissue", service.command("tissue", "elastic"), {}).shared_words() == ("elastic",)
 

@@ -9,9 +9,10 @@ from typer.testing import CliRunner
 from palpate import service
 from palpate.commands import app_for
 from palpate.console import EXIT_BAD_INPUT
-from palpate.run.processes import ProcessListError, compose_file, how, override_files, read_processes
+from palpate.run.processes import compose_file, how, override_files, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
 from palpate.study.spec import load_study
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 
 INHERITED = "${PALPATE_SETTINGS:-}"
@@ -34,7 +35,7 @@ def test_every_role_of_a_run_is_in_the_compose_file() -> None:
 def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: str) -> None:
     path = tmp_path / "docker-compose.yml"
     path.write_text(text)
-    with pytest.raises(ProcessListError) as caught:
+    with pytest.raises(UserError) as caught:
         read_processes(path, ("robot",))
     assert str(path) in str(caught.value)
     assert error in str(caught.value)
@@ -42,7 +43,7 @@ def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: st
 
 def test_a_missing_compose_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_COMPOSE", "no/such/file.yml")
-    with pytest.raises(ProcessListError, match=r"no/such/file\.yml"):
+    with pytest.raises(UserError, match=r"no/such/file\.yml"):
         compose_file()
 
 

@@ -8,7 +8,7 @@ from queue import Empty, SimpleQueue
 import pytest
 import zenoh
 
-from palpate.replay.play import Player, PlayError
+from palpate.replay.play import Player
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
@@ -16,6 +16,7 @@ from palpate_bus.recordings import open_recording
 from palpate_bus.wire.liveliness import GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import topic_key, unpack
 from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_errors import UserError
 
 CONTROL = Path(__file__).parent / "references" / "control.mcap"
 RULES = contract()
@@ -86,6 +87,6 @@ def test_it_does_not_speak_over_a_living_service_nor_move_one(
             player.play()
             assert player.sent > 0
     else:
-        with pytest.raises(PlayError, match=said):
+        with pytest.raises(UserError, match=said):
             Player(open_recording(CONTROL), topics=[topic], listen=endpoint, drive=drive)
     tokens.undeclare()

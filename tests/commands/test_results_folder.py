@@ -14,15 +14,16 @@ from PIL import Image
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.page import write_page
 from palpate.report.results import write_results
-from palpate.run.folder import FolderError, _locked, results_folder, unless_begun
+from palpate.run.folder import _locked, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_name import name_run, run_of
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 
 
 def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(FolderError, match=r"there is thesis\.tex in it"), results_folder(tmp_path):
+    with pytest.raises(UserError, match=r"there is thesis\.tex in it"), results_folder(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 
@@ -67,14 +68,14 @@ def test_what_was_to_be_overwritten_comes_back_when_the_run_cannot_begin(tmp_pat
 
 def test_a_folder_with_a_scenario_of_its_user_is_not_removed(tmp_path: Path) -> None:
     (tmp_path / "scenario.yaml").write_text("name: mine\n", encoding="utf-8")
-    with pytest.raises(FolderError, match="not removed"), results_folder(tmp_path, overwrite=True):
+    with pytest.raises(UserError, match="not removed"), results_folder(tmp_path, overwrite=True):
         pass
     assert (tmp_path / "scenario.yaml").exists()
 
 
 def test_overwriting_removes_nothing_that_is_not_of_a_run(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(FolderError, match="not removed"), results_folder(tmp_path, overwrite=True):
+    with pytest.raises(UserError, match="not removed"), results_folder(tmp_path, overwrite=True):
         pass
     assert (tmp_path / "thesis.tex").exists()
 
@@ -83,7 +84,7 @@ def test_overwriting_removes_nothing_that_is_not_of_a_run(tmp_path: Path) -> Non
 def test_two_runs_cannot_have_one_folder_at_a_time(tmp_path: Path, overwrite: bool) -> None:
     with results_folder(tmp_path / "out") as out:
         (out / "scenario.yaml").write_text("", encoding="utf-8")
-        with pytest.raises(FolderError, match="a run is writing into it"), results_folder(out, overwrite=overwrite):
+        with pytest.raises(UserError, match="a run is writing into it"), results_folder(out, overwrite=overwrite):
             pass
         assert (out / "scenario.yaml").exists()
 
@@ -106,12 +107,12 @@ def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path) -> None:
     for name in ("one", "two"):
         write_scenario_files(scenario, tmp_path / name)
         write_results(tmp_path / name, scenario, result(collected()))
-    shutil.copy(tmp_path / "one" / "evidence.npz", tmp_path / "two")
+    shutil.copy(tmp_path / "one" / "evidence.mcap", tmp_path / "two")
     with pytest.raises(EvidenceError, match="these are two runs"):
         write_page(tmp_path / "two")
 
 
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("", encoding="utf-8")
-    with pytest.raises(FolderError, match="cannot be made a folder"), results_folder(tmp_path / "out"):
+    with pytest.raises(UserError, match="cannot be made a folder"), results_folder(tmp_path / "out"):
         pass

@@ -8,7 +8,7 @@ from toy_runs import run_toys
 
 from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
-from palpate.run.self_test import RATES, Kept, measure
+from palpate.run.self_test import RATES, TimingResult, measure
 from palpate_bus.messages.stamps import NS
 from palpate_models.scenario.load import load_scenario
 
@@ -26,7 +26,7 @@ from palpate_models.scenario.load import load_scenario
     ],
 )
 def test_the_greatest_rate_that_was_kept_is_chosen(ticks: float, late_ms: float, rate: float | None) -> None:
-    assert Kept(ticks, late_ms).rate == rate
+    assert TimingResult(ticks, late_ms).rate == rate
 
 
 def test_the_measurement_is_of_this_machine() -> None:
@@ -35,7 +35,7 @@ def test_the_measurement_is_of_this_machine() -> None:
     assert kept.late_ms > 0.0
 
 
-def told(monkeypatch: pytest.MonkeyPatch, kept: Kept, tissue: str = "winkler") -> float:
+def told(monkeypatch: pytest.MonkeyPatch, kept: TimingResult, tissue: str = "winkler") -> float:
     monkeypatch.setattr(examine, "measure", lambda: kept)
     scenario = load_scenario("clean", [f"services.tissue={tissue}"])
     return examine._rate(scenario)
@@ -45,20 +45,20 @@ def test_a_run_says_what_rate_it_takes_or_why_it_does_not_begin(
     monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     monkeypatch.delenv("PALPATE_RATE", raising=False)
-    assert told(monkeypatch, Kept(1.0, 1.0)) == 1.0
+    assert told(monkeypatch, TimingResult(1.0, 1.0)) == 1.0
     assert capsys.readouterr().err == ""
-    assert told(monkeypatch, Kept(0.4, 12.0)) == 0.25
+    assert told(monkeypatch, TimingResult(0.4, 12.0)) == 0.25
     assert "keeps 0.25 of real time now: in a second three processes woke for 40 % of their ticks" in capsys.readouterr().err
     for kept, tissue, why in (
-        (Kept(0.01, 900.0), "winkler", "cannot keep 0.1 of real time"),
-        (Kept(0.4, 1.0), "none", "hardware"),
+        (TimingResult(0.01, 900.0), "winkler", "cannot keep 0.1 of real time"),
+        (TimingResult(0.4, 1.0), "none", "hardware"),
     ):
         with pytest.raises(typer.Exit) as refused:
             told(monkeypatch, kept, tissue)
         assert refused.value.exit_code == EXIT_BAD_INPUT
         assert why in capsys.readouterr().err
     monkeypatch.setenv("PALPATE_RATE", "0.5")
-    assert told(monkeypatch, Kept(1.0, 1.0)) == RATES[1]
+    assert told(monkeypatch, TimingResult(1.0, 1.0)) == RATES[1]
 
 
 def test_time_goes_as_slowly_as_was_asked_for() -> None:

@@ -14,10 +14,11 @@ from rich.console import Console
 
 from palpate.console import EXIT_FAILED
 from palpate.run.conclusion import conclude
-from palpate.run.folder import FolderError, WatchedRoom, another_folder, check_room, what_it_takes
+from palpate.run.folder import WatchedRoom, another_folder, check_room, what_it_takes
 from palpate.run.outlook import Outlook
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
+from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Exam, Mode
 
@@ -30,12 +31,12 @@ def leave(megabytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
 
 def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     leave(40, monkeypatch)
-    with pytest.raises(FolderError, match=r"40 MB are free there, and this run needs about \d{2} MB; without recordings"):
+    with pytest.raises(UserError, match=r"40 MB are free there, and this run needs about \d{2} MB; without recordings"):
         check_room(tmp_path, Exam(), "normal")
     check_room(tmp_path, Exam(), "none")
     leave(100, monkeypatch)
     check_room(tmp_path, Exam(), "normal")
-    with pytest.raises(FolderError, match=r"100 MB are free there, and this run needs about \d{3} MB"):
+    with pytest.raises(UserError, match=r"100 MB are free there, and this run needs about \d{3} MB"):
         check_room(tmp_path, Exam(), "full")
 
 

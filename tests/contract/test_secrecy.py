@@ -13,7 +13,7 @@ import pytest
 
 from palpate.run import composed, processes
 from palpate.run.forks import Forks
-from palpate.run.placement import apart
+from palpate.run.group import apart
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, workers, write_scenario_files
 from palpate_bus.contract import contract

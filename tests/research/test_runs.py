@@ -10,12 +10,12 @@ import pytest
 
 from palpate.quick.case import run_quick
 from palpate.report.results import truth_of_run
-from palpate.run.repeat import ProcessSample, Soak, read_growths, read_samples
 from palpate_models.scenario.load import load_scenario
 from research import depth as depth_study
 from research import reassessed, soak
 from research.depth import Depths, met_by
 from research.disturbances import ROWS, Disturbance, examined, line
+from research.soak import ProcessSample, Soak, read_growths, read_samples
 
 
 def test_errors_are_parted_into_those_of_strokes_and_those_within() -> None:
@@ -49,7 +49,7 @@ def test_what_was_noted_is_drawn_and_told(tmp_path: Path, capsys: pytest.Capture
     lines = [",".join(ProcessSample.__dataclass_fields__), *(",".join(map(str, astuple(sample))) for sample in samples)]
     (folder / "soak.csv").write_text("\n".join(lines) + "\n", encoding="utf-8")
     assert read_samples(folder) == samples
-    noted = Soak.of(samples)
+    noted = Soak(samples)
     noted.write(folder)
     assert read_growths(folder) == noted.growths()
     soak.main([folder], tmp_path / "soak.png")

@@ -56,7 +56,7 @@ def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
         assert outcome.report is not None
         hashes.append(outcome.report.run_hash)
     kept = tmp_path / "True" / "runs" / one[0].case_id
-    assert {"scenario.yaml", "evidence.npz", "report.html"} <= {path.name for path in kept.iterdir()}
+    assert {"scenario.yaml", "evidence.mcap", "report.html"} <= {path.name for path in kept.iterdir()}
     assert not (tmp_path / "False" / "runs").exists()
     assert hashes[0] == hashes[1] != ""
 

@@ -1,0 +1,220 @@
+"""Interrupted runs: results from what was recorded (`palpate report --recover`), and their continuation (`palpate run --resume`).
+
+A run that continues DIR has its results in DIR/resumed, and one that continues that in DIR/resumed/resumed.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from collections import deque
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from itertools import chain
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+
+from palpate.environment import given
+from palpate.replay.rerun import rerun
+from palpate.report.archive import (
+    EvidenceError,
+    InterruptedRun,
+    NothingRecordedError,
+    completed,
+    inputs,
+    interrupted_run,
+    tick_after,
+)
+from palpate.report.evidence import points
+from palpate_assessment.sampling import columns
+from palpate_assessment.service import AssessmentService
+from palpate_bus.contract import contract
+from palpate_bus.implementations import create
+from palpate_bus.messages import ExamState, codec
+from palpate_bus.messages.geometry import vector
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.recordings import RecordedMessage, RecordingError
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.settings import variable
+from palpate_conductor.collector import Collected
+from palpate_conductor.outcome import RunResult, gave_up
+from palpate_models.numerics.frames import apply, inverse
+from palpate_models.scenario.checkpoint import Checkpoint
+from palpate_models.scenario.load import exam_input, seen, view_of
+from palpate_models.scenario.schema import Scenario
+
+FOLDER: Final = "resumed"
+"""Within the folder of the run that is continued."""
+RUNTIME: Final = "recovered"
+
+
+def recovered(folder: Path) -> tuple[Scenario, RunResult]:
+    """Return the scenario and the results of the interrupted run in `folder`, without a run hash.
+
+    If it ended before the findings, the assessment that the scenario names processes the recorded examination again.
+
+    Raises EvidenceError if the run is still on, is complete, or has no recording.
+    """
+    if completed(folder) is not None:
+        raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
+    run = interrupted_run(folder)
+    note = ""
+    checkpoint, earlier = _before(folder.resolve())
+    collected, recording = run.collected, run.recording
+    if collected.findings is None or not collected.findings.final:
+        try:
+            with checkpoint_given(checkpoint):
+                _assess(run)
+        except RecordingError as error:
+            raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
+        except Exception as error:  # a user-defined assessment, which may have ended the run
+            note = f"; the assessment could not finish: {type(error).__name__}: {error}"
+    why = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
+    text = f"recovered from an unfinished run: the recording ends at {recording.last / NS:.3f} s"
+    return run.scenario, RunResult(
+        runtime=RUNTIME,
+        collected=collected,
+        run_hash=None,
+        digests={},
+        sim_time_s=recording.last / NS,
+        wall_time_s=0.0,
+        start_time_s=0.0,
+        blame={},
+        counters={},
+        failure=Failure(FailureCode.UNFINISHED, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
+        lost={"conductor": recording.last},
+        earlier=earlier,
+    )
+
+
+def _assess(run: InterruptedRun) -> None:
+    """Runs the assessment to its end on what was recorded."""
+    scenario, recording, collected = run.scenario, run.recording, run.collected
+    exam = collected.exam
+    if exam is None:
+        return
+    rules, row = contract(), contract().topics["exam/state"]
+    end = tick_after(recording.last, "assessment")
+    exam.phase, phase = ExamState.PHASE_ABORTED, exam.phase
+    over = RecordedMessage(end, row.name, codec.encode(exam, row.type), len(collected.exam_states) + 1)
+    exam.phase = phase
+    service = create("assessment", scenario.services.assessment, seen(scenario, view_of("assessment")))
+    received = chain(inputs(recording, "assessment"), [over])
+    for sent in rerun(service, rules, received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
+        if sent.topic == "assessment/map":
+            collected.stiffness_map = codec.decode(sent.payload, rules.topics[sent.topic].type)
+        elif sent.topic == "assessment/findings":
+            collected.findings = codec.decode(sent.payload, rules.topics[sent.topic].type)
+
+
+@dataclass(frozen=True)
+class Resumption:
+    """An examination to continue."""
+
+    folder: Path
+    """Folder of the continuation."""
+    scenario: Scenario
+    checkpoint: Checkpoint
+    earlier: tuple[Collected, ...]
+    """Messages of the interrupted runs, oldest first."""
+
+    @property
+    def summary(self) -> str:
+        """What is continued, for the user."""
+        left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
+        return f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples are there{left}"
+
+
+def resumption(folder: Path) -> Resumption:
+    """Return how to continue the run in `folder`, or the latest continuation of it.
+
+    Raises EvidenceError if it was completed, is still on, or has no recording, no samples, or no targets left.
+    """
+    while _holds_run(folder / FOLDER):
+        folder /= FOLDER
+    if completed(folder) is not None:
+        raise EvidenceError(f"--resume {folder}: its run was completed")
+    runs = _runs(folder)
+    reached = _reached(runs)
+    if not len(reached.felt.time):
+        raise EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
+    if not len(reached.left) and not runs[-1].scenario.exam.searched:
+        raise EvidenceError(f"--resume {folder}: all targets were reached; palpate report {folder} --recover has its findings")
+    return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs))
+
+
+def _holds_run(folder: Path) -> bool:
+    """True if a folder has a run that can be continued, or that is completed or still on; not one killed at its start."""
+    if not (folder / "scenario.yaml").is_file():
+        return False
+    try:
+        return completed(folder) is not None or interrupted_run(folder) is not None
+    except NothingRecordedError:
+        return False
+
+
+def _before(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
+    """Return checkpoint and messages of the runs that the one in `folder` continued; None and () if it continued none."""
+    if folder.name != FOLDER or not (folder.parent / "scenario.yaml").is_file():
+        return None, ()
+    runs = _runs(folder.parent)
+    return _reached(runs), tuple(run.collected for run in runs)
+
+
+@contextmanager
+def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
+    """Passes a checkpoint to services that are made meanwhile. Its path is neutral: the results folder may name the patient."""
+    if checkpoint is None:
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="palpate-") as place:
+        path = Path(place) / "checkpoint.npz"
+        path.write_bytes(checkpoint.bytes())
+        with given({variable("checkpoint"): str(path)}):
+            yield
+
+
+def _runs(folder: Path) -> list[InterruptedRun]:
+    """Return the run in a folder, and before it those that it continued."""
+    folders = [folder.resolve()]
+    while folders[0].name == FOLDER and (folders[0].parent / "scenario.yaml").is_file():
+        folders.insert(0, folders[0].parent)
+    return [interrupted_run(one) for one in folders]
+
+
+def _reached(runs: list[InterruptedRun]) -> Checkpoint:
+    """Return the checkpoint at the end of the last of some runs, each of which continued the one before."""
+    reached: Checkpoint | None = None
+    for run in runs:
+        reached = _after(run, reached)
+    assert reached is not None
+    return reached
+
+
+def _after(run: InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+    known, c = exam_input(run.scenario), run.collected
+    assessment = AssessmentService(known, earlier)
+    if c.surface is not None:
+        assessment.perceive(c.surface)
+    motions = deque(c.motions)
+    for state in c.exam_states:
+        while motions and nanoseconds(motions[0].header.stamp) <= nanoseconds(state.header.stamp):
+            assessment.add_motion(motions.popleft())
+        assessment.take(state)
+    X_AW = inverse(np.array(known.X_WA))
+    if c.surface is None or c.targets is None:  # before the first view of the surface
+        surface, left = (np.empty((0, 3)), np.empty((0, 2))) if earlier is None else (earlier.surface, earlier.left)
+    else:
+        surface = apply(X_AW, points(c.surface))
+        targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
+        wanted = range(len(targets)) if earlier is None else earlier.wanted(targets, run.scenario.exam.spacing_m)
+        left = targets[[i for i in sorted(wanted) if i >= _latest(c.exam_states)]]
+    strokes = max((int(state.stroke) for state in c.exam_states), default=0)
+    return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)
+
+
+def _latest(exam_states: Iterable[Any]) -> int:
+    """Return the latest target with steady contact; it is palpated again, since its stroke continues from there."""
+    return max((int(state.target_index) for state in exam_states if state.steady), default=0)
