@@ -18,9 +18,7 @@ from palpate.replay.golden import GoldenCase, make_reference, prepare, replay_se
 from palpate.replay.play import Player
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
-from palpate_bus.recordings import RecordingError, open_recording
-from palpate_bus.settings import BusConfigError
-from palpate_models.scenario.load import ScenarioError
+from palpate_bus.recordings import open_recording
 from palpate_plugins import PluginError
 
 
