@@ -42,8 +42,8 @@ def noticed(folder: Path) -> Noticed:
     """Return the detection of the motion in the run of a folder. Raises EvidenceError or ScenarioError."""
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
     at_s = BodyMotion(scenario.phantom.motion, scenario.seed).at_s
-    detected = np.array([event.time_s for event in evidence.events if event.words == NOTICED])
-    looked = np.array([event.time_s for event in evidence.events if event.words.startswith(f"{NOTICED}: ")])
+    detected = np.array([event.time_s for event in evidence.events if event.text == NOTICED])
+    looked = np.array([event.time_s for event in evidence.events if event.text.startswith(f"{NOTICED}: ")])
     during = (evidence.true_time >= at_s) & (evidence.true_time < at_s + LIFTED_S)
     over = at_s > evidence.time[-1]
     return Noticed(

@@ -237,8 +237,11 @@ def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: st
     states = _columns(c.exam_states)
     contacts = columns_of(((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in c.indentation), _CONTACT)
     known, uncertainty = _depth_known(c, states)
+    reported: dict[str, Any] = {
+        name: states[name] for name in ("time", "phase", "depth", "setpoint", "force", *_FLAGS, "visited", "skipped")
+    }
     return Evidence(
-        **{name: states[name] for name in ("time", "phase", "depth", "setpoint", "force", *_FLAGS, "visited", "skipped")},
+        **reported,
         **contacts,
         depth_known=known,
         uncertainty=uncertainty,

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-from palpate.run.group import Groups, UserError, apart
+from palpate.run.group import Groups, apart
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
@@ -18,6 +18,7 @@ from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.handover import ROLES
 from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, Timing
+from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 
