@@ -1,20 +1,84 @@
-"""What `palpate check` does: runs the suite of a role, here or on the bus, and prints the outcome."""
+"""Runs the conformance suite of a role, in this process or on a bus, with a progress bar, and prints the result."""
 
 from __future__ import annotations
 
 import os
+import shlex
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
 
 import typer
+from rich.console import Console, RenderableType
+from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
 from palpate.check.live_rig import LiveRig
-from palpate.check.progress import CheckDisplay
 from palpate.check.report import ConformanceReport, Verdict
-from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.starting import started
-from palpate.check.suites import check
+from palpate.check.rig import Rig, RigSettings, ServiceRig
+from palpate.check.suites import LASTS_S, check
 from palpate.console import table, wide_console
 from palpate_bus import implementations
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runs.joining import NoBus
 from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_models.scenario.load import dump_scenario, view_of
+
+
+@contextmanager
+def started(words: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
+    """Starts the implementation for the time of the check, if its command was given."""
+    if words is None:
+        yield
+        return
+    with tempfile.TemporaryDirectory(prefix="palpate-check-") as folder:
+        view = view_of(role)
+        file = Path(folder) / f"{view}.yaml"
+        file.write_text(dump_scenario(settings.scenario, view), encoding="utf-8")
+        environment = {
+            **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
+            "PALPATE_OUT": folder, "PALPATE_RECORD": "none", "ROS_DOMAIN_ID": str(domain),
+        }  # fmt: skip
+        split = shlex.split(words)
+        try:
+            child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
+        except OSError as error:
+            raise NoBus(f"--start {words}: {error}") from error
+        try:
+            yield
+            child.wait(timeout=5)
+        except subprocess.TimeoutExpired:
+            pass
+        finally:
+            for end in (child.terminate, child.kill):
+                if child.poll() is None:
+                    end()
+                    with suppress(subprocess.TimeoutExpired):
+                        child.wait(timeout=5)
+
+
+class CheckDisplay(Progress):
+    """A bar that follows the clock of a rig, for a `with` block; nothing where there is no terminal."""
+
+    def __init__(self, rig: Rig, report: ConformanceReport) -> None:
+        """Reads rig and report about ten times a second while the suite runs."""
+        console = Console(stderr=True)
+        text = TextColumn("{task.description}, {task.fields[checks]} checks")
+        columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
+        super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
+        self._rig, self._report = rig, report
+        self._shown = self.add_task(rig.role.name, total=LASTS_S[rig.role.name], checks=0)
+
+    def get_renderables(self) -> Iterable[RenderableType]:
+        """Updates the task and returns what to draw; rich calls it at each refresh."""
+        if self.task_ids:  # rich also draws before there is a task
+            about = f"{self._rig.role.name}: {self._report.group}"
+            checks = len(self._report.results)
+            self.update(self._shown, completed=self._rig.t / NS, description=about, checks=checks)
+        yield from super().get_renderables()
+
 
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED: "dim"}
 
@@ -29,7 +93,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
 def check_live(
     role: str, settings: RigSettings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
 ) -> ConformanceReport:
-    """Waits for an implementation on the bus, and checks it there. Raises NoBus where none comes."""
+    """Waits for an implementation on the bus and checks it there. Raises NoBus if none joins."""
     options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
     report = ConformanceReport(role)
     with session(options) as bus:
@@ -48,7 +112,7 @@ def check_live(
 
 
 def print_report(report: ConformanceReport, failures: bool) -> None:
-    """Prints each check, or with `failures` what failed alone, and the verdict."""
+    """Prints each check, or with `failures` only failed ones, and the verdict."""
     out = wide_console()
     rows = table("", "check", "expected", "got")
     group = ""

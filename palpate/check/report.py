@@ -1,4 +1,4 @@
-"""What a conformance check found."""
+"""Results of a conformance check."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 
 
 class Verdict(StrEnum):
-    """How one check went."""
+    """Verdict of one check."""
 
     PASSED = "passed"
     FAILED = "failed"
@@ -24,7 +24,7 @@ class Result:
     verdict: Verdict
     expected: str = ""
     got: str = ""
-    """What came, or why it was skipped."""
+    """The value received, or the reason for a skip."""
 
 
 @dataclass
@@ -36,29 +36,29 @@ class ConformanceReport:
     group: str = ""
 
     def section(self, name: str) -> None:
-        """What follows is about this."""
+        """Begins a group of checks."""
         self.group = name
 
     def expect(self, name: str, ok: bool, expected: object, got: object) -> bool:
-        """Takes a check; returns whether it passed."""
+        """Records a check; returns True if it passed."""
         verdict = Verdict.PASSED if ok else Verdict.FAILED
         self.results.append(Result(self.group, name, verdict, str(expected), str(got)))
         return ok
 
     def skip(self, name: str, why: str) -> None:
-        """Takes note of a check that was not made."""
+        """Records a check that was not made."""
         self.results.append(Result(self.group, name, Verdict.SKIPPED, "", why))
 
     @property
     def failed(self) -> list[Result]:
-        """Checks that failed."""
+        """Failed checks."""
         return [result for result in self.results if result.verdict is Verdict.FAILED]
 
     @property
     def passed(self) -> bool:
-        """Whether something was checked and nothing failed."""
+        """True if at least one check passed and none failed."""
         return not self.failed and any(result.verdict is Verdict.PASSED for result in self.results)
 
     def as_json(self) -> dict[str, Any]:
-        """For `--json`."""
+        """Return the report as JSON data."""
         return {"role": self.role, "passed": self.passed, "results": [asdict(result) for result in self.results]}

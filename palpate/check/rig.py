@@ -28,7 +28,7 @@ class HeardMessage(NamedTuple):
     """A message of the implementation."""
 
     t: int
-    """When it came [ns], on the rig's clock."""
+    """Time of receipt [ns], on the rig's clock."""
     message: Any
     sequence: int
     sent: int
@@ -37,41 +37,41 @@ class HeardMessage(NamedTuple):
 
 @dataclass(frozen=True)
 class RigSettings:
-    """How a check is to be done."""
+    """Settings of a check."""
 
     scenario: Scenario
     slack_ms: float = 150.0
-    """What transport and an ordinary scheduler may add to a reaction of a live implementation."""
+    """Allowance for transport and scheduling of a live implementation."""
     motion: bool = True
-    """Whether the implementation may be moved: never on a real arm without its operator's consent."""
+    """True if the implementation may move; on a real arm this needs its operator's consent."""
 
 
 class Rig(ABC):
     """One implementation of a role under test."""
 
     live = False
-    """Whether it runs in real time and the implementation is a separate process."""
+    """True for a separate process in real time."""
 
     def __init__(self, role: str, settings: RigSettings, rules: Contract | None = None) -> None:
         self.rules = rules or contract()
         self.role = self.rules.roles[role]
         self.settings = settings
         self.log: dict[str, list[HeardMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}
-        """Everything that the implementation sent, by topic."""
+        """All messages of the implementation, by topic."""
         self.undecodable: list[str] = []
-        """What it sent that is no message, a sentence each."""
+        """Descriptions of payloads that could not be decoded."""
         self.t = 0
         """Now [ns]."""
         self.memory: dict[str, int] = {}
-        """What a suite keeps from one check to the next."""
+        """State that a suite keeps between checks."""
 
     @property
     def slack(self) -> int:
-        """What transport and an ordinary scheduler may add to a reaction [ns]; nothing in simulated time."""
+        """Allowance for transport and scheduling [ns]; 0 in simulated time."""
         return round(self.settings.slack_ms * MS) if self.live else 0
 
     def run(self, seconds: float, feed: Feed) -> dict[str, list[HeardMessage]]:
-        """Lets time pass while `feed` is sent; returns what the implementation sent meanwhile, by topic."""
+        """Advances by `seconds` while `feed` is sent; returns the messages received in this time, by topic."""
         before = {name: len(heard) for name, heard in self.log.items()}
         self._advance(self.t + round(seconds * 1e9), feed)
         return {name: heard[before[name] :] for name, heard in self.log.items()}
@@ -83,7 +83,7 @@ class Rig(ABC):
 
     @abstractmethod
     def _advance(self, end: int, feed: Feed) -> None:
-        """Lets time pass up to `end` [ns]."""
+        """Advances to `end` [ns]."""
 
     @abstractmethod
     def send(self, topic: str, message: Message) -> None:
@@ -91,7 +91,7 @@ class Rig(ABC):
 
     @abstractmethod
     def lose(self, role: str) -> None:
-        """Tells the implementation that a role is gone."""
+        """Reports a role as lost."""
 
 
 class ServiceRig(Rig):

@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 
 from palpate.check.live_rig import LiveRig
+from palpate.check.perform import started
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.starting import started
 from palpate.check.suites import LASTS_S, SUITES, check
 from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, names

@@ -16,9 +16,9 @@ import numpy as np
 import pytest
 
 from palpate.check.live_rig import LiveRig
+from palpate.check.perform import started
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings
-from palpate.check.starting import started
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet
 from palpate_bus.contract import contract
