@@ -21,7 +21,7 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 FLAT = """
-from palpate_models.phantom import flat_phantom
+from palpate_models.patient.phantom import flat_phantom
 from palpate_models.section import Pose
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.service import TissueService

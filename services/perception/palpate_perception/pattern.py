@@ -1,6 +1,6 @@
 """Steps 4 and 5 of the paper's point-cloud processing: down-sampling to palpation points, and their order.
 
-Which points, and in which order, is the scan pattern's to say (`palpate_models.patterns`).
+Which points, and in which order, is the scan pattern's to say (`palpate_models.scenario.patterns`).
 """
 
 from __future__ import annotations
