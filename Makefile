@@ -32,8 +32,13 @@ test-browser: install  ## opens the dashboard of live runs in headless Chromium
 bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench
 
-lint: install  ## first what is amiss in the pages, which decides nothing
-	@$(BIN)/python -m pytest -q -m "pages" --tb=line tests 2>&1 | sed -n '/^FAILED/s/^/pages: /p; $$s/^/pages: /p'
+# The folders whose English is checked: docstrings, comments, messages and pages.
+PLAIN := *.md .ci .github asv compose dashboards docs fmus research services/assessment services/camera services/conductor \
+	services/recorder services/search
+lint: install  ## code, types, imports, pages and plain English
+	$(BIN)/python -m pytest -q -m "pages" tests
+	$(BIN)/codespell -D - -D .codespell-house-words.txt $$(git ls-files $(PLAIN) | grep -vE '\.(png|gif|csv|json|html|parquet|mcap)$$')
+	$(BIN)/python tests/plain_english.py $(PLAIN)
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy

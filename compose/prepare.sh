@@ -1,7 +1,7 @@
 #!/bin/sh
-# The first container of a run, started as root: lets the services' user write into the results folder, whoever made it, and
-# writes the scenario files there as that user. PALPATE_SETTINGS holds overrides a.b=c, separated by spaces. Who may not know
-# the patient is given a volume with a file of its own.
+# The first container of a run, started as root: makes the results folder writable for the services' user and writes the scenario
+# files as that user. PALPATE_SETTINGS has overrides a.b=c, separated by spaces. Services that may not know the patient get a volume
+# with their own file.
 set -euf
 chmod 1777 /results
 for setting in ${PALPATE_SETTINGS:-}; do

@@ -45,14 +45,14 @@ MARGINS: Final[dict[str, tuple[float, str]]] = {
     "ratio_error": (0.10, "ratio of findings over the true one, less one"),
     "mean_force_N": (0.25, "mean measured force [N]"),
 }
-"""What is compared, the margin of its mean difference, and what it is."""
+"""Compared figures: name, margin of the mean difference, description."""
 _SHOWN: Final = 150
 """Places of a map in the plot."""
 
 
 @dataclass(frozen=True, eq=False)
 class Tier:
-    """What one tier made of a case."""
+    """Result of one tier for a case."""
 
     figures: dict[str, float]
     """By the names of MARGINS; NaN where it has none."""

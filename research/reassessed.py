@@ -1,4 +1,4 @@
-"""Recorded examinations assessed again by the assessment of now: as they are, and with one more error in what was measured.
+"""Recorded examinations assessed again by the current assessment: unchanged, and with one more error in what was measured.
 
     palpate run healthy --seed 1000 --composed --record normal -o runs/1000 --set errors=none ...
     OPENBLAS_NUM_THREADS=1 python -m research.reassessed runs/* --row "depth off by 1 mm"
@@ -37,7 +37,7 @@ from palpate_models.scenario.schema import Scenario
 from research.felt_scans import FIELD_LENGTH_M
 
 Change = Callable[[Any, float], None]
-"""What a row does to a state of the examination; with 1 or -1, the sign of the patient's disturbance."""
+"""Change of a state of the examination; with 1 or -1, the sign of the patient's disturbance."""
 
 
 def _deeper(state: Any, sign: float) -> None:

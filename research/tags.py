@@ -2,7 +2,7 @@
 
     python -m research.tags [PAIRS]
 
-The examinations are equal to the bit, so that processor time compares them; the time they take depends on what else is going on.
+The examinations are equal to the bit, so that processor time compares them; the time they take depends on other load.
 """
 
 from __future__ import annotations

@@ -80,7 +80,7 @@ def faults(path: Path) -> Iterator[str]:
     )
     for line, text, kind in texts(source):
         shown = f"{path.relative_to(ROOT)}:{line}"
-        flat = " ".join(text.split())
+        flat = " ".join(re.sub(r"`[^`]*`", " ", text).split()) if kind != "name" else text
         if kind == "name":
             yield f"{shown}: a house word in a name: {flat}"
             continue

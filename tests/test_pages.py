@@ -38,8 +38,8 @@ def parse(words: list[str]) -> None:
     command: Any = typer.main.get_command(app_for(words[0]))
     while getattr(command, "commands", None):
         assert words, "a command is missing"
-        if words[0] not in command.commands and (usual := getattr(command, "usual", None)):
-            words.insert(0, usual)
+        if words[0] not in command.commands and "run" in command.commands:  # `palpate study NAME`
+            words.insert(0, "run")
         assert words[0] in command.commands, f"no command {words[0]!r} among {', '.join(command.commands)}"
         command = command.commands[words.pop(0)]
     context = command.context_class(command)

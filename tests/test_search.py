@@ -13,7 +13,7 @@ import palpate
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
 from palpate_search.choice import policy
-from research.search.whole import told
+from research.search.whole import summary
 
 CENTRE = (0.04, -0.03)
 STILL = {"breathing": {"kind": "none"}}
@@ -77,7 +77,7 @@ def test_a_lump_that_was_missed_counts_as_the_whole_budget() -> None:
             {**one, "seed": 2, "lump": False, "found": False, "presses": 12, "place_error_m": np.nan, "false_findings": 1},
         ]
     )
-    said = "\n".join(told(rows))
+    said = "\n".join(summary(rows))
     assert "found 1 of 2" in said
     assert "presses 60 (" in said
     assert "no finding 0 of 1" in said

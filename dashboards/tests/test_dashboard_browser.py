@@ -23,7 +23,7 @@ from palpate_dashboard.sinks import Live
 from palpate_models.scenario.schema import Scenario
 
 SCENE = {"skin": (palette.SKIN, 4, 0.001), "table": (palette.SHEET, 4, 0.001)}
-"""What the scene must show: colour, reach of its hue [deg], part of the page (of a small region 0.003 is skin)."""
+"""Required content of the scene: colour, reach of its hue [deg], part of the page (of a small region 0.003 is skin)."""
 CURVE = {"curve": (palette.FORCE, 6, 0.0001)}
 
 
@@ -78,7 +78,7 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> n
 
 
 def start(words: list[str], environment: dict[str, str], log: IO[str] | None = None) -> subprocess.Popen[bytes]:
-    """A command that heeds Ctrl+C: what a shell starts in the background ignores it, and that is inherited."""
+    """Start a command that responds to Ctrl+C, which processes in the background of a shell ignore by inheritance."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     try:
         return subprocess.Popen(words, env=environment, stdout=log, stderr=log)

@@ -87,10 +87,10 @@ def test_a_recording_in_several_files_is_read_whole(tmp_path: Path) -> None:
 
 def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) -> None:
     record(tmp_path, 1.0)
-    heard: list[int] = []
-    assert replay.main(tmp_path, heard.append) == tmp_path / FILE
-    assert heard == sorted(heard)
-    assert heard[-1] >= 0.9e9
+    received: list[int] = []
+    assert replay.main(tmp_path, received.append) == tmp_path / FILE
+    assert received == sorted(received)
+    assert received[-1] >= 0.9e9
 
     def interrupted(t: int) -> None:
         raise KeyboardInterrupt

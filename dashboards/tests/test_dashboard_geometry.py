@@ -1,4 +1,4 @@
-"""What the dashboard computes before it draws."""
+"""Geometry that the dashboard computes before it draws."""
 
 from __future__ import annotations
 

@@ -67,7 +67,7 @@ WAITS = ("sim/contact_wrench", "sim/surface", "grant")
 
 
 def draw(path: Path, messages: Iterable[tuple[int, Messages]], without: tuple[str, ...] = ()) -> dict[str, Any]:
-    rr.set_strict_mode(True)  # else the library logs its errors and goes on
+    rr.set_strict_mode(True)  # else the library logs its errors and continues
     service = DashboardService(Scenario(name="test"), path, Live())
     inbox = FakeInbox()
     for t, new in messages:

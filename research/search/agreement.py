@@ -1,8 +1,8 @@
-"""How far the surrogate's presses are from those of the true tissue: `python -m research.search.agreement`.
+"""Difference of presses on the surrogate from those on the true tissue: `python -m research.search.agreement`.
 
 The same patients, places and errors of the examination, pressed by both hands. What counts for a search is the logarithm of the
 force: its
-level, which is the patient's own and which the posterior finds, and what is left of the difference beside that.
+level, which is the patient's own and which the posterior finds, and what is left of the difference besides that.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def main(
     print(
         f"{number} patients, {PRESSES} presses each: log-force differs in level by {level.mean():.3f} "
         f"(95 %: {level.mean() - half:.3f} to {level.mean() + half:.3f}), SD over patients {level.std(ddof=1):.3f}; "
-        f"beside that SD {rest.std():.3f}, 95 % within {np.quantile(np.abs(rest), 0.95):.3f}"
+        f"besides that SD {rest.std():.3f}, 95 % within {np.quantile(np.abs(rest), 0.95):.3f}"
     )
 
 

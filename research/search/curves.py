@@ -1,4 +1,4 @@
-"""What the study of searches says: `python -m research.search.curves out/search-study` prints the table and draws the curves.
+"""Results of the study of searches: `python -m research.search.curves out/search-study` prints the table and draws the curves.
 
 The threshold of each policy is the SPECIFICITY quantile, over healthy tuning patients, of the greatest probability within the
 budget. A lump is found at the press after which it is first said to be near a place within NEAR_M of where it is; one that is
@@ -160,7 +160,7 @@ def main(
     folder: Annotated[Path, typer.Argument(help="Folder of trials.")] = Path("out/search-study"),
     hand: Annotated[str, typer.Option(help="Trials of which hand.")] = "surrogate",
     picture: Annotated[Path | None, typer.Option(help="Where to draw the curves.")] = None,
-    outcome: Annotated[Path | None, typer.Option(help="Where to write what came of each search, as a CSV file.")] = None,
+    outcome: Annotated[Path | None, typer.Option(help="CSV file of the results of each search.")] = None,
 ) -> None:
     """Compare the policies of the trials in a folder."""
     files = sorted(folder.glob(f"{hand}-*.csv"))

@@ -21,7 +21,7 @@ from palpate_search.presses import Budget
 
 FRAMES_PER_S: Final = 3
 _LAST: Final = 6
-"""So often the last frame is shown."""
+"""Number of repetitions of the last frame."""
 
 
 def main(

@@ -46,7 +46,7 @@ SETTINGS: Final[dict[str, Any]] = {
 }
 TEACHER: Final = "informed"
 ASTRAY: Final = 0.15
-"""Share of the teacher's presses that go to a random place: it shows how to go on from there, too."""
+"""Share of the teacher's presses that go to a random place: it shows how to continue from there."""
 PASSES: Final = 8
 """Through all that the teacher showed."""
 
@@ -66,16 +66,16 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
         """The first maps."""
-        observed, told = self._env.reset(seed=seed, options=options)
-        return observed["maps"], told
+        observed, given = self._env.reset(seed=seed, options=options)
+        return observed["maps"], given
 
     def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
         """A press of the usual depth at a place, or of the greatest."""
         depth, row, column = np.unravel_index(int(action), (2, *self._shape[1:]))
         share = 2.0 * np.array((row / (self._shape[1] - 1), column / (self._shape[2] - 1))) - 1.0
         press = np.array((*share, self._env.usual_depth if depth == 0 else 1.0), dtype=np.float32)
-        observed, reward, over, cut, told = self._env.step(press)
-        return observed["maps"], reward, over, cut, told
+        observed, reward, over, cut, given = self._env.step(press)
+        return observed["maps"], reward, over, cut, given
 
     def shown(self) -> int:
         """The action that the teacher would take."""
@@ -158,7 +158,7 @@ class LearningCurve(BaseCallback):
 
 
 def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], float]:
-    """Of the teacher with each patient: maps (n, layers, nx, ny), its actions (n,), what came of them (n,), mean reward."""
+    """Of the teacher with each patient: maps (n, layers, nx, ny), its actions (n,), rewards (n,), mean reward."""
     env = Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))
     seen: list[NDArray[np.float32]] = []
     chosen: list[int] = []

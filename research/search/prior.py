@@ -1,4 +1,4 @@
-"""What bellies and errors are like, for the posterior: `python -m research.search.prior`.
+"""Amplitudes of natural variation and errors for the posterior: `python -m research.search.prior`.
 
 The amplitudes of its Gaussian model (`palpate_search.posterior`) by maximum likelihood over healthy tuning patients, each pressed
 at random places by the surrogate.

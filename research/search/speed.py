@@ -17,7 +17,7 @@ _KINDS: Final[tuple[tuple[Literal["surrogate", "patient"], bool, int], ...]] = (
     ("surrogate", True, 20),
     ("patient", False, 2),
 )
-"""Who presses, whether with maps, and how many episodes a round has."""
+"""Hand, use of maps, and number of episodes per round."""
 
 
 def rate(env: SearchEnv, episodes: int) -> float:
@@ -34,7 +34,9 @@ def rate(env: SearchEnv, episodes: int) -> float:
     return episodes * PRESSES / spent
 
 
-def main(rounds: Annotated[int, typer.Option(min=1, help="The median is told, with the least and the greatest.")] = 5) -> None:
+def main(
+    rounds: Annotated[int, typer.Option(min=1, help="The median is reported, with the least and the greatest.")] = 5,
+) -> None:
     """Measure how fast an agent can learn, by each hand."""
     for hand, maps, episodes in _KINDS:
         env = SearchEnv(hand, presses=PRESSES, maps=maps)

@@ -1,6 +1,6 @@
 """The study of searches: the same patients by every policy. `python -m research.search.study` makes the trials.
 
-Each trial goes on for the whole budget, and what was known is kept after each press. All policies have one judge, the posterior:
+Each trial uses the whole budget, and what was known is kept after each press. All policies have one judge, the posterior:
 a lump is said to be near the most probable place when its probability exceeds a threshold, which is chosen for each policy on
 healthy tuning patients (`curves`).
 """
@@ -48,7 +48,7 @@ def run(seeds: Sequence[int], hand: str, names: Sequence[str], out: Path) -> Non
 def main(
     first_seed: Annotated[int, typer.Option(min=0, help="Of the patients; below 1000 they tune thresholds.")] = 1000,
     number: Annotated[int, typer.Option("-n", min=1, help="Patients; every second one has a lump.")] = 100,
-    every: Annotated[int, typer.Option(min=1, help="Only every so many-th seed; 2 for healthy patients alone.")] = 1,
+    every: Annotated[int, typer.Option(min=1, help="Step between seeds; 2 for healthy patients alone.")] = 1,
     hand: Annotated[str, typer.Option(help=f"Who presses: {', '.join(HANDS)}.")] = "surrogate",
     names: Annotated[list[str] | None, typer.Option("--policy", help="Only these policies.")] = None,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where the trials are.")] = Path("out/search-study"),

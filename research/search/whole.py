@@ -50,8 +50,8 @@ def examined(seed: int, name: str, folder: Path) -> dict[str, Any]:
     }
 
 
-def told(rows: pd.DataFrame) -> Iterator[str]:
-    """What came of the examinations, a line for each policy and kind of patient. Misses count as the whole budget of presses."""
+def summary(rows: pd.DataFrame) -> Iterator[str]:
+    """Yield a line for each policy and kind of patient. Misses count as the whole budget of presses."""
     rng = np.random.default_rng(0)
     for name, mine in rows.groupby("policy"):
         ill, healthy = mine[mine.lump], mine[~mine.lump]
@@ -80,7 +80,7 @@ def main(
     wanted = [(seed, name) for seed in range(first_seed, first_seed + number) for name in names or ["informed"]]
     frame = pd.DataFrame([examined(seed, name, out / f"{seed}-{name}") for seed, name in track(wanted, "examining")])
     frame.to_csv(out / FILE, index=False, float_format="%.6g")
-    print(f"{frame.seed.nunique()} patients", *told(frame), sep="\n")
+    print(f"{frame.seed.nunique()} patients", *summary(frame), sep="\n")
 
 
 if __name__ == "__main__":

@@ -1,6 +1,6 @@
 """Scans without a robot: a sphere slid over the real tissue along a snake, with the errors that measuring has.
 
-`python bench_assessment_scans.py [SEEDS]` prints what the assessment makes of many phantoms.
+`python bench_assessment_scans.py [SEEDS]` prints the results of the assessment on many phantoms.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ FORCE_SD = 0.03
 
 
 class FakeInbox:
-    """What a step receives, by topic."""
+    """Messages of a step, by topic."""
 
     def __init__(self, messages: dict[str, list[Any]]) -> None:
         self._messages = messages
@@ -64,7 +64,7 @@ class Scan:
 
 
 def truth_of(scenario: Scenario) -> Truth:
-    """What can truly be felt. The sphere is laterally where it is believed to be."""
+    """True apparent stiffness. The sphere has no lateral error."""
     model = build_phantom(scenario.phantom, scenario.seed)
     body = TrueBody(model.vertices, model.triangles, matrix(true_pose(scenario)))
     pressed = press_patient(scenario)
@@ -215,7 +215,7 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
 
 
 def scored(data: Scan) -> Scores:
-    """The scores of what the service makes of a scan."""
+    """The scores of the service on a scan."""
     stiffness_map, findings, _ = examine(data)
     return score(found_of(findings.findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
 

@@ -1,4 +1,4 @@
-"""Tensed muscle and lump: what is seen of a muscle, and what that makes of the probabilities."""
+"""Signs of a muscle around a lump, and their effect on probabilities."""
 
 from __future__ import annotations
 

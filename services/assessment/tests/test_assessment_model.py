@@ -105,7 +105,7 @@ def test_a_lump_in_the_model_takes_its_contrast() -> None:
     assert covariance[0, 0] > 0
 
 
-def test_the_zero_of_the_force_is_told_by_the_strokes_and_makes_the_level_unsure() -> None:
+def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain() -> None:
     zeros = 0.25 * np.random.default_rng(0).standard_normal(20)
     wall = natural(1, 0.1)
     steady = lines(lambda xy: LEVEL + wall(xy))

@@ -59,7 +59,7 @@ def test_a_sample_that_was_forgotten_does_not_come_out() -> None:
     assert sampler.add(state(8, depth=-0.01, counts=False, touching=False)) is None
 
 
-def test_time_in_contact_starts_anew_with_each_stroke() -> None:
+def test_time_in_contact_restarts_with_each_stroke() -> None:
     first = [state(k, x=0.0003 * k) for k in range(100)]
     gap = [state(100, depth=-0.01, counts=False, touching=False)]
     second = [state(101 + k, x=0.05 + 0.0003 * k) for k in range(100)]

@@ -36,7 +36,7 @@ def followed_for(breath: SeenBreath, seconds: float, delay: float = 0.15) -> lis
     return settled
 
 
-def test_depth_is_as_it_would_have_been_told_with_the_breath_known() -> None:
+def test_depth_is_corrected_by_the_measured_breathing() -> None:
     breath = SeenBreath()
     breath.perceive(VERTICES, SHARES)
     settled = followed_for(breath, 5.0)
@@ -64,10 +64,10 @@ def test_a_camera_that_falls_silent_holds_nothing_back_for_longer_than_half_a_se
         breath.take(state(0.01 * k))
         late += [(0.01 * k - one.time, one) for one in breath.settled()]
     assert max(delay for delay, _ in late) <= 0.5 + 1e-9
-    assert late[-1][1].depth == pytest.approx(DEPTH - true_breath(late[-1][1].time)), "as it was told"
+    assert late[-1][1].depth == pytest.approx(DEPTH - true_breath(late[-1][1].time)), "as it was reported"
 
 
-def test_between_images_too_far_apart_depth_stays_as_told() -> None:
+def test_depth_is_unchanged_between_distant_images() -> None:
     time, depth, followed = np.array((0.1, 0.7, 1.3)), np.full(3, DEPTH), np.zeros(3)
     images = (np.array((0.0, 0.2, 1.2, 1.4)), np.full(4, 0.002))
     assert depth_seen(time, depth, followed, np.ones(3), images) - DEPTH == pytest.approx((0.002, 0.0, 0.002))

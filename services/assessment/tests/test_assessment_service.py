@@ -33,7 +33,7 @@ def small() -> Scan:
 
 @pytest.fixture(scope="module")
 def truth(small: Scan) -> Truth:
-    """What can be felt there."""
+    """True apparent stiffness there."""
     return truth_of(small.scenario)
 
 

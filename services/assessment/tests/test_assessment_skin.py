@@ -32,9 +32,9 @@ def correction(count: int) -> Message:
     return SurfaceCorrection(header(20 * NS, "abdomen"), outward, sigma)
 
 
-def sample(time: float, told: float, x: float = 0.02) -> ForceSample:
-    """Felt where the skin was taken to lie `told` [m] outward of the perceived wall."""
-    position = np.array((x, 0.0, 0.75 * x)) + told * SLOPE
+def sample(time: float, reported: float, x: float = 0.02) -> ForceSample:
+    """Sample whose skin was assumed `reported` [m] outward of the perceived wall."""
+    position = np.array((x, 0.0, 0.75 * x)) + reported * SLOPE
     return ForceSample(time, position, SLOPE, np.zeros(3), 0.010, 2.0, 0.01, 1.0, False, 1, 5e-4)
 
 
@@ -46,11 +46,11 @@ def test_depth_counts_from_where_the_skin_was_after_all() -> None:
     assert [s.depth_uncertainty for s in again] == pytest.approx((1e-4, 1e-4))
 
 
-def test_what_was_felt_before_the_look_or_beside_the_surface_stays() -> None:
+def test_samples_before_the_scan_or_off_the_surface_are_unchanged() -> None:
     skin = skin_of(wall(), correction(9), X_AW)
     assert skin is not None
-    before, beside = sample(9.0, 0.0), replace(sample(12.0, 0.0), position=np.array((0.3, 0.0, 0.2)))
-    assert skin.again([before, beside]) == [before, beside]
+    before, other = sample(9.0, 0.0), replace(sample(12.0, 0.0), position=np.array((0.3, 0.0, 0.2)))
+    assert skin.again([before, other]) == [before, other]
 
 
 def test_a_correction_of_another_surface_is_none() -> None:

@@ -149,7 +149,7 @@ class Conductor:
         exited: Callable[[], Mapping[str, str]] = dict,
         tell: Callable[[Conductor], None] = lambda _: None,
     ) -> RunOutcome:
-        """Run to the end. `exited` gives the roles whose process ended, with a text that says how; `tell` is called often.
+        """Run to the end. `exited` gives the roles whose process ended, with a text of the reason; `tell` is called often.
 
         Raises RunFailed if the run cannot start; later failures, KeyboardInterrupt included, are in the outcome.
         """

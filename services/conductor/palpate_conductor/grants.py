@@ -36,7 +36,7 @@ class Grants:
         self._send = send
         self._realtime, self._limit, self._wallclock = timing.realtime, timing.limit, timing.wallclock
         self.horizon = NEVER
-        """Last granted tick [ns]; in wall-clock mode the start by the wall clock, then the end."""
+        """Last granted tick [ns]; in wall-clock mode the start in Unix time, then the end."""
         self.last = False
         """True if the run ends there."""
         self.paused = False

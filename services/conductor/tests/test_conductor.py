@@ -65,7 +65,7 @@ def test_kept_messages_take_less_than_a_quarter_of_the_memory() -> None:
 # -- heartbeat and frozen processes
 
 
-def test_a_process_without_a_connection_is_told_from_one_that_exited() -> None:
+def test_a_process_without_a_connection_is_distinguished_from_one_that_exited() -> None:
     child = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE)
     watch = FreezeWatch(Patience())
     watch.add("planning", {"pid": child.pid, "home": pid_space()})

@@ -1,4 +1,4 @@
-"""What recording costs: time a message and bytes on disk, by compression, for the traffic of an examination in contact.
+"""Cost of recording: time per message and bytes on disk, by compression, for the traffic of an examination in contact.
 
 python services/recorder/tests/bench_recorder.py [SIMULATED SECONDS]
 """

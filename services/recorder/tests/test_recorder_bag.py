@@ -357,7 +357,7 @@ def test_on_a_small_disk_room_is_left_for_the_report(small_disk: Path) -> None:
 
 
 def test_a_write_error_ends_the_recording_and_not_the_run(small_disk: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """As above, but it fills up faster than anybody looks."""
+    """As above, but the disk fills up between two checks."""
     monkeypatch.setattr("palpate_recorder.service.SPARE_BYTES", 0)
     service = RecorderService(small_disk / RECORDING)
     record(service, 10_000)

@@ -152,8 +152,8 @@ class Posterior:
     @property
     def noise_m(self) -> float:
         """SD of the next press's depth error under that model [m], taken from the latest press."""
-        told = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
-        return float(self._models[self.likeliest][1] * told)
+        reported = self.presses[-1].depth_uncertainty if self.presses else self.task.depth_uncertainty
+        return float(self._models[self.likeliest][1] * reported)
 
     def contrast(self) -> tuple[Array, Array]:
         """Return mean and variance of the log-contrast under each hypothesis, shape (h,) each, by the most probable model."""
