@@ -172,6 +172,7 @@ _SEQUENCES: Final = ("exam_states", "indentation", "motions", "samples", "status
 
 def _collected(evidence: Recording) -> Collected:
     """Return what `_messages` wrote."""
+    evidence.check(contract(), list(evidence.types))
     fields = {topic: field for field, topic in _TOPICS.items()}
     kept: dict[str, Any] = {field: [] for field in _SEQUENCES}
     for message in evidence.messages(list(evidence.types)):
