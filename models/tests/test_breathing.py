@@ -88,7 +88,7 @@ def test_the_seed_decides_the_breaths():
     np.testing.assert_array_equal(first.table, again.table)
     assert abs(first.excursion(1.0) - other.excursion(1.0)) > 1e-5
     phases = [table(seed)[0, 0] for seed in range(60)]
-    assert np.ptp(phases) > 0.8 * 60 / 14  # nobody waits for the examination to begin
+    assert np.ptp(phases) > 0.8 * 60 / 14  # phases do not start with the examination
 
 
 def test_the_held_breath_is_a_stretch_at_rest():

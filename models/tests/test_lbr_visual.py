@@ -35,7 +35,7 @@ def test_arm_has_the_volume_of_a_slender_robot(meshes: dict[str, list[VisualMesh
 
 
 def _outside(points: np.ndarray, capsules: tuple[lbr.Capsule, ...]) -> float:
-    """How far the farthest point is outside all capsules [m]."""
+    """Distance of the farthest point outside all capsules [m]."""
     depth = [cone(c.start, np.add(c.end, (0, 0, 1e-9)), c.radius, c.radius)(points) for c in capsules]
     return float(np.min(depth, axis=0).max())
 

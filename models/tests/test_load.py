@@ -91,6 +91,6 @@ def test_a_setting_is_read_like_a_file() -> None:
         ("exam.region_m=[0.1, 0.1, 0.1]", r"exam\.region_m = .*: want at most 2 values"),
     ],
 )
-def test_a_value_that_cannot_be_is_told_with_its_unit_and_how_many_are_wanted(setting: str, said: str) -> None:
+def test_an_invalid_value_is_reported_with_unit_and_count(setting: str, said: str) -> None:
     with pytest.raises(ScenarioError, match=said):
         load_scenario("healthy", [setting])

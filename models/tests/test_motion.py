@@ -64,7 +64,7 @@ def test_the_seed_decides_moment_and_direction():
     assert sides == {-1, 1}
 
 
-def test_nobody_moves_by_default():
+def test_patients_lie_still_by_default():
     body = BodyMotion(Motion(), 3)
     assert not body.moves
     np.testing.assert_array_equal(body.pose(1e3), np.eye(4))

@@ -95,7 +95,7 @@ def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:
         ("HEAD\ndef scan(exam, surface):\n    return Scan([])", "0 targets, want 1 to"),
     ],
 )
-def test_a_file_that_is_no_pattern_is_told_with_its_line(tmp_path: Path, text: str | None, said: str) -> None:
+def test_an_invalid_pattern_file_is_reported_with_its_line(tmp_path: Path, text: str | None, said: str) -> None:
     file = tmp_path / "mine.py"
     if text is not None:
         file.write_text(text.replace("HEAD", "import numpy as np\nfrom palpate_models.scenario.patterns import Scan"))

@@ -184,7 +184,7 @@ def test_under_fat_the_wall_is_two_springs_in_series() -> None:
     assert under_fat(wall, MEASURED_FAT_M) == wall
 
 
-def test_moments_are_told_apart() -> None:
+def test_moments_are_distinguished() -> None:
     rng = np.random.default_rng(0)
     count, places = 4000, 5
     mix = np.array([[0.2, 0.0, 0.0], [0.05, 0.1, 0.0], [-0.1, 0.1, 0.3]])

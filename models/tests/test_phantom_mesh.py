@@ -208,7 +208,7 @@ def test_a_lesion_beside_the_body_is_refused():
         ({"workspace_min_m": (0.8, 0.0, 0.0)}, "want -3 <= min < max <= 3"),
     ],
 )
-def test_limits_that_would_protect_nobody_are_refused(settings, words):
+def test_limits_without_effect_are_refused(settings, words):
     with pytest.raises(ValueError, match=words):
         Limits(**settings)
 

@@ -342,7 +342,7 @@ def test_a_clock_that_is_set_back_makes_no_gap_wider() -> None:
 
 
 def test_silent_sender_is_braked_smoothly() -> None:
-    """Set-points stop: the motion goes on for the bridging time, brakes within 25 ms and stands."""
+    """Set-points stop: the motion continues for the bridging time, brakes within 25 ms and stands."""
     guide = Extrapolator(10 * MS)
     guide.accept(at(0, 0.0, 0.1), 0)
     values = [guide.at(t * MS) for t in range(200)]
@@ -366,7 +366,7 @@ def test_change_of_mode_starts_afresh() -> None:
     np.testing.assert_allclose(now.motion.qdd, 0.0)
 
 
-def test_joint_setpoints_tell_their_acceleration_within_bounds() -> None:
+def test_joint_setpoints_determine_their_acceleration_within_bounds() -> None:
     guide = Extrapolator(10 * MS)
     guide.accept(at(0, 0.0, 0.0, ControlMode.JOINT), 0)
     guide.accept(at(10 * MS, 0.0, 0.05, ControlMode.JOINT), 10 * MS)

@@ -188,7 +188,7 @@ def moving() -> tuple[Arm, Stream]:
     return arm, stream
 
 
-def test_a_controller_whose_clock_was_set_back_is_heard_on(moving: tuple[Arm, Stream]) -> None:
+def test_a_controller_whose_clock_was_set_back_is_still_obeyed(moving: tuple[Arm, Stream]) -> None:
     arm, stream = moving
     assert arm.update(100 * MS, stream.at(100 * MS, START - 3_600_000_000_000))
     assert arm.received == 100 * MS
@@ -217,7 +217,7 @@ def stamps(rig: Rig, ticks: int, topic: str) -> list[int]:
     return found
 
 
-def test_joint_states_carry_the_time_at_which_the_state_was_heard() -> None:
+def test_joint_states_carry_the_time_at_which_the_state_was_received() -> None:
     rig = Rig(period_ms=5)
     rig.tick(101)
     assert stamps(rig, 10, "joint_states") == [1, 2, 3, 4, 0] * 2

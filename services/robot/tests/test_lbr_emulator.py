@@ -53,7 +53,7 @@ def test_a_sleep_that_is_a_little_long_does_no_harm() -> None:
     assert min(b - a for a, b in pairwise(began)) >= PERIOD // 2
 
 
-def test_an_address_that_is_in_use_is_told_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_address_that_is_in_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
         taken.listen()

@@ -1,4 +1,4 @@
-"""A driver that dies in contact: the stack goes on pushing, the watchdog does not let it."""
+"""A driver that dies in contact: the stack continues to push, the watchdog does not let it."""
 
 from __future__ import annotations
 
@@ -120,7 +120,7 @@ def test_a_driver_that_wakes_and_hears_the_watchdog_holds(rig: Rig) -> None:
     assert np.abs(rig.port.torques[-1]).max() < 0.5, "damping alone"
 
 
-def test_a_release_lasts_only_when_nobody_else_commands(rig: Rig) -> None:
+def test_a_release_lasts_only_without_another_commander(rig: Rig) -> None:
     rig.port.commanded_by = [b"watchdog"]
     rig.tick(20)
     release(rig)
@@ -139,7 +139,7 @@ def test_a_new_driver_takes_over_from_a_watchdog_that_still_commands() -> None:
     assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
 
 
-def heard(port: Any, count: int) -> list[bytes]:
+def received(port: Any, count: int) -> list[bytes]:
     found: list[bytes] = []
     begin = time.monotonic()
     while len(found) < count and time.monotonic() - begin < 20.0:
@@ -148,7 +148,7 @@ def heard(port: Any, count: int) -> list[bytes]:
     return found
 
 
-def test_over_zenoh_the_sender_of_every_command_is_told(tmp_path: Path) -> None:
+def test_over_zenoh_every_command_has_its_sender(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
     node = RosNode("watchdog", 0, BusOptions(listen=(endpoint,)))
     topic, command = "lbr/command/torque", LBRTorqueCommand(np.zeros(7), np.zeros(7))
@@ -162,12 +162,12 @@ def test_over_zenoh_the_sender_of_every_command_is_told(tmp_path: Path) -> None:
             port.command(np.zeros(7), np.zeros(7))
             time.sleep(0.005)
         assert set(first) == {watchdog.gid}, "the port's own commands are not those of another"
-        driver = (set(heard(lambda: commands.others(watchdog.gid), 1))).pop()
+        driver = (set(received(lambda: commands.others(watchdog.gid), 1))).pop()
         time.sleep(0.2)
         commands.take()
         for publisher in (watchdog, new, watchdog):
             publisher.publish(command)
-        assert heard(lambda: commands.others(watchdog.gid), 1) == [new.gid], "not hidden by the newer one of the watchdog"
+        assert received(lambda: commands.others(watchdog.gid), 1) == [new.gid], "not hidden by the newer one of the watchdog"
         assert len({driver, new.gid, watchdog.gid}) == 3
     finally:
         port.close()

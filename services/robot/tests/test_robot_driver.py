@@ -54,7 +54,7 @@ def test_idle_until_the_first_valid_command() -> None:
     driver = Driver(EMERGENCY)
     assert not _update(driver, 0, None).any()
     assert not _update(driver, 5 * MS, _command(MS, valid_ms=0)).any()
-    assert driver.mode is DriverMode.IDLE, "a command that is born expired is no command"
+    assert driver.mode is DriverMode.IDLE, "a command that is already expired is ignored"
     np.testing.assert_array_equal(_update(driver, 6 * MS, _command(5 * MS)), np.full(7, 2.0))
     assert driver.mode is DriverMode.ACTIVE
 
@@ -132,7 +132,7 @@ def test_a_force_that_is_no_number_holds(active: Driver) -> None:
 
 
 def test_a_jump_of_the_torque_holds(active: Driver) -> None:
-    """What a damaged message looks like: every number in its range, and none that the controller can have meant."""
+    """A damaged message: every number in its range, and none that the controller can have meant."""
     for tick in range(1, 40):
         torque = np.full(7, 2.0) + np.eye(7)[3] * 0.9 * TUNING.torque_rate_nm_per_ms * tick
         assert _update(active, (tick + 1) * MS, _command(tick * MS, torque)).any()

@@ -1,4 +1,4 @@
-"""What sensors and arm get wrong: each error shows in readings or in motion, by the size that was drawn."""
+"""Errors of sensors and arm: each error shows in readings or in motion, by the size that was drawn."""
 
 from __future__ import annotations
 
@@ -211,8 +211,8 @@ def test_friction_is_that_of_the_true_arm(plant: Any) -> None:
     assert abs(expected / (4.0 / 20.0) - 1) > 0.05
 
 
-def test_the_service_measures_another_tool_pose_than_the_true_one_and_tells_the_nominal_arm() -> None:
-    """What others compute from joint_states and robot_description is off by the drawn errors; without them it is exact."""
+def test_the_service_measures_another_tool_pose_than_the_true_one_and_reports_the_nominal_arm() -> None:
+    """The pose computed from joint_states and robot_description is off by the drawn errors; without them it is exact."""
     found = []
     for errors in ("none", "poor"):
         scenario = Scenario(seed=5, errors=Errors(level=errors))  # type: ignore[arg-type]
@@ -220,8 +220,8 @@ def test_the_service_measures_another_tool_pose_than_the_true_one_and_tells_the_
         assert service.start()["robot_description"].data == lbr.urdf(scenario.robot)
         sent = service.step(0, HandInbox())
         p = sent["sim/tool_state"].pose.position
-        told = tool_pose(sent["joint_states"].position, scenario.robot)[:3, 3]
-        found.append(np.linalg.norm(told - (p.x, p.y, p.z)))
+        reported = tool_pose(sent["joint_states"].position, scenario.robot)[:3, 3]
+        found.append(np.linalg.norm(reported - (p.x, p.y, p.z)))
     assert found[0] < 1e-5
     drawn = draw_errors(Errors(level="poor"), 5).arm
     lengths = DartPlant(Robot(), drawn=drawn).tool_motion()[:3] - DartPlant(Robot()).tool_motion()[:3]
@@ -236,9 +236,9 @@ def test_the_emulated_arm_has_the_errors_and_the_driver_does_not_know_them() -> 
     drawn = draw_errors(scenario.errors, 2)
     emulator = Emulator(plant_input(scenario), Options())
     state, tool = emulator.state(0), emulator.tool(0)
-    told = tool_pose(np.array(state.measured_joint_position), scenario.robot)[:3, 3]
+    reported = tool_pose(np.array(state.measured_joint_position), scenario.robot)[:3, 3]
     p = tool.pose.position
-    assert np.linalg.norm(told - (p.x, p.y, p.z)) > 1e-3
+    assert np.linalg.norm(reported - (p.x, p.y, p.z)) > 1e-3
     off = np.array(state.measured_joint_position) - lbr.HOME
     np.testing.assert_allclose(off, drawn.arm.zero_rad, atol=1e-4 * 60 + 3e-4)
     f = emulator.wrench(0).wrench.force

@@ -74,7 +74,7 @@ def excited(robot: Robot, q: np.ndarray, ticks: int = 400) -> Iterator[tuple[Muj
 
 @pytest.mark.parametrize(("friction", "part"), [(0.0, 1.0), (Robot().joint_friction_nm, 0.95)])
 def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float, part: float) -> None:
-    """What is left is half a millisecond of motion. Where a joint turns round, friction jumps, one step earlier or later."""
+    """The difference is half a millisecond of motion. Where a joint turns round, friction jumps, one step earlier or later."""
     positions, errors, readings = [], [], []
     for mujoco, dart in excited(Robot(joint_friction_nm=friction), postures(1, seed=3)[0]):
         p, p_dart = mujoco.tool_motion()[:3], dart.tool_motion()[:3]

@@ -142,7 +142,7 @@ def test_status_carries_the_means_since_the_last_one(rig: Rig) -> None:
     np.testing.assert_allclose([wrench.force.x, wrench.force.z, wrench.torque.y], mean[14:], atol=1e-12)
 
 
-def test_obeys_torque_and_tells_it(rig: Rig) -> None:
+def test_obeys_torque_and_reports_it(rig: Rig) -> None:
     rig.servo(600, lbr.HOME + 0.02)
     assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
     np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME + 0.02, atol=2e-3)
@@ -238,7 +238,7 @@ def test_in_contact_with_tissue_that_stands_still_it_holds(rig: Rig) -> None:
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_DEVICE)
 
 
-def test_a_controller_that_gives_up_is_heard_however_far_its_clock_is_ahead(rig: Rig) -> None:
+def test_a_controller_that_gives_up_is_obeyed_however_far_its_clock_is_ahead(rig: Rig) -> None:
     rig.servo(50)
     late = COMMAND(header(rig.t + 180 * MS), np.zeros(7), duration_message(0), "joint_states are 34 ms old")
     rig.inbox.messages["control/joint_torque"] = late

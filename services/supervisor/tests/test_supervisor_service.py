@@ -1,4 +1,4 @@
-"""The supervisor with messages that are no good."""
+"""The supervisor with messages that are invalid."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def test_a_measurement_that_is_only_repeated_is_silence() -> None:
 
 
 @pytest.mark.parametrize(("vertices", "normals"), [(4, 6), (6, 5), (6, 9), (9, 6)])
-def test_a_surface_that_is_none_stops_softly_and_ends_nobody(vertices: int, normals: int) -> None:
+def test_an_invalid_surface_stops_softly_and_ends_no_process(vertices: int, normals: int) -> None:
     mesh = SurfaceMesh(
         header(0), np.zeros(vertices, np.float32), np.zeros(normals, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
     )

@@ -260,7 +260,7 @@ def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> 
     assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
 
 
-def test_a_driver_is_given_time_to_hear_of_its_release_and_no_more() -> None:
+def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
     latch = Latch()
     latch.update(0, [DRIVER], False)
     latch.update(10 * MS, [DRIVER], True)

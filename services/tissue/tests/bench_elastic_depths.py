@@ -1,7 +1,7 @@
 """Can a lesion be felt at its depth? Scans without a robot over the elastic body, with the errors that measuring has.
 
-`python bench_elastic_depths.py [DEPTH_MM ...]` prints what the assessment makes of `deep_lesion` with its lesion at each depth:
-the figures of the README. It uses the assessment's own bench of scans (services/assessment/tests).
+`python bench_elastic_depths.py [DEPTH_MM ...]` prints the results of the assessment for `deep_lesion` with its lesion at
+each depth. It uses the assessment's own bench of scans (services/assessment/tests).
 """
 
 from __future__ import annotations

@@ -250,7 +250,7 @@ def test_breathing_lifts_the_skin_into_the_sphere() -> None:
     start, inspiration, expiration, pause, _ = breathing.table[1]
     steps = round(1000 * (start + inspiration + expiration + pause))
     forces = [tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.015)), STILL, 0.015)[0][2] for k in range(steps)]
-    assert max(forces[500:]) > 0.5  # at the first step somebody is in the middle of a breath: that is a jump
+    assert max(forces[500:]) > 0.5  # a jump at the first step: the patient is in the middle of a breath
     assert forces[round(1000 * (start + inspiration))] == pytest.approx(max(forces[500:]), rel=0.05)
     assert forces[-1] == 0
 
@@ -278,7 +278,7 @@ def test_a_position_that_is_no_number_is_refused() -> None:
 
 OFFSETS = ((0.0, 0.0), (0.00075, 0.0), (0.0, 0.00087), (0.0004, 0.00025))
 
-"""Where the sphere presses, against the lattice [m]: a result must not depend on it."""
+"""Place of the sphere relative to the lattice [m]: a result must not depend on it."""
 
 
 def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:

@@ -46,7 +46,7 @@ def plane(half_m: float) -> PhantomModel:
 
 @cache
 def fine() -> PhantomModel:
-    """So fine that a press at any place of the lattice is the same within a percent or two."""
+    """Mesh so fine that a press at any place of the lattice is the same within a percent or two."""
     return flat_phantom(0.05, 0.0025)
 
 
@@ -61,7 +61,7 @@ def layer(half_m: float = 0.045) -> Compliance:
 
 
 def reach(beside_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets springs act as far beside the sphere."""
+    """Lets springs act away from the sphere."""
     for name in ("_BESIDE_M", "_BESIDE_MUSCLE_M"):
         monkeypatch.setattr(f"palpate_tissue.backends.elastic.tissue.{name}", beside_m)
 

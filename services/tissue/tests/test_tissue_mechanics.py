@@ -337,8 +337,8 @@ def test_fields_of_small_and_large_meshes_move_alike():
 def reference_step(wall, patch, motion, radius, excursion):
     """The step in numpy and scipy, from the equations of the README: u, y, contact forces f and the force on the sphere."""
     A = csr_array((wall.rate, wall.indices.astype(np.int32), wall.indptr.astype(np.int32)), shape=(len(wall.u),) * 2)
-    beside = stress(wall.u, np.sqrt(wall.spring[0])) + wall.spring[2] * wall.activation * np.maximum(wall.u, 0.0)
-    u = wall.u + A @ (wall.u - wall.y.sum(axis=0)) - wall.share * beside
+    adjacent = stress(wall.u, np.sqrt(wall.spring[0])) + wall.spring[2] * wall.activation * np.maximum(wall.u, 0.0)
+    u = wall.u + A @ (wall.u - wall.y.sum(axis=0)) - wall.share * adjacent
     n, X, (beta, gain) = patch.table[:, :3], patch.table[:, 3:6], patch.table[:, 6:].T
     d = motion[0] - X
     s = -(d * n).sum(axis=1)

@@ -43,7 +43,7 @@ def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 
 def pressed(case: Scenario, X_WA: np.ndarray, make: Callable[[Scenario], Service] = create) -> dict[str, Any]:
-    """What is sent when the indenter presses and slides, along a path in A, on a body that is at X_WA."""
+    """Return the messages when the indenter presses and slides, along a path in A, on a body that is at X_WA."""
     service, inbox, out, start = make(case), OneTopic(), {}, AFTER
     service.start()
     for k in range(start + 151):

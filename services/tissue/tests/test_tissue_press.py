@@ -90,7 +90,7 @@ def test_the_fast_way_is_the_slow_one_on_people(name: str, seed: int) -> None:
 
 
 def test_a_press_lets_voluntary_guarding_fade_by_a_quarter_and_involuntary_stays() -> None:
-    """What is expected is written out by hand: 20 mm/s provoke a quarter of the contraction, a hold at 10 mm provokes nothing."""
+    """The expected value is written by hand: 20 mm/s provoke a quarter of the contraction, a hold at 10 mm provokes nothing."""
     ends = np.array(ENDS_S)
     level = contracted(True, ends, depths(ends))
     at_depth = 0.25 + 0.75 * math.exp(-0.5 / FADING_S)

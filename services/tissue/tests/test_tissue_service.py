@@ -91,7 +91,7 @@ def test_every_output_is_sent_on_its_ticks_encodes_and_lies_in_range():
                 assert (value <= high).all(), (name, field)
 
 
-def test_truth_tells_the_phantom():
+def test_truth_describes_the_phantom():
     case = scenario()
     truth = create(case).start()["truth/phantom"]
     truth = decode(encode(truth, "palpation_msgs/msg/PhantomTruth"), "palpation_msgs/msg/PhantomTruth")
@@ -118,7 +118,7 @@ def test_wrench_and_depth_follow_the_true_pose_of_the_patient():
     np.testing.assert_allclose(forces[1], forces[0], rtol=1e-6, atol=1e-8)
     depths = [out["truth/indentation"].depth for out in outs]
     assert depths[0] == pytest.approx(depths[1], abs=1e-9)
-    assert 0.007 < depths[0] < 0.009  # beside the umbilicus the surface is a little higher
+    assert 0.007 < depths[0] < 0.009  # next to the umbilicus the surface is a little higher
 
 
 def test_indentation_truth_is_consistent_with_the_wrench():
@@ -232,7 +232,7 @@ def test_normals_of_a_dent_are_those_of_the_mesh():
 
 
 def test_a_process_that_stood_still_moves_the_tool_as_fast_as_it_went() -> None:
-    """A millimetre in a tenth of a second, heard of every millisecond, at its end while ticks are caught up, or once and late."""
+    """One millimetre in a tenth of a second: every sample received, only the last while catching up, or one late sample."""
     known = scenario()
     X_WA = matrix(true_pose(known))
 

@@ -46,8 +46,8 @@ def test_the_compiled_springs_are_those_of_the_law():
     tissue.displacement[:] = before
     tissue._wall.activation[0] = tissue.activation
     stiffen(tissue._wall)
-    beside = wall.stress(before, model.stiffening) + 0.7 * model.tension * np.maximum(before, 0.0)
-    np.testing.assert_allclose(tissue.displacement, before - tissue.dt / 0.05 * beside, atol=1e-17)
+    adjacent = wall.stress(before, model.stiffening) + 0.7 * model.tension * np.maximum(before, 0.0)
+    np.testing.assert_allclose(tissue.displacement, before - tissue.dt / 0.05 * adjacent, atol=1e-17)
 
 
 def test_a_wall_without_springs_takes_no_step_for_them():
@@ -198,7 +198,7 @@ def test_voluntary_guarding_returns_with_a_quick_and_with_a_deep_press():
     assert slow == pytest.approx(math.exp(-DEPTH_M / SPEED_MPS / FADING_S), rel=0.01)
     for k in range(500):
         tissue.idle(k * 1e-3)
-    assert tissue.activation == slow  # as it was while nobody touches
+    assert tissue.activation == slow  # unchanged without contact
     even_press(tissue, speed=0.1, depth=0.020)
     assert tissue.activation > 0.85
     tissue.activation = 0.0

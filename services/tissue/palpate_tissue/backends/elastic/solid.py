@@ -48,8 +48,8 @@ def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> Node
 def _axis(half: float, pitch: float) -> tuple[Array, slice]:
     count = int(np.ceil(half / pitch - 1e-9))
     inside = pitch * np.arange(-count, count + 1)
-    beside = inside[-1] + np.cumsum(pitch * 1.6 ** np.arange(1, 6))
-    return np.concatenate((-beside[::-1], inside, beside)), slice(len(beside), len(beside) + len(inside))
+    others = inside[-1] + np.cumsum(pitch * 1.6 ** np.arange(1, 6))
+    return np.concatenate((-others[::-1], inside, others)), slice(len(others), len(others) + len(inside))
 
 
 def _layers(thickness: float, pitch: float) -> Array:

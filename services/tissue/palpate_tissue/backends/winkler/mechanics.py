@@ -81,8 +81,8 @@ def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
     """Return the matrices of a phantom."""
     matrix = stiffness_matrix(model, stiffness)
     damping = stiffness.dashpot_s * model.stiffness * model.areas
-    beside = wall.largest_slope(model.stiffening, model.tension)
-    hardest = matrix + sparse.diags_array(np.where(~model.fixed, model.stiffness * model.areas * beside, 0.0))
+    adjacent = wall.largest_slope(model.stiffening, model.tension)
+    hardest = matrix + sparse.diags_array(np.where(~model.fixed, model.stiffness * model.areas * adjacent, 0.0))
     return Mechanics(matrix, damping, _largest_rate(hardest, damping), _gershgorin(hardest, damping))
 
 
