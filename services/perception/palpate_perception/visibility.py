@@ -142,6 +142,6 @@ def gaps(
         Reason.BEYOND_ABDOMEN: beyond,
         Reason.TOO_FEW_POINTS: inside & ~behind & ~beyond & ~none,
     }
-    shares = {reason: np.count_nonzero(mask) / total for reason, mask in masks.items()}
+    shares = {reason: float(np.count_nonzero(mask)) / total for reason, mask in masks.items()}
     listed = {r: share for r, share in sorted(shares.items(), key=lambda item: -item[1]) if share > 0.005}
     return Gaps(listed, before)

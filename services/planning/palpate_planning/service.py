@@ -11,7 +11,15 @@ import numpy as np
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import Checker
-from palpate_bus.messages import CameraTrigger, OperatorRequest, RobotStatus, SearchRequest, SupervisorState, SurfaceMotion
+from palpate_bus.messages import (
+    CameraTrigger,
+    OperatorRequest,
+    PalpationTargets,
+    RobotStatus,
+    SearchRequest,
+    SupervisorState,
+    SurfaceMotion,
+)
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import header
@@ -147,7 +155,8 @@ class PlanningService(Service):
             return PerceptionFailure(Cause(Reason.VIEW_FAILED, "perception/targets: refused"))
         if not len(targets.positions) or self._mesh is None:
             text = targets.message or "perception found no targets, or no usable surface"
-            return PerceptionFailure(Cause(Reason.VIEW_BLOCKED if "blocked" in text else Reason.VIEW_FAILED, text))
+            blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
+            return PerceptionFailure(Cause(Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED, text))
         try:
             return abdomen_of(self._mesh, targets, self._X_WA)
         except ValueError as error:
