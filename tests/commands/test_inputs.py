@@ -47,7 +47,7 @@ def test_a_setting_that_cannot_be(words: tuple[str, ...]) -> None:
 def test_a_file_that_cannot_be_written(command: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "file: cannot be made a folder" in refused(command, "--out", "file/figures.json")
-    assert "isnofilethatcanbewritten" in refused(command, "--out", str(tmp_path)).replace(" ", "")
+    assert "isnotawritablefile" in refused(command, "--out", str(tmp_path)).replace(" ", "")
 
 
 @pytest.mark.parametrize("words", ["study smoke --out", "reproduce --out", "reproduce --docs", "validate --docs"])
