@@ -26,8 +26,7 @@ from numpy.typing import NDArray
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import SearchCase, case
 from palpate_models.numerics.frames import Array
-from palpate_search.maps import LAYERS, maps, shape
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import LAYERS, Posterior, maps, shape
 from palpate_search.presses import Budget, Task, seconds
 
 ID: Final = "Palpate/Search-v0"
@@ -53,7 +52,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
         An action is place and depth, each scaled to -1..1 over the allowed range. The observation has `history`, one row per
         press: x, y and depth as in an action, the logarithm of the force over 5 N, and 1, or zeros for future presses; and
-        `left`, the share of remaining presses. With maps it has `maps`, the posterior at every place (`palpate_search.maps`).
+        `left`, the share of remaining presses. With maps it has `maps`, the posterior per place (`palpate_search.posterior`).
         """
         if hand not in ("surrogate", "patient"):
             raise ValueError(f"hand = {hand!r}: want surrogate or patient")

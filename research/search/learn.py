@@ -26,7 +26,7 @@ from torch import nn
 
 from palpate.search.environment import SearchEnv
 from palpate_search.choice import policy
-from palpate_search.maps import LAYERS
+from palpate_search.posterior import LAYERS
 
 WIDTH: Final = 16
 """Channels of the hidden layers."""

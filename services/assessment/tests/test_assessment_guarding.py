@@ -9,9 +9,8 @@ import pytest
 from assessment_lines import LEVEL, lines, lump, natural
 
 from palpate_assessment.calibration import learned
-from palpate_assessment.detection import Candidate
+from palpate_assessment.detection import Candidate, Signs, signs
 from palpate_assessment.findings import causes
-from palpate_assessment.guarding import Signs, signs
 from palpate_assessment.model import Bump, Regression, amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample

@@ -10,8 +10,7 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
-from palpate_assessment.detection import Candidate, agreed, matched, strongest
-from palpate_assessment.guarding import Signs
+from palpate_assessment.detection import Candidate, Signs, agreed, matched, strongest
 from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 

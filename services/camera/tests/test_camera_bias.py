@@ -11,9 +11,9 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_camera.backends.kinect.bias import DepthBias, field
+from palpate_camera.backends.kinect.errors import DepthBias, field
 from palpate_camera.backends.kinect.service import CameraService
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.messages import Pinhole
 from palpate_models.scenario.errors import CameraErrors, DrawnCamera, Errors, draw_errors
 from palpate_models.scenario.load import plant_input
 from palpate_models.scenario.schema import Camera, Scenario

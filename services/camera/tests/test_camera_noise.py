@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_camera.backends.kinect.noise import (
+from palpate_camera.backends.kinect.errors import (
     BASELINE_M,
     DISPARITY_STEP_PX,
     GRAZING_RAD,

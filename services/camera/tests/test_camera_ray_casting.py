@@ -7,7 +7,7 @@ import pytest
 import trimesh
 
 from palpate_camera.backends.kinect.scene import Caster, Mesh, Scene
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.messages import Pinhole
 from palpate_models.numerics.frames import apply, inverse, look_at
 
 PINHOLE = Pinhole(160, 120, 150.0, 150.0, 79.5, 59.5)

@@ -1,6 +1,7 @@
-"""Steps 1 to 3 of the paper's point-cloud processing: to world, invalid points out, region of interest.
+"""Point clouds of one camera view: the five steps of the paper's processing, from a depth image to palpation points.
 
-Frames: C is the camera's optical frame (x right, y down, z forward), W world, A the abdomen's registered frame.
+Frames: C is the camera's optical frame (x right, y down, z forward), W world, A the abdomen's registered frame. Patterns in
+`palpate_models.scenario.patterns` choose the points and their order.
 """
 
 from __future__ import annotations
@@ -12,9 +13,32 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.schema import Exam
+
+HEIGHT_M: Final = (-0.16, 0.06)
+"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
+TABLE_CLEARANCE_M: Final = 0.02
+"""Points this near to the table's top are the table."""
+
+
+@dataclass(frozen=True, slots=True)
+class Intrinsics:
+    """Intrinsics and pose from camera_info and tf_static."""
+
+    K: Array
+    """Shape (3, 3), in pixels."""
+    X_WC: Array
+    """Calibrated pose of the optical frame in world, shape (4, 4)."""
+    shape: tuple[int, int]
+    """Height and width of the full image."""
+
+    def same(self, other: Intrinsics) -> bool:
+        """True if the other has the same intrinsics and pose."""
+        return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)
+
 
 JUMP: Final = 0.015
 """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
@@ -133,3 +157,36 @@ def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
     _, sheet = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
     best = np.argmax(np.bincount(sheet, weights=inside.astype(np.float64)))
     return cloud.where(np.asarray(sheet == best, np.bool_))
+
+
+Index = NDArray[np.intp]
+
+
+def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
+    """Step 4: one point for each node of the lattice, as a voxel grid of the lattice's spacing does.
+
+    Returns the nodes' xy [m], shape (len(x) * len(y), 2), lines first, and whether a point of the cloud `p` (in A,
+    shape (n, 3)) lies in a node's cell. The nodes themselves, not the cells' centroids, keep spacing and ends exact.
+    """
+    i, j = (_nearest(s, coordinate) for s, coordinate in ((x, p[:, 0]), (y, p[:, 1])))
+    inside = (i >= 0) & (j >= 0)
+    seen = np.zeros((len(x), len(y)), np.bool_)
+    seen[i[inside], j[inside]] = True
+    nodes = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    return nodes, seen.ravel()
+
+
+def supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
+    """Return the mask of targets, shape (m,), whose cell contains a point of the cloud `p` (in A, shape (n, 3)).
+
+    `xy`: targets in A [m], shape (m, 2); their cells are squares of the side `spacing` [m].
+    """
+    distance, _ = cKDTree(p[:, :2]).query(xy, p=np.inf, distance_upper_bound=spacing / 2)
+    return np.isfinite(distance)
+
+
+def _nearest(station: Array, coordinate: Array) -> Index:
+    """Index of the nearest station, -1 for what is further than half a step."""
+    step = station[1] - station[0] if len(station) > 1 else np.inf
+    i = np.clip(np.rint((coordinate - station[0]) / step), 0, len(station) - 1).astype(np.intp)
+    return np.where(np.abs(coordinate - station[i]) <= step / 2, i, -1)

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_perception import cloud
-from palpate_perception.views import Intrinsics
+from palpate_perception.cloud import Intrinsics
 from palpate_perception.wall import EDGE, steady
 
 NEAR_M: Final = 0.04

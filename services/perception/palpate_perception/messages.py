@@ -13,8 +13,8 @@ from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox
 from palpate_models.numerics.frames import Array
+from palpate_perception.cloud import Intrinsics
 from palpate_perception.tracker import Followed
-from palpate_perception.views import Intrinsics
 
 FRAME: Final = contract().topics["perception/targets"].frame or ""
 """Frame of the surface and the targets."""

@@ -12,11 +12,10 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
-from palpate_perception import cloud, pattern, surface, visibility
-from palpate_perception.cloud import Cloud, RegionBox
+from palpate_perception import cloud, surface, visibility
+from palpate_perception.cloud import HEIGHT_M, TABLE_CLEARANCE_M, Cloud, Intrinsics, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
 from palpate_perception.surface import HeightField
-from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 from palpate_perception.visibility import Gaps, Reason
 from palpate_perception.wall import BreathingMode
 
@@ -132,7 +131,7 @@ class Pipeline:
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
         nodes = scan.targets + shift  # 5
-        known = pattern.supported(p_A, nodes, self._exam.spacing_m)  # 4
+        known = cloud.supported(p_A, nodes, self._exam.spacing_m)  # 4
         p_W, n_W = self._on(field, nodes)
         targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
 
@@ -166,7 +165,7 @@ class Pipeline:
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         x = stations(cx + shift[0], width + 2 * MESH_MARGIN_M, MESH_STEP_M)
         y = stations(cy + shift[1], height + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        nodes, known = pattern.downsample(p_A, x, y)
+        nodes, known = cloud.downsample(p_A, x, y)
         keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
         a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))

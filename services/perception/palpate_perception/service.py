@@ -17,15 +17,13 @@ from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception import messages
-from palpate_perception.cloud import Cloud
-from palpate_perception.follower import Follower
+from palpate_perception.cloud import Cloud, Intrinsics
+from palpate_perception.follower import LONGEST_S, Follower
 from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
-from palpate_perception.views import Intrinsics
 from palpate_perception.visibility import Reason
 from palpate_perception.wall import BreathingMode
-from palpate_perception.watch import LONGEST_S
 
 IMAGE: Final = "camera/depth/image_raw"
 CORRECTED_EVERY_NS: Final = 5 * NS

@@ -14,6 +14,26 @@ each of them (a jackknife, Efron and Stein 1981): with w the weights
     var d = sum_P (d - d_P)^2,   d - d_P = sum_{i in P} w_i m_i (y_i - m_i d) / sum_{i not in P} w_i m_i^2,
 
 half of which is the error of the images that the wall model was fitted to.
+
+Registration of a patient who has moved compares the wall of one scan with that of the previous one, pixel by pixel.
+
+A body on a table shifts along it by s_x, s_y and turns about its long axis by theta. The wall's pixels then measure the outward
+displacement
+
+    y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
+
+with the normals n_i midway between both scans, which leaves no error of second order. Both walls are means over two breaths, so
+the remaining error is the camera's systematic one, not pixel noise.
+
+The mean of all small images corrects the surface of a burst.
+
+A burst lasts two seconds, so camera errors of a few seconds are part of its surface. Small images continue for minutes. Pixel i,
+with the outward displacement y_i of the wall, gives the displacement of the wall without breathing
+
+    r_i = mean of (y_i - m_i d)
+
+over all images in which the arm does not hide it. These displacements are fitted over x and y of A by the smoothing spline of
+the surface.
 """
 
 from __future__ import annotations
@@ -25,11 +45,81 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array
-from palpate_perception.average import WallAverage
+from palpate_models.numerics.frames import Array, apply
+from palpate_perception import surface
 from palpate_perception.breath_filter import BreathFilter
-from palpate_perception.registration import PRIOR, reasons
+from palpate_perception.surface import HeightField
 from palpate_perception.wall import SeenWall
+
+SHIFT_PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
+"""Standard deviations of the rise d [m], s_x, s_y [m] and theta [rad] of a body that moves."""
+SEEN_M: Final = 1.4e-3
+"""Equivalent independent error of a pixel in both scans [m]: 0.7 mm shared by four neighbours (docs/errors.md)."""
+SHIFT_TUKEY: Final = 5.0
+"""Tukey's biweight, in standard deviations of a pixel: clothes and arms move otherwise."""
+SHIFT_ROUNDS: Final = 4
+
+
+def reasons(lifts: Array, n_A: Array, from_middle: Array) -> Array:
+    """Return the outward displacement of pixels by unit d, s_x, s_y and theta, shape (n, 4); theta turns about the middle."""
+    turn = from_middle[:, 2] * n_A[:, 0] - from_middle[:, 0] * n_A[:, 2]  # n . (e_y x p)
+    return np.column_stack((lifts, n_A[:, :2], turn))
+
+
+def shift_between(before: SeenWall, after: SeenWall, middle: Array, drift: float) -> Array:
+    """Return the shift of the skin around `middle` (A, [m], shape (3,)) along the table [m], in A, shape (2,).
+
+    `drift`: drift of the camera's depth between the scans [m]; in an oblique view it would look like a shift.
+    """
+    _, i, j = np.intersect1d(before.pixel, after.pixel, assume_unique=True, return_indices=True)
+    y = 2 * (after.depth[j] - drift - before.depth[i]) / (after.gain[j] + before.gain[i])
+    n_A = (before.n_A[i] + after.n_A[j]) / 2
+    X = reasons((before.lifts[i] + after.lifts[j]) / 2, n_A, (before.p_A[i] + after.p_A[j]) / 2 - middle)
+    motion: Array = np.zeros(4)
+    prior = np.diag(np.array(SHIFT_PRIOR) ** -2.0)
+    weight: Array = np.full(len(y), SEEN_M**-2.0)
+    for _ in range(SHIFT_ROUNDS):
+        motion = np.asarray(np.linalg.solve(X.T @ (weight[:, np.newaxis] * X) + prior, X.T @ (weight * y)))
+        scale = max(SEEN_M, 1.5 * float(np.median(np.abs(y - X @ motion))))
+        weight = np.clip(1 - ((y - X @ motion) / (SHIFT_TUKEY * scale)) ** 2, 0, None) ** 2 / scale**2
+    return np.asarray(motion[1:3])
+
+
+FEWEST: Final = 30
+"""Least number of images of a pixel."""
+LEAST_PIXELS: Final = 12
+"""Fewer pixels over the surface correct nothing."""
+KEPT_M: Final = 2e-4
+"""Error of a pixel's mean [m] [A]; uniform, so it does not change weights."""
+
+
+class WallAverage:
+    """The mean of what each pixel of the wall shows."""
+
+    def __init__(self, wall: SeenWall, watched: int) -> None:
+        """The wall as `watched` images have shown it."""
+        self._wall = wall
+        self._images = np.full(len(wall.pixel), float(watched))
+        self._sum = np.zeros(len(wall.pixel))
+
+    def add(self, still: Array, seen: NDArray[np.bool_]) -> None:
+        """Takes an image: outward displacement without the breath [m], and which pixels showed the wall, shape (n,) each."""
+        self._images += seen
+        self._sum += np.where(seen, still, 0.0)
+
+    def outward_of(self, field: HeightField, X_AW: Array) -> HeightField | None:
+        """Return the outward offset of the wall from a surface [m], over its rectangle; None with too few pixels."""
+        wall = self._wall
+        z = wall.depth + wall.gain * self._sum / self._images
+        x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T
+        low, high = ((getattr(field.x, end), getattr(field.y, end)) for end in ("low", "high"))
+        over = (self._images >= FEWEST) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        if np.count_nonzero(over) < LEAST_PIXELS:
+            return None
+        x, y, height = x[over], y[over], height[over]
+        outward = (height - field.height(x, y)) * field.normal(x, y)[:, 2]
+        return surface.fit(np.column_stack((x, y, outward)), np.full(len(x), KEPT_M), low, high)
+
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
 """Forecast times after an exposure [s]."""
@@ -121,7 +211,7 @@ class Tracker:
         self._whole = float(self._certainty @ wall.lifts**2)
         self._precision = np.zeros((4, 4))
         self._pull = np.zeros(4)
-        self._prior = np.diag(np.array(PRIOR) ** -2.0)
+        self._prior = np.diag(np.array(SHIFT_PRIOR) ** -2.0)
         self._calm_s = float(t_s[-1])
         self._drift = np.zeros(4)
         self._usual = 1.0

@@ -23,9 +23,8 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
-from palpate_perception.cloud import RegionBox
+from palpate_perception.cloud import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics, RegionBox
 from palpate_perception.fusion import Image
-from palpate_perception.views import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics
 
 MARGIN_M: Final = 0.12
 """Margin of the tracked area around the region [m]; it distinguishes a shift from a breath."""

@@ -15,9 +15,9 @@ from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
+from palpate_perception.follower import rises
 from palpate_perception.tracker import jackknife
 from palpate_perception.wall import steady, without_gaps
-from palpate_perception.watch import rises
 
 
 def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: float = 20.0) -> tuple[Run, Patient]:

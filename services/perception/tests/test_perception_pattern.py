@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_perception import pattern
+from palpate_perception import cloud
 
 
 def test_down_sampling_gives_one_node_a_cell_and_says_which_have_no_points() -> None:
@@ -12,8 +12,8 @@ def test_down_sampling_gives_one_node_a_cell_and_says_which_have_no_points() -> 
     rng = np.random.default_rng(0)
     p = np.column_stack((rng.uniform(-0.12, 0.12, 4000), rng.uniform(-0.08, 0.08, 4000), np.zeros(4000)))
     hole = np.hypot(p[:, 0] - 0.05, p[:, 1]) < 0.04
-    nodes, known = pattern.downsample(p[~hole], x, y)
+    nodes, known = cloud.downsample(p[~hole], x, y)
     assert nodes.shape == (15, 2)
     np.testing.assert_allclose(nodes[:3], [(-0.1, -0.05), (-0.1, 0.0), (-0.1, 0.05)])
     np.testing.assert_allclose(nodes[~known], [(0.05, 0.0)], atol=1e-12)
-    assert (pattern.supported(p[~hole], nodes, 0.05) == known).all()
+    assert (cloud.supported(p[~hole], nodes, 0.05) == known).all()

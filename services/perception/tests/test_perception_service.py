@@ -20,7 +20,7 @@ from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input, true_pose
 from palpate_models.scenario.patterns import lattice
 from palpate_models.scenario.schema import Scenario
-from palpate_perception import cloud, pattern, pipeline
+from palpate_perception import cloud, pipeline
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S
 from palpate_perception.visibility import Reason
@@ -275,7 +275,7 @@ def test_two_runs_give_the_same_bytes_and_another_seed_does_not() -> None:
 
 def test_the_five_steps_run_in_the_papers_order(monkeypatch: pytest.MonkeyPatch) -> None:
     calls: list[str] = []
-    for module, names in ((cloud, ("to_world", "remove_invalid", "crop")), (pipeline, ("scan_of",)), (pattern, ("supported",))):
+    for module, names in ((cloud, ("to_world", "remove_invalid", "crop", "supported")), (pipeline, ("scan_of",))):
         for name in names:
             step = getattr(module, name)
             monkeypatch.setattr(module, name, lambda *a, _s=step, _n=name: calls.append(_n) or _s(*a))

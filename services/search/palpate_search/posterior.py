@@ -25,7 +25,7 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
-from palpate_search.presses import SHALLOWEST_M, Budget, Press, Task
+from palpate_search.presses import PRESS_S, SHALLOWEST_M, Budget, Press, Task, seconds
 
 RADII_M: Final = (0.014, 0.022, 0.030)
 """Palpable radii of the lump hypotheses."""
@@ -270,3 +270,28 @@ class Posterior:
             self._whitened = np.pad(self._whitened, ((0, 0), (0, most)))
             self._bumps = np.pad(self._bumps, ((0, 0), (0, most), (0, 0)))
             self._field = np.pad(self._field, ((0, 0), (0, most), (0, 0)))
+
+
+LAYERS = 6
+
+
+def shape(posterior: Posterior) -> tuple[int, int]:
+    """Return the number of places along x and y."""
+    rows = len(np.unique(posterior.task.places[:, 0]))
+    return rows, len(posterior.task.places) // rows
+
+
+def maps(posterior: Posterior) -> Array:
+    """Return layers over the places, shape (LAYERS, nx, ny), all within about -1 to 1.
+
+    Log probability of a lump at the place over chance; mean (centred) and SD of the log field; travel time to the place [s];
+    probability of any lump; share of remaining presses.
+    """
+    mean, variance = posterior.field()
+    left = 1.0 - len(posterior.presses) / posterior.task.budget.presses
+    layers = np.empty((LAYERS, len(mean)))
+    layers[0] = np.log(posterior.by_place * len(mean) + 0.01) / np.log(len(mean))
+    layers[1], layers[2] = mean - mean.mean(), np.sqrt(variance)
+    layers[3] = seconds(posterior.here, posterior.task.places) - PRESS_S
+    layers[4], layers[5] = posterior.lump, left
+    return layers.reshape(LAYERS, *shape(posterior))

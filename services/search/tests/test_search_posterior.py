@@ -9,7 +9,7 @@ from scipy.stats import multivariate_normal
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, natural
 from palpate_models.scenario.press import DEPTH_M
-from palpate_search.information import information
+from palpate_search.policies.informed import information
 from palpate_search.posterior import (
     BONE_SD,
     CONTRAST,

@@ -13,8 +13,7 @@ from typing import Final
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_search.maps import maps
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import Posterior, maps
 from palpate_search.presses import Budget
 
 WEIGHTS: Final = "ppo.npz"

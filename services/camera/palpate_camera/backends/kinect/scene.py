@@ -3,20 +3,94 @@
 A view is kept as inverse depth w = 1/z, which is linear in the pixel coordinates on a plane: at an offset (du, dv) [px]
 from a pixel, the plane seen in it is at w + gu du + gv dv. So a view with w, gu, gv can be looked up between its
 pixels, exactly for a flat facet and without mixing near and far at an edge.
+
+Rasterisation of triangle meshes, in homogeneous coordinates (Olano and Greer 1997).
+
+A ray r = ((u - cx)/fx, (v - cy)/fy, 1) meets the plane of a triangle a, b, c (in C) at the inverse depth
+
+    w = (e_a + e_b + e_c) . r,   e_a = (b x c) / d,  e_b = (c x a) / d,  e_c = (a x b) / d,  d = a . (b x c)
+
+and does so inside of it, and before the camera, where none of e_a . r, e_b . r, e_c . r is negative. These are linear in u and
+v, so a triangle that reaches behind the camera needs no clipping.
 """
 
 from __future__ import annotations
 
+import math
+from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
-from palpate_camera.backends.kinect.raster import rasterise
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.messages import Pinhole
+from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.robot import table
+from palpate_models.robot import visual as lbr_visual
+from palpate_models.scenario.schema import Robot
 
 Image = NDArray[np.float32]
+_NEAR_M = 1e-3
+"""The image of a triangle with a corner nearer than this is looked for everywhere."""
+
+
+@compiled
+def _bounds(x: float, y: float, z: float, size: int) -> tuple[int, int]:
+    """The pixels from the first to before the last that may lie between three coordinates."""
+    low, high = min(x, y, z), max(x, y, z)
+    return min(max(math.ceil(low), 0), size), min(max(math.floor(high) + 1, 0), size)
+
+
+@compiled
+def rasterise(p_C: Array, triangles: NDArray[np.uint32], lens: Array, w: Image, gu: Image, gv: Image, cos: Image) -> None:
+    """Draws a mesh into a view where it is nearer: `w`, `gu`, `gv` and `cos` as in `scene.View`.
+
+    `p_C`: vertices [m], shape (n, 3); `triangles`: shape (m, 3); `lens`: fx, fy, cx, cy [px].
+    """
+    fx, fy, cx, cy = lens
+    height, width = w.shape
+    e = np.empty((3, 3))
+    slope = np.empty((3, 3))
+    image = np.empty((len(p_C), 2))
+    for i in range(len(p_C)):
+        image[i, 0] = fx * p_C[i, 0] / p_C[i, 2] + cx
+        image[i, 1] = fy * p_C[i, 1] / p_C[i, 2] + cy
+    for i in range(len(triangles)):
+        first, second, third = triangles[i, 0], triangles[i, 1], triangles[i, 2]
+        u0, u1, v0, v1 = 0, width, 0, height
+        if min(p_C[first, 2], p_C[second, 2], p_C[third, 2]) > _NEAR_M:
+            u0, u1 = _bounds(image[first, 0], image[second, 0], image[third, 0], width)
+            v0, v1 = _bounds(image[first, 1], image[second, 1], image[third, 1], height)
+        if u0 >= u1 or v0 >= v1:
+            continue
+        a, b, c = p_C[first], p_C[second], p_C[third]
+        for j in range(3):
+            k, m = (j + 1) % 3, (j + 2) % 3
+            e[0, j] = b[k] * c[m] - b[m] * c[k]
+            e[1, j] = c[k] * a[m] - c[m] * a[k]
+            e[2, j] = a[k] * b[m] - a[m] * b[k]
+        d = a[0] * e[0, 0] + a[1] * e[0, 1] + a[2] * e[0, 2]
+        if d == 0.0:  # seen edge-on
+            continue
+        for j in range(3):
+            slope[j, 0] = e[j, 0] / (d * fx)
+            slope[j, 1] = e[j, 1] / (d * fy)
+            slope[j, 2] = e[j, 2] / d - slope[j, 0] * cx - slope[j, 1] * cy
+        du, dv, at_0 = slope[:, 0].sum(), slope[:, 1].sum(), slope[:, 2].sum()
+        normal = math.sqrt((fx * du) ** 2 + (fy * dv) ** 2 + (at_0 + du * cx + dv * cy) ** 2)
+        for v in range(v0, v1):
+            for u in range(u0, u1):
+                inside = True
+                for j in range(3):
+                    inside = inside and slope[j, 0] * u + slope[j, 1] * v + slope[j, 2] >= 0.0
+                near = du * u + dv * v + at_0
+                if inside and near > w[v, u]:
+                    ray = math.sqrt(((u - cx) / fx) ** 2 + ((v - cy) / fy) ** 2 + 1.0)
+                    w[v, u], gu[v, u], gv[v, u], cos[v, u] = near, du, dv, near / (normal * ray)
+
+
 Triangles = NDArray[np.uint32]
 
 
@@ -115,3 +189,36 @@ def _same(old: Mesh, new: Mesh, tolerance: float) -> bool:
         and np.array_equal(old.triangles, new.triangles)
         and bool(np.abs(old.vertices - new.vertices).max(initial=0.0) <= tolerance)
     )
+
+
+def merge(meshes: Iterable[Mesh]) -> Mesh:
+    """One mesh of several. Raises ValueError when there is none."""
+    parts = list(meshes)
+    if not parts:
+        raise ValueError("nothing to merge: want at least one mesh")
+    offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
+    triangles = [part.triangles + np.uint32(offset) for part, offset in zip(parts, offsets, strict=True)]
+    return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(triangles))
+
+
+def furniture(robot: Robot) -> Mesh:
+    """Table and robot base, in world."""
+    return merge(
+        Mesh(apply(box.X_WB, np.asarray(shape.vertices, np.float64)), shape.faces.astype(np.uint32))
+        for box in table.boxes(robot)
+        for shape in (trimesh.creation.box(box.size),)
+    )
+
+
+def links(robot: Robot) -> dict[str, Mesh]:
+    """Shape of each link, by link name, in the link's frame."""
+    return {
+        name: merge(Mesh(part.vertices, part.triangles.astype(np.uint32)) for part in parts)
+        for name, parts in lbr_visual.visual_meshes(robot).items()
+    }
+
+
+def placed(shapes: dict[str, Mesh], X_WL: dict[str, Array]) -> Mesh | None:
+    """The links of which the pose is known, in world; None when there is none."""
+    parts = [Mesh(apply(X_WL[name], shape.vertices), shape.triangles) for name, shape in shapes.items() if name in X_WL]
+    return merge(parts) if parts else None

@@ -14,12 +14,10 @@ from palpate_bus.messages.geometry import transform_matrix, transform_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
-from palpate_camera.backends.kinect import surroundings
-from palpate_camera.backends.kinect.bias import DepthBias
-from palpate_camera.backends.kinect.noise import KinectNoise
+from palpate_camera.backends.kinect import scene
+from palpate_camera.backends.kinect.errors import DepthBias, KinectNoise
 from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
-from palpate_camera.messages import FRAME
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.messages import FRAME, Pinhole
 from palpate_models.numerics.frames import Array, look_at
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import plant_input
@@ -43,12 +41,12 @@ class CameraService(Service):
         noise, wander, small = (np.random.Generator(np.random.PCG64(s)) for s in (stream, *stream.spawn(2)))
         scale, apart = drawn.camera.given.noise_scale, messages.apart(camera.width_px)
         self._bias = DepthBias(self._pinhole, drawn.camera, wander)
-        X_WCt, furniture = self._X_WC @ drawn.X_CCt, surroundings.furniture(known.robot)
+        X_WCt, furniture = self._X_WC @ drawn.X_CCt, scene.furniture(known.robot)
         self._whole, self._small = (
             _Picture(self._pinhole, k, X_WCt, furniture, KinectNoise(camera.focal_px, scale, rng, k))
             for k, rng in ((1, noise), (apart, small))
         )
-        self._links = surroundings.links(known.robot)
+        self._links = scene.links(known.robot)
         self._on: int | None = None
         self._wanted = 0
         self._taken = 0
@@ -68,7 +66,7 @@ class CameraService(Service):
         if surface is None:
             return {}
         skin, poses = surface_mesh(surface), inbox.latest("sim/link_poses")
-        robot = None if poses is None else surroundings.placed(self._links, link_poses(poses))
+        robot = None if poses is None else scene.placed(self._links, link_poses(poses))
         on_s = (t - self._on) / NS
         outbox = messages.small(t, self._small.take(on_s, skin, robot, self._bias), self._small.pinhole)
         if self._wanted:

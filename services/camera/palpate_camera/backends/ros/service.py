@@ -1,4 +1,4 @@
-"""The bridge: a ROS 2 camera's depth image, camera_info and tf_static in place of the simulated camera's."""
+"""ROS transform trees as poses. Arrays in, arrays out."""
 
 from __future__ import annotations
 
@@ -18,11 +18,28 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera import messages
-from palpate_camera.backends.ros.convert import CameraError, chain
-from palpate_camera.messages import FRAME
-from palpate_camera.pinhole import Pinhole
+from palpate_camera.messages import FRAME, Pinhole
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import RosCamera, Scenario
+
+
+class CameraError(ValueError):
+    """A ROS camera that cannot be used. Names what is wrong and what is wanted."""
+
+
+def chain(transforms: Mapping[str, tuple[str, Array]], root: str, leaf: str) -> Array | None:
+    """X_RL, shape (4, 4), from the parent and pose of each frame; None while a link of the chain is missing."""
+    X = np.eye(4)
+    frame, seen = leaf, set[str]()
+    while frame != root:
+        if frame not in transforms or frame in seen:
+            return None
+        seen.add(frame)
+        parent, X_PF = transforms[frame]
+        X = X_PF @ X
+        frame = parent
+    return X
+
 
 POSE_WAIT_S = 20.0
 """Time limit for the camera pose before the run."""
