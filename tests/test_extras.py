@@ -221,5 +221,5 @@ def test_the_conductors_image_has_all_that_its_command_imports() -> None:
     tops = {name.partition(".")[0] for name in done.stdout.split()} - PACKAGES.keys()
     named = {DISTRIBUTION.get(top, top) for top in tops}
     others = set().union(*map(direct, EXTRAS)) - has
-    assert "mcap" in others
+    assert "rerun-sdk" in others
     assert not named & others, f"the conductor's image does not install {', '.join(sorted(named & others))}"

@@ -105,7 +105,7 @@ def test_killed_in_one_process(tmp_path: Path) -> None:
     assert forces[nearest] == pytest.approx(undisturbed, rel=0.15)
     again = go_on(folder, "--composed")
     assert again.status == 2
-    assert "was completed; there is nothing to go on with" in again.output
+    assert "was completed" in again.output
 
 
 @pytest.mark.slow

@@ -53,7 +53,7 @@ def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
                 why = "an observer has its own process" if role in contract().roles else f"there is no role {role!r}"
                 raise UserError(f"--group {text}: {why}; allowed are {', '.join(workers)}")
             if role in placed:
-                raise UserError(f"--group {text}: {role} is in another group already")
+                raise UserError(f"--group {text}: {role} is in a group already")
             placed.append(role)
     return together
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from rich.console import Console
 
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
-from palpate_bus.messages import RobotStatus
+from palpate_bus.messages import RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_models.scenario.load import load_scenario
 
@@ -35,7 +34,8 @@ def test_that_the_arm_is_held_is_told_with_the_failure(tmp_path: Path, capsys: p
     write_scenario_files(scenario, tmp_path)
     gathered = collected()
     why = "emergency stop of the supervisor: planning is silent"
-    held = SimpleNamespace(header=header(17_830_000_000), mode=RobotStatus.MODE_SAFE_HOLD, reason=why)
+    zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0)
     gathered.status_changes.append(held)
     for failure in ("planning lost at 17.780 s", f"planning lost at 17.780 s: {why}"):
         with pytest.raises(typer.Exit):

@@ -30,7 +30,7 @@ def test_the_first_ctrl_c_ends_the_examination_and_the_next_is_answered(capfd: p
             press()
         assert ending.asked
         press()
-        assert "Ctrl-C once more, and they are lost" in capfd.readouterr().err
+        assert "another Ctrl-C discards them" in capfd.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             press()
     with pytest.raises(KeyboardInterrupt):
@@ -43,7 +43,7 @@ def test_once_all_is_measured_the_first_is_answered(capfd: pytest.CaptureFixture
         all_is_measured()
         press()
         assert ending.asked
-        assert "it is ending" in capfd.readouterr().err
+        assert "ending and writing" in capfd.readouterr().err
         with pytest.raises(KeyboardInterrupt):
             press()
 

@@ -157,5 +157,5 @@ def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(archive.EvidenceError, match=r"report\.json is no report of this version: .*scenario: Field required"):
         write_page(tmp_path)
     (tmp_path / archive.FILE).write_bytes(b"not an archive")
-    with pytest.raises(archive.EvidenceError, match=r"evidence\.npz cannot be read"):
+    with pytest.raises(archive.EvidenceError, match=r"evidence\.mcap cannot be read"):
         archive.read_evidence(tmp_path)

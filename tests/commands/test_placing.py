@@ -48,8 +48,8 @@ def test_as_many_processes_as_are_wanted_hold_every_service_once(number: int) ->
     ("options", "words"),
     [
         (["--group", "robot,arm"], "there is no role 'arm'"),
-        (["--group", "robot,robot"], "robot is placed already"),
-        (["--group", "robot,control", "--group", "tissue,robot"], "robot is placed already"),
+        (["--group", "robot,robot"], "robot is in a group already"),
+        (["--group", "robot,control", "--group", "tissue,robot"], "robot is in a group already"),
         (["--group", "robot,dashboard"], "an observer has its own process"),
         (["--group", ""], "there is no role ''"),
         (["--processes", "0"], "allowed are 1 to 8"),

@@ -81,12 +81,12 @@ def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs
             assert chosen is None
             continue
         assert name == f"{role}-{chosen}"
-        service = document["services"][role]
+        entry = document["services"][role]
         assert choice(checked(load_scenario("healthy", words)), role) == chosen
         processes = read_processes(compose_file(), (role,), (file,))
         assert processes[role].command == service.command(role), "which goes by the scenario"
-        assert service["build"]["args"]["GROUP"] == name
-        assert service["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
+        assert entry["build"]["args"]["GROUP"] == name
+        assert entry["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
 
 
 def test_the_override_for_hardware_starts_no_simulation() -> None:
@@ -119,7 +119,7 @@ def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
     assert how(3, log) == "left with status 3: MeshError: two holes"
     assert how(-9, log) == "killed by signal 9"
     log.write_text("")
-    assert how(1, log) == "left with status 1: it said nothing"
+    assert how(1, log) == "left with status 1: its log is empty"
     assert how(0, log).endswith("?")
 
 

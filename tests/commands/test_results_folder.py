@@ -23,7 +23,7 @@ from palpate_models.scenario.load import load_scenario
 
 def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(UserError, match=r"there is thesis\.tex in it"), results_folder(tmp_path):
+    with pytest.raises(UserError, match=r"it holds thesis\.tex"), results_folder(tmp_path):
         pass
     assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
 

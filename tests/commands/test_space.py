@@ -60,7 +60,7 @@ def test_a_disk_that_fills_up_is_told_once(tmp_path: Path, monkeypatch: pytest.M
         leave(megabytes, monkeypatch)
         room.tell(RunProgress(0, 1.0, Collected(), ()))
     assert len(told) == 3
-    assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination goes on"]
+    assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
 
 
 def test_what_a_folder_does_not_take_is_written_to_another(
