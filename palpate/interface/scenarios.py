@@ -46,7 +46,7 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
     >>> chosen = palpate.scenario("lump", seed=3, exam={"pattern": "raster", "region_m": [0.1, 0.1]})
     >>> chosen.exam.pattern, chosen.exam.region_m, chosen.seed
     ('raster', (0.1, 0.1), 3)
-    >>> palpate.scenario("lump", exam={"dept_m": 0.008})
+    >>> palpate.scenario("lump", exam={"dept_m": 0.008})  # doctest: +IGNORE_EXCEPTION_DETAIL
     Traceback (most recent call last):
         ...
     ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
