@@ -19,5 +19,5 @@ def test_a_slower_role_sends_at_each_of_its_steps_and_nothing_else_changes() -> 
 
 
 def test_a_role_that_is_none_is_named() -> None:
-    with pytest.raises(ValueError, match="PALPATE_PERIODS: there is no role 'controller'"):
+    with pytest.raises(ValueError, match="PALPATE_PERIODS: unknown role 'controller'"):
         with_periods(TEXT, {"controller": 5})

@@ -91,7 +91,7 @@ def test_a_port_in_use_has_a_message_of_one_line() -> None:
     said = str(refused.value)
     assert said == (
         f"cannot open a zenoh session that listens at {where}: that address is in use; "
-        "end the process that listens there, or name another address"
+        "end the process that listens there, or use another address"
     )
 
 
