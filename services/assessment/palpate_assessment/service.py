@@ -12,9 +12,10 @@ from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
+from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_assessment.seen_breath import SeenBreath
-from palpate_assessment.skin import SEEN, KnownSkin, skin_of
+from palpate_assessment.skin import KnownSkin
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
 from palpate_bus.messages.codec import Message

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from palpate_assessment.messages import skin_of
 from palpate_assessment.sampling import ForceSample
-from palpate_assessment.skin import skin_of
 from palpate_bus.messages import SurfaceCorrection, SurfaceMesh
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header
