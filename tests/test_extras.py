@@ -94,8 +94,8 @@ OPTIONAL = {"zenoh_ros2_sdk"}
 """Imported only if find_spec finds it; in no extra."""
 ON_DEMAND = {"playwright": "dashboard", "palpate_robot.plant.Plant": "run"}
 """Imports of a single function, and the extra that its callers need."""
-NOT_IMPORTED = {"bokeh", "ziglang"}
-"""Run as a program, or imported by another library: Dask's dashboard uses bokeh."""
+NOT_IMPORTED = {"bokeh", "stable-baselines3", "torch", "ziglang"}
+"""Run as a program, or imported by another library or by research: Dask uses bokeh, training a policy torch."""
 
 
 def need_of(module: str) -> str:

@@ -29,7 +29,7 @@ def reproduce(
     from palpate.report.archive import EvidenceError, completed
     from palpate.run.inputs import usable
     from palpate_reproduction import reproduction
-    from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, RunError, perform, record_graph
+    from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, ReproductionError, perform, record_graph
 
     console = Console(stderr=True)
     quiet = quiet or as_json
@@ -53,7 +53,7 @@ def reproduce(
                 tell("starting a run on the bus, for its graph")
                 record_graph(out / "bus")
             facts = reproduction.write(out, cases, page, images, chosen, tell)
-    except (RunError, EvidenceError) as error:
+    except (ReproductionError, EvidenceError) as error:
         fail(error)
     except OSError as error:
         refuse(error)

@@ -20,7 +20,7 @@ from palpate_dashboard.replay import recording_of
 from palpate_models.scenario.load import load_scenario
 from palpate_reproduction import figures
 from palpate_reproduction.limits import limits
-from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, ReproductionCase, RunError
+from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, ReproductionCase, ReproductionError
 from palpate_reproduction.scene import Moment, Stage, deformation_mm, moments
 
 WATCHING = ("conductor", "dashboard", "recorder")
@@ -46,7 +46,7 @@ def way(case: ReproductionCase, folder: Path) -> tuple[MeasuredWay, Evidence]:
     report, evidence = read_report(folder), read_evidence(folder)
     held = np.flatnonzero(evidence.in_contact)
     if not len(held):
-        raise RunError(f"{folder}: the tool never touched anything")
+        raise ReproductionError(f"{folder}: the tool never touched anything")
     first, last = held[0], held[-1]
     dice = "" if report.scores is None or report.scores.dice is None else f"{report.scores.dice:.2f}"
     found = ", ".join(f.quadrant for f in report.findings) or "none"
@@ -93,7 +93,7 @@ def write(
 ) -> dict[str, Any]:
     """Draws everything from the runs in `runs` and writes `page`; returns the figures it quotes.
 
-    Raises RunError, EvidenceError or OSError when a run lacks what is needed.
+    Raises ReproductionError, EvidenceError or OSError when a run lacks what is needed.
     """
     images.mkdir(parents=True, exist_ok=True)
     folder = runs / SNAKE.name
@@ -109,7 +109,7 @@ def write(
     chosen = chosen_moments(evidence[0])
     recording = recording_of(folder)
     if not recording:
-        raise RunError(f"{folder}: it has no recording")
+        raise ReproductionError(f"{folder}: it has no recording")
     rest, *seen = moments(recording, [min(0.2, chosen[0][1]), *(time for _, time, _ in chosen)])
     shown = [(words, moment, close) for (words, _, close), moment in zip(chosen, seen, strict=True)]
     figures.phases(images / "figure-6-phases.png", Stage(scenario, rest), shown)

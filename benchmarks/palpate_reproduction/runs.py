@@ -44,12 +44,12 @@ POINTS: Final = ReproductionCase("raster", "point")
 CASES: Final = (SNAKE, ReproductionCase("raster", "continuous"), ReproductionCase("snake", "point"), POINTS)
 
 
-class RunError(RuntimeError):
+class ReproductionError(RuntimeError):
     """An examination that did not complete. Names its folder and what it said."""
 
 
 def perform(case: ReproductionCase, folder: Path, settings: tuple[str, ...]) -> None:
-    """Examines in one process into `folder`; the paper's case is recorded. Raises RunError."""
+    """Examines in one process into `folder`; the paper's case is recorded. Raises ReproductionError."""
     words = ["--composed", "--quiet", "--record", "full" if case == SNAKE else "none"]
     for setting in (f"exam.pattern={case.pattern}", f"exam.mode={case.mode}", *settings):
         words += ["--set", setting]
@@ -59,11 +59,11 @@ def perform(case: ReproductionCase, folder: Path, settings: tuple[str, ...]) -> 
     finally:
         _stop(process)
     if process.returncode or completed(folder) is None:
-        raise RunError(f"{case.name} left with status {process.returncode}: {_said(folder)} ({folder})")
+        raise ReproductionError(f"{case.name} left with status {process.returncode}: {_said(folder)} ({folder})")
 
 
 def record_graph(folder: Path) -> None:
-    """Starts an examination as processes on a bus, writes the graph of what is there, and ends it. Raises RunError."""
+    """Starts an examination as processes on a bus, writes the graph of what is there, and ends it. Raises ReproductionError."""
     process = _start(folder, ["--quiet", "--json"])
     try:
         while process.poll() is None:
@@ -74,7 +74,7 @@ def record_graph(folder: Path) -> None:
                     (folder / GRAPH).write_text(json.dumps(rows, indent=1), encoding="utf-8")
                     return
             sleep(POLL_S)
-        raise RunError(f"the run on the bus left with status {process.returncode}: {_said(folder)} ({folder})")
+        raise ReproductionError(f"the run on the bus left with status {process.returncode}: {_said(folder)} ({folder})")
     finally:
         _stop(process)
 

@@ -29,8 +29,8 @@ from palpate_planning.stroke import (
     PUSHING,
     STROKE,
     Descent,
-    Moment,
     Stages,
+    StrokeInput,
     StrokeStage,
     is_limited,
     is_steady,
@@ -122,7 +122,7 @@ class _Descent(Descent):
             self._on_tared(self.stroke)
         return tared
 
-    def learn(self, now: Moment) -> None:
+    def learn(self, now: StrokeInput) -> None:
         """Leave the wall as it is."""
 
 
@@ -165,7 +165,7 @@ class QuickExamination:
         with suppress(StopIteration):
             while True:
                 contact = self._measured()
-                stage = stages.send(Moment(self._count, contact, open=self._open))
+                stage = stages.send(StrokeInput(self._count, contact, open=self._open))
                 rows.append(self._period(stage, contact))
         return rows
 

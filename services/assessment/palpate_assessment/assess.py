@@ -24,8 +24,8 @@ _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""
 
 
-class Reason(IntEnum):
-    """Reason why a place is not assessed; numbers of StiffnessMap.msg."""
+class UnassessedReason(IntEnum):
+    """UnassessedReason why a place is not assessed; numbers of StiffnessMap.msg."""
 
     ASSESSED = 0
     NOT_REACHED = 1
@@ -44,7 +44,7 @@ class AssessedMap:
     """Lower end of its 90 % band [N]."""
     upper: Array
     unassessed: NDArray[np.uint8]
-    """Values of `Reason`, shape (n,)."""
+    """Values of `UnassessedReason`, shape (n,)."""
     background: float
     """Robust level of the unremarkable wall's apparent stiffness [N]."""
     findings: list[Area]
@@ -66,26 +66,26 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     regression, candidates, reasons = judged
     apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
     unassessed = reasons[nearest]
-    unassessed[apart > reach] = Reason.NOT_REACHED
-    weighed = areas(regression, candidates, grid, unassessed == Reason.ASSESSED)
+    unassessed[apart > reach] = UnassessedReason.NOT_REACHED
+    weighed = areas(regression, candidates, grid, unassessed == UnassessedReason.ASSESSED)
     threshold = calibration.threshold(false_findings)
     findings = [area for area in weighed if area.logit >= threshold]
     return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
 
 
 def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate], NDArray[np.int_]] | None:
-    """Return the regression of consistent samples, the candidate lumps, and the `Reason` of each sample that is left out.
+    """Return the regression of consistent samples, the candidate lumps, and the `UnassessedReason` of each excluded sample.
 
     None with too few samples.
     """
-    reasons = np.where(o.yielded, Reason.YIELDED, Reason.ASSESSED)
+    reasons = np.where(o.yielded, UnassessedReason.YIELDED, UnassessedReason.ASSESSED)
     telling = np.flatnonzero(~o.yielded)
     if len(telling) < FEWEST:
         return None
     regression, candidates = detect(o.part(telling), calibration)
     wrong = contradicted(regression)
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
-        reasons[telling[wrong]] = Reason.CONTRADICTED
+        reasons[telling[wrong]] = UnassessedReason.CONTRADICTED
         regression, candidates = detect(o.part(telling[~wrong]), calibration)
     return regression, candidates, reasons
 
@@ -97,7 +97,7 @@ def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> Asse
     if o is None:
         return None
     apart, _ = cKDTree(o.xy).query(grid.nodes[:, :2])
-    unassessed = np.where(apart <= reach, Reason.ASSESSED, Reason.NOT_REACHED).astype(np.uint8)
+    unassessed = np.where(apart <= reach, UnassessedReason.ASSESSED, UnassessedReason.NOT_REACHED).astype(np.uint8)
     return _assessment(Regression(o, calibration, (), usual_amplitudes(o)), grid, unassessed, [], [])
 
 
@@ -106,7 +106,7 @@ def _assessment(
 ) -> AssessedMap:
     mean, sd = regression.field(grid.nodes[:, :2])
     remarkable = np.any([area.nodes for area in findings], axis=0) if findings else np.zeros(len(mean), dtype=bool)
-    rest = (unassessed == Reason.ASSESSED) & ~remarkable
+    rest = (unassessed == UnassessedReason.ASSESSED) & ~remarkable
     return AssessedMap(
         grid=grid,
         apparent=np.exp(mean),

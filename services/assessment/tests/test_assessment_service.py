@@ -10,7 +10,7 @@ from bench_assessment_scans import FakeInbox, Scan, examine, scan, truth_of
 
 from palpate.report.evidence import found_of, map_of
 from palpate.report.scoring import Truth, score
-from palpate_assessment.assess import Reason
+from palpate_assessment.assess import UnassessedReason
 from palpate_assessment.service import GROWING_EVERY, AssessmentService, create
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
@@ -161,7 +161,7 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
 
 
 def test_reasons_have_the_numbers_of_the_message() -> None:
-    assert all(getattr(StiffnessMap, reason.name) == reason for reason in Reason)
+    assert all(getattr(StiffnessMap, reason.name) == reason for reason in UnassessedReason)
 
 
 def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) -> None:

@@ -16,7 +16,7 @@ from palpate_perception import cloud, surface, visibility
 from palpate_perception.cloud import HEIGHT_M, TABLE_CLEARANCE_M, Cloud, Intrinsics, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
 from palpate_perception.surface import HeightField
-from palpate_perception.visibility import Gaps, Reason
+from palpate_perception.visibility import Gaps, ViewReason
 from palpate_perception.wall import BreathingMode
 
 MARGIN_M: Final = 0.03
@@ -76,7 +76,7 @@ class Perceived:
     frames: int
     coverage: float
     """Part of the region of interest that was seen."""
-    reason: Reason
+    reason: ViewReason
     """Why there are no targets."""
     message: str
     """The reason, or a remark about the targets, as text for people; empty when there is neither."""
@@ -126,7 +126,7 @@ class Pipeline:
 
         if (away := float(np.abs(shift).max())) > MARGIN_M:  # beyond what is cropped, fitted and judged for what is missing
             message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * MARGIN_M:.0f} mm)"
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, Reason.PATIENT_MOVED, message)
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, ViewReason.PATIENT_MOVED, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
@@ -139,7 +139,7 @@ class Pipeline:
         sigma = float(np.sqrt(np.mean(field.sigma(nodes[:, 0], nodes[:, 1]) ** 2) + motion**2))
         message = _remarks(int(np.count_nonzero(~known)), len(nodes), motion)
         mesh = self._mesh(field, p_A, mode, shift)
-        return Perceived(points, mesh, targets, sigma, fused.frames, coverage, Reason.NONE, message, field)
+        return Perceived(points, mesh, targets, sigma, fused.frames, coverage, ViewReason.NONE, message, field)
 
     def _gaps(self, seen: NDArray[np.bool_], p_A: Array, depth: Array, origin: tuple[int, int], camera: Intrinsics) -> Gaps:
         xy, _ = visibility.cells(self._exam)

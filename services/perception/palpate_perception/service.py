@@ -22,7 +22,7 @@ from palpate_perception.follower import LONGEST_S, Follower
 from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
-from palpate_perception.visibility import Reason
+from palpate_perception.visibility import ViewReason
 from palpate_perception.wall import BreathingMode
 
 IMAGE: Final = "camera/depth/image_raw"
@@ -187,16 +187,16 @@ def _disagreement(frame: Message, camera: Intrinsics) -> str:
 def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
     """Return the answer to a burst of which no frame could be used."""
     if burst.wrong:
-        reason, why = Reason.BAD_FRAMES, burst.wrong
+        reason, why = ViewReason.BAD_FRAMES, burst.wrong
     elif inbox.lost("camera"):
-        reason, why = Reason.NO_CAMERA, "the camera service has left the run"
+        reason, why = ViewReason.NO_CAMERA, "the camera service has left the run"
     elif burst.waiting and inbox.latest("tf_static") is None:
-        reason, why = Reason.NO_CALIBRATION, "frames received, but no tf_static with the camera's pose"
+        reason, why = ViewReason.NO_CALIBRATION, "frames received, but no tf_static with the camera's pose"
     elif burst.waiting:
-        reason, frame = Reason.NO_CALIBRATION, burst.waiting[0].header.frame_id
+        reason, frame = ViewReason.NO_CALIBRATION, burst.waiting[0].header.frame_id
         why = f"frames received, but no camera/depth/camera_info or no pose of {frame!r} in world"
     else:
-        reason = Reason.NO_FRAMES
+        reason = ViewReason.NO_FRAMES
         why = f"no frame on camera/depth/image_raw within {PATIENCE_NS / NS:.0f} s of the expected end of the burst"
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
     return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"nothing seen: {why}")

@@ -61,7 +61,7 @@ def quadric(p_A: Array, xy: Array) -> Array:
     return np.asarray(rows(xy) @ np.linalg.lstsq(system, right)[0])
 
 
-class Reason(IntEnum):
+class ViewReason(IntEnum):
     """Reasons for an answer without targets; values as in `palpation_msgs/PalpationTargets`."""
 
     NONE = 0
@@ -79,12 +79,12 @@ class Reason(IntEnum):
 
 
 HINTS: Final = {
-    Reason.VIEW_BLOCKED: "view blocked by an object, probably the arm, up to {:.2f} m in front of the surface",
-    Reason.SELF_OCCLUDED: "hidden behind the abdomen itself: place the camera higher",
-    Reason.OUT_OF_IMAGE: "outside the image: turn the camera towards the region",
-    Reason.NO_DEPTH: "no depth: seen at too grazing an angle or out of range",
-    Reason.BEYOND_ABDOMEN: "no abdomen there: the surface lies deeper, the region reaches past its edge",
-    Reason.TOO_FEW_POINTS: "seen by too few pixels, or cut off by a jump in depth",
+    ViewReason.VIEW_BLOCKED: "view blocked by an object, probably the arm, up to {:.2f} m in front of the surface",
+    ViewReason.SELF_OCCLUDED: "hidden behind the abdomen itself: place the camera higher",
+    ViewReason.OUT_OF_IMAGE: "outside the image: turn the camera towards the region",
+    ViewReason.NO_DEPTH: "no depth: seen at too grazing an angle or out of range",
+    ViewReason.BEYOND_ABDOMEN: "no abdomen there: the surface lies deeper, the region reaches past its edge",
+    ViewReason.TOO_FEW_POINTS: "seen by too few pixels, or cut off by a jump in depth",
 }
 
 
@@ -92,15 +92,19 @@ HINTS: Final = {
 class Gaps:
     """Parts of the region that were not seen, by reason."""
 
-    shares: dict[Reason, float]
+    shares: dict[ViewReason, float]
     """Fraction of the region, largest first, without those of at most half a percent."""
     obstacle_m: float
     """Largest distance of an obstacle from the surface behind it [m]."""
 
     @property
-    def reason(self) -> Reason:
+    def reason(self) -> ViewReason:
         """The reason to act on: a blocked view even if it is not the largest part, since another view can avoid it."""
-        return Reason.VIEW_BLOCKED if Reason.VIEW_BLOCKED in self.shares else next(iter(self.shares), Reason.TOO_FEW_POINTS)
+        return (
+            ViewReason.VIEW_BLOCKED
+            if ViewReason.VIEW_BLOCKED in self.shares
+            else next(iter(self.shares), ViewReason.TOO_FEW_POINTS)
+        )
 
     def __str__(self) -> str:
         """Text for people."""
@@ -135,12 +139,12 @@ def gaps(
     none = inside & np.isnan(measured)
     before = float(np.max(nearer[hidden], initial=0.0))
     masks = {
-        Reason.VIEW_BLOCKED: hidden,
-        Reason.SELF_OCCLUDED: itself,
-        Reason.OUT_OF_IMAGE: ~inside,
-        Reason.NO_DEPTH: none,
-        Reason.BEYOND_ABDOMEN: beyond,
-        Reason.TOO_FEW_POINTS: inside & ~behind & ~beyond & ~none,
+        ViewReason.VIEW_BLOCKED: hidden,
+        ViewReason.SELF_OCCLUDED: itself,
+        ViewReason.OUT_OF_IMAGE: ~inside,
+        ViewReason.NO_DEPTH: none,
+        ViewReason.BEYOND_ABDOMEN: beyond,
+        ViewReason.TOO_FEW_POINTS: inside & ~behind & ~beyond & ~none,
     }
     shares = {reason: float(np.count_nonzero(mask)) / total for reason, mask in masks.items()}
     listed = {r: share for r, share in sorted(shares.items(), key=lambda item: -item[1]) if share > 0.005}

@@ -23,7 +23,7 @@ from palpate_models.scenario.schema import Scenario
 from palpate_perception import cloud, pipeline
 from palpate_perception.service import PerceptionService, create
 from palpate_perception.tracker import FORECAST_S
-from palpate_perception.visibility import Reason
+from palpate_perception.visibility import ViewReason
 
 TICK = 100 * MS
 
@@ -196,7 +196,7 @@ def test_the_robot_in_the_way_is_noticed_and_named() -> None:
     targets = sent["perception/targets"]
     assert len(targets.positions) == len(targets.normals) == len(targets.lines) == 0
     assert 0.2 < targets.coverage < 0.95
-    assert targets.reason == Reason.VIEW_BLOCKED
+    assert targets.reason == ViewReason.VIEW_BLOCKED
     assert "perception/surface" not in sent
 
 
@@ -213,13 +213,13 @@ def test_a_camera_that_looks_aside_is_told_so() -> None:
     targets = look(scenario("camera.look_at_m=[2.0, -1.0, 1.5]"), 1)["perception/targets"]
     assert len(targets.positions) == 0
     assert targets.coverage == 0.0
-    assert targets.reason == Reason.OUT_OF_IMAGE
+    assert targets.reason == ViewReason.OUT_OF_IMAGE
 
 
 def test_a_region_past_the_abdomen_has_no_targets() -> None:
     targets = look(scenario("exam.region_m=[0.6, 0.3]"), 4)["perception/targets"]
     assert len(targets.positions) == 0
-    assert targets.reason == Reason.BEYOND_ABDOMEN
+    assert targets.reason == ViewReason.BEYOND_ABDOMEN
 
 
 def test_a_wrong_extrinsic_calibration_shifts_the_surface_accordingly() -> None:
@@ -311,7 +311,7 @@ def test_a_patient_who_moved_beyond_what_is_fitted_is_not_measured(away: float, 
     perception._follower.shift = np.array((0.0, -away))
     sent = look(case, perception=perception)["perception/targets"]
     assert (len(sent.positions) > 0) == targets
-    assert sent.reason == (Reason.NONE if targets else Reason.PATIENT_MOVED)
+    assert sent.reason == (ViewReason.NONE if targets else ViewReason.PATIENT_MOVED)
 
 
 def test_a_burst_without_frames_is_answered_in_words() -> None:
@@ -322,7 +322,7 @@ def test_a_burst_without_frames_is_answered_in_words() -> None:
     (answer,) = [outbox for outbox in sent if outbox]
     targets = answer["perception/targets"]
     assert (len(targets.positions), targets.coverage, targets.frames_fused) == (0, 0.0, 0)
-    assert targets.reason == Reason.NO_FRAMES
+    assert targets.reason == ViewReason.NO_FRAMES
 
 
 def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
@@ -330,7 +330,7 @@ def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
     perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 5)}))
     inbox.gone.add("camera")
     targets = perception.step(2 * TICK, inbox.receive({}))["perception/targets"]
-    assert targets.reason == Reason.NO_CAMERA
+    assert targets.reason == ViewReason.NO_CAMERA
 
 
 def test_frames_that_cannot_be_read_are_answered_in_words() -> None:
@@ -343,7 +343,7 @@ def test_frames_that_cannot_be_read_are_answered_in_words() -> None:
     sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
     sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
     (answer,) = [outbox for outbox in sent if outbox]
-    assert answer["perception/targets"].reason == Reason.BAD_FRAMES
+    assert answer["perception/targets"].reason == ViewReason.BAD_FRAMES
 
 
 def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
@@ -355,7 +355,7 @@ def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
     sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
     sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
     (answer,) = [outbox for outbox in sent if outbox]
-    assert answer["perception/targets"].reason == Reason.NO_CALIBRATION
+    assert answer["perception/targets"].reason == ViewReason.NO_CALIBRATION
 
 
 @pytest.mark.parametrize("larger", ["info", "image"])
@@ -376,7 +376,7 @@ def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -
     assert set(sent) == {"perception/targets"}, "answered at once: more frames will not help"
     targets = sent["perception/targets"]
     assert len(targets.positions) == 0
-    assert targets.reason == Reason.BAD_FRAMES
+    assert targets.reason == ViewReason.BAD_FRAMES
 
 
 def test_forecasts_are_at_the_times_that_the_message_says() -> None:

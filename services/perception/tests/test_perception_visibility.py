@@ -9,7 +9,7 @@ from palpate_bus.messages import PalpationTargets
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
-from palpate_perception.visibility import Gaps, Reason
+from palpate_perception.visibility import Gaps, ViewReason
 
 K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])
 X_AC = look_at(np.array([0.4, -0.45, 0.92]), np.array([0.0, 0.0, -0.03]))
@@ -54,15 +54,15 @@ def test_no_gap_without_missing_cells() -> None:
 @pytest.mark.parametrize(
     ("offset", "plane_m", "reason"),
     [
-        ((0.0, 0.0, 0.0), 0.3, Reason.VIEW_BLOCKED),
-        ((0.0, 0.0, -0.06), 0.0, Reason.SELF_OCCLUDED),
-        ((0.0, 0.0, 0.0), np.nan, Reason.NO_DEPTH),
-        ((0.0, 0.0, 0.0), -0.2, Reason.BEYOND_ABDOMEN),
-        ((3.0, 0.0, 0.0), 0.0, Reason.OUT_OF_IMAGE),
-        ((0.0, 0.0, 0.0), 0.0, Reason.TOO_FEW_POINTS),
+        ((0.0, 0.0, 0.0), 0.3, ViewReason.VIEW_BLOCKED),
+        ((0.0, 0.0, -0.06), 0.0, ViewReason.SELF_OCCLUDED),
+        ((0.0, 0.0, 0.0), np.nan, ViewReason.NO_DEPTH),
+        ((0.0, 0.0, 0.0), -0.2, ViewReason.BEYOND_ABDOMEN),
+        ((3.0, 0.0, 0.0), 0.0, ViewReason.OUT_OF_IMAGE),
+        ((0.0, 0.0, 0.0), 0.0, ViewReason.TOO_FEW_POINTS),
     ],
 )
-def test_reason_of_missing_cells(offset: tuple[float, float, float], plane_m: float, reason: Reason) -> None:
+def test_reason_of_missing_cells(offset: tuple[float, float, float], plane_m: float, reason: ViewReason) -> None:
     found = gaps(all_cells() + np.array(offset), flat_depth(plane_m))
     assert found.reason == reason
     assert found.shares == {reason: 1.0}
@@ -70,7 +70,7 @@ def test_reason_of_missing_cells(offset: tuple[float, float, float], plane_m: fl
 
 def test_obstacle_has_distance_and_share() -> None:
     found = gaps(all_cells()[:120], flat_depth(0.3))
-    assert found.shares == {Reason.VIEW_BLOCKED: pytest.approx(0.3)}
+    assert found.shares == {ViewReason.VIEW_BLOCKED: pytest.approx(0.3)}
     assert found.obstacle_m == pytest.approx(0.35, abs=0.05)
 
 
@@ -81,12 +81,12 @@ def test_largest_gap_comes_first_but_a_blocked_view_is_the_reason() -> None:
     depth[:, :middle] = np.nan
     depth[:, middle:] = flat_depth(0.3)[:, middle:]
     found = gaps(all_cells(), depth)
-    assert list(found.shares) == [Reason.NO_DEPTH, Reason.VIEW_BLOCKED]
-    assert found.reason == Reason.VIEW_BLOCKED
+    assert list(found.shares) == [ViewReason.NO_DEPTH, ViewReason.VIEW_BLOCKED]
+    assert found.reason == ViewReason.VIEW_BLOCKED
 
 
 def test_reasons_are_those_of_the_message() -> None:
-    assert {r.name: r.value for r in Reason} == {r.name: getattr(PalpationTargets, r.name) for r in Reason}
+    assert {r.name: r.value for r in ViewReason} == {r.name: getattr(PalpationTargets, r.name) for r in ViewReason}
 
 
 def test_the_rough_guess_follows_the_cloud_and_stays_sane_without_one() -> None:

@@ -22,7 +22,7 @@ from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.reasons import Cause, Reason
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
-from palpate_planning.stops import Course, Stops
+from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
@@ -136,7 +136,7 @@ class RequestedPresses:
             self.done = self._number
 
 
-class Examination:
+class ExaminationSequence:
     """Runs one examination. `step` each planning period; `status` is what exam/state reports."""
 
     def __init__(self, known: ExamInput, periods: Periods, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
@@ -158,7 +158,7 @@ class Examination:
         WORKER.submit(self._planner.prepare)
         follower = TrajectoryFollower(self._kinematics, np.array(lbr.HOME))
         arm = FreeMotion(follower, self._planner, lockstep=lockstep)
-        self._course = Course(arm, 0 if before is None else before.strokes)
+        self._course = ExamCourse(arm, 0 if before is None else before.strokes)
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart = RestartRamp()
         self._views = Views(look_postures(known))

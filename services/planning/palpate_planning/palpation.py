@@ -18,8 +18,8 @@ from palpate_planning.stroke import (
     STROKE,
     Descent,
     Duration,
-    Moment,
     Stages,
+    StrokeInput,
     StrokeStage,
     clearance,
     follow,
@@ -217,7 +217,7 @@ class Palpation:
         self._check_elbow(contact)
         self._check_wall(t, contact)
         self.stage = self._stages.send(
-            Moment(
+            StrokeInput(
                 t,
                 contact,
                 open=self._watch.open,

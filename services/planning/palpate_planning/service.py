@@ -31,7 +31,7 @@ from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Following, Scenario
 from palpate_planning.contact import SensorReading
-from palpate_planning.examination import Examination
+from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import abdomen_of, correction_message, motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
@@ -57,12 +57,14 @@ class PlanningService(Service):
     role: ClassVar[str] = "planning"
 
     def __init__(self, known: ExamInput, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
-        """`before` and `lockstep` as in `Examination`."""
+        """`before` and `lockstep` as in `ExaminationSequence`."""
         roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
         _lower_worker_priority()
-        self._exam = Examination(known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep)
+        self._exam = ExaminationSequence(
+            known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep
+        )
         self._supervisor_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None

@@ -17,7 +17,7 @@ END_AFTER = SECOND
 """The run continues for this time after the examination has ended [ns]."""
 
 
-class Course:
+class ExamCourse:
     """State that the phases of an examination and its stops share."""
 
     def __init__(self, arm: FreeMotion, strokes: int) -> None:
@@ -72,7 +72,7 @@ class Stops:
     planning's set-point follows the measured posture, so that nothing pulls when the driver releases it.
     """
 
-    def __init__(self, course: Course, patience_s: float) -> None:
+    def __init__(self, course: ExamCourse, patience_s: float) -> None:
         """A stop that is not released within `patience_s` ends the examination."""
         self._course = course
         self._patience_s = patience_s

@@ -1,6 +1,6 @@
 """One stroke: rest and tare above the skin, descend to the touch, indent, settle, slide or hold, lift.
 
-`press`, `lift` and `travel` are generators. Each resumption is one planning period: it is sent the `Moment`, moves the commanded
+`press`, `lift` and `travel` are generators. Each resumption is one planning period: it receives a `StrokeInput`, moves the commanded
 indenter (`StrokeMotion`) and yields the stage of the stroke. The planning service and the quick tier drive the same generators.
 """
 
@@ -78,7 +78,7 @@ PUSHING: Final = (*PRESSING, StrokeStage.LIFT)
 """Stages in which the measured force is fed forward."""
 
 
-class Moment(NamedTuple):
+class StrokeInput(NamedTuple):
     """Input of a stroke at one planning period."""
 
     t: int
@@ -99,7 +99,7 @@ class Moment(NamedTuple):
 
 
 T = TypeVar("T")
-Stages = Generator[StrokeStage, Moment, T]
+Stages = Generator[StrokeStage, StrokeInput, T]
 """Part of a stroke, period by period."""
 
 
@@ -268,7 +268,7 @@ class Descent:
         self.stroke += over
         return over
 
-    def probe(self, now: Moment) -> bool:
+    def probe(self, now: StrokeInput) -> bool:
         """Descend fast to the uncertainty of the wall, from there at probe speed; return True once the skin is touched."""
         contact, depth = now.contact, self._motion.depth
         unsure = TOUCH.sigmas * contact.wall.sigma
@@ -288,7 +288,7 @@ class Descent:
             self.failed = Cause(Reason.NO_TISSUE, text)
         return self._found
 
-    def learn(self, now: Moment) -> None:
+    def learn(self, now: StrokeInput) -> None:
         """Correct the wall by the touch."""
         self.touched, outward = self._motion.wall.touched(now.contact.foot, self._onset.touch(), self.stroke, now.t)
         self._motion.shift(outward)

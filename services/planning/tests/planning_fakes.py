@@ -15,7 +15,7 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_planning.contact import SensorReading, ToolWeight
-from palpate_planning.examination import Examination
+from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.reasons import NO_CAUSE
@@ -97,7 +97,7 @@ class World:
         self.misled = 0.0
         """Forecasts err by so much [m], one outward and the next inward."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = Examination(settings, PERIODS)
+        self.exam = ExaminationSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
         self.weight = ToolWeight.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1])

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate_supervisor.watch import Breach, Cause, Level
+from palpate_supervisor.watch import Breach, Level, StopCause
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class LatchTuning:
 
 
 TUNING = LatchTuning()
-RECOVERABLE = frozenset({Cause.DEPTH, Cause.WORKSPACE})
+RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
 """Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
 
 
@@ -29,7 +29,7 @@ class Stop:
 
     t: int
     level: Level
-    cause: Cause
+    cause: StopCause
     reason: str
 
 
@@ -38,7 +38,7 @@ class Latch:
 
     def __init__(self) -> None:
         self.level = Level.OK
-        self.cause = Cause.NONE
+        self.cause = StopCause.NONE
         self.reason = ""
         self.releases = 0
         self.refusals = 0
@@ -46,8 +46,8 @@ class Latch:
         """All stops; an escalation counts again."""
         self._since = 0
         self._released = -TUNING.driver_grace_ns
-        self._recovering: dict[Cause, Breach] = {}  # ignored breaches, as they were at the release
-        self._begun: dict[Cause, int] = {}  # start of each uninterrupted present cause [ns]
+        self._recovering: dict[StopCause, Breach] = {}  # ignored breaches, as they were at the release
+        self._begun: dict[StopCause, int] = {}  # start of each uninterrupted present cause [ns]
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
         """Updates the latch at `t` [ns] with the present breaches and an operator's request for release."""
@@ -59,7 +59,7 @@ class Latch:
         self._recovering = {cause: released for cause, released in self._recovering.items() if cause in causes}
         self._begun = {cause: self._begun.get(cause, t) for cause in causes}
         fresh = t - self._released < TUNING.driver_grace_ns
-        standing = [breach for breach in breaches if not (self._recovers(breach) or (fresh and breach.cause is Cause.DRIVER))]
+        standing = [breach for breach in breaches if not (self._recovers(breach) or (fresh and breach.cause is StopCause.DRIVER))]
         if release:
             standing = self._release(t, standing)
         for breach in sorted(standing, key=lambda breach: -breach.level):
@@ -69,7 +69,7 @@ class Latch:
             began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
             if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
                 reason = f"soft stop did not help within {breach.timeout_ns / 1e6:.0f} ms: {breach.reason}"
-                self._latch(t, Breach(Level.EMERGENCY, Cause.UNHEEDED, reason))
+                self._latch(t, Breach(Level.EMERGENCY, StopCause.UNHEEDED, reason))
 
     def _recovers(self, breach: Breach) -> bool:
         """Return True if `breach` was released and has not grown since."""
@@ -85,13 +85,13 @@ class Latch:
 
     def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
         """Grants a release unless a breach that motion cannot end is present; returns the breaches still to be judged."""
-        against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not Cause.DRIVER]
+        against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not StopCause.DRIVER]
         if against:
             self.refusals += 1
             self.reason = f"release refused: {against[0].reason}"
             return standing
         self._recovering = {breach.cause: breach for breach in standing if breach.cause in RECOVERABLE}
-        self.level, self.cause, self.reason = Level.OK, Cause.NONE, ""
+        self.level, self.cause, self.reason = Level.OK, StopCause.NONE, ""
         self.releases += 1
         self._released = t
         return []

@@ -18,7 +18,7 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import Breach, Cause, Level, LimitWatch
+from palpate_supervisor.watch import Breach, Level, LimitWatch, StopCause
 
 LOSS_LEVELS = (("control", Level.EMERGENCY), ("planning", Level.EMERGENCY), ("assessment", Level.SOFT_STOP))
 """Stop level when a role is lost. Without control or planning the arm must stand still; without assessment pressing is
@@ -72,14 +72,14 @@ class SupervisorService(Service):
         breaches = self._presence(t, inbox)
         for request in inbox.new("operator/request"):
             if request.request == OperatorRequest.STOP:
-                breaches.append(Breach(Level.EMERGENCY, Cause.OPERATOR, f"stopped by the operator: {request.reason}"))
+                breaches.append(Breach(Level.EMERGENCY, StopCause.OPERATOR, f"stopped by the operator: {request.reason}"))
             elif request.request == OperatorRequest.SOFT_STOP:
-                breaches.append(Breach(Level.SOFT_STOP, Cause.OPERATOR, f"soft stop by the operator: {request.reason}"))
+                breaches.append(Breach(Level.SOFT_STOP, StopCause.OPERATOR, f"soft stop by the operator: {request.reason}"))
             elif request.request in (OperatorRequest.RELEASE, OperatorRequest.END):
                 release = True
             else:
                 reason = f"operator/request: unknown request {request.request} is treated as a stop"
-                breaches.append(Breach(Level.EMERGENCY, Cause.INVALID, reason))
+                breaches.append(Breach(Level.EMERGENCY, StopCause.INVALID, reason))
         for mesh in inbox.new("perception/surface"):
             breaches += self._take_surface(mesh)
         if inbox.new("robot/status"):
@@ -109,7 +109,7 @@ class SupervisorService(Service):
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
         """Return breaches for lost roles and for watched topics that are too old."""
         lost = [(role, level) for role, level in LOSS_LEVELS if inbox.lost(role)]
-        found = [Breach(level, Cause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns) for role, level in lost]
+        found = [Breach(level, StopCause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns) for role, level in lost]
         self._began = t if self._began is None else self._began
         if t - self._began <= TUNING.settle_ns:
             return found
@@ -117,7 +117,7 @@ class SupervisorService(Service):
             received = inbox.stamp(name)
             if received is not None and t - received > self._max_age:
                 reason = f"no message on {name} for {(t - received) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-                found.append(Breach(Level.EMERGENCY, Cause.SILENT, reason))
+                found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason))
         return found
 
     def _take_surface(self, mesh: Any) -> list[Breach]:
@@ -128,14 +128,14 @@ class SupervisorService(Service):
             normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
             self._surface = RestSurface(vertices, normals, self._radius)
         except ValueError as error:
-            return [Breach(Level.SOFT_STOP, Cause.INVALID, f"perception/surface: {error}")]
+            return [Breach(Level.SOFT_STOP, StopCause.INVALID, f"perception/surface: {error}")]
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
         values = {"position": status.position, "velocity": status.velocity, "wrench": wrench(status.wrench)}
         for name, value in values.items():
             if not np.isfinite(value).all():
-                return [Breach(Level.EMERGENCY, Cause.INVALID, f"robot/status: {name} = {value}: must be finite")]
+                return [Breach(Level.EMERGENCY, StopCause.INVALID, f"robot/status: {name} = {value}: must be finite")]
         self._tool = tool = self._sense.sense(*values.values())
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
@@ -147,9 +147,9 @@ class SupervisorService(Service):
         found = self._watch.judge(tool, depth, stamp, t)
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-            found.append(Breach(Level.EMERGENCY, Cause.SILENT, f"robot/status repeats a measurement of age {age}"))
+            found.append(Breach(Level.EMERGENCY, StopCause.SILENT, f"robot/status repeats a measurement of age {age}"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
-            found.append(Breach(Level.EMERGENCY, Cause.DRIVER, f"safe hold of the driver: {status.reason}"))
+            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, f"safe hold of the driver: {status.reason}"))
         return found
 
 

@@ -51,7 +51,7 @@ class Level(IntEnum):
     EMERGENCY = 2
 
 
-class Cause(IntEnum):
+class StopCause(IntEnum):
     """Values of `palpation_msgs/SupervisorState.cause`."""
 
     NONE = 0
@@ -72,7 +72,7 @@ class Breach:
     """A limit that is violated now. `cause` is the code to act on; `reason` is text for people."""
 
     level: Level
-    cause: Cause
+    cause: StopCause
     reason: str
     timeout_ns: int = TUNING.soft_stop_timeout_ns
     """Time that a soft stop has to end the breach."""
@@ -117,9 +117,9 @@ class LimitWatch:
             return []
         found = f"external force {force:.1f} N, rising at {rate:.0f} N/s" if rate > 0 else f"external force {force:.1f} N"
         if not soon <= limits.force_emergency_n:
-            return [Breach(Level.EMERGENCY, Cause.FORCE, f"{found}, emergency limit {limits.force_emergency_n:g} N")]
+            return [Breach(Level.EMERGENCY, StopCause.FORCE, f"{found}, emergency limit {limits.force_emergency_n:g} N")]
         timeout = TUNING.rising_timeout_ns if rising else TUNING.soft_stop_timeout_ns
-        return [Breach(Level.SOFT_STOP, Cause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
+        return [Breach(Level.SOFT_STOP, StopCause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
 
     def _depth(self, depth: float, force: float) -> list[Breach]:
         limit = self._limits.depth_m + TUNING.depth_margin_m
@@ -127,16 +127,16 @@ class LimitWatch:
             return []  # without force there is no tissue: the arm is next to the abdomen, which the workspace check covers
         level = Level.EMERGENCY if depth > limit + TUNING.depth_margin_m else Level.SOFT_STOP
         reason = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
-        return [Breach(level, Cause.DEPTH, reason, beyond_m=depth - limit)]
+        return [Breach(level, StopCause.DEPTH, reason, beyond_m=depth - limit)]
 
     def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * TUNING.speed_margin
         if not speed <= free:  # also for NaN
-            return [Breach(Level.EMERGENCY, Cause.SPEED, f"robot/status: tool speed {speed:.2f} m/s, limit {free:.2f} m/s")]
+            return [Breach(Level.EMERGENCY, StopCause.SPEED, f"robot/status: tool speed {speed:.2f} m/s, limit {free:.2f} m/s")]
         contact = self._limits.contact_speed_mps
         if force > TUNING.contact_n and speed > contact:
             reason = f"robot/status: tool speed {speed:.2f} m/s at {force:.1f} N, limit in contact {contact:.2f} m/s"
-            return [Breach(Level.EMERGENCY, Cause.SPEED, reason)]
+            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason)]
         return []
 
     def _workspace(self, p_W: Array) -> list[Breach]:
@@ -146,4 +146,4 @@ class LimitWatch:
         if beyond[k] <= 0.0:
             return []
         reason = f"tool at {'xyz'[k]} = {p_A[k]:.3f} m in the abdomen frame, allowed {low[k]:g} to {high[k]:g} m"
-        return [Breach(Level.EMERGENCY, Cause.WORKSPACE, reason, beyond_m=float(beyond[k]))]
+        return [Breach(Level.EMERGENCY, StopCause.WORKSPACE, reason, beyond_m=float(beyond[k]))]

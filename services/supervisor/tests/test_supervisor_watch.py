@@ -15,7 +15,7 @@ from palpate_models.scenario.schema import Limits
 from palpate_supervisor import latch as latch_module
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
-from palpate_supervisor.watch import TUNING, Breach, Cause, Level, LimitWatch
+from palpate_supervisor.watch import TUNING, Breach, Level, LimitWatch, StopCause
 
 KNOWN = exam_input(load_scenario("clean"))
 
@@ -32,20 +32,20 @@ def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth
 @pytest.mark.parametrize(
     ("values", "level", "cause"),
     [
-        ({"force": 26.0}, Level.SOFT_STOP, Cause.FORCE),
-        ({"force": 41.0}, Level.EMERGENCY, Cause.FORCE),
-        ({"speed": 0.7}, Level.EMERGENCY, Cause.SPEED),
-        ({"speed": 0.3, "force": 6.0}, Level.EMERGENCY, Cause.SPEED),
-        ({"depth": 0.047, "force": 9.0}, Level.SOFT_STOP, Cause.DEPTH),
-        ({"depth": 0.071, "force": 9.0}, Level.EMERGENCY, Cause.DEPTH),
-        ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, Cause.WORKSPACE),
-        ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, Cause.WORKSPACE),
+        ({"force": 26.0}, Level.SOFT_STOP, StopCause.FORCE),
+        ({"force": 41.0}, Level.EMERGENCY, StopCause.FORCE),
+        ({"speed": 0.7}, Level.EMERGENCY, StopCause.SPEED),
+        ({"speed": 0.3, "force": 6.0}, Level.EMERGENCY, StopCause.SPEED),
+        ({"depth": 0.047, "force": 9.0}, Level.SOFT_STOP, StopCause.DEPTH),
+        ({"depth": 0.071, "force": 9.0}, Level.EMERGENCY, StopCause.DEPTH),
+        ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, StopCause.WORKSPACE),
+        ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, StopCause.WORKSPACE),
     ],
 )
-def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: Level, cause: Cause) -> None:
+def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: Level, cause: StopCause) -> None:
     (breach,) = judge(**values)  # type: ignore[arg-type]
     assert (breach.level, breach.cause) == (level, cause)
-    assert (breach.beyond_m > 0) == (cause in (Cause.DEPTH, Cause.WORKSPACE))
+    assert (breach.beyond_m > 0) == (cause in (StopCause.DEPTH, StopCause.WORKSPACE))
 
 
 @pytest.mark.parametrize(
@@ -84,12 +84,12 @@ def test_a_stamp_that_comes_again_is_nothing_to_take_a_rate_from() -> None:
 def test_a_force_that_stays_over_the_limit_is_stopped_however_often_its_stamp_comes_again() -> None:
     watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
     found = [watch.judge(Tool(ABOVE, 0.0, 30.0), None, 0, n * 10 * MS) for n in range(20)]
-    assert [breach.cause for breach in found[-1]] == [Cause.FORCE]
+    assert [breach.cause for breach in found[-1]] == [StopCause.FORCE]
 
 
 def test_what_is_no_number_is_a_breach() -> None:
-    assert {breach.cause for breach in judge(speed=np.nan)} == {Cause.SPEED}
-    assert {breach.cause for breach in judge(force=np.nan)} == {Cause.FORCE}
+    assert {breach.cause for breach in judge(speed=np.nan)} == {StopCause.SPEED}
+    assert {breach.cause for breach in judge(force=np.nan)} == {StopCause.FORCE}
 
 
 def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
@@ -161,20 +161,20 @@ def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
         RestSurface(bad, bad, 0.015)
 
 
-SOFT = Breach(Level.SOFT_STOP, Cause.FORCE, "26 N")
+SOFT = Breach(Level.SOFT_STOP, StopCause.FORCE, "26 N")
 
-EMERGENCY = Breach(Level.EMERGENCY, Cause.FORCE, "41 N")
+EMERGENCY = Breach(Level.EMERGENCY, StopCause.FORCE, "41 N")
 
-DEPTH = Breach(Level.SOFT_STOP, Cause.DEPTH, "27 mm")
+DEPTH = Breach(Level.SOFT_STOP, StopCause.DEPTH, "27 mm")
 
-DRIVER = Breach(Level.EMERGENCY, Cause.DRIVER, "the driver holds")
+DRIVER = Breach(Level.EMERGENCY, StopCause.DRIVER, "the driver holds")
 
 
 def test_a_stop_stands_when_its_cause_has_gone() -> None:
     latch = Latch()
     latch.update(0, [SOFT], False)
     latch.update(10 * MS, [], False)
-    assert (latch.level, latch.cause, latch.reason) == (Level.SOFT_STOP, Cause.FORCE, "26 N")
+    assert (latch.level, latch.cause, latch.reason) == (Level.SOFT_STOP, StopCause.FORCE, "26 N")
     latch.update(20 * MS, [], True)
     assert (latch.level, latch.releases) == (Level.OK, 1)
 
@@ -184,7 +184,7 @@ def test_the_worst_counts_and_the_first_of_equals() -> None:
     latch.update(0, [SOFT, EMERGENCY], False)
     assert latch.level is Level.EMERGENCY
     latch.update(10 * MS, [DRIVER, SOFT], False)
-    assert latch.cause is Cause.FORCE
+    assert latch.cause is StopCause.FORCE
     assert [stop.level for stop in latch.stops] == [Level.EMERGENCY]
 
 
@@ -194,16 +194,16 @@ def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
         latch.update(t, [SOFT], False)
     assert latch.level is Level.SOFT_STOP
     latch.update(TUNING.soft_stop_timeout_ns + 10 * MS, [SOFT], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
     assert "26 N" in latch.reason
 
 
 def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
     latch = Latch()
-    rising = Breach(Level.SOFT_STOP, Cause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
+    rising = Breach(Level.SOFT_STOP, StopCause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
     for t in range(0, TUNING.rising_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [rising], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_soft_stop_that_helps_stays_one() -> None:
@@ -242,22 +242,22 @@ def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
     latch.update(0, [DEPTH], False)
     latch.update(10 * MS, [DEPTH], True)
     latch.update(20 * MS, [replace(DEPTH, level=Level.EMERGENCY)], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.DEPTH)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.DEPTH)
 
 
 def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
     latch = Latch()
     for n in range(TUNING.soft_stop_timeout_ns // (10 * MS) + 4):
         latch.update(n * 10 * MS, [SOFT] if n % 2 == 0 else [], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
     latch = Latch()
-    latch.update(0, [Breach(Level.SOFT_STOP, Cause.OPERATOR, "enough")], False)
+    latch.update(0, [Breach(Level.SOFT_STOP, StopCause.OPERATOR, "enough")], False)
     for t in range(1000 * MS, 1000 * MS + TUNING.soft_stop_timeout_ns + 20 * MS, 10 * MS):
         latch.update(t, [SOFT], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.UNHEEDED)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
 def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
@@ -267,7 +267,7 @@ def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
     latch.update(20 * MS, [DRIVER], False)
     assert latch.level is Level.OK
     latch.update(10 * MS + latch_module.TUNING.driver_grace_ns, [DRIVER], False)
-    assert latch.cause is Cause.DRIVER
+    assert latch.cause is StopCause.DRIVER
 
 
 def test_a_release_of_nothing_is_harmless() -> None:
@@ -278,10 +278,10 @@ def test_a_release_of_nothing_is_harmless() -> None:
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
     latch = Latch()
-    outside = Breach(Level.EMERGENCY, Cause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
+    outside = Breach(Level.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
     latch.update(0, [outside], False)
     latch.update(10 * MS, [outside], True)
     latch.update(20 * MS, [replace(outside, beyond_m=0.02 + 0.9 * latch_module.TUNING.further_m)], False)
     assert latch.level is Level.OK
     latch.update(30 * MS, [replace(outside, beyond_m=0.02 + 1.1 * latch_module.TUNING.further_m)], False)
-    assert (latch.level, latch.cause) == (Level.EMERGENCY, Cause.WORKSPACE)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.WORKSPACE)
