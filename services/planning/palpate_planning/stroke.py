@@ -1,6 +1,6 @@
 """One stroke: rest and tare above the skin, descend to the touch, indent, settle, slide or hold, lift.
 
-`press`, `lift` and `travel` are generators. Each resumption is one planning period: it receives a `StrokeInput`, moves the commanded
+`press`, `lift` and `travel` are generators. Each resumption is one planning period: it receives a `StrokeInput`, moves the
 indenter (`StrokeMotion`) and yields the stage of the stroke. The planning service and the quick tier drive the same generators.
 """
 
