@@ -41,13 +41,13 @@ def test_it_keeps_to_the_budget_of_presses() -> None:
     rig, report = played(budget=SearchBudget(presses=5))
     assert report.passed
     assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
-    assert "5 presses are made" in rig.last(REQUEST).reason
+    assert "5 presses made" in rig.last(REQUEST).reason
 
 
 def test_it_keeps_to_the_budget_of_time() -> None:
     rig, _ = played(budget=SearchBudget(seconds=2.0))
     assert rig.last(REQUEST).request == SearchRequest.DONE
-    assert rig.last(REQUEST).reason == "2 s are over"
+    assert rig.last(REQUEST).reason == "2 s elapsed"
 
 
 @pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
@@ -115,4 +115,4 @@ def test_the_report_says_what_it_took() -> None:
     facts = service.finish()
     assert facts["presses"] == 5
     assert 4 * PRESS_S <= facts["seconds"] <= 6 * PRESS_S + 0.5
-    assert facts["ended"] == "5 presses are made"
+    assert facts["ended"] == "5 presses made"
