@@ -1,4 +1,4 @@
-"""`palpate fmu`: build, look at and simulate FMUs."""
+"""`palpate fmu`: builds, inspects and simulates FMUs."""
 
 from __future__ import annotations
 
@@ -17,23 +17,23 @@ if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
 
 DENSE = 2000
-"""Continuous states that a dense Jacobian can do: at this number it has 32 MB."""
+"""Continuous states up to which a dense Jacobian is practical (32 MB)."""
 NAMES_CHECKED = 1000
-"""More variables than this are not held to the naming convention: FMPy takes milliseconds a name."""
+"""Variables up to which names are checked against the naming convention: FMPy takes milliseconds per name."""
 MESHES = (".obj", ".stl", ".ply")
 
-app = typer.Typer(name="fmu", help="The abdomen as an FMU; FMUs of any kind looked at.", no_args_is_help=True)
+app = typer.Typer(name="fmu", help="Export the abdomen as an FMU; inspect and simulate any FMU.", no_args_is_help=True)
 
 
 def _scenario(name: str, settings: list[str]) -> Scenario:
-    """A scenario by name or file, or the default one with a mesh as its phantom."""
+    """Return the scenario of a name or file, or the default scenario with a mesh as its phantom."""
     from palpate_models.patient.schema import Phantom
     from palpate_models.scenario.load import ScenarioError, load_scenario
     from palpate_models.scenario.schema import Scenario
 
     if Path(name).suffix.lower() in MESHES:
         if settings:
-            raise ScenarioError(f"{name}: --set is for scenarios: name one that has phantom.kind: mesh and phantom.mesh: {name}")
+            raise ScenarioError(f"{name}: --set needs a scenario: name one with phantom.kind: mesh and phantom.mesh: {name}")
         return Scenario(name=Path(name).stem, phantom=Phantom(kind="mesh", mesh=name))
     return load_scenario(name, settings)
 
@@ -42,13 +42,13 @@ def _scenario(name: str, settings: list[str]) -> Scenario:
 def build(
     phantom: Annotated[str, typer.Argument(help="Name or file of a scenario, or a mesh (OBJ, STL, PLY).")] = "clean",
     out: Annotated[Path, typer.Option("--out", "-o", help="The FMU to write.")] = Path("abdomen.fmu"),
-    fmi: Annotated[int, typer.Option(min=2, max=3, help="FMI version; 2 shows a sample of the surface only.")] = 3,
+    fmi: Annotated[int, typer.Option(min=2, max=3, help="FMI version; version 2 has only a sample of the surface.")] = 3,
     only: Annotated[
         list[str] | None,
         typer.Option(
             "--platform",
             metavar="NAME",
-            help="Binaries for it, such as x86_64-linux; may be repeated. All by default.",
+            help="Platform of a binary, such as x86_64-linux; may be repeated. By default all.",
         ),
     ] = None,
     settings: Annotated[
@@ -77,24 +77,24 @@ def build(
                 fmi,
                 names,
                 compiling=lambda name: bar.update(
-                    task, advance=1, description=f"compiling for {name} (a minute, the first time)"
+                    task, advance=1, description=f"compiling for {name} (about a minute the first time)"
                 ),
             )
     except (ScenarioError, MeshError, ExportError, CompileError, ValueError, OSError) as error:
         refuse(error)
     if not quiet:
-        places = ", ".join(names)
-        console.print(f"{out}: FMI {fmi}.0, {out.stat().st_size / 1e6:.1f} MB, for {places}", highlight=False, soft_wrap=True)
+        size = f"{out.stat().st_size / 1e6:.1f} MB"
+        console.print(f"{out}: FMI {fmi}.0, {size}, for {', '.join(names)}", highlight=False, soft_wrap=True)
 
 
 def _states(count: int) -> str:
-    """How many continuous states model exchange has, and what that asks of a solver."""
-    words = f"continuous states: {count}"
+    """Return the number of continuous states of model exchange as text, with advice when a dense Jacobian is too large."""
+    number = f"continuous states: {count}"
     if count <= DENSE:
-        return words
+        return number
     return (
-        f"{words}: a solver with a dense Jacobian, such as FMPy's CVode, holds {8e-6 * count**2:.0f} MB and factors them; "
-        "take steps of 1 ms (solver='Euler'), a sparse Jacobian, or a coarser mesh (--set phantom.edge_m=0.02)"
+        f"{number}: a solver with a dense Jacobian, such as FMPy's CVode, needs {8e-6 * count**2:.0f} MB for it; "
+        "use steps of 1 ms (solver='Euler'), a sparse Jacobian, or a coarser mesh (--set phantom.edge_m=0.02)"
     )
 
 
@@ -110,12 +110,12 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     try:
         description = fmpy.read_model_description(str(file))
         with zipfile.ZipFile(file) as archive:
-            places = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")})
+            platforms = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")})
     except Exception as error:
         refuse(f"{file}: not an FMU: {error}")
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
-    console.print(f"{description.description or ''}\nplatforms: {', '.join(places) or 'none (sources only)'}", highlight=False)
+    console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}", highlight=False)
     console.print(_states(int(description.numberOfContinuousStates or 0)), highlight=False, soft_wrap=True)
     table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
     for v in read_variables(description).values():
@@ -134,17 +134,17 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
 
 @app.command()
 def simulate(
-    file: Annotated[Path, typer.Argument(help="An FMU; an abdomen is probed, any other one run as it is.")],
+    file: Annotated[Path, typer.Argument(help="An FMU; an abdomen is probed, any other FMU is run without inputs.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="PNG to write; a CSV is written next to it.")] = Path("probing.png"),
-    at: Annotated[tuple[float, float], typer.Option(help="Where to press: x and y in the abdomen frame, in metres.")] = (
+    at: Annotated[tuple[float, float], typer.Option(help="Position of the press: x and y in the abdomen frame, in metres.")] = (
         0.0,
         0.05,
     ),
-    depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="How deep, in metres.")] = 0.010,
-    speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="How fast, in m/s.")] = 0.02,
-    hold: Annotated[float, typer.Option(min=0, max=60, help="How long it is held, in seconds.")] = 1.0,
+    depth: Annotated[float, typer.Option(min=0.001, max=0.03, help="Depth of the press, in metres.")] = 0.010,
+    speed: Annotated[float, typer.Option(min=0.001, max=0.2, help="Speed of the press, in m/s.")] = 0.02,
+    hold: Annotated[float, typer.Option(min=0, max=60, help="Duration of the hold, in seconds.")] = 1.0,
 ) -> None:
-    """Press into an abdomen, hold and withdraw, and plot the force against the depth; run any other FMU and plot its outputs."""
+    """Press into an abdomen, hold, withdraw, and plot force against depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native
     from palpate_fmu.instance import FmuError, FmuInstance
     from palpate_fmu.probing import plot_probing, probe, write_csv

@@ -27,9 +27,8 @@ import psutil
 from palpate.environment import FIXED
 from palpate.report.evidence import peak_force
 from palpate.run.group import apart
-from palpate.run.processes import LocalProcesses, compose_file, read_processes
+from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
-from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
 from palpate_benchmarks.campaign import CONTACT_S, PATIENCE, SETTINGS, forks
 from palpate_bus.contract import contract

@@ -1,1 +1,1 @@
-"""What `import palpate` offers: patients without an arm, examinations, assessments and studies, from a notebook or a program."""
+"""The library: patients without an arm, examinations, assessments and studies for notebooks and programs."""

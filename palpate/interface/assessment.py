@@ -36,13 +36,13 @@ from palpate_planning.contact import CONTACT_ON_N
 _NO_TRIANGLES = np.empty(0, np.uint32)
 _NO_SHARES = np.empty(0, np.float32)
 
-KNOWN_M = 0.0003
-"""Standard deviation of depth that is stated: indenter and skin are known exactly, but for the mesh between its points [A]."""
+DEPTH_SD_M = 0.0003
+"""Published SD of depth [m]: indenter and skin are known exactly except between the points of the mesh [A]."""
 
 
 @dataclass(frozen=True, eq=False)
 class StiffnessMap(Map):
-    """Apparent stiffness over the skin with its 90 % band; n nodes, in the abdomen frame as the examination has it."""
+    """Apparent stiffness over the skin with its 90 % band; n nodes, in the abdomen frame as registered."""
 
     triangles: NDArray[np.int64]
     """Nodes of each triangle, shape (m, 3), counter-clockwise seen from outside."""
@@ -51,18 +51,18 @@ class StiffnessMap(Map):
 
     @classmethod
     def of(cls, message: Any) -> StiffnessMap:
-        """The map of a `palpation_msgs/StiffnessMap`."""
+        """Return the map of a `palpation_msgs/StiffnessMap`."""
         triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
         return cls(**vars(map_of(message)), triangles=triangles, background=float(message.background))
 
     @property
     def uncertainty(self) -> Array:
-        """Half width of the 90 % band [1], shape (n,): the factor from the middle to either end, less one."""
+        """Half width of the 90 % band [1], shape (n,): the factor from the middle to either end, minus one."""
         return half_width(self.lower, self.upper)
 
     @property
     def frame(self) -> pd.DataFrame:
-        """A row for each node."""
+        """One row per node."""
         x, y, z = self.vertices.T
         columns = {"x_m": x, "y_m": y, "z_m": z, "apparent_N": self.apparent, "lower_N": self.lower, "upper_N": self.upper}
         return pd.DataFrame({**columns, "scanned": self.scanned, "finding": self.finding})
@@ -73,43 +73,43 @@ class StiffnessMap(Map):
         Parameters
         ----------
         axes
-            Where to draw; new axes by default.
+            Axes to draw on; new axes by default.
         values
-            At the nodes, shape (n,); by default the apparent stiffness [N].
+            Values of the nodes, shape (n,); by default the apparent stiffness [N].
         label, cmap
-            Of the colour bar.
+            Label and colours of the colour bar.
 
         Returns
         -------
         Axes
-            Those drawn on.
+            The axes drawn on.
         """
         if axes is None:
-            from matplotlib import pyplot  # noqa: PLC0415 - who has axes needs no windows
+            from matplotlib import pyplot  # noqa: PLC0415 - given axes need no windows
 
             axes = pyplot.subplots()[1]
-        shown, words = (self.apparent, "apparent stiffness [N]") if values is None else (values, "")
+        shown, default = (self.apparent, "apparent stiffness [N]") if values is None else (values, "")
         mesh = Triangulation(1e3 * self.vertices[:, 0], 1e3 * self.vertices[:, 1], self.triangles)
         image = axes.tripcolor(mesh, shown, cmap=cmap, shading="gouraud")
         figure = axes.get_figure()
         assert figure is not None
-        figure.colorbar(image, ax=axes, label=label or words)
+        figure.colorbar(image, ax=axes, label=label or default)
         axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
         return axes
 
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """What the assessment makes of touches."""
+    """Result of an assessment of touches."""
 
     samples: pd.DataFrame
-    """What it thinned them to, with the columns of samples.csv."""
+    """Samples that the assessment used, with the columns of samples.csv."""
     map: StiffnessMap | None
-    """None while there are too few samples, and of an assessment that draws none."""
+    """None if there are too few samples, or if the assessment publishes no map."""
     findings: pd.DataFrame
-    """A row for each stiff area."""
+    """One row per stiff area."""
     facts: dict[str, Any] = field(default_factory=dict)
-    """What the assessment says of itself."""
+    """Facts that the assessment service reported at its end."""
 
     def __repr__(self) -> str:
         return f"Assessment({len(self.samples)} samples, {len(self.findings)} findings{'' if self.map else ', no map yet'})"
@@ -120,27 +120,27 @@ class Assessment:
 
 
 def assess(touches: Touch | Iterable[Touch]) -> Assessment:
-    """Has the assessment of the scenario make map and findings of touches, as it does in an examination.
+    """Return map and findings of touches, computed by the assessment service of the scenario as in an examination.
 
-    It is given what it is given there: the skin as it is seen, and force and depth over time; nothing of the truth.
+    The service receives the same inputs as in an examination: the perceived surface, and force and depth over time.
 
     Parameters
     ----------
     touches
-        What `Patient.press` and `Patient.slide` returned, all of one patient, in any order. Of each, what was felt at depth
-        counts: a press that is not held says nothing.
+        Results of `Patient.press` and `Patient.slide`, all of one patient, in any order. Only forces at depth count: a press
+        without a hold adds no sample.
 
     Returns
     -------
     Assessment
-        Samples, map and findings. Without map and findings while there are too few samples.
+        Samples, map and findings. Map and findings are empty if there are too few samples.
 
     Raises
     ------
     ValueError
         There are no touches, or they are of several patients.
     PluginError
-        The scenario's assessment cannot be made.
+        The scenario's assessment cannot be created.
 
     Examples
     --------
@@ -155,13 +155,13 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
     """
     felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
     if not felt:
-        raise ValueError("touches: there are none; want what Patient.press and Patient.slide return")
+        raise ValueError("touches: there are none; want the results of Patient.press and Patient.slide")
     seen = felt[0].seen
     if any(touch.seen is not seen for touch in felt):
-        raise ValueError("touches: they are of several patients; want those of one")
+        raise ValueError("touches: they are of several patients; want touches of one patient")
     gathered = _gathered(seen, felt)
     (service,) = load_services(seen.scenario, ("assessment",))
-    with threadpool_limits(1):  # a result is not to depend on how many threads there are
+    with threadpool_limits(1):  # the result must not depend on the number of threads
         facts = have_assessed(service, gathered)
     return Assessment(
         samples=samples_frame(gathered.samples),
@@ -172,7 +172,7 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
 
 
 def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
-    """Touches as the messages of an examination whose states they were, in world as the patient is registered."""
+    """Return the touches as messages of an examination, in the world frame, with the patient as registered."""
     X_WA = np.array(exam_input(seen.scenario).X_WA)
     R_WA = X_WA[:3, :3]
     states = list(chain.from_iterable(_states(touch, X_WA, stroke) for stroke, touch in enumerate(touches, start=1)))
@@ -183,7 +183,7 @@ def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
 
 
 def _states(touch: Touch, X_WA: Array, stroke: int) -> list[Any]:
-    """`exam/state` at each instant of a touch, which is the n-th stroke, and one after it, out of contact."""
+    """Return `exam/state` at each time of a touch, with its stroke number, and one state after it, out of contact."""
     places, normals = apply(X_WA, touch.position), touch.normal @ X_WA[:3, :3].T
     rows = zip(touch.time, places, normals, touch.depth, touch.force, touch.steady, strict=True)
     states = [
@@ -196,7 +196,7 @@ def _states(touch: Touch, X_WA: Array, stroke: int) -> list[Any]:
 def _state(
     t: int, phase: int, p_W: Array, n_W: Array, stroke: int, felt: tuple[float, float] = (0.0, 0.0), steady: bool = False
 ) -> Any:
-    """`exam/state` at time `t` [ns], with depth [m] and force [N] as they are felt."""
+    """Return `exam/state` at time `t` [ns]; `felt` is the measured depth [m] and force [N]."""
     depth, force = felt
     touching = force > CONTACT_ON_N
     return exam_state(
@@ -209,20 +209,20 @@ def _state(
         depth_setpoint=depth,
         depth=depth,
         normal_force=force,
-        depth_uncertainty=KNOWN_M,
+        depth_uncertainty=DEPTH_SD_M,
         stroke=stroke,
     )
 
 
 def samples_frame(messages: list[Any]) -> pd.DataFrame:
-    """`palpation_msgs/PalpationSample`, a row each, with the columns of samples.csv."""
+    """Return a row per `palpation_msgs/PalpationSample`, with the columns of samples.csv."""
     samples = samples_of(messages)
     return pd.DataFrame({**sample_columns(samples), "force_limited": samples.force_limited})
 
 
 def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:
-    """Findings, a row each: where [m], area [m^2], apparent stiffness over that of the surroundings with its 90 % band;
-    probability of a lump, and of a tensed muscle.
+    """Return a row per finding: position [m], area [m^2], ratio of apparent stiffness to the surroundings with its 90 % band,
+    and the probabilities of a lump and of a tensed muscle.
     """
     columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper", "confidence", "guarding")
     values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, f.confidence, f.guarding) for f in rows]
@@ -230,12 +230,12 @@ def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:
 
 
 def findings_html(findings: pd.DataFrame) -> str:
-    """The findings as a table of HTML, or that there are none."""
+    """Return the findings as an HTML table, or a sentence if there are none."""
     return str(findings.to_html(index=False, float_format="{:.3g}".format)) if len(findings) else "<p>no finding</p>"
 
 
 def drawn(found: StiffnessMap, samples: pd.DataFrame) -> bytes:
-    """The map and where samples were taken, as PNG."""
+    """Return a PNG of the map with the positions of the samples."""
     figure = Figure(figsize=(5.2, 4.2), dpi=110, layout="constrained")
     axes = found.plot(figure.add_subplot())
     axes.plot(1e3 * samples.x_m, 1e3 * samples.y_m, ".", ms=2, color="white", alpha=0.6)
@@ -245,5 +245,5 @@ def drawn(found: StiffnessMap, samples: pd.DataFrame) -> bytes:
 
 
 def html_of(png: bytes, width: str = "auto") -> str:
-    """A picture that is part of the page."""
+    """Return an HTML image with embedded data."""
     return f'<img style="width: {width}" src="data:image/png;base64,{base64.b64encode(png).decode()}">'

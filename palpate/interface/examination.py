@@ -1,4 +1,4 @@
-"""Whole examinations for the library: `palpate run` in its own process, and what it left as arrays, tables and pictures."""
+"""Whole examinations for the library: `palpate run` in its own process, and its results as arrays, tables and pictures."""
 
 from __future__ import annotations
 
@@ -35,11 +35,11 @@ _SEEN_FRAMES: Final = ("time", "phase", "depth", "setpoint", "force", "in_contac
 
 
 class ExaminationError(RunError):
-    """An examination that left no results. Says why, in the words of the command line."""
+    """An examination left no results; has the message of the command line."""
 
 
 class Examination:
-    """The results folder of an examination, read when something of it is asked for.
+    """The results folder of an examination. Files are read on first use.
 
     >>> import palpate
     >>> examination = palpate.Examination("out/clean-20260101-120000")  # doctest: +SKIP
@@ -47,51 +47,51 @@ class Examination:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        """Of a run that was made before, by `palpate.run` or on the command line. Raises EvidenceError for any other folder."""
+        """Opens the results of `palpate.run` or `palpate run`. Raises EvidenceError for any other folder."""
         self.folder = Path(folder)
-        """Where the results are."""
+        """The results folder."""
         self.report: Report = read_report(self.folder)
-        """What report.json says: findings, scores against the truth, where the time went."""
+        """The content of report.json: findings, scores against the truth, timing."""
 
     @property
     def failure(self) -> str | None:
-        """Why the examination did not come to its end, None where it did."""
+        """Reason why the examination was not completed; None if it was."""
         return self.report.failure
 
     @property
     def findings(self) -> pd.DataFrame:
-        """The stiff areas that it found, a row each: quadrant, place [m], area [m^2], ratio with its 90 % band, confidence."""
+        """One row per finding: quadrant, position [m], area [m^2], ratio with its 90 % band, confidence."""
         return findings_frame(self.report.findings)
 
     @cached_property
     def samples(self) -> pd.DataFrame:
-        """Forces at depth, a row for each few millimetres of travel: samples.csv."""
+        """Forces at depth, one row per few millimetres of travel (samples.csv)."""
         return pd.read_csv(self.folder / "samples.csv").astype({"force_limited": bool})
 
     @cached_property
     def states(self) -> pd.DataFrame:
-        """What it measured over time, a row for each state: time [s], phase, depth and set-point [m], force [N], flags."""
+        """Measurements over time, one row per state: time [s], phase, depth and set-point [m], force [N], flags."""
         return pd.DataFrame({name: getattr(self._evidence, name) for name in _SEEN_FRAMES})
 
     @cached_property
     def map(self) -> StiffnessMap | None:
-        """The stiffness map, None where the examination came to none."""
+        """The stiffness map; None if the examination produced none."""
         message = self._evidence.stiffness_map
         return None if message is None else StiffnessMap.of(message)
 
     @property
     def recording(self) -> Path | None:
-        """The drawing of the run for the dashboard, recording.rrd; None where nothing was recorded."""
+        """The dashboard's recording, recording.rrd; None if nothing was recorded."""
         return self._file("recording.rrd")
 
     @property
     def mcap(self) -> Path | None:
-        """Every message of the run, a rosbag2 folder; None where nothing was recorded."""
+        """The recorded messages, a rosbag2 folder; None if nothing was recorded."""
         return self._file(RECORDING)
 
     @property
     def page(self) -> Path:
-        """The report to read, report.html."""
+        """The report as a page, report.html."""
         return self.folder / PAGE
 
     @cached_property
@@ -130,9 +130,9 @@ def run(
     quiet: bool = False,
     **settings: Any,
 ) -> Examination:
-    """Runs a whole examination: arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
+    """Runs a whole examination with arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
 
-    It has its own process, in an environment that makes results repeatable: the run hash is that of the command line.
+    Uses its own process with the environment that makes results repeatable: the run hash equals that of the command line.
 
     Parameters
     ----------
@@ -143,21 +143,22 @@ def run(
     overwrite
         Remove the results of an earlier run from the folder.
     record
-        Which recordings to write, recording.rrd and MCAP: "full", every message; "normal", a fifth of that; "none".
+        Recordings to write, recording.rrd and MCAP: "full" has every message, "normal" a fifth of that, "none" nothing.
     quiet
-        Do not tell on stderr how the examination goes on.
+        Print no progress on stderr.
 
     Returns
     -------
     Examination
-        Also of an examination that was given up, such as one that the supervisor stopped: `failure` says why, and a warning.
+        Also if the examination failed, for example when the supervisor stopped it: then `failure` has the reason, and a
+        warning is issued.
 
     Raises
     ------
     ScenarioError, MeshError, PluginError
-        As `palpate.scenario` does, before anything starts.
+        As from `palpate.scenario`, before anything starts.
     ExaminationError
-        There are no results: the folder cannot take them, for instance.
+        There are no results, for example because the folder is not writable.
 
     Examples
     --------
@@ -173,9 +174,9 @@ def run(
         file = Path(place) / f"{chosen.name}.yaml"
         file.write_text(dump_scenario(chosen), encoding="utf-8")
         flags = {"--overwrite": overwrite, "--quiet": quiet}
-        words = [str(file), "--out", str(folder), "--composed", "--record", record]
-        words += [flag for flag, wanted in flags.items() if wanted]
-        status, said = _palpate("run", *words, quiet=quiet)
+        arguments = [str(file), "--out", str(folder), "--composed", "--record", record]
+        arguments += [flag for flag, wanted in flags.items() if wanted]
+        status, said = _palpate("run", *arguments, quiet=quiet)
     if status not in (0, EXIT_FAILED) or not (folder / "report.json").is_file():
         raise ExaminationError(said[-1] if said else f"{folder}: there are no results (status {status})")
     examination = Examination(folder)
@@ -184,16 +185,16 @@ def run(
     return examination
 
 
-def _palpate(*words: str, quiet: bool) -> tuple[int, list[str]]:
-    """Runs a command of `palpate`, which passes an interruption on to it. Returns its status and what it said on stderr."""
-    command = [sys.executable, "-m", "palpate", *words]
+def _palpate(*arguments: str, quiet: bool) -> tuple[int, list[str]]:
+    """Runs a `palpate` command and forwards an interruption to it; returns its status and its lines on stderr."""
+    command = [sys.executable, "-m", "palpate", *arguments]
     with subprocess.Popen(
         command,
         stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE,
         text=True,
         env={**os.environ, **FIXED},
-        start_new_session=True,  # so that it is interrupted once, by us
+        start_new_session=True,  # Ctrl-C reaches it once, from this process
     ) as process:
         assert process.stderr is not None
         said = []

@@ -13,30 +13,29 @@ from palpate_models.scenario.schema import Scenario
 
 
 def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int | None = None, **settings: Any) -> Scenario:
-    """A scenario that can be examined, checked as the command line checks it.
+    """Return a scenario after the checks of the command line.
 
     Parameters
     ----------
     source
-        Name of a scenario (`palpate scenarios` lists them) or path of a YAML file. A scenario that is there already is taken as
-        it is, and has no settings.
+        Name of a scenario (`palpate scenarios` lists them), path of a YAML file, or a scenario; a scenario takes no settings.
     seed
-        The seed that patient and equipment are drawn from; by default the scenario's own.
+        Seed of patient and equipment; by default the scenario's.
     **settings
-        Fields of a scenario, each section a mapping: `exam={"pattern": "raster", "depth_m": 0.008}`. What is not mentioned stays
-        as it is. A field may also be given by its path: `**{"exam.depth_m": 0.008}`.
+        Fields of a scenario, each section a mapping: `exam={"pattern": "raster", "depth_m": 0.008}`. Other fields keep their
+        values. A field may also be given by its path: `**{"exam.depth_m": 0.008}`.
 
     Returns
     -------
     Scenario
-        Frozen, with the person drawn where the scenario leaves him to the seed.
+        Frozen; a person that the scenario leaves to the seed has been drawn.
 
     Raises
     ------
     ScenarioError
         Names file, field, value and what is allowed.
     MeshError
-        The phantom cannot be made.
+        The phantom cannot be built.
     PluginError
         There is no such service.
 
@@ -51,16 +50,16 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
         ...
     ScenarioError: --set exam.dept_m: exam.dept_m = 0.008: there is no such field. Did you mean depth_m?
     """
-    words = as_settings(dict(paths(settings)))
+    given = as_settings(dict(paths(settings)))
     if isinstance(source, Scenario):
-        if words:
-            raise ScenarioError(f"{source.name}: {words[0]}: settings go with the name or file of a scenario, not with one")
+        if given:
+            raise ScenarioError(f"{source.name}: {given[0]}: settings need the name or file of a scenario, not a Scenario object")
         return examinable(whole_scenario(source, seed))
-    return examinable(load_scenario(str(source), words, seed))
+    return examinable(load_scenario(str(source), given, seed))
 
 
 def paths(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:
-    """Path and value of each field of nested mappings."""
+    """Yield path and value of each field of nested mappings."""
     for name, value in settings.items():
         path = f"{above}{name}"
         if isinstance(value, Mapping) and value:

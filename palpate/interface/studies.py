@@ -20,32 +20,32 @@ from palpate_models.scenario.load import as_settings
 
 
 class StudyResult:
-    """The folder of a study that is done."""
+    """The folder of a finished study."""
 
     def __init__(self, folder: Path, record: RunRecord) -> None:
         self.folder = folder
-        """Where its results are."""
+        """The results folder."""
         self.record = record
-        """What was run, where, with which code, and the digest."""
+        """Command, machine, code version and digest of the study."""
 
     @property
     def page(self) -> Path:
-        """The page to read, study.html."""
+        """The report as a page, study.html."""
         return self.folder / PAGE
 
     @cached_property
     def cases(self) -> pd.DataFrame:
-        """A row for each case: patient, method, errors, what it came to and what it took."""
+        """One row per case: patient, method, errors, outcome, duration."""
         return pd.read_parquet(self.folder / "cases.parquet")
 
     @cached_property
     def findings(self) -> pd.DataFrame:
-        """A row for each finding of each case."""
+        """One row per finding of each case."""
         return pd.read_parquet(self.folder / "findings.parquet")
 
     @cached_property
     def lumps(self) -> pd.DataFrame:
-        """A row for each lump of each case, found or not."""
+        """One row per lump of each case, found or not."""
         return pd.read_parquet(self.folder / "lumps.parquet")
 
     def __repr__(self) -> str:
@@ -64,20 +64,20 @@ def study(
     out: str | Path | None = None,
     **settings: Any,
 ) -> StudyResult:
-    """Runs a study, or goes on with one that was stopped, as `palpate study run` does on this machine.
+    """Runs a study or continues an interrupted one, as `palpate study run` does on this machine.
 
     Parameters
     ----------
     source
         Name of a study (`palpate study list`) or path of a YAML file.
     split
-        tune: patients to choose thresholds on; test: those to report.
+        tune: patients for choosing thresholds; test: patients to report.
     number
-        Patients of each population, instead of the study's own.
+        Patients per population; by default the study's number.
     methods
         Only these methods of the study.
     workers
-        Cases at a time; by default one a core.
+        Cases at a time; by default one per core.
     out
         Folder of the study; by default out/study/NAME-SPLIT. Finished cases in it are not run again.
     **settings
@@ -86,14 +86,14 @@ def study(
     Returns
     -------
     StudyResult
-        Its tables, and the page that was made of them.
+        Its tables and its page.
 
     Raises
     ------
     StudyError
-        The study, or what is asked of it, cannot be used. Names file, field, value and what is allowed.
+        The study or an argument is invalid. Names file, field, value and what is allowed.
     StudyStopped
-        The cases cannot be examined; what was done is kept.
+        The cases cannot be examined; finished cases are kept.
 
     Examples
     --------
@@ -110,8 +110,8 @@ def study(
     folder, manifest = opened(path, chosen.name, cases, command_of(str(source), request, methods or ()))
     if todo := len(folder.missing(cases)):
         begin, count = monotonic(), workers or cores()
-        with cluster(count) as hands:
-            run_cases(folder, cases, hands, lambda _: None)
+        with cluster(count) as client:
+            run_cases(folder, cases, client, lambda _: None)
         folder.add_session(Session(workers=count, cases=todo, elapsed_s=round(monotonic() - begin, 1)))
     record, _ = conclude(folder, manifest)
     return StudyResult(path, record)

@@ -1,1 +1,1 @@
-"""Replay: a recording on the bus again, and one service again against what it was given."""
+"""Replays a recording on the bus, and re-runs one service on its recorded inputs."""

@@ -1,4 +1,4 @@
-"""`palpate replay`: its options. What it does is imported when it is done, so that its help does not wait for it."""
+"""`palpate replay`. Imports on use, so that its help is fast."""
 
 from __future__ import annotations
 
@@ -11,26 +11,29 @@ import typer
 def replay(  # noqa: PLR0913 - the options of a command
     file: Annotated[Path, typer.Argument(help="A run's folder, a rosbag2 folder or an .mcap file.")],
     service: Annotated[
-        str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Run this service again: tissue, tissue=fmu, ...")
+        str | None, typer.Option(metavar="ROLE[=NAME_OR_FILE]", help="Re-run this service: tissue, tissue=fmu, ...")
     ] = None,
     rate: Annotated[float, typer.Option(min=0.01, help="Simulated seconds per second.")] = 1.0,
     begin: Annotated[float, typer.Option("--from", min=0.0, help="Simulated time to begin at, in seconds.")] = 0.0,
-    length: Annotated[float | None, typer.Option("--for", min=0.0, help="How long to play, in simulated seconds.")] = None,
+    length: Annotated[float | None, typer.Option("--for", min=0.0, help="Duration to play, in simulated seconds.")] = None,
     topics: Annotated[list[str] | None, typer.Option("--topic", help="Play these topics only; may be repeated.")] = None,
     listen: Annotated[
-        str | None, typer.Option(help="Endpoint to play at; by default what PALPATE_LISTEN and PALPATE_ROUTER say.")
+        str | None, typer.Option(help="Endpoint to play at; by default that of PALPATE_LISTEN and PALPATE_ROUTER.")
     ] = None,
     hold: Annotated[bool, typer.Option("--hold", help="Stay on the bus at the end until Ctrl-C.")] = False,
     drive: Annotated[bool, typer.Option("--drive", help="Play even if a running service would act on it.")] = False,
     tolerance: Annotated[
         list[str] | None,
-        typer.Option(metavar="X|TOPIC:FIELD=X", help="As a part of each field's range (1e-06), or in a field's unit."),
+        typer.Option(
+            metavar="X|TOPIC:FIELD=X",
+            help="Allowed difference: part of each field's range (1e-06), or in a field's unit.",
+        ),
     ] = None,
-    scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default the run's own.")] = None,
+    scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default that of the run.")] = None,
     update_refs: Annotated[Path | None, typer.Option(help="With --service: write its reference to this file.")] = None,
     as_json: Annotated[bool, typer.Option("--json", help="Print the comparison as JSON.")] = False,
 ) -> None:
-    """Play a recording on the bus, or re-run one service against it and compare.
+    """Play a recording on the bus, or re-run one service on its inputs and compare the outputs.
 
     [bold]Examples[/]
 
@@ -47,7 +50,9 @@ def replay(  # noqa: PLR0913 - the options of a command
       palpate replay tissue.mcap --service tissue --update-refs tissue.mcap      renews it
     """
     from palpate.console import refuse
-    from palpate.replay.perform import Passage, Playing, play, run_again, write_reference
+    from palpate.replay.golden import run_again, write_reference
+    from palpate.replay.play import play
+    from palpate_bus.messages.stamps import NS
 
     on_the_bus: dict[str, object] = {
         "--rate": rate != 1.0,
@@ -56,20 +61,21 @@ def replay(  # noqa: PLR0913 - the options of a command
         "--hold": hold,
         "--drive": drive,
     }
-    part_alone: dict[str, object] = {"--from": begin, "--for": length}
+    of_the_part: dict[str, object] = {"--from": begin, "--for": length}
     compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}
     again = {"--update-refs": update_refs, "--scenario": scenario, **compared}
-    unused, why = on_the_bus | part_alone, "is for a recording that is played on the bus; --service compares the whole of it"
+    unused, why = on_the_bus | of_the_part, "is for a recording that is played on the bus; --service compares all of it"
     if service is None:
-        unused, why = again, "goes with --service ROLE"
+        unused, why = again, "needs --service ROLE"
     elif update_refs is not None:
-        unused, why = on_the_bus | compared, "does not go with --update-refs, which only writes"
+        unused, why = on_the_bus | compared, "cannot be combined with --update-refs, which only writes"
     for option in (name for name, value in unused.items() if value):
         refuse(f"{option} {why}")
-    part = Passage(begin, length)
+    start = round(begin * NS)
+    end = None if length is None else start + round(length * NS)
     if service is None:
-        play(file, part, Playing(rate, topics, listen, hold, drive))
+        play(file, start, end, rate, topics, listen, hold, drive)
     elif update_refs is not None:
-        write_reference(file, service, scenario, part, update_refs)
+        write_reference(file, service, scenario, start, end, update_refs)
     else:
         run_again(file, service, scenario, tolerance or [], as_json)

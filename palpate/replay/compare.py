@@ -1,26 +1,29 @@
-"""Messages as flat fields: names without indices, values as numbers or words."""
+"""Compares the messages of a re-run service with the recorded ones, field by field."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass, field, fields, is_dataclass
+from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from rich.table import Table
 
-from palpate_bus.contract import Contract, Topic
+from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
+from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import RecordedMessage
+from palpate_plugins import PluginError
 
-Words = tuple[str | bool, ...]
-Value = NDArray[Any] | Words
+Value = NDArray[Any] | tuple[str | bool, ...]
+"""Numbers, or strings and booleans."""
 
 
 def flat(message: Any, prefix: str = "") -> Iterator[tuple[str, Value]]:
-    """Every leaf of a message: its dotted name, and its numbers as an array of one dimension or its words.
+    """Yield dotted name and value of every leaf of a message: numbers as a one-dimensional array, else strings or booleans.
 
-    The items of a list of messages share a name. Image and point-cloud bytes that hold floats come as floats.
+    The items of a list of messages share a name. Image and point-cloud bytes that hold floats are returned as floats.
     """
     for row in fields(message):
         if row.name.startswith("__"):
@@ -43,7 +46,7 @@ def flat(message: Any, prefix: str = "") -> Iterator[tuple[str, Value]]:
 
 
 def _floats(message: Any) -> NDArray[np.float32] | None:
-    """The floats in the bytes of a depth image or point cloud; None for any other message."""
+    """Return the floats in the bytes of a depth image or point cloud; None for any other message."""
     kind = getattr(message, "__msgtype__", "")
     if kind == "sensor_msgs/msg/Image" and message.encoding == "32FC1":
         return np.asarray(message.data, np.uint8).view(np.float32)
@@ -53,21 +56,21 @@ def _floats(message: Any) -> NDArray[np.float32] | None:
 
 
 RELATIVE = 1e-6
-"""Default tolerance, as a part of a field's range in the contract; without a range, of the value or of one, whichever is more.
+"""Default tolerance, as a part of a field's range in the contract; without a range, of the value or of 1, whichever is greater.
 
-On the platform of the recording a service gives the same bits; other processors and libraries differ in the last ones."""
+On the platform of the recording a service returns the same bits; with other processors and libraries the last bits differ."""
 
 
 @dataclass(frozen=True)
 class Tolerance:
-    """How far a number may be from the recorded one."""
+    """Allowed difference of numbers from the recorded ones."""
 
     relative: float = RELATIVE
     absolute: Mapping[str, float] = field(default_factory=dict)
-    """By `topic:field`, in the field's unit; a field holds for all below it. Wins over `relative`."""
+    """By `topic:field`, in the field's unit; applies to all fields below it, too. Takes precedence over `relative`."""
 
     def of(self, topic: Topic, name: str) -> tuple[float, float]:
-        """Absolute and relative part for a field."""
+        """Return the absolute and the relative part for a field."""
         for part in _upwards(name):
             key = f"{topic.name}:{part}"
             if key in self.absolute:
@@ -93,12 +96,12 @@ class FieldDifference:
     recorded: str
     got: str
     deviation: float
-    """In the field's unit; infinite where words, sizes or NaNs differ."""
+    """In the field's unit; infinite if strings, sizes or NaNs differ."""
     tolerance: float
 
     @property
     def ratio(self) -> float:
-        """Deviation over tolerance."""
+        """Deviation divided by tolerance."""
         if self.deviation == 0:
             return 0.0
         return self.deviation / self.tolerance if self.tolerance > 0 else float("inf")
@@ -106,20 +109,21 @@ class FieldDifference:
 
 @dataclass
 class TopicResult:
-    """How one output topic compares."""
+    """Comparison of one output topic."""
 
     topic: str
     messages: int = 0
-    """Compared."""
+    """Compared messages."""
     identical: int = 0
-    """How many of the compared messages are equal byte for byte."""
+    """Compared messages that are equal byte for byte."""
     missing: int = 0
-    """Recorded, but not sent now."""
+    """Recorded messages that were not sent."""
     extra: int = 0
-    """Sent now, but not recorded."""
+    """Sent messages that were not recorded."""
     off_time: int = 0
-    """Sent at another tick than recorded."""
+    """Messages sent at another tick than recorded."""
     worst: dict[str, FieldDifference] = field(default_factory=dict)
+    """By field."""
 
     @property
     def violations(self) -> list[FieldDifference]:
@@ -128,7 +132,7 @@ class TopicResult:
 
     @property
     def agrees(self) -> bool:
-        """Whether the service sent what was recorded, within tolerance."""
+        """True if the sent messages are the recorded ones, within tolerance."""
         return not (self.missing or self.extra or self.off_time or self.violations)
 
 
@@ -139,7 +143,7 @@ def compare(
     tolerance: Tolerance,
     topics: Iterable[str],
 ) -> dict[str, TopicResult]:
-    """Pairs messages by topic and sequence number; both streams are in order of their stamps. `topics` are those compared."""
+    """Return the comparison of `topics`; messages are paired by topic and sequence number. Both streams are ordered by stamp."""
     results = {name: TopicResult(name) for name in topics}
     waiting: dict[tuple[str, int], RecordedMessage] = {}
     recorded = iter(expected)
@@ -189,7 +193,7 @@ def _note(result: TopicResult, difference: FieldDifference) -> None:
 
 def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, tolerance: Tolerance) -> FieldDifference | None:
     if isinstance(a, tuple) or isinstance(b, tuple):
-        return None if a == b else FieldDifference(name, stamp, _word(a), _word(b), float("inf"), 0.0)
+        return None if a == b else FieldDifference(name, stamp, _text(a), _text(b), float("inf"), 0.0)
     if a.shape != b.shape:
         return FieldDifference(name, stamp, f"{a.size} items", f"{b.size} items", float("inf"), 0.0)
     x, y = a.astype(np.float64), b.astype(np.float64)
@@ -206,5 +210,53 @@ def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, toleran
     return FieldDifference(name, stamp, f"{x[i]:.9g}", f"{y[i]:.9g}", float(off[i]), float(allowed[i]))
 
 
-def _word(value: Value) -> str:
+def _text(value: Value) -> str:
     return ", ".join(repr(item) for item in value) if isinstance(value, tuple) else f"{value.size} items"
+
+
+def parse_tolerance(options: list[str]) -> Tolerance:
+    """Return the tolerance of `--tolerance` options. Raises PluginError for an invalid one."""
+    relative, absolute = RELATIVE, {}
+    for option in options:
+        name, _, number = option.rpartition("=")
+        try:
+            value = float(number)
+        except ValueError:
+            raise PluginError(f"--tolerance {option}: want a number, or TOPIC:FIELD=NUMBER") from None
+        if not value >= 0:
+            raise PluginError(f"--tolerance {option}: want at least 0")
+        if not name:
+            relative = value
+            continue
+        topic = name.partition(":")[0]
+        if topic not in contract().topics:
+            raise PluginError(f"--tolerance {option}: the contract has no topic {topic!r}")
+        absolute[name] = value
+    return Tolerance(relative, absolute)
+
+
+def as_dict(result: TopicResult) -> dict[str, Any]:
+    """Return a result for `--json`."""
+    row = asdict(result)
+    row["agrees"] = result.agrees
+    row["worst"] = [{**asdict(d), "ratio": d.ratio} for d in sorted(result.worst.values(), key=lambda d: -d.ratio)]
+    return row
+
+
+def result_table(results: Mapping[str, TopicResult]) -> Table:
+    """Return the comparison with a row per topic."""
+    table = Table(
+        "topic", "messages", "identical", "missing", "extra", "worst field", "difference", "allowed", "at \\[s]", box=None
+    )
+    for result in results.values():
+        worst = max(result.worst.values(), key=lambda d: d.ratio, default=None)
+        counts = [str(n) for n in (result.messages, result.identical, result.missing, result.extra)]
+        cells = ["", "", "", ""] if worst is None else [
+            worst.name,
+            f"{worst.deviation:.3g}" if worst.deviation != float("inf") else f"{worst.recorded} -> {worst.got}",
+            f"{worst.tolerance:.3g}",
+            f"{worst.stamp / NS:.3f}",
+        ]  # fmt: skip
+        style = None if result.agrees else "red"
+        table.add_row(result.topic, *counts, *cells, style=style)
+    return table

@@ -1,12 +1,14 @@
-"""References: a cut of a recording that one service is held to, small enough for a repository.
+"""Golden replay: runs one service again on recorded inputs and compares its outputs; writes references for tests.
 
-A reference is an MCAP file like any recording, with the service's inputs, its outputs and, as an attachment, its scenario. Times
-are shifted so that it begins at zero, and floats keep 24 bits (relative 3e-8), which is what makes it small. The outputs are what
-the service gives on the rounded inputs, so on one platform a reference differs from a replay by that rounding alone.
+A reference is a short part of a recording, small enough for a repository: an MCAP file with the service's inputs, its outputs
+and, as an attachment, its scenario. Times begin at zero, and floats keep 24 bits (relative 3e-8), which makes the file small. The
+outputs are those for the rounded inputs, so on one platform a reference differs from a replay by the rounding of outputs only.
 """
 
 from __future__ import annotations
 
+import json
+import logging
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -16,8 +18,10 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from rich.console import Console
 
-from palpate.replay.compare import Tolerance, TopicResult, compare
+from palpate.console import TimeLeft, fail
+from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
 from palpate.replay.rerun import rerun
 from palpate_bus import implementations
 from palpate_bus.contract import MS, Contract, Topic, contract
@@ -30,21 +34,20 @@ from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
 
 DROPPED_BITS = np.int64(~((1 << 29) - 1))
-"""Keeps 23 of the 52 fraction bits of a double, and so 24 significant ones."""
+"""Mask that keeps 23 of the 52 fraction bits of a double, so 24 significant bits."""
 
 
 def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int, end: int) -> Iterator[RecordedMessage]:
-    """The messages of `topics` from `begin` to `end` [ns], rounded, shifted to zero and numbered anew.
+    """Yield the messages of `topics` from `begin` to `end` [ns], rounded, with times and sequence numbers from zero.
 
-    What each topic carried last before `begin` comes first, as a late joiner would find it.
+    The last earlier message of each topic that is not periodic comes first, as for a late joiner.
     """
     names = tuple(topics)
     numbers = dict.fromkeys(names, 0)
     before: dict[str, RecordedMessage] = {}
     if begin > 0:
-        for message in recording.messages(names, None, begin - 1):
-            before[message.topic] = message
-    kept = [replace_stamp(m, begin) for m in before.values() if not rules.topics[m.topic].periodic]
+        before = {message.topic: message for message in recording.messages(names, None, begin - 1)}
+    kept = [message._replace(stamp=begin) for message in before.values() if not rules.topics[message.topic].periodic]
     for message in [*kept, *recording.messages(names, begin, end)]:
         topic = rules.topics[message.topic]
         numbers[topic.name] += 1
@@ -53,13 +56,8 @@ def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int
         yield RecordedMessage(stamp, topic.name, rounded(topic, message.payload, begin), sequence)
 
 
-def replace_stamp(message: RecordedMessage, stamp: int) -> RecordedMessage:
-    """The message as if it had been sent at `stamp` [ns]."""
-    return message._replace(stamp=stamp)
-
-
 def rounded(topic: Topic, payload: bytes, shift: int = 0) -> bytes:
-    """A message with its doubles rounded and its time stamps `shift` [ns] earlier (not before zero)."""
+    """Return a message with rounded doubles and with time stamps `shift` [ns] earlier (not below zero)."""
     return codec.encode(_rounded_value(codec.decode(payload, topic.type), shift), topic.type)
 
 
@@ -85,7 +83,7 @@ def _round(values: Any) -> Any:
 def write_recording(
     path: Path, rules: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
-    """Writes messages to an MCAP file; an old file is replaced only when the new one is complete.
+    """Writes messages to an MCAP file and replaces an old file when the new one is complete.
 
     `attachments`: media type and content by name.
     """
@@ -113,28 +111,28 @@ def _register(writer: Writer, topic: Topic) -> int:
 
 @dataclass(frozen=True)
 class GoldenCase:
-    """One service against one recording."""
+    """A service and the recording that it is compared with."""
 
     recording: Recording
     role: str
     service: Service
     scenario: str
-    """As YAML."""
+    """YAML."""
     rules: Contract
 
     @property
     def inputs(self) -> tuple[str, ...]:
-        """Topics that the service reads and the recording has."""
+        """Recorded topics that the service reads."""
         return tuple(topic.name for topic, _ in self.rules.inputs(self.role) if topic.name in self.recording.types)
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Topics that the service writes and the recording has."""
+        """Recorded topics that the service sends."""
         return tuple(topic.name for topic in self.rules.outputs(self.role) if topic.name in self.recording.types)
 
     @property
     def end(self) -> int:
-        """Last tick of the role in the recording [ns]: of its periodic outputs, or else the recording's last stamp."""
+        """Last tick of the role in the recording [ns], from its periodic outputs, else from the recording's last stamp."""
         period = self.rules.roles[self.role].period
         periodic = [t for t in self.outputs if self.rules.topics[t].periodic and self.recording.counts[t]]
         if periodic:
@@ -143,64 +141,64 @@ class GoldenCase:
 
 
 def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase:
-    """Opens a recording and makes the service `choice`: ROLE as the scenario has it, or ROLE=NAME_OR_FILE.
+    """Opens a recording and creates the service `choice`: ROLE with the scenario's implementation, or ROLE=NAME_OR_FILE.
 
-    The scenario is `scenario`, else the recording's own, else the one beside it. Raises RecordingError, PluginError or
+    The scenario is `scenario`, else the one in the recording, else the one in its folder. Raises RecordingError, PluginError or
     ScenarioError.
     """
     rules = contract()
     role, _, name = choice.partition("=")
     workers = [row.name for row in rules.roles.values() if not row.observer and row.name != "conductor"]
     if role not in workers:
-        raise PluginError(f"--service {choice}: no service {role!r}; services are {', '.join(workers)}")
+        raise PluginError(f"--service {choice}: there is no service {role!r}; allowed are {', '.join(workers)}")
     if name:
         implementations.check(role, name)
     recording = open_recording(path)
-    text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _beside(path, role)
+    text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _scenario_near(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
     recording.check(rules, topics)
     if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
-        raise RecordingError(f"{path}: has nothing that {role} sent, so there is nothing to compare with")
+        raise RecordingError(f"{path}: has no message of {role} to compare with")
     loaded = load_text(text)
     service = implementations.create(role, name or getattr(loaded.services, role), loaded)
     return GoldenCase(recording, role, service, text, rules)
 
 
 def load_text(text: str) -> Scenario:
-    """A scenario from YAML text. Raises ScenarioError."""
+    """Return the scenario of a YAML text. Raises ScenarioError."""
     with tempfile.TemporaryDirectory(prefix="palpate-replay-") as folder:
         file = Path(folder) / "recorded.yaml"
         file.write_text(text, encoding="utf-8")
         return load_scenario(str(file))
 
 
-def _beside(path: Path, role: str) -> str:
-    name = f"{view_of(role)}.yaml"  # as in a run
+def _scenario_near(path: Path, role: str) -> str:
+    """Return the text of the scenario file of a role in the run's folder. Raises RecordingError if there is none."""
+    name = f"{view_of(role)}.yaml"
     for folder in (path, *path.resolve().parents[:2]):
         if (folder / name).is_file():
             return (folder / name).read_text(encoding="utf-8")
-    raise RecordingError(f"{path}: no {name} in it or beside it; {role} needs the scenario of the run: --scenario FILE")
+    raise RecordingError(f"{path}: no {name} in it or next to it; {role} needs the scenario of the run: --scenario FILE")
 
 
 def replay_service(
-    case: GoldenCase, tolerance: Tolerance, tell: Callable[[int], None] = lambda _: None
+    case: GoldenCase, tolerance: Tolerance, progress: Callable[[int], None] = lambda _: None
 ) -> dict[str, TopicResult]:
-    """Re-runs the service and compares all that it sends; `tell` hears how far it is [ns], with each message."""
+    """Re-runs the service and compares all its messages; calls `progress` with the stamp of each [ns]."""
 
     def sent() -> Iterator[RecordedMessage]:
         for message in rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end):
-            tell(message.stamp)
+            progress(message.stamp)
             yield message
 
     expected = case.recording.messages(case.outputs, end=case.end)
     results = compare(expected, sent(), case.rules, tolerance, case.outputs)
-    facts = case.service.finish()
-    del facts
+    case.service.finish()
     return results
 
 
 def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
-    """Writes what the service gets from `begin` to `end` [ns], and what it answers, as a reference."""
+    """Writes a reference: the inputs of the service from `begin` to `end` [ns] and its outputs."""
     period = case.rules.roles[case.role].period
     begin -= begin % max(period, 100 * MS)  # a tick of every role
     end = min(end, case.end)
@@ -214,3 +212,24 @@ def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
 def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[RecordedMessage]:
     for message in messages:
         yield message._replace(payload=rounded(rules.topics[message.topic], message.payload))
+
+
+def write_reference(file: Path, service: str, scenario: Path | None, start: int, end: int | None, target: Path) -> None:
+    """Writes the reference of a service from a recording between `start` and `end` [ns]."""
+    case = prepare(file, service, scenario)
+    make_reference(case, target, start, case.end if end is None else end)
+    Console(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
+
+
+def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:
+    """Runs a service again on its recorded inputs and prints the comparison. Raises typer.Exit(3) if the outputs differ."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    case = prepare(file, service, scenario)
+    with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
+        results = replay_service(case, parse_tolerance(tolerance), bar.reach)
+    if as_json:
+        print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
+    else:
+        Console(width=max(140, Console().width)).print(result_table(results))
+    if not all(result.agrees for result in results.values()):
+        fail(f"the messages of {case.role} differ from {file}; if this is intended, renew it with --update-refs")

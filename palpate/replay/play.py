@@ -1,16 +1,21 @@
-"""A recording on the bus again: the same keys, bytes and sequence numbers, paced by the wall clock."""
+"""Plays a recording on the bus: the same keys, bytes and sequence numbers, in scaled real time."""
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Collection
+from pathlib import Path
 from time import monotonic_ns, sleep
 from types import TracebackType
 from typing import Self
 
+from rich.console import Console
+
+from palpate.console import TimeLeft
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.messages import Clock, codec
 from palpate_bus.messages.stamps import NS, time_message
-from palpate_bus.recordings import Recording
+from palpate_bus.recordings import Recording, open_recording
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch
@@ -19,15 +24,15 @@ from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_sessio
 from palpate_errors import UserError
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
-"""Where a replay is to be found when the environment names no endpoint: where ROS 2's rmw_zenoh looks for its router."""
+"""Endpoint of a replay if the environment names none: ROS 2's rmw_zenoh expects its router here."""
 LOOK_NS = NS
-"""How long the bus is looked at before anything is played, and how often while it plays."""
+"""The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
 CLOCK = "clock"
-CLOCK_PERIOD = 10 * MS
+CLOCK_PERIOD_NS = 10 * MS
 
 
 class Player:
-    """Plays a recording. Every role that it speaks for shows in the ROS graph; use it as a context manager."""
+    """Plays a recording. Every role that it plays appears in the ROS graph; use it as a context manager."""
 
     def __init__(
         self,
@@ -39,7 +44,7 @@ class Player:
     ) -> None:
         """Joins the bus.
 
-        Raises UserError when a living service sends what would be played, or would act on it without `drive`.
+        Raises UserError if a running service sends a topic that would be played, or, without `drive`, would act on it.
         """
         self._recording = recording
         self._rate = rate
@@ -55,12 +60,12 @@ class Player:
             domain = Settings.read().domain
             self._graph = GraphWatch(self._session, domain)
             begin = monotonic_ns()
-            while monotonic_ns() - begin < LOOK_NS:  # peers that are there find us within retries of a tenth of a second
+            while monotonic_ns() - begin < LOOK_NS:  # peers retry every 0.1 s to connect
                 self._look()
                 sleep(0.05)
             clock = [CLOCK] if CLOCK not in recording.types and topics is None else []
             members: dict[str, Member] = {}
-            self._members = members  # a member that is let go takes its tokens along
+            self._members = members  # a deleted member withdraws its tokens
             self._publishers: dict[str, Sender] = {}
             for name in (*self.topics, *clock):
                 row = rules.topics[name]
@@ -77,10 +82,10 @@ class Player:
         """Simulated time reached [ns]."""
         self.sent = 0
         self.lag_ms = 0.0
-        """How late a message left, at worst."""
+        """Largest delay of a message."""
 
     def _look(self) -> None:
-        """Raises UserError when a living service of someone else forbids what is played."""
+        """Raises UserError if a service of another process sends a topic that is played, or would act on it."""
         self._graph.changes()
         own = str(self._session.zid())
         alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
@@ -89,18 +94,18 @@ class Player:
             row = rules.topics[name]
             if row.producer in alive:
                 raise UserError(
-                    f"{row.producer} lives on this bus and sends {name} itself; play on another bus (--listen) or other topics"
+                    f"{row.producer} runs on this bus and sends {name} itself; play on another bus (--listen) or other topics"
                 )
             acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
             if acting and not self._drive:
-                raise UserError(f"{', '.join(acting)} would act on {name}; --drive if that is meant")
+                raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
-    def play(self, start: int = 0, until: int | None = None, tell: Callable[[int], None] = lambda _: None) -> None:
-        """Plays from `start` to `until` [ns]. Latched messages and what was last said before `start` come first.
+    def play(self, start: int = 0, until: int | None = None, progress: Callable[[int], None] = lambda _: None) -> None:
+        """Plays from `start` to `until` [ns], beginning with the last earlier message of each topic that is not periodic.
 
-        `tell` hears how far it is [ns], with each message.
+        Calls `progress` with the stamp of each message [ns].
 
-        Raises UserError when a service comes alive that must not meet what is played.
+        Raises UserError if a service appears that sends a topic that is played, or would act on it.
         """
         self.now = start
         self._next_clock = start
@@ -108,18 +113,18 @@ class Player:
             self._prelude(start)
         epoch = 0
         for message in self._recording.messages(self.topics, start, until):
-            epoch = epoch or monotonic_ns()  # not before the first chunk is unpacked
+            epoch = epoch or monotonic_ns()  # after the first chunk is unpacked
             while self._own_clock and self._next_clock <= message.stamp:
                 self._wait(epoch + round((self._next_clock - start) / self._rate))
                 self._tick()
             self._wait(epoch + round((message.stamp - start) / self._rate))
             self.now = message.stamp
-            tell(self.now)
+            progress(self.now)
             self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
             self.sent += 1
 
     def _prelude(self, start: int) -> None:
-        """What a late joiner would know at `start`: the last message of each topic that is not periodic."""
+        """Sends the last message before `start` of each topic that is not periodic, which a late joiner would receive."""
         rules = contract()
         quiet = [name for name in self.topics if not rules.topics[name].periodic]
         last = {message.topic: message for message in self._recording.messages(quiet, end=start - 1)}
@@ -129,8 +134,8 @@ class Player:
 
     def _tick(self) -> None:
         message = Clock(time_message(self._next_clock))
-        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // CLOCK_PERIOD + 1)
-        self._next_clock += CLOCK_PERIOD
+        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // CLOCK_PERIOD_NS + 1)
+        self._next_clock += CLOCK_PERIOD_NS
 
     def _wait(self, due: int) -> None:
         now = monotonic_ns()
@@ -173,3 +178,30 @@ def _options(listen: str | None) -> BusOptions:
     if not (options.listen or options.connect or options.router or options.file):
         return BusOptions(listen=(DEFAULT_LISTEN,))
     return options
+
+
+def play(
+    file: Path,
+    start: int,
+    end: int | None,
+    rate: float,
+    topics: Collection[str] | None,
+    listen: str | None,
+    hold: bool,
+    drive: bool,
+) -> None:
+    """Plays a recording on the bus from `start` to `end` [ns] or Ctrl-C; with `hold` until Ctrl-C. Raises UserError."""
+    logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
+    console = Console(stderr=True)
+    recording = open_recording(file)
+    with Player(recording, rate, topics, listen, drive) as player:
+        console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends", highlight=False)
+        try:
+            with TimeLeft("playing", start, min(end or recording.last, recording.last)) as bar:
+                player.play(start, end, bar.reach)
+            console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, at most {player.lag_ms:.1f} ms late")
+            if hold:
+                console.print("holding; Ctrl-C ends")
+                player.hold()
+        except KeyboardInterrupt:
+            console.print(f"ended at {player.now / NS:.3f} s after {player.sent} messages")

@@ -1,4 +1,4 @@
-"""One service again, in this process, against recorded inputs: the lockstep order of the run, no transport, no wall clock."""
+"""Re-runs one service in this process on recorded inputs, in the lockstep order of the run, without transport."""
 
 from __future__ import annotations
 
@@ -13,13 +13,14 @@ from palpate_bus.service import Service
 def rerun(
     service: Service, rules: Contract, inputs: Iterable[RecordedMessage], end: int, begin: int = 0
 ) -> Iterator[RecordedMessage]:
-    """What `service` sends when it gets `inputs` (in order of their stamps), from its start to the tick `end` [ns].
+    """Yield the messages of `service` for `inputs` (ordered by stamp), from its start to the tick `end` [ns].
 
-    Its first step is at the tick `begin` [ns], where it gets all that came until then at once.
+    The first step is at the tick `begin` [ns] and receives all earlier inputs.
 
-    At tick T it sees what it saw in the run: `same_tick` messages up to T, `previous` ones up to T less their topic's period. An
-    observed topic is outside the barrier, so when a message of one was seen in a distributed run is not known; here it is seen
-    on the tick after its stamp, as in a composed run. Raises LockstepError when the service breaks its contract.
+    At tick T the service receives the same inputs as in the run: `same_tick` messages up to T, `previous` messages up to T minus
+    the period of their topic. Observed topics are outside the barrier, so the tick at which a distributed run received a message
+    of one is unknown; here it is the tick after its stamp, as in a composed run. Raises LockstepError if the service breaks its
+    contract.
     """
     stepper = Stepper(service, rules)
     late = {name for name, buffer in stepper.buffers.items() if buffer.edge is Edge.OBSERVE}

@@ -36,7 +36,7 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     with results_first():
         with RunDisplay(console, quiet, chosen.exam) as display:
             timing = Timing(wallclock, 1.0 if realtime else None)
-            result = conduct(session, roles, display.tell, timing=timing, tree=FrameTree(exam_input(chosen)))
+            result = conduct(session, roles, display.show, timing=timing, tree=FrameTree(exam_input(chosen)))
         all_is_measured()
         close_session(session)
         conclude(console, out, chosen, result, quiet)

@@ -9,9 +9,8 @@ from time import perf_counter
 from palpate.run.group import Groups, apart
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
-from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, override_files, read_processes
+from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, override_files, read_processes
 from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
-from palpate.run.secure import SecureBus
 from palpate_bus import implementations
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
 from palpate_conductor.collector import FrameTree

@@ -22,9 +22,9 @@ from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
 from palpate.run.places import Absent
+from palpate.run.processes import SecureBus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
-from palpate.run.secure import SecureBus
 from palpate.run.self_test import RATES, measure
 from palpate_bus.implementations import check_libraries
 from palpate_bus.settings import Settings
@@ -58,7 +58,7 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
         if not options.silent:
             _announce(console, scenario, options, folder)
         with RunDisplay(console, options.silent, scenario.exam) as display, given({"PALPATE_RECORD": options.record}):
-            tell = WatchedRoom(folder, display.tell, say).tell
+            tell = WatchedRoom(folder, display.show, say).check
             with unless_begun(folder, lambda: display.begun), checkpoint_given(None if before is None else before.checkpoint):
                 check_room(folder, scenario.exam, options.record)
                 result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)

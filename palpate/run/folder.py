@@ -174,8 +174,8 @@ class WatchedRoom:
         self._folder, self._tell, self._warn = folder, tell, warn
         self._warned = False
 
-    def tell(self, progress: RunProgress) -> None:
-        """Passes on the progress."""
+    def check(self, progress: RunProgress) -> None:
+        """Checks the free space and passes on the progress."""
         if not self._warned and (left := free_mb(self._folder)) < LOW_MB:
             self._warned = True
             self._warn(f"{self._folder}: {left:.0f} MB are left there: recordings will stop, the examination continues")

@@ -13,7 +13,7 @@ import typer
 
 DEFAULT_SCENARIO = "lump"
 Record = Literal["none", "normal", "full"]
-"""What is recorded of a run; see `palpate_bus.settings.Settings.record`."""
+"""The recording of a run; see `palpate_bus.settings.Settings.record`."""
 ScenarioName = Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]

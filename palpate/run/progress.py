@@ -143,7 +143,7 @@ class RunDisplay:
         self._keys.__exit__(kind, error, trace)
         self._bar.stop()
 
-    def tell(self, progress: RunProgress) -> None:
+    def show(self, progress: RunProgress) -> None:
         """Shows the state of the run."""
         for sentence in progress.trouble[self._troubles_shown :]:
             self._console.print(f"[bold red]{escape(sentence)}[/]", highlight=False, soft_wrap=True)

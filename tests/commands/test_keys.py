@@ -23,7 +23,7 @@ def request(number, reason):
     collected.supervisor = SimpleNamespace(level=int(stops), reason="an operator" if stops else "")
 with RunDisplay(Console(stderr=True, width=200), False, Exam()) as display:
     while len(asked) < 3:
-        display.tell(RunProgress(0, 1.0, collected, (), request))
+        display.show(RunProgress(0, 1.0, collected, (), request))
         time.sleep(0.01)
 print("asked", asked, [OperatorRequest.SOFT_STOP, OperatorRequest.STOP, OperatorRequest.RELEASE], flush=True)
 """

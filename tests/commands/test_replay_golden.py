@@ -32,7 +32,7 @@ def test_every_service_still_answers_as_its_reference_says(role: str) -> None:
     differing = [
         (name, result.violations[:3], result.missing, result.extra) for name, result in results.items() if not result.agrees
     ]
-    assert not differing, f"{differing}; if that is meant: {RENEW.format(path, role)}"
+    assert not differing, f"{differing}; if this is intended: {RENEW.format(path, role)}"
     assert sum(result.messages for result in results.values()) > 0
 
 
@@ -88,7 +88,7 @@ def test_renewing_a_reference_makes_the_changed_service_agree(tmp_path: Path) ->
         (("--topic", "nothing"), "nothing"),
         (("--update-refs", "new.mcap"), "--update-refs goes with --service"),
         (("--service", "control", "--for", "5"), "--for is for a recording that is played"),
-        (("--service", "control", "--update-refs", "new.mcap", "--json"), "--json does not go with --update-refs"),
+        (("--service", "control", "--update-refs", "new.mcap", "--json"), "--json cannot be combined with --update-refs"),
     ],
 )
 def test_bad_input_ends_with_status_2_and_says_what_is_wrong(words: tuple[str, ...], said: str) -> None:

@@ -73,7 +73,7 @@ def test_every_message_arrives_as_it_was_recorded(endpoint: str, listener: zenoh
 @pytest.mark.parametrize(
     ("topic", "drive", "said"),
     [
-        ("joint_states", True, "robot lives on this bus"),
+        ("joint_states", True, "robot runs on this bus"),
         ("control/joint_torque", False, "robot would act on control/joint_torque"),
         ("control/joint_torque", True, None),
     ],

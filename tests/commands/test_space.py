@@ -58,7 +58,7 @@ def test_a_disk_that_fills_up_is_told_once(tmp_path: Path, monkeypatch: pytest.M
     room = WatchedRoom(tmp_path, told.append, said.append)
     for megabytes in (500, 10, 5):
         leave(megabytes, monkeypatch)
-        room.tell(RunProgress(0, 1.0, Collected(), ()))
+        room.check(RunProgress(0, 1.0, Collected(), ()))
     assert len(told) == 3
     assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
 
