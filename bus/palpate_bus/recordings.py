@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import heapq
+import shlex
 import struct
+from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
-from typing import NamedTuple
+from typing import IO, NamedTuple
 
 import yaml
 from mcap.exceptions import McapError
-from mcap.reader import make_reader
+from mcap.reader import McapReader, NonSeekingReader, make_reader
+from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
 from zstandard import ZstdError
 
-from palpate_bus.contract import Contract
+from palpate_bus.contract import Contract, Topic
+from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import RECORDING
 from palpate_errors import UserError
 
@@ -25,6 +29,10 @@ KEPT_EVERY = "kept_every_ms"
 """Metadata of a channel: period [ms] in which one message was kept."""
 SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
+UNIX_NS = 10**17
+"""Stamps from here on [ns] are Unix time, as other recorders write it, not the simulated time of a run."""
+BROKEN = (McapError, EOFError, RuntimeError, ValueError, KeyError, ZstdError, struct.error)
+"""Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum."""
 
 
 class RecordingError(UserError):
@@ -35,10 +43,37 @@ class RecordedMessage(NamedTuple):
     """One recorded message."""
 
     stamp: int
-    """Simulated time [ns] of the tick that sent it."""
+    """Time [ns] at which it was sent: simulated, or Unix time in recordings of other writers."""
     topic: str
     payload: bytes
     sequence: int
+
+
+class RecordedType(NamedTuple):
+    """Type of a recorded topic, as its writer described it."""
+
+    name: str
+    type_hash: str = ""
+    """RIHS01 hash; empty if the writer stored none, as before ROS 2 Iron."""
+    definition: str = ""
+    """Text of the .msg file and of the types in it; empty if the writer stored none."""
+    encoding: str = "cdr"
+
+    def difference(self, topic: Topic) -> str:
+        """Describe how the type differs from the contract's; empty if it does not. Without a hash the definition counts."""
+        if self.encoding != "cdr":
+            return f"in the encoding {self.encoding!r}, this installation reads 'cdr'"
+        found = self.type_hash if self.type_hash.startswith("RIHS01_") else ""
+        if self.name == topic.type and not found:
+            if not self.definition:
+                return ""
+            try:
+                found = definition_hash(self.name, self.definition)
+            except CodecError as error:
+                return f"with a definition that cannot be compared: {error}"
+        if (self.name, found) == (topic.type, topic.type_hash):
+            return ""
+        return f"as {self.name} {found}".rstrip() + f", this installation has {topic.type} {topic.type_hash}"
 
 
 @dataclass(frozen=True)
@@ -47,8 +82,8 @@ class Recording:
 
     path: Path
     files: tuple[Path, ...]
-    types: dict[str, tuple[str, str]]
-    """Message type and RIHS01 hash by topic (without its leading slash)."""
+    types: dict[str, RecordedType]
+    """Message type by topic (without its leading slash); channels without a schema are left out."""
     counts: dict[str, int]
     """Messages by topic."""
     thinned: dict[str, int]
@@ -59,26 +94,44 @@ class Recording:
     """Latest stamp [ns]."""
     scenario: str | None
     """Scenario as YAML, if the file has one."""
+    unindexed: frozenset[Path] = frozenset()
+    """Files without a usable index, which are read from beginning to end."""
 
     def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
         """Yield messages of `topics` in order of their stamps, from `begin` to `end` [ns], both included.
 
-        Raises RecordingError if a file is truncated.
+        Raises RecordingError if a file is damaged.
         """
-        names = [f"/{topic}" for topic in topics]
+        names = [f"/{topic}" for topic in topics] + list(topics)  # other writers leave out the slash
         if not names:
             return
         with ExitStack() as stack:
-            streams = [stack.enter_context(file.open("rb")) for file in self.files]
-            readers = [make_reader(stream).iter_messages(topics=names, starting_at=begin, ending_at=end) for stream in streams]
+            streams = [(file, stack.enter_context(file.open("rb"))) for file in self.files]
+            readers = [
+                self._reader(file, stream).iter_messages(topics=names, starting_at=begin, ending_at=end)
+                for file, stream in streams
+            ]
             each = [
-                (RecordedMessage(m.log_time, channel.topic[1:], m.data, m.sequence) for _, channel, m in reader)
+                (
+                    RecordedMessage(m.log_time, channel.topic.removeprefix("/"), m.data, m.sequence)
+                    for schema, channel, m in reader
+                    if schema is not None
+                )
                 for reader in readers
             ]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
-            except (McapError, EOFError, struct.error, ZstdError) as error:
-                raise RecordingError(f"{self.path}: truncated: {error!r}; {_RECOVER}") from error
+            except BROKEN as error:
+                broken = self.path if self.path.is_file() else self.files[0].parent
+                raise RecordingError(f"{self.path}: is damaged; {_recover(broken)}") from error
+
+    def _reader(self, file: Path, stream: IO[bytes]) -> McapReader:
+        return (NonSeekingReader if file in self.unindexed else make_reader)(stream, validate_crcs=True)
+
+    def origin(self, topics: Collection[str]) -> int:
+        """Return the stamp [ns] at which the time of `topics` begins: 0 in simulated time, their first stamp in Unix time."""
+        first = next(self.messages(topics), None)
+        return 0 if first is None or first.stamp < UNIX_NS else first.stamp
 
     def check(self, rules: Contract, topics: Collection[str], *, whole: bool = True) -> None:
         """Raise RecordingError if a topic was recorded with another type or definition than the contract's.
@@ -91,68 +144,161 @@ class Recording:
                     f"{self.path}: only one message of topic {name} per {self.thinned[name]} ms was kept, but all are needed; "
                     "record with --record full"
                 )
-            row, recorded = rules.topics[name], self.types.get(name)
-            if recorded is not None and recorded != (row.type, row.type_hash):
+            if name in self.types and (difference := self.types[name].difference(rules.topics[name])):
                 raise RecordingError(
-                    f"{self.path}: topic {name} was recorded as {recorded[0]} {recorded[1]}, "
-                    f"this installation has {row.type} {row.type_hash}; record again, or replay with the version that recorded it"
+                    f"{self.path}: topic {name} was recorded {difference}; "
+                    "record again, or replay with the version that recorded it"
                 )
 
 
-_RECOVER = "if its recorder was killed, first: python -m palpate_recorder.recover FOLDER"
+def _recover(path: Path) -> str:
+    return f"run: python -m palpate_recorder.recover {shlex.quote(str(path))}"
 
 
-def _files(path: Path) -> tuple[Path, ...]:
+def _convert(path: Path) -> str:
+    path = path if path.name else path.resolve()
+    source, target = shlex.quote(str(path)), shlex.quote(str(path.with_name(f"{path.stem}_mcap")))
+    return f"run: rosbags-convert --src {source} --dst {target} --dst-storage mcap"
+
+
+def _unreadable(file: Path, path: Path) -> RecordingError:
+    """Return the error for a file that is not a complete MCAP file. `path`: its recording."""
+    with file.open("rb") as stream:
+        head = stream.read(16)
+    if not head:
+        return RecordingError(f"{file}: is empty, so nothing was recorded")
+    if head.startswith(b"SQLite format 3"):
+        return RecordingError(f"{file}: is an SQLite bag, want MCAP; {_convert(path)}")
+    if head.startswith(b"#ROSBAG"):
+        return RecordingError(f"{file}: is a ROS 1 bag, want MCAP; {_convert(path)}")
+    if head.startswith(b"\x28\xb5\x2f\xfd"):
+        remedy = _convert(path) if path != file else f"run: zstd -d {shlex.quote(str(file))}"
+        return RecordingError(f"{file}: is compressed as a whole, want MCAP; {remedy}")
+    if not head.startswith(b"\x89MCAP"):
+        return RecordingError(f"{file}: is not an MCAP file: it begins with {head[:8]!r}")
+    return RecordingError(f"{file}: is unfinished: still being written, cut off, or its recorder was killed; {_recover(path)}")
+
+
+def _files(path: Path) -> tuple[Path, tuple[Path, ...]]:
+    """Return the file or folder of a recording and its files."""
     if path.is_file():
-        return (path,)
+        return path, (path,)
     folder = path / RECORDING if (path / RECORDING).is_dir() else path
     metadata = folder / "metadata.yaml"
     if metadata.is_file():
-        info = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-        return tuple(folder / name for name in info["relative_file_paths"])
-    found = sorted(folder.glob("*.mcap")) if folder.is_dir() else []
+        return folder, _listed(metadata)
+    found = sorted(folder.glob("*.mcap")) or sorted(folder.glob("*.db3"))
     if not found:
         raise RecordingError(f"{path}: no recording there; give a run's folder, a rosbag2 folder or an .mcap file")
-    raise RecordingError(f"{folder}: has no metadata.yaml, so it was not completed; {_RECOVER}")
+    if len(found) > 1:
+        raise RecordingError(
+            f"{folder}: has {len(found)} files but no metadata.yaml, so it was not completed; {_recover(folder)}"
+        )
+    return folder, tuple(found)
+
+
+def _listed(metadata: Path) -> tuple[Path, ...]:
+    """Return the files that rosbag2's description of a recording lists."""
+    try:
+        info = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
+        files = tuple(metadata.parent / name for name in info["relative_file_paths"])
+        compression = str(info.get("compression_mode") or "").lower()
+    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, AttributeError) as error:
+        why = str(error).partition("\n")[0]
+        raise RecordingError(f"{metadata}: is not rosbag2's description of a recording ({why}); give its .mcap file") from error
+    if compression == "message":
+        raise RecordingError(f"{metadata}: compression_mode = message, want none or chunks of MCAP; {_convert(metadata.parent)}")
+    for file in files:
+        if not file.is_file():
+            raise RecordingError(f"{metadata}: lists {file.name}, which is not there")
+    if not files:
+        raise RecordingError(f"{metadata}: lists no file")
+    return files
+
+
+@dataclass
+class _Contents:
+    """What one file has, by channel id."""
+
+    schemas: dict[int, Schema]
+    channels: dict[int, Channel]
+    counts: dict[int, int]
+    stamps: tuple[int, ...]
+    """Earliest and latest stamp [ns]; empty without a message."""
+    scenario: str | None
+    indexed: bool
+
+
+def _contents(file: Path) -> _Contents:
+    """Return what a file has, by its summary, or read from beginning to end if that is missing or incomplete."""
+    with file.open("rb") as stream:
+        reader = make_reader(stream)
+        summary = reader.get_summary()
+        scenario = next((a.data.decode() for a in reader.iter_attachments() if a.name == SCENARIO), None)
+        if summary is not None and (statistics := summary.statistics) is not None:
+            known = all(channel.schema_id in (0, *summary.schemas) for channel in summary.channels.values())
+            counts = statistics.channel_message_counts
+            if known and counts.keys() <= summary.channels.keys() and sum(counts.values()) == statistics.message_count:
+                stamps = (statistics.message_start_time, statistics.message_end_time) if statistics.message_count else ()
+                return _Contents(summary.schemas, summary.channels, counts, stamps, scenario, indexed=True)
+        stream.seek(0)
+        schemas: dict[int, Schema] = {}
+        channels: dict[int, Channel] = {}
+        counted: Counter[int] = Counter()
+        stamps = ()
+        for record in StreamReader(stream).records:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel):
+                channels[record.id] = record
+            elif isinstance(record, Message):
+                counted[record.channel_id] += 1
+                stamps = (min((*stamps, record.log_time)), max((*stamps, record.log_time)))
+        return _Contents(schemas, channels, counted, stamps, scenario, indexed=False)
 
 
 def open_recording(path: Path) -> Recording:
     """Open a recording and read its metadata. Raises RecordingError."""
-    files = _files(path)
-    types: dict[str, tuple[str, str]] = {}
-    counts: dict[str, int] = {}
+    where, files = _files(path)
+    types: dict[str, RecordedType] = {}
+    counts: Counter[str] = Counter()
     thinned: dict[str, int] = {}
-    first: list[int] = []
-    last: list[int] = []
+    stamps: list[int] = []
     scenario = None
+    unindexed = set()
     for file in files:
         try:
-            with file.open("rb") as stream:
-                reader = make_reader(stream)
-                summary = reader.get_summary()
-                if summary is None or summary.statistics is None:
-                    raise RecordingError(f"{file}: has no summary; {_RECOVER}")
-                for attachment in reader.iter_attachments():
-                    if attachment.name == SCENARIO:
-                        scenario = attachment.data.decode()
-        except (McapError, EOFError, struct.error, OSError) as error:
-            raise RecordingError(f"{file}: cannot be read as MCAP: {error!r}; {_RECOVER}") from error
-        if summary.statistics.message_count:
-            first.append(summary.statistics.message_start_time)
-            last.append(summary.statistics.message_end_time)
-        for channel in summary.channels.values():
+            contents = _contents(file)
+        except OSError as error:
+            if not file.stat().st_size or error.filename is None:  # too short for its footer
+                raise _unreadable(file, where) from error
+            raise RecordingError(f"{file}: {error.strerror}") from error
+        except BROKEN as error:
+            raise _unreadable(file, where) from error
+        stamps += contents.stamps
+        scenario = contents.scenario or scenario
+        if not contents.indexed:
+            unindexed.add(file)
+        for channel in contents.channels.values():
+            schema = contents.schemas.get(channel.schema_id)
+            if schema is None:
+                continue
             topic = channel.topic.removeprefix("/")
-            types[topic] = (summary.schemas[channel.schema_id].name, channel.metadata.get("topic_type_hash", ""))
+            types[topic] = recorded_type(channel, schema)
             if every := int(channel.metadata.get(KEPT_EVERY, 0)):
                 thinned[topic] = every
-            counts[topic] = counts.get(topic, 0) + summary.statistics.channel_message_counts.get(channel.id, 0)
-    if not first:
+            counts[topic] += contents.counts.get(channel.id, 0)
+    if not stamps:
         raise RecordingError(f"{path}: holds no message")
-    return Recording(path, files, types, counts, thinned, min(first), max(last), scenario)
+    return Recording(path, files, types, dict(counts), thinned, min(stamps), max(stamps), scenario, frozenset(unindexed))
 
 
-BROKEN = (McapError, EOFError, RuntimeError, ValueError, ZstdError, struct.error)
-"""Errors at the end of a truncated file: a short record, a chunk that does not decompress, a wrong checksum."""
+def recorded_type(channel: Channel, schema: Schema) -> RecordedType:
+    """Return the type of a channel."""
+    definition = schema.data.decode(errors="replace") if schema.encoding == "ros2msg" else ""
+    package, _, name = schema.name.rpartition("/")  # some writers leave out msg
+    full = schema.name if "/" in package else f"{package}/msg/{name}"
+    return RecordedType(full, channel.metadata.get("topic_type_hash", ""), definition, channel.message_encoding)
 
 
 def complete_records(path: Path) -> Iterator[object]:

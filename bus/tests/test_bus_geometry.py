@@ -102,11 +102,19 @@ def test_depth_survives_a_round_trip() -> None:
     np.testing.assert_array_equal(depth_in_metres("camera", depth_message(header(0), METRES)), METRES)
 
 
-@pytest.mark.parametrize("invalid", [0.0, -1.0, np.inf])
-def test_invalid_distances_are_nan(invalid: float) -> None:
-    pixels = METRES.copy()
+@pytest.mark.parametrize(
+    ("encoding", "invalid"),
+    [
+        *(("32FC1", value) for value in (0.0, -1.0, np.inf, -np.inf, np.nan, 65.535, 65535.0)),
+        *((encoding, value) for encoding in ("16UC1", "mono16") for value in (0, 65535)),
+    ],
+)
+def test_what_is_not_a_measurement_is_nan(encoding: str, invalid: float) -> None:
+    pixels = METRES.copy() if encoding == "32FC1" else np.nan_to_num(1000 * METRES).round().astype("<u2")
     pixels[0, 0] = invalid
-    assert np.isnan(depth_in_metres("camera", image("32FC1", pixels, False, 0))[0, 0])
+    depth = depth_in_metres("camera", image(encoding, pixels, False, 0))
+    assert np.isnan(depth[0, 0])
+    assert depth[1, 1] == 2.25
 
 
 def test_malformed_depth_images_are_rejected() -> None:

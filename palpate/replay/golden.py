@@ -157,6 +157,10 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _scenario_near(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
     recording.check(rules, topics)
+    if recording.origin([name for name in topics if recording.counts.get(name)]):
+        raise RecordingError(
+            f"{path}: has Unix time, not the simulated time of a run: it can be played, but no service re-run on it"
+        )
     if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
         raise RecordingError(f"{path}: has no message of {role} to compare with")
     loaded = load_text(text)

@@ -21,12 +21,14 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.transport import Sender
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
-from palpate_errors import UserError
+from palpate_errors import RunError, UserError
 
 DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Endpoint of a replay if the environment names none: ROS 2's rmw_zenoh expects its router here."""
 LOOK_NS = NS
 """The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
+LONGEST_NS = 7 * 86400 * NS
+"""Longest recording that is played [ns]; a longer one has stamps of two clocks."""
 CLOCK = "clock"
 CLOCK_PERIOD_NS = 10 * MS
 
@@ -44,7 +46,8 @@ class Player:
     ) -> None:
         """Joins the bus.
 
-        Raises UserError if a running service sends a topic that would be played, or, without `drive`, would act on it.
+        Raises UserError if nothing can be played, or if a running service sends a topic that would be played, or, without `drive`,
+        would act on it.
         """
         self._recording = recording
         self._rate = rate
@@ -53,6 +56,10 @@ class Player:
         rules = contract()
         self.topics = _chosen(recording, rules, topics)
         recording.check(rules, self.topics, whole=False)
+        self.origin = recording.origin(self.topics)
+        """Stamp [ns] from which the times of `play` count."""
+        if (span := recording.last - self.origin) > LONGEST_NS:
+            raise UserError(f"{recording.path}: its stamps span {span / NS / 86400:.0f} days: some of them are wrong")
         options = _options(listen)
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
         self._session = open_session(options)
@@ -79,7 +86,7 @@ class Player:
         self._encode_clock = codec.encoder(rules.topics[CLOCK].type)
         self._next_clock = 0
         self.now = 0
-        """Simulated time reached [ns]."""
+        """Time reached [ns], from the recording's origin."""
         self.sent = 0
         self.lag_ms = 0.0
         """Largest delay of a message."""
@@ -101,15 +108,17 @@ class Player:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
     def play(self, start: int = 0, until: int | None = None, progress: Callable[[int], None] = lambda _: None) -> None:
-        """Plays from `start` to `until` [ns], beginning with the last earlier message of each topic that is not periodic.
+        """Plays from `start` to `until` [ns after the origin], beginning with the last earlier message of each topic that is not periodic.
 
         Calls `progress` with the stamp of each message [ns].
 
         Raises UserError if a service appears that sends a topic that is played, or would act on it.
         """
-        self.now = start
+        self.now, prelude = start, start > 0
+        start += self.origin
+        until = None if until is None else until + self.origin
         self._next_clock = start
-        if start > 0:
+        if prelude:
             self._prelude(start)
         epoch = 0
         for message in self._recording.messages(self.topics, start, until):
@@ -118,7 +127,7 @@ class Player:
                 self._wait(epoch + round((self._next_clock - start) / self._rate))
                 self._tick()
             self._wait(epoch + round((message.stamp - start) / self._rate))
-            self.now = message.stamp
+            self.now = message.stamp - self.origin
             progress(self.now)
             self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
             self.sent += 1
@@ -168,7 +177,15 @@ def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | Non
     unknown = [name for name in wanted if name not in rules.topics]
     if unknown and topics:
         raise UserError(f"--topic {', '.join(unknown)}: not in the contract")
-    return tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
+    chosen = tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
+    if not chosen:
+        known = ", ".join(
+            f"{name} ({recording.types[name].name}, {recording.counts[name]} messages)" for name in sorted(wanted)[:12]
+        )
+        raise UserError(
+            f"{recording.path}: has no message on a topic of the contract; it has {known or 'no topic with a schema'}"
+        )
+    return chosen
 
 
 def _options(listen: str | None) -> BusOptions:
@@ -196,9 +213,14 @@ def play(
     recording = open_recording(file)
     with Player(recording, rate, topics, listen, drive) as player:
         console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends", highlight=False)
+        last = recording.last - player.origin
+        if start > last:
+            raise UserError(f"--from {start / NS:g}: {file} ends at {last / NS:.3f} s")
         try:
-            with TimeLeft("playing", start, min(end or recording.last, recording.last)) as bar:
+            with TimeLeft("playing", start, last if end is None else min(end, last)) as bar:
                 player.play(start, end, bar.reach)
+            if not player.sent:
+                raise RunError(f"{file}: played no message: it has none in the part that was chosen")
             console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, at most {player.lag_ms:.1f} ms late")
             if hold:
                 console.print("holding; Ctrl-C ends")

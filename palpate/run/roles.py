@@ -59,7 +59,7 @@ def settings_of(options: Sequence[str]) -> list[str]:
 def checked(scenario: Scenario) -> Scenario:
     """Return the scenario with absolute paths of user-defined services, after all its choices were checked.
 
-    Raises PluginError that names the scenario, the field, its value and what is allowed.
+    Raises PluginError that names the scenario, the field, its value and what is allowed, RecordingError for a camera's recording.
     """
     services = {role: choice(scenario, role) for role in _ROLES}
     for role in scenario.services.model_extra or {}:
@@ -76,6 +76,8 @@ def checked(scenario: Scenario) -> Scenario:
         if is_file(name):
             services[role] = str(Path(name).resolve())
     _check_fmu(scenario)
+    if services["camera"] == "replay":  # now, not after all processes have started
+        implementations.create("camera", "replay", scenario)
     search = scenario.search
     if scenario.exam.searched:
         try:

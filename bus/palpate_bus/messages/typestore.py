@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from rosbags.typesys import Stores, TypesysError, get_types_from_msg, get_typestore
 
 
 class CodecError(ValueError):
@@ -72,6 +72,20 @@ def type_hash(name: str) -> str:
     """Return the RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which is part of rmw_zenoh's key."""
     message_type(name)
     return str(store.hash_rihs01(name))
+
+
+def definition_hash(name: str, text: str) -> str:
+    """Return the RIHS01 hash of a message type by its .msg text, as in recordings. It may lack nested types that ROS 2 has.
+
+    Raises CodecError for a text that cannot be read.
+    """
+    recorded = get_typestore(Stores.EMPTY)
+    try:
+        recorded.register(get_types_from_msg("\n".join(text.splitlines()), name))
+        recorded.fielddefs = {**store.fielddefs, **recorded.fielddefs}
+        return str(recorded.hash_rihs01(name))
+    except (TypesysError, KeyError, ValueError) as error:
+        raise CodecError(f"{name}: its definition cannot be parsed") from error
 
 
 def array_dtype(base: str) -> np.dtype[Any]:

@@ -1,6 +1,7 @@
 """A camera that shows a recording: it conforms, shows the recorded pixels at new stamps, and names what a recording lacks."""
 
 import copy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from palpate.check.suites.camera import plane
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import header, nanoseconds, time_message
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
 from palpate_camera.backends.replay.service import POSE, ReplayedCamera, create
@@ -90,8 +91,56 @@ def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[
     poses = [pose._replace(message=stranger), pose._replace(t=pose.t + 1, sequence=pose.sequence + 1)]
     folder = record(tmp_path / "recording_mcap", {**seen, INFO: late, POSE: poses})
     camera = ReplayedCamera(open_recording(folder))
-    assert [item.child_frame_id for item in camera.start()[POSE].transforms] == ["gripper", "camera_depth_optical_frame"]
+    assert camera.start()[POSE] == pose.message
     assert camera.finish()["frames_recorded"] == FRAMES
+
+
+def restamped(received: list[HeardMessage], stamp: Callable[[int], int]) -> list[HeardMessage]:
+    """Return messages with other stamps in their headers, by their time [ns]; they were logged in steps of 100 ms."""
+    changed = copy.deepcopy(received)
+    for message in changed:
+        message.message.header.stamp = time_message(stamp(message.t))
+    return changed
+
+
+@pytest.mark.parametrize(
+    ("image_stamp", "info_stamp"),
+    [
+        (lambda _: 0, lambda _: 0),
+        (lambda _: 5, lambda t: t),
+        (lambda t: t, lambda _: 0),
+        (lambda t: t, lambda t: t + 137),
+        (lambda t: t - t % (200 * MS), lambda t: t - t % (200 * MS)),
+        (lambda t: t - t % (200 * MS), lambda t: t),
+    ],
+)
+def test_images_whose_stamps_repeat_or_are_not_those_of_their_intrinsics_are_all_shown(
+    seen: dict[str, list[HeardMessage]], tmp_path: Path, image_stamp: Callable[[int], int], info_stamp: Callable[[int], int]
+) -> None:
+    images, infos = restamped(seen[IMAGE], image_stamp), restamped(seen[INFO], info_stamp)
+    folder = record(tmp_path / "recording_mcap", {**seen, IMAGE: images, INFO: infos})
+    rig = ServiceRig(ReplayedCamera(open_recording(folder)), RigSettings(SCENARIO))
+    rig.send("planning/camera_trigger", CameraTrigger(header(0), FRAMES))
+    shown = rig.run(1.0, {})[IMAGE]
+    assert len(shown) == FRAMES
+    for received, then in zip(shown, seen[IMAGE], strict=True):
+        np.testing.assert_array_equal(received.message.data, then.message.data)
+
+
+def test_one_camera_info_is_that_of_all_images_and_a_message_recorded_twice_counts_once(
+    seen: dict[str, list[HeardMessage]], tmp_path: Path
+) -> None:
+    twice = [one for received in seen[IMAGE] for one in (received, received._replace(t=received.t + 1))]
+    folder = record(tmp_path / "recording_mcap", {**seen, IMAGE: twice, INFO: seen[INFO][:1]})
+    assert ReplayedCamera(open_recording(folder)).finish()["frames_recorded"] == FRAMES
+
+
+def test_intrinsics_that_change_are_refused(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
+    infos = copy.deepcopy(seen[INFO])
+    infos[-1].message.k[0] *= 1.1
+    folder = record(tmp_path / "recording_mcap", {**seen, INFO: infos})
+    with pytest.raises(RecordingError, match="intrinsics change"):
+        ReplayedCamera(open_recording(folder))
 
 
 def test_a_recording_without_small_images_has_those_of_its_whole_ones(

@@ -2,16 +2,16 @@
 
     python -m palpate_recorder.recover DIR/recording_mcap
 
-writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken file, an index and `metadata.yaml`.
+writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken files, an index and `metadata.yaml`. It takes the
+recordings of other writers too, as a folder or as one MCAP file, and keeps their topics of ROS 2.
 """
 
 from __future__ import annotations
 
 import sys
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Collection, Iterator
 from dataclasses import dataclass
-from itertools import count, takewhile
 from operator import attrgetter
 from pathlib import Path
 
@@ -19,24 +19,20 @@ import yaml
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
 
-from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, Recording, complete_records
+from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, RecordedType, Recording, complete_records, recorded_type
 from palpate_recorder.bag import BagWriter, Channel
 
 
-def recover(folder: Path) -> Path:
-    """Write the complete chunks of the recording `folder` to `<folder>_recovered`; return that folder.
+def recover(path: Path) -> Path:
+    """Write the complete chunks of the recording `path` to the folder `<path>_recovered`; return that folder.
 
-    Raises FileNotFoundError if `folder` holds no recording, ValueError if not even its first chunk is complete.
+    Raises FileNotFoundError if there is no recording, ValueError if not even its first chunk is complete.
     """
-    paths = _parts(folder)
-    names = _channels(paths[0])
-    if not names:
-        raise ValueError(f"{paths[0]}: broken before the end of its first chunk, nothing to recover")
-    bag = BagWriter(folder.with_name(f"{folder.name}_recovered"), names.values())
-    for path in paths:  # every file has the same channels, registered in the same order
-        for record in complete_records(path):
-            if isinstance(record, Message):
-                bag.write(names[record.channel_id].topic, record.data, record.log_time, record.sequence)
+    broken = _Broken(path)
+    deque(broken.messages(), maxlen=0)  # the writer needs all channels first
+    bag = BagWriter(path.with_name(f"{path.stem}_recovered"), broken.found().values())
+    for channel, message in broken.messages():
+        bag.write(channel.topic, message.data, message.log_time, message.sequence)
     bag.close()
     return bag.folder
 
@@ -56,21 +52,20 @@ class Salvaged(Recording):
 
 def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
     """Return the complete chunks of some topics of the recording `folder`. Raises as `recover`."""
-    paths = _parts(folder)
-    names = _channels(paths[0])
-    if not names:
-        raise ValueError(f"{paths[0]}: broken before the end of its first chunk, nothing to recover")
-    wanted = {number: channel.topic[1:] for number, channel in names.items() if channel.topic[1:] in frozenset(topics)}
-    records = (record for path in paths for record in complete_records(path) if isinstance(record, Message))
-    held = [RecordedMessage(r.log_time, wanted[r.channel_id], r.data, r.sequence) for r in records if r.channel_id in wanted]
+    broken, wanted = _Broken(folder), frozenset(f"/{topic}" for topic in topics)
+    held = [
+        RecordedMessage(record.log_time, channel.topic[1:], record.data, record.sequence)
+        for channel, record in broken.messages()
+        if channel.topic in wanted
+    ]
+    channels = {name[1:]: channel for name, channel in broken.found().items()}
     if not held:
         raise ValueError(f"{folder}: holds none of {', '.join(topics)}")
     held.sort(key=attrgetter("stamp"))
-    channels = {channel.topic[1:]: channel for channel in names.values()}
     return Salvaged(
         path=folder,
-        files=tuple(paths),
-        types={name: (channel.type, channel.type_hash) for name, channel in channels.items()},
+        files=tuple(broken.files),
+        types={name: RecordedType(channel.type, channel.type_hash, channel.schema) for name, channel in channels.items()},
         counts=dict(Counter(message.topic for message in held)),
         thinned={name: channel.kept_every_ms for name, channel in channels.items() if channel.kept_every_ms},
         first=held[0].stamp,
@@ -80,38 +75,53 @@ def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
     )
 
 
-def _parts(folder: Path) -> list[Path]:
-    """Return the files of a recording. Raises FileNotFoundError if there are none."""
-    numbered = (folder / f"{folder.name}_{number}.mcap" for number in count())
-    paths = list(takewhile(Path.is_file, numbered))
-    if not paths:
-        raise FileNotFoundError(f"{folder / folder.name}_0.mcap: no recording there; give the folder that holds the .mcap file")
-    return paths
+class _Broken:
+    """The files of a truncated recording, oldest first, and their channels."""
+
+    def __init__(self, path: Path) -> None:
+        """Raises FileNotFoundError if there is no file."""
+        self.files = [path] if path.is_file() else sorted(path.glob("*.mcap"), key=_number)
+        if not self.files:
+            raise FileNotFoundError(f"{path}: no recording there; give an .mcap file, or the folder that holds it")
+        self._channels: dict[str, Channel] = {}
+
+    def found(self) -> dict[str, Channel]:
+        """Return the channels of ROS 2 that `messages` came upon, by topic. Raises ValueError if there are none."""
+        if not self._channels:
+            raise ValueError(f"{self.files[0]}: broken before the end of its first chunk, nothing to recover")
+        return self._channels
+
+    def messages(self) -> Iterator[tuple[Channel, Message]]:
+        """Yield the complete messages of ROS 2 with their channels."""
+        for file in self.files:
+            schemas: dict[int, Schema] = {}
+            channels: dict[int, Channel] = {}
+            for record in complete_records(file):
+                if isinstance(record, Schema):
+                    schemas[record.id] = record
+                elif isinstance(record, ChannelRecord) and record.message_encoding == "cdr" and record.schema_id in schemas:
+                    channel = _channel(record, schemas[record.schema_id])
+                    channels[record.id] = self._channels.setdefault(channel.topic, channel)
+                elif isinstance(record, Message) and record.channel_id in channels:
+                    yield channels[record.channel_id], record
 
 
-def _channels(path: Path) -> dict[int, Channel]:
-    """Return the channels of a file by their ids; they precede its messages."""
-    schemas: dict[int, Schema] = {}
-    names: dict[int, Channel] = {}
-    for record in complete_records(path):
-        if isinstance(record, Schema):
-            schemas[record.id] = record
-        elif isinstance(record, ChannelRecord) and record.id not in names:
-            names[record.id] = _channel(record, schemas[record.schema_id])
-        elif isinstance(record, Message):
-            break
-    return names
+def _number(path: Path) -> tuple[int, str]:
+    """Return the number at the end of a file's name, by which long recordings are ordered."""
+    number = path.stem.rpartition("_")[2]
+    return (int(number) if number.isdecimal() else 0, path.name)
 
 
 def _channel(record: ChannelRecord, schema: Schema) -> Channel:
-    qos = yaml.safe_load(record.metadata["offered_qos_profiles"])[0]
+    kind = recorded_type(record, schema)
+    profiles = yaml.safe_load(record.metadata.get("offered_qos_profiles", "")) or [{}]
     return Channel(
-        topic=record.topic,
-        type=schema.name,
-        schema=schema.data.decode(),
-        type_hash=record.metadata["topic_type_hash"],
-        depth=qos["depth"],
-        transient_local=qos["durability"] == "transient_local",
+        topic=f"/{record.topic.removeprefix('/')}",
+        type=kind.name,
+        schema=kind.definition,
+        type_hash=kind.type_hash,
+        depth=profiles[0].get("depth", 1),
+        transient_local=profiles[0].get("durability") in ("transient_local", 1),  # 1: as before ROS 2 Jazzy
         kept_every_ms=int(record.metadata.get(KEPT_EVERY, 0)),
     )
 

@@ -8,22 +8,25 @@ is stamped with the tick at which it is sent. The camera pose is that of the rec
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from operator import attrgetter
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final, NamedTuple
 
 from palpate_bus.contract import contract
-from palpate_bus.messages.codec import Message, decode
-from palpate_bus.messages.geometry import depth_in_metres
-from palpate_bus.messages.stamps import nanoseconds, time_message
+from palpate_bus.messages import TFMessage, TransformStamped
+from palpate_bus.messages.codec import CodecError, Message, decode
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
-from palpate_camera.messages import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_camera.inputs import CameraError, CameraInput, Frame, StaticTransforms
+from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.scenario.schema import Scenario
 
-POSE = "tf_static"
-_Pair = tuple[RecordedMessage, RecordedMessage]
+POSE: Final = "tf_static"
+WORLD: Final = "world"
 
 
 class ReplayedCamera(Service):
@@ -32,36 +35,34 @@ class ReplayedCamera(Service):
     role: ClassVar[str] = "camera"
 
     def __init__(self, recording: Recording) -> None:
-        """Reads the frames, about 1 MB each. Raises RecordingError when the recording has no frame or no pose."""
+        """Reads and checks the frames, about 1 MB each. Raises RecordingError without a usable frame of a known pose."""
         rules = contract()
-        by_topic: dict[str, dict[int, RecordedMessage]] = {topic: {} for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO)}
-        poses: list[RecordedMessage] = []
-        self._types = {topic: rules.topics[topic].type for topic in (*by_topic, POSE)}
-        recording.check(rules, self._types)
-        for message in recording.messages(self._types):
-            if message.topic == POSE:
-                poses.append(message)
-            else:  # by the header: a recording of ROS has the time at which each was received
-                by_topic[message.topic][nanoseconds(self._message(message).header.stamp)] = message
-        recorded = {**by_topic, POSE: poses}
+        recorded: dict[str, list[RecordedMessage]] = {topic: [] for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, POSE)}
+        recording.check(rules, recorded)
+        for message in recording.messages(recorded):
+            recorded[message.topic].append(message)
         for topic in (IMAGE, INFO, POSE):
             if not recorded[topic]:
                 raise RecordingError(f"{recording.path}: has no message of {topic}; a camera can be replayed only from all of "
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
-        self._pose = self._message(poses[0])
-        for message in poses[1:]:  # each sender of a system publishes its own
-            self._pose.transforms.extend(self._message(message).transforms)
-        self._frames = _pairs(by_topic[IMAGE], by_topic[INFO])
-        if not self._frames:
-            raise RecordingError(f"{recording.path}: no image has a camera_info of its stamp")
-        self._small = _pairs(by_topic[SMALL_IMAGE], by_topic[SMALL_INFO])
+        self._transforms = StaticTransforms()
+        try:
+            for pose in _decoded(recorded[POSE], rules.topics[POSE].type):  # each sender of a system publishes its own
+                self._transforms.add(pose.message.transforms)
+            first = decode(recorded[IMAGE][0].payload, rules.topics[IMAGE].type)
+            frame = first.header.frame_id.lstrip("/")
+            self._pose = self._transforms.need(WORLD, frame)
+            self._frames = _frames(recorded, IMAGE, INFO, frame)
+            self._small = _frames(recorded, SMALL_IMAGE, SMALL_INFO, frame)
+        except (CameraError, CodecError) as error:
+            raise RecordingError(f"{recording.path}: {error}") from error
         self._path = recording.path
         self._wanted = 0
         self._shown = self._ticks = 0
 
     def start(self) -> Outbox:
         """The recorded pose of the optical frame in world, latched."""
-        return {POSE: self._pose}
+        return {POSE: TFMessage([TransformStamped(header(0, WORLD), FRAME, self._pose)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """The next small image, and the next whole one while a burst lasts; a new trigger replaces the burst under way."""
@@ -70,33 +71,71 @@ class ReplayedCamera(Service):
         outbox = self._next_small(t)
         self._ticks += 1
         if self._wanted:
-            outbox |= self._pair(t, self._frames, self._shown, (IMAGE, INFO))
+            outbox |= messages.whole(t, *self._frames[self._shown % len(self._frames)])
             self._wanted -= 1
             self._shown += 1
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
         """Return the number of frames played, and of different ones."""
-        return {"recording": str(self._path), "frames": self._shown, "frames_recorded": len(self._frames)}
+        return {
+            "recording": str(self._path),
+            "frames": self._shown,
+            "frames_recorded": len(self._frames),
+            "transforms_left_out": self._transforms.left_out,
+        }
 
     def _next_small(self, t: int) -> dict[str, Message]:
         if self._small:
-            return self._pair(t, self._small, self._ticks, (SMALL_IMAGE, SMALL_INFO))
-        image, info = self._pair(t, self._frames, self._ticks, (IMAGE, INFO)).values()
-        return messages.every_few(t, depth_in_metres(IMAGE, image), messages.pinhole_of(info))
-
-    def _pair(self, t: int, pairs: list[_Pair], index: int, topics: tuple[str, str]) -> dict[str, Message]:
-        image, info = (self._message(part) for part in pairs[index % len(pairs)])
-        image.header.stamp = info.header.stamp = time_message(t)
-        return dict(zip(topics, (image, info), strict=True))
-
-    def _message(self, recorded: RecordedMessage) -> Message:
-        return decode(recorded.payload, self._types[recorded.topic])
+            return messages.small(t, *self._small[self._ticks % len(self._small)])
+        return messages.every_few(t, *self._frames[self._ticks % len(self._frames)])
 
 
-def _pairs(images: Mapping[int, RecordedMessage], infos: Mapping[int, RecordedMessage]) -> list[_Pair]:
-    """Images with the intrinsics of their stamp, in their order."""
-    return [(images[t], infos[t]) for t in sorted(images) if t in infos]
+class _Logged(NamedTuple):
+    """A recorded message and when its recorder received it [ns]."""
+
+    time: int
+    message: Message
+
+    @property
+    def stamp(self) -> int:
+        """Time of its header [ns]."""
+        return nanoseconds(self.message.header.stamp)
+
+
+def _decoded(recorded: Sequence[RecordedMessage], kind: str) -> Iterator[_Logged]:
+    """Decode messages; one that was recorded twice counts once. Raises CodecError."""
+    once = {message.payload: message for message in recorded}
+    return (_Logged(message.stamp, decode(message.payload, kind)) for message in once.values())
+
+
+def _pairs(images: Sequence[_Logged], infos: Sequence[_Logged]) -> Iterator[tuple[Message, Message]]:
+    """Pair images, in order of stamps, with the intrinsics of that stamp; with those logged nearest if it has none or several."""
+    counts = Counter(info.stamp for info in infos)
+    by_stamp = {info.stamp: info for info in infos if counts[info.stamp] == 1}
+    for image in sorted(images, key=attrgetter("stamp")):  # equal stamps stay in the order of the log
+        info = by_stamp.get(image.stamp) or min(infos, key=lambda info, logged=image.time: abs(info.time - logged))
+        yield image.message, info.message
+
+
+def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str, frame: str) -> list[Frame]:
+    """Return the images of a pair of topics with their intrinsics; none without both. Raises CameraError, CodecError."""
+    types = contract().topics
+    images, infos = (list(_decoded(recorded[topic], types[topic].type)) for topic in (image, info))
+    source = CameraInput(
+        image=image,
+        info=info,
+        frame=frame,
+        other_frame="images, intrinsics and pose must be of one frame",
+        distorted=f"record that as {image}, with d = 0",
+    )
+    frames = [source.read(*pair) for pair in _pairs(images, infos)] if infos else []
+    if len(sizes := {frame.pinhole for frame in frames}) > 1:
+        first, second = list(sizes)[:2]
+        raise CameraError(
+            f"{info}: the intrinsics change within the recording: {first} and {second}; record one mode of the camera"
+        )
+    return frames
 
 
 def create(scenario: Scenario) -> ReplayedCamera:

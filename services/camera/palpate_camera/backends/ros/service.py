@@ -1,4 +1,4 @@
-"""ROS transform trees as poses. Arrays in, arrays out."""
+"""The camera as a service that passes on the images of a ROS 2 depth camera."""
 
 from __future__ import annotations
 
@@ -7,42 +7,21 @@ from collections.abc import Callable, Mapping
 from time import monotonic, sleep, time_ns
 from typing import Any, ClassVar
 
-import numpy as np
-from scipy.spatial.transform import Rotation
-
-from palpate_bus.messages import Quaternion, TFMessage, Transform, TransformStamped, Vector3
-from palpate_bus.messages.geometry import depth_in_metres
+from palpate_bus.messages import TFMessage, Transform, TransformStamped
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera import messages
-from palpate_camera.messages import FRAME, Pinhole
-from palpate_models.numerics.frames import Array
+from palpate_camera.inputs import CameraError, CameraInput, StaticTransforms
+from palpate_camera.messages import FRAME
 from palpate_models.scenario.schema import RosCamera, Scenario
-
-
-class CameraError(ValueError):
-    """A ROS camera that cannot be used. Names what is wrong and what is wanted."""
-
-
-def chain(transforms: Mapping[str, tuple[str, Array]], root: str, leaf: str) -> Array | None:
-    """X_RL, shape (4, 4), from the parent and pose of each frame; None while a link of the chain is missing."""
-    X = np.eye(4)
-    frame, seen = leaf, set[str]()
-    while frame != root:
-        if frame not in transforms or frame in seen:
-            return None
-        seen.add(frame)
-        parent, X_PF = transforms[frame]
-        X = X_PF @ X
-        frame = parent
-    return X
-
 
 POSE_WAIT_S = 20.0
 """Time limit for the camera pose before the run."""
+FRAME_WAIT_S = 2.0
+"""Time limit for the first image and its intrinsics, which are checked before the run."""
 OLDEST_NS = 300_000_000
 """An image that seems older than this has a stamp of another clock."""
 
@@ -106,12 +85,22 @@ class RosCameraService(Service):
         wait_s: float = POSE_WAIT_S,
         now: Callable[[], int] = time_ns,
     ) -> None:
-        """Waits for the camera's pose; `now` is ROS's clock [ns].
+        """Waits for the camera's pose and first image; `now` is ROS's clock [ns].
 
-        Raises CameraError naming the frames that are known when the pose does not come.
+        Raises CameraError naming the frames that are known when the pose does not come, or the first image if it cannot be used.
         """
-        self._port, self._frame, self._now = port, frame, now
-        self._X_WC = _await_pose(port, frame, world, wait_s)
+        self._port, self._now = port, now
+        self._input = CameraInput(
+            image="depth image",
+            info="camera_info",
+            frame=frame,
+            other_frame="set camera.ros.frame={}",
+            distorted="set camera.ros.image to the rectified one: `rect` in its name, and p in camera_info",
+            rectified=port.rectified,
+        )
+        self._transforms = StaticTransforms()
+        self._pose = _await_pose(port, self._transforms, frame, world, wait_s)
+        _check_first(port, self._input, min(wait_s, FRAME_WAIT_S))
         self._wanted = self._asked = 0
         self._stamp = 0
         """When the newest image was taken, by the driver's clock [ns]; 0: none, or the driver does not say."""
@@ -120,9 +109,7 @@ class RosCameraService(Service):
 
     def start(self) -> Outbox:
         """The calibrated pose of the optical frame in world, latched."""
-        x, y, z, w = (float(v) for v in Rotation.from_matrix(self._X_WC[:3, :3]).as_quat(canonical=True))
-        pose = Transform(Vector3(*self._X_WC[:3, 3].tolist()), Quaternion(x, y, z, w))
-        return {"tf_static": TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])}
+        return {"tf_static": TFMessage([TransformStamped(header(0, "world"), FRAME, self._pose)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """The newest frame's small image, and the whole one while a burst lasts, but not what came before its trigger."""
@@ -131,7 +118,10 @@ class RosCameraService(Service):
         if triggers:
             self._wanted, self._asked = int(triggers[-1].frames), nanoseconds(triggers[-1].header.stamp)
             self._facts["bursts"] += len(triggers)
-        if not images or info is None:
+        if not images:
+            return {}
+        if info is None:
+            self._problem = "images, but no camera_info"
             return {}
         stamp = nanoseconds(images[-1].header.stamp)
         if self._stamp and stamp == self._stamp:  # a relay or a driver that hangs shows a wall that stands still
@@ -139,10 +129,8 @@ class RosCameraService(Service):
             return {}
         self._stamp = stamp
         try:
-            _agree(images[-1], info, self._frame)
-            depth = depth_in_metres("depth image", images[-1])
-            pinhole = _pinhole(info, rectified=self._port.rectified)
-        except ValueError as error:
+            depth, pinhole = self._input.read(images[-1], info)
+        except CameraError as error:
             self._facts["frames_rejected"] += 1
             self._problem = str(error)
             return {}
@@ -160,50 +148,32 @@ class RosCameraService(Service):
         return max(t - age, 0) if 0 <= age <= OLDEST_NS else t
 
     def finish(self) -> Mapping[str, Any]:
-        """Return the numbers of forwarded, repeated and rejected messages, with reasons."""
-        return {**self._facts, "problem": self._problem}
+        """Return the numbers of forwarded, repeated and rejected messages, with reasons, and the transforms left out."""
+        return {**self._facts, "problem": self._problem, "transforms_left_out": self._transforms.left_out}
 
 
-def _await_pose(port: CameraPort, frame: str, world: str, wait_s: float) -> Array:
-    known: dict[str, tuple[str, Array]] = {}
+def _await_pose(port: CameraPort, transforms: StaticTransforms, frame: str, world: str, wait_s: float) -> Transform:
     begin = monotonic()
     while True:
-        for item in port.transforms():
-            p, q = item.transform.translation, item.transform.rotation
-            X = np.eye(4)
-            X[:3, :3] = Rotation.from_quat((q.x, q.y, q.z, q.w)).as_matrix()
-            X[:3, 3] = p.x, p.y, p.z
-            known[item.child_frame_id.lstrip("/")] = (item.header.frame_id.lstrip("/"), X)
-        X_WC = chain(known, world, frame)
-        if X_WC is not None:
-            return X_WC
-        if monotonic() - begin > wait_s:
-            tree = ", ".join(f"{parent} -> {child}" for child, (parent, _) in sorted(known.items())) or "nothing"
-            raise CameraError(f"tf_static has no way from {world!r} to {frame!r}: it has {tree}. Calibrate and publish it")
+        transforms.add(port.transforms())
+        if transforms.pose(world, frame) is not None or monotonic() - begin > wait_s:
+            return transforms.need(world, frame)
         sleep(0.05)
 
 
-def _agree(image: Any, info: Any, frame: str) -> None:
-    """The intrinsics must be those of the image, and the pose that of its frame: else everything that is seen is shifted."""
-    for what, message in (("depth image", image), ("camera_info", info)):
-        named = message.header.frame_id.lstrip("/")
-        if named != frame:
-            raise CameraError(f"{what} is in frame {named!r}, the pose is that of {frame!r}: set camera.ros.frame={named}")
-    if (image.width, image.height) != (info.width, info.height):
-        raise CameraError(f"depth image is {image.width} x {image.height}, camera_info says {info.width} x {info.height}")
-
-
-def _pinhole(info: Any, *, rectified: bool) -> Pinhole:
-    """Intrinsics of the image as it is, without distortion: of a rectified one P's, where it is set (sensor_msgs/CameraInfo)."""
-    P = np.asarray(info.p, dtype=float).reshape(3, 4)
-    K, name = (P[:, :3], "p") if rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
-    if name == "k" and np.any(np.abs(np.asarray(info.d)) > 1e-9):
-        raise CameraError(
-            f"camera_info: d = {list(info.d)}: want an image without distortion, or a rectified one: `rect` in its name, and p"
-        )
-    if K[0, 0] <= 0 or K[1, 1] <= 0:
-        raise CameraError(f"camera_info: {name} = {K.ravel().tolist()}: the focal lengths must be positive")
-    return Pinhole(int(info.width), int(info.height), *map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
+def _check_first(port: CameraPort, source: CameraInput, wait_s: float) -> None:
+    """Raises CameraError if the first image that comes within a time cannot be used."""
+    begin = monotonic()
+    images: list[Any] = []
+    while True:
+        images += port.images()
+        info = port.info()
+        if images and info is not None:
+            source.read(images[-1], info)
+            return
+        if monotonic() - begin > wait_s:
+            return
+        sleep(0.01)
 
 
 def create(scenario: Scenario) -> RosCameraService:

@@ -1,0 +1,149 @@
+"""Checks of camera messages of other makers: images, intrinsics and static transforms, from ROS or from a recording."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Iterable
+from dataclasses import dataclass
+from math import isfinite
+from typing import Any, Final, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_bus.messages import Transform
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import depth_in_metres, transform_matrix, transform_message
+from palpate_camera.messages import Pinhole
+from palpate_errors import UserError
+
+log = logging.getLogger(__name__)
+
+LEAST_FOCAL: Final = 0.05
+"""Least focal length, as a share of the image's size: an angle of view of 169 degrees."""
+LARGEST_DISTORTION: Final = 1e-9
+"""Greatest distortion coefficient of an image that counts as undistorted."""
+
+
+class CameraError(UserError):
+    """A camera that cannot be used. Names topic, field, value and what is wanted."""
+
+
+class Frame(NamedTuple):
+    """One image of a camera."""
+
+    depth: NDArray[np.float32]
+    """[m], shape (height, width), NaN where nothing was measured."""
+    pinhole: Pinhole
+
+
+@dataclass(frozen=True)
+class CameraInput:
+    """A camera's pair of topics, and what its messages must agree with."""
+
+    image: str
+    """Image topic, as errors name it."""
+    info: str
+    """Topic of the intrinsics, as errors name it."""
+    frame: str
+    """Optical frame whose pose is known."""
+    other_frame: str
+    """Remedy for images in the frame `{}`."""
+    distorted: str
+    """Remedy for a distorted image."""
+    rectified: bool = False
+    """True if images are rectified: they use `camera_info`'s P, otherwise its K and distortion."""
+
+    def read(self, image: Message, info: Message) -> Frame:
+        """Return an image with its intrinsics. Raises CameraError."""
+        for topic, message in ((self.image, image), (self.info, info)):
+            named = message.header.frame_id.lstrip("/")
+            if named != self.frame:
+                raise CameraError(
+                    f"{topic} is in frame {named!r}, the pose is that of {self.frame!r}: {self.other_frame.format(named)}"
+                )
+        if (image.width, image.height) != (info.width, info.height):
+            raise CameraError(f"{self.image} is {image.width} x {image.height}, {self.info} says {info.width} x {info.height}")
+        pinhole = self._pinhole(info)
+        try:
+            return Frame(depth_in_metres(self.image, image), pinhole)
+        except ValueError as error:
+            raise CameraError(str(error)) from error
+
+    def _pinhole(self, info: Message) -> Pinhole:
+        """Return the intrinsics of the image as it is: P's of a rectified one, where it is set, otherwise K's (sensor_msgs)."""
+        P = np.asarray(info.p, dtype=float).reshape(3, 4)
+        K, name = (P[:, :3], "p") if self.rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
+        if name == "k" and not np.all(np.abs(np.asarray(info.d)) <= LARGEST_DISTORTION):  # also true for NaN
+            raise CameraError(
+                f"{self.info}: d = {np.asarray(info.d).tolist()}: want an image without distortion: rectify it "
+                f"(ros2 run image_proc rectify_node --ros-args -p interpolation:=0) and {self.distorted}"
+            )
+        width, height = int(info.width), int(info.height)
+        fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
+        where = f"{self.info}: {name} = {K.ravel().tolist()}"
+        if not (np.isfinite(K).all() and fx > 0 and fy > 0):
+            raise CameraError(f"{where}: all must be finite, and the focal lengths positive")
+        if fx < LEAST_FOCAL * width or fy < LEAST_FOCAL * height:
+            raise CameraError(f"{where}: focal lengths of {fx:g} and {fy:g} px are not of an image of {width} x {height} px")
+        if not (0 < cx < width and 0 < cy < height):
+            raise CameraError(f"{where}: the principal point ({cx:g}, {cy:g}) is not in the image of {width} x {height} px")
+        return Pinhole(width, height, fx, fy, cx, cy)
+
+
+class StaticTransforms:
+    """The transforms of `tf_static`. Invalid ones are left out and named, as tf2 does; the newest valid one of a frame counts."""
+
+    def __init__(self) -> None:
+        self._links: dict[str, tuple[str, Transform]] = {}
+        self.left_out: dict[str, str] = {}
+        """What is wrong with the transforms that were left out, by frame."""
+
+    def add(self, transforms: Iterable[Any]) -> None:
+        """Take transforms."""
+        for item in transforms:
+            parent, child = item.header.frame_id.lstrip("/"), item.child_frame_id.lstrip("/")
+            if problem := _problem(parent, child, item.transform):
+                self.left_out[child] = problem
+            else:
+                self._links[child] = parent, item.transform
+
+    def pose(self, root: str, leaf: str) -> Transform | None:
+        """Return the pose of a frame in another one; None while a link of the chain is missing."""
+        X, frame, chain = np.eye(4), leaf, list[Transform]()
+        while frame != root:
+            if frame not in self._links or len(chain) > len(self._links):  # or a circle
+                return None
+            frame, transform = self._links[frame]
+            chain.append(transform)
+            X = transform_matrix(transform) @ X
+        return chain[0] if len(chain) == 1 else transform_message(X)
+
+    def need(self, root: str, leaf: str) -> Transform:
+        """Return the pose of a frame in another one; log what is left out. Raises CameraError naming a bad or missing link."""
+        if (pose := self.pose(root, leaf)) is not None:
+            for child, problem in self.left_out.items():
+                log.warning("tf_static: the transform of %r is not needed and left out: %s", child, problem)
+            return pose
+        frame, seen = leaf, set[str]()
+        while frame in self._links and frame not in seen:
+            seen.add(frame)
+            frame = self._links[frame][0]
+        if frame in self.left_out:
+            raise CameraError(f"tf_static: the pose of {leaf!r} in {root!r} needs that of {frame!r}: {self.left_out[frame]}")
+        tree = ", ".join(f"{parent} -> {child}" for child, (parent, _) in sorted(self._links.items())) or "nothing"
+        raise CameraError(f"tf_static has no way from {root!r} to {leaf!r}: it has {tree}. Calibrate and publish it")
+
+
+def _problem(parent: str, child: str, transform: Transform) -> str:
+    """Describe what is wrong with a transform; empty if it is valid."""
+    if not parent or not child or parent == child:
+        return f"it is from {parent!r} to {child!r}, want two frames"
+    p = transform.translation
+    if not all(map(isfinite, (p.x, p.y, p.z))):
+        return f"translation = ({p.x}, {p.y}, {p.z}): must be finite"
+    try:
+        transform_matrix(transform)
+    except ValueError as error:
+        return str(error)
+    return ""
