@@ -70,6 +70,49 @@ def test_every_message_arrives_as_it_was_recorded(endpoint: str, listener: zenoh
         assert player.sent == sum(recording.counts.values())
 
 
+def foreign(path: Path, topic: str, kind: str, stamps: tuple[int, ...]) -> Path:
+    """Write a recording as other recorders of ROS 2 do."""
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2", "other")
+        schema = writer.register_schema(kind, "ros2msg", codec.definition(kind).encode())
+        channel = writer.register_channel(topic, "cdr", schema)
+        for stamp in stamps:
+            writer.add_message(channel, stamp, bytes(64), stamp)
+        writer.finish()
+    return path
+
+
+def test_a_recording_of_unix_time_begins_at_its_first_message(endpoint: str, tmp_path: Path) -> None:
+    stamps = tuple(1_700_000_000_000_000_000 + k * 100_000_000 for k in range(5))
+    path = foreign(tmp_path / "a.mcap", "/camera/depth/image_raw", "sensor_msgs/msg/Image", stamps)
+    with Player(open_recording(path), rate=10, listen=endpoint) as player:
+        player.play()
+        assert (player.sent, player.now) == (5, 400_000_000)
+    with Player(open_recording(path), rate=10, listen=endpoint) as player:
+        player.play(150_000_000, 350_000_000)
+        assert (player.sent, player.now) == (3, 300_000_000), "two, and the one before"
+
+
+@pytest.mark.parametrize(
+    ("topic", "stamps", "options", "status", "said"),
+    [
+        ("/chatter", (5,), (), 2, "no message on a topic of the contract; it has chatter (std_msgs/msg/String, 1 messages)"),
+        ("/tf_static", (5,), ("--from", "7"), 2, "--from 7: "),
+        ("/camera/depth/image_raw", (0, 10**9), ("--from", "0.3", "--for", "0.1"), 3, "played no message"),
+        ("/tf_static", (0, 1_700_000_000_000_000_000), (), 2, "some of them are wrong"),
+    ],
+)
+def test_a_recording_with_nothing_to_play_is_a_failure(
+    endpoint: str, tmp_path: Path, topic: str, stamps: tuple[int, ...], options: tuple[str, ...], status: int, said: str
+) -> None:
+    row = RULES.topics.get(topic[1:])
+    path = foreign(tmp_path / "a.mcap", topic, "std_msgs/msg/String" if row is None else row.type, stamps)
+    done = CliRunner().invoke(app("replay"), ["replay", str(path), "--listen", endpoint, *options])
+    assert done.exit_code == status, done.output
+    assert said in done.stderr
+
+
 @pytest.mark.parametrize(
     ("topic", "drive", "said"),
     [

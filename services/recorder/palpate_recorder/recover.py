@@ -30,7 +30,8 @@ def recover(path: Path) -> Path:
     """
     broken = _Broken(path)
     deque(broken.messages(), maxlen=0)  # the writer needs all channels first
-    bag = BagWriter(path.with_name(f"{path.stem}_recovered"), broken.found().values())
+    name = path.stem if path.is_file() else path.name
+    bag = BagWriter(path.with_name(f"{name}_recovered"), broken.found().values())
     for channel, message in broken.messages():
         bag.write(channel.topic, message.data, message.log_time, message.sequence)
     bag.close()
@@ -128,7 +129,7 @@ def _channel(record: ChannelRecord, schema: Schema) -> Channel:
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: python -m palpate_recorder.recover DIR/recording_mcap")
+        sys.exit("usage: python -m palpate_recorder.recover FOLDER_OR_FILE")
     try:
         print(recover(Path(sys.argv[1])))
     except (OSError, ValueError) as error:

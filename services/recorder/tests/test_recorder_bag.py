@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag2 import Reader
@@ -151,6 +152,35 @@ def test_salvage_returns_what_recover_writes(tmp_path: Path) -> None:
     assert list(salvaged.messages(["joint_states"], 5 * MS, 7 * MS)) == list(recovered.messages(["joint_states"], 5 * MS, 7 * MS))
     with pytest.raises(ValueError, match="holds none of exam/state"):
         salvage(crashed, ["exam/state"])
+
+
+@pytest.mark.parametrize("as_folder", [False, True])
+def test_the_file_of_another_writer_is_recovered(tmp_path: Path, as_folder: bool) -> None:
+    """It has no type hash, qualities of service as ROS 2 Humble writes them or none, and channels that are not of ROS 2."""
+    path = tmp_path / "camera" / "camera_0.mcap"
+    path.parent.mkdir()
+    with path.open("wb") as stream:
+        writer = Writer(stream, compression=CompressionType.NONE, chunk_size=1000)
+        writer.start("ros2", "other")
+        events = writer.register_channel("/events", "json", 0)
+        kind = writer.register_schema("tf2_msgs/TFMessage", "ros2msg", codec.definition("tf2_msgs/msg/TFMessage").encode())
+        latched = writer.register_channel("/tf_static", "cdr", kind, {"offered_qos_profiles": "- depth: 7\n  durability: 1\n"})
+        writer.add_message(latched, 5, b"tf", 5)
+        for stamp in range(100, 200):
+            writer.add_message(events, stamp, b"{}", stamp)
+        later = writer.register_channel("tf", "cdr", kind)
+        for stamp in range(200, 300):
+            writer.add_message(later, stamp, b"tf", stamp)
+        writer.finish()
+    whole = path.read_bytes()
+    path.write_bytes(whole[: len(whole) // 2])
+    recovered = recover(path.parent if as_folder else path)
+    assert recovered.name == ("camera_recovered" if as_folder else "camera_0_recovered")
+    recording = open_recording(recovered)
+    recording.check(contract(), ["tf", "tf_static"])
+    assert recording.types.keys() == {"tf", "tf_static"}
+    assert recording.counts["tf_static"] == 1
+    assert 0 < recording.counts["tf"] < 100
 
 
 def test_recover_reports_errors(tmp_path: Path) -> None:

@@ -109,12 +109,16 @@ def _decoded(recorded: Sequence[RecordedMessage], kind: str) -> Iterator[_Logged
     return (_Logged(message.stamp, decode(message.payload, kind)) for message in once.values())
 
 
+def _nearest(infos: Sequence[_Logged], time: int) -> _Logged:
+    return min(infos, key=lambda info: abs(info.time - time))
+
+
 def _pairs(images: Sequence[_Logged], infos: Sequence[_Logged]) -> Iterator[tuple[Message, Message]]:
     """Pair images, in order of stamps, with the intrinsics of that stamp; with those logged nearest if it has none or several."""
     counts = Counter(info.stamp for info in infos)
     by_stamp = {info.stamp: info for info in infos if counts[info.stamp] == 1}
     for image in sorted(images, key=attrgetter("stamp")):  # equal stamps stay in the order of the log
-        info = by_stamp.get(image.stamp) or min(infos, key=lambda info, logged=image.time: abs(info.time - logged))
+        info = by_stamp.get(image.stamp) or _nearest(infos, image.time)
         yield image.message, info.message
 
 
