@@ -46,8 +46,8 @@ class Player:
     ) -> None:
         """Joins the bus.
 
-        Raises UserError if nothing can be played, or if a running service sends a topic that would be played, or, without `drive`,
-        would act on it.
+        Raises UserError if nothing can be played, or if a running service sends a topic that would be played, or, without
+        `drive`, would act on it.
         """
         self._recording = recording
         self._rate = rate
@@ -108,7 +108,9 @@ class Player:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
     def play(self, start: int = 0, until: int | None = None, progress: Callable[[int], None] = lambda _: None) -> None:
-        """Plays from `start` to `until` [ns after the origin], beginning with the last earlier message of each topic that is not periodic.
+        """Plays from `start` to `until` [ns after the origin].
+
+        It begins with the last earlier message of each topic that is not periodic.
 
         Calls `progress` with the stamp of each message [ns].
 
