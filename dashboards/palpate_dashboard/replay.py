@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import os
 import sys
-from collections.abc import Callable, Iterable, Iterator, Sequence, Set
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from heapq import heappop, heappush
 from itertools import groupby
@@ -18,13 +18,13 @@ from time import monotonic, sleep
 
 import zenoh
 from mcap.reader import make_reader
-from mcap.records import Channel
+from mcap.records import Channel, Schema
 from mcap.records import Message as McapMessage
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.codec import Message
-from palpate_bus.recordings import BROKEN, complete_records
+from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
 from palpate_bus.runs.announcement import Run, live
 from palpate_bus.runs.operator_keys import OperatorKeys
 from palpate_bus.runs.operator_requests import order
@@ -96,9 +96,9 @@ def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
     """Yields time [ns], topic and payload of all complete messages on observed topics, ordered by time.
 
     The last file may still be written or be truncated. Services send messages in chunks, so order is restored within `DISORDER`.
-    Raises OSError.
+    Raises OSError, RecordingError for a topic of another type than the contract's.
     """
-    topics = {f"/{topic.name}" for topic, _ in contract().inputs("dashboard")}
+    topics = {f"/{topic.name}": topic for topic, _ in contract().inputs("dashboard")}
     waiting: list[tuple[int, int, str, bytes]] = []
     for count, (name, record) in enumerate(_records(files, topics)):
         heappush(waiting, (record.log_time, count, name, record.data))
@@ -110,11 +110,17 @@ def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
         yield time, topic, payload
 
 
-def _records(files: Sequence[Path], topics: Set[str]) -> Iterator[tuple[str, McapMessage]]:
+def _records(files: Sequence[Path], topics: Mapping[str, Topic]) -> Iterator[tuple[str, McapMessage]]:
     for path in files:
         names: dict[int, str] = {}
+        schemas: dict[int, Schema] = {}
         for record in complete_records(path):
-            if isinstance(record, Channel) and record.topic in topics:
+            if isinstance(record, Schema):
+                schemas[record.id] = record
+            elif isinstance(record, Channel) and record.topic in topics and record.schema_id in schemas:
+                difference = recorded_type(record, schemas[record.schema_id]).difference(topics[record.topic])
+                if difference:
+                    raise RecordingError(f"{path}: topic {record.topic[1:]} was recorded {difference}; record again")
                 names[record.id] = record.topic.removeprefix("/")
             elif isinstance(record, McapMessage) and record.channel_id in names:
                 yield names[record.channel_id], record

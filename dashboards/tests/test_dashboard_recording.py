@@ -16,6 +16,7 @@ from rerun.chunk import RrdReader
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import KeyValue, codec
+from palpate_bus.recordings import RecordingError
 from palpate_dashboard import replay
 from palpate_dashboard.columns import TIMELINE
 from palpate_dashboard.layout import blueprint
@@ -308,7 +309,9 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     with mcap.open("wb") as stream:
         writer = Writer(stream)
         writer.start("ros2")
-        ids = {name: writer.register_channel(f"/{name}", "cdr", 0) for name in OBSERVED}
+        types = {name: contract().topics[name].type for name in OBSERVED}
+        schemas = {kind: writer.register_schema(kind, "ros2msg", b"") for kind in set(types.values())}
+        ids = {name: writer.register_channel(f"/{name}", "cdr", schemas[kind]) for name, kind in types.items()}
         for t, new in steps:
             for name, message in new.items():
                 writer.add_message(ids[name], t, codec.encode(message, contract().topics[name].type), t)
@@ -324,6 +327,18 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     again.temporal.pop("/text/status")
     assert again.temporal == live.temporal
     assert again.static == live.static
+
+
+def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
+    path = tmp_path / "recording_mcap_0.mcap"
+    with path.open("wb") as stream:
+        writer = Writer(stream)
+        writer.start("ros2")
+        schema = writer.register_schema("palpation_msgs/msg/ExamState", "ros2msg", b"float64 x\n")
+        writer.add_message(writer.register_channel("/exam/state", "cdr", schema), 0, bytes(12), 0)
+        writer.finish()
+    with pytest.raises(RecordingError, match="exam/state was recorded as palpation_msgs/msg/ExamState RIHS01_"):
+        list(replay.messages([path]))
 
 
 def test_force_over_depth_holds_every_reading_in_contact_once(whole: tuple[Recording, dict[str, Any]]) -> None:

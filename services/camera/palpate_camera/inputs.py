@@ -71,7 +71,7 @@ class CameraInput:
             raise CameraError(str(error)) from error
 
     def _pinhole(self, info: Message) -> Pinhole:
-        """Return the intrinsics of the image as it is: P's of a rectified one, where it is set, otherwise K's (sensor_msgs)."""
+        """Return the intrinsics of the image: P of a rectified one if it is set, otherwise K (sensor_msgs/CameraInfo)."""
         P = np.asarray(info.p, dtype=float).reshape(3, 4)
         K, name = (P[:, :3], "p") if self.rectified and P.any() else (np.asarray(info.k, dtype=float).reshape(3, 3), "k")
         if name == "k" and not np.all(np.abs(np.asarray(info.d)) <= LARGEST_DISTORTION):  # also true for NaN
@@ -97,7 +97,7 @@ class StaticTransforms:
     def __init__(self) -> None:
         self._links: dict[str, tuple[str, Transform]] = {}
         self.left_out: dict[str, str] = {}
-        """What is wrong with the transforms that were left out, by frame."""
+        """Defects of the transforms that were left out, by frame."""
 
     def add(self, transforms: Iterable[Any]) -> None:
         """Take transforms."""
