@@ -31,8 +31,8 @@ SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
 UNIX_NS = 10**17
 """Stamps from here on [ns] are Unix time, as other recorders write it, not the simulated time of a run."""
-BROKEN = (McapError, EOFError, RuntimeError, ValueError, KeyError, ZstdError, struct.error)
-"""Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum."""
+BROKEN = (McapError, EOFError, RuntimeError, ValueError, KeyError, MemoryError, ZstdError, struct.error)
+"""Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum or length."""
 
 
 class RecordingError(UserError):
@@ -283,8 +283,11 @@ def open_recording(path: Path) -> Recording:
             schema = contents.schemas.get(channel.schema_id)
             if schema is None:
                 continue
-            topic = channel.topic.removeprefix("/")
-            types[topic] = recorded_type(channel, schema)
+            topic, kind = channel.topic.removeprefix("/"), recorded_type(channel, schema)
+            earlier = types.get(topic, kind)
+            if (earlier.name, earlier.encoding) != (kind.name, kind.encoding):
+                kind = RecordedType(f"{earlier.name} ({earlier.encoding}) and {kind.name} ({kind.encoding})")
+            types[topic] = kind
             if every := int(channel.metadata.get(KEPT_EVERY, 0)):
                 thinned[topic] = every
             counts[topic] += contents.counts.get(channel.id, 0)
