@@ -17,7 +17,7 @@ STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 MAY_KNOW_THE_PHANTOM = {"tissue"}
 SHARED_VALUES = {"palpate_bus.setpoint"}
 """What planning makes and control follows: arrays, which know of their message."""
-MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "moving.py", "stop_requests.py", "bench.py"}
+MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py", "bench.py"}
 NOT_IN_A_STEP = {
     "zenoh",
     "socket",
