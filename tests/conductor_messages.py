@@ -1,4 +1,4 @@
-"""Messages of a small examination, made by hand: a lesion, a finding 4 mm beside it, a flat abdomen."""
+"""Synthetic messages of a small examination: a lesion, a finding 4 mm away, a flat abdomen."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate.exam_state import exam_state
 from palpate_bus.messages import (
     ExamState,
     Finding,
@@ -27,11 +28,8 @@ from palpate_conductor.outcome import RunResult
 
 LESION, FOUND, RADIUS = (-0.05, -0.05), (-0.046, -0.05), 0.03
 P_WA = (0.56, 0.0, 0.93)
-SETTINGS = (
-    f"phantom.lesions=[{{centre_m: [{LESION[0]}, {LESION[1]}], radii_m: [{RADIUS}, {RADIUS}]}}]",
-    "phantom.edge_m=0.01",
-)
-"""Of a scenario with this lesion, whose coarse mesh is quickly pressed."""
+SETTINGS = (f"phantom.lesions=[{{centre_m: [{LESION[0]}, {LESION[1]}], radii_m: [{RADIUS}, {RADIUS}]}}]", "phantom.edge_m=0.01")
+"""Settings of this lesion, with a coarse mesh."""
 
 
 def plane(half: float, pitch: float) -> tuple[np.ndarray, np.ndarray]:
@@ -110,28 +108,12 @@ def samples() -> list[Any]:
 
 def exam_states(measured_error: float) -> list[Any]:
     return [
-        ExamState(
-            header=header(k * 10_000_000, "world"),
-            phase=ExamState.PHASE_SCAN,
-            message="",
-            target_index=k,
-            target_count=100,
-            targets_skipped=2,
-            in_contact=True,
-            steady=k >= 10,
-            force_limited=False,
-            view_blocked=False,
-            depth_setpoint=0.01,
-            depth=0.01 + measured_error,
-            normal_force=2.5,
-            surface_point=Point(P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
-            surface_normal=Vector3(0.0, 0.0, 1.0),
-            end_tick=-1,
-            depth_uncertainty=0.0005,
-            wall_displacement=0.0,
-            stroke=1,
-            patient_moved=False,
-            reason=0,
+        exam_state(
+            k * 10_000_000,
+            ExamState.PHASE_SCAN,
+            (P_WA[0] - 0.05, P_WA[1] - 0.05, P_WA[2]),
+            **{"target_index": k, "target_count": 100, "targets_skipped": 2, "in_contact": True, "steady": k >= 10, "stroke": 1},
+            **{"depth_setpoint": 0.01, "depth": 0.01 + measured_error, "normal_force": 2.5, "depth_uncertainty": 0.0005},
         )
         for k in range(100)
     ]
@@ -154,7 +136,7 @@ def indentation(depth_error: float) -> list[Any]:
 
 
 def collected(depth_error: float = 0.0003, measured_error: float = 0.0, map_too: bool = True) -> Collected:
-    """Everything that the conductor collects from a whole run, or from one that ended before its map."""
+    """Return all messages that the conductor collects from a whole run, or from one that ended before its map."""
     vertices, triangles = plane(0.125, 0.005)
     return Collected(
         exam_states=exam_states(measured_error),

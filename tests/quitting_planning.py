@@ -1,4 +1,4 @@
-"""Planning that gives the examination up a moment after its beginning; a file for `palpate run --service planning=FILE`."""
+"""Planning that aborts the examination after a second, for `palpate run --service planning=FILE`."""
 
 from __future__ import annotations
 
@@ -15,12 +15,11 @@ MS = 1_000_000
 
 
 class Quitting(PlanningService):
-    """Says what planning says when it has to end the examination."""
+    """Planning whose phase is always aborted."""
 
     end: int | None = None
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """As planning, but for the phase."""
         out: dict[str, Any] = dict(super().step(t, inbox))
         self.end = t + 1000 * MS if self.end is None else self.end
         given_up = {"phase": ExamState.PHASE_ABORTED, "message": "aborted in phase HOME: enough", "end_tick": self.end}
@@ -29,5 +28,4 @@ class Quitting(PlanningService):
 
 
 def create(scenario: Scenario) -> Quitting:
-    """The service of a scenario."""
     return Quitting(exam_input(scenario))

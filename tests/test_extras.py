@@ -141,7 +141,7 @@ def libraries(name: str) -> set[str]:
 
 
 def imported(tree: ast.Module) -> Iterator[str]:
-    """Modules, or names in modules, that a file imports, at its top or in a function."""
+    """Yield the modules, or names in modules, that a file imports anywhere."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -201,7 +201,7 @@ def test_images_install_nothing_that_no_extra_does(name: str) -> None:
 
 
 def with_required(distributions: set[str]) -> set[str]:
-    """Distributions, and all that they require themselves."""
+    """Return distributions with all that they require."""
     found, left = set[str](), list(distributions)
     while left:
         name = re.sub(r"[-_.]+", "-", left.pop()).lower()

@@ -1,8 +1,7 @@
-"""What decides whether a change is good: whole examinations, through the command that users run.
+"""The gate: whole examinations, through the command that users run.
 
-It is the clean world: a patient who lies still, and equipment that errs by white noise alone (docs/reality.md says what comes of
-any other). The region is a part of the abdomen that holds the lesion and tissue around it, so that this takes minutes. What looks
-at no examination that others look at, too, is in test_gate_alone.py, since a worker of `make test` takes whole files.
+The world is clean: a patient who lies still, and equipment whose only error is white noise. The region holds the lesion and
+tissue around it, to take minutes. Tests that share no examination are in test_gate_alone.py, for the other worker.
 """
 
 from __future__ import annotations
@@ -14,16 +13,15 @@ from examination import GATE, Finished, palpate_run
 
 LOCALISED_M = 1.7e-3
 DICE = 0.80
-"""With the area in which the lump is felt, which is wider than the lump."""
+"""Of the area in which the lump is felt, which is wider than the lump."""
 COVERAGE = 0.85
 HIGHEST_FORCE_N = 11.3
 DEPTH_RMS_M = 0.25e-3
-"""Depth is counted from where the skin is touched, not from what a camera without error sees: 0.18 mm, of which 0.15 are a touch
-that is felt late between the points of the skin's mesh."""
+"""Measured 0.18 mm, of which 0.15 mm come from touches detected late between vertices of the surface mesh."""
 
 
 def assert_within_bounds(finished: Finished) -> None:
-    """The lesion was found, where it is and as large as it is; nothing else was; and the abdomen was pressed gently."""
+    """Check that exactly the lesion was found, in its place and size, with a low force."""
     assert finished.status == 0, finished.output
     report = finished.report
     scores = report["scores"]
@@ -41,7 +39,7 @@ def test_the_lesion_is_found(distributed: Finished) -> None:
 
 
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
-    """The sums are the same in another order: 1e-13 of a force, which sticking and slipping enlarge; the scores do not differ."""
+    """Sums in another order differ by 1e-13 of a force, which stick and slip amplify; the scores do not differ."""
     finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*GATE, "services.tissue=fmu"))
     assert_within_bounds(finished)
     ours, theirs = finished.report, composed.report

@@ -1,11 +1,10 @@
-"""The rest of what decides whether a change is good (test_gate.py): a healthy patient, and a service killed in contact."""
+"""The rest of the gate (test_gate.py): a healthy patient, and a service killed in contact."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
-from examination import SHORT, palpate_run
-from killing import assert_held_and_no_harder, kill_in_contact
+from examination import SHORT, assert_held_and_no_harder, kill_in_contact, palpate_run
 
 
 def test_healthy_has_no_finding(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""The wheel, installed where nobody has a checkout: bare it is bus and contract, with [run] it examines an abdomen."""
+"""The wheel, installed without a checkout: without extras it is bus and contract, with [run] it examines an abdomen."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Elsewhere:
         self.run("python", "-m", "pip", "install", "-q", "-c", str(ROOT / "constraints.txt"), f"{self.wheel}{extra}")
 
     def run(self, program: str, *words: str, status: int = 0) -> str:
-        """Runs a program of the environment, which sees nothing of the checkout. Returns what it printed."""
+        """Run a program of the environment outside the checkout; return its output."""
         environment = {name: value for name, value in os.environ.items() if not name.startswith(("PYTHON", "PALPATE"))}
         command = [str(self.folder / "venv/bin" / program), *words]
         done = subprocess.run(
@@ -48,7 +48,7 @@ class Elsewhere:
 
 @pytest.fixture(scope="module")
 def elsewhere() -> Iterator[Elsewhere]:
-    """Removed at the end: an environment is 1.5 GB."""
+    """The environment of 1.5 GB is removed at the end."""
     with tempfile.TemporaryDirectory(prefix="palpate-install-") as folder:
         yield Elsewhere(Path(folder))
 

@@ -1,12 +1,22 @@
-"""A service's process is killed while the indenter is in contact. That of control's is in test_gate_alone.py."""
+"""A process of an examination is killed or frozen while the indenter is in contact."""
 
 from __future__ import annotations
 
 import json
+import subprocess
+import sys
+import time
+from collections.abc import Mapping
 from pathlib import Path
 
+import psutil
 import pytest
-from killing import assert_held_and_no_harder, kill_in_contact
+from examination import assert_held_and_no_harder, kill_in_contact
+
+from palpate.report.evidence import peak_force
+from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, Blow, Struck, calm_rate, strike
+from palpate_bus.messages import ExamState, RobotStatus
+from palpate_bus.runtime.failure import FailureCode
 
 pytestmark = pytest.mark.slow
 
@@ -24,18 +34,99 @@ def test_without_the_physics_the_run_ends_at_once(role: str, tmp_path: Path) -> 
     assert any(f"{role} lost at" in line for line in killed.lines)
 
 
-@pytest.mark.parametrize("role", ["dashboard"])
-def test_without_a_viewer_the_run_continues(role: str, tmp_path: Path) -> None:
-    killed = kill_in_contact(role, tmp_path)
+def test_without_a_viewer_the_run_continues(tmp_path: Path) -> None:
+    killed = kill_in_contact("dashboard", tmp_path)
     assert killed.status == 0, killed.lines
     assert killed.named_after_s < 2.0
 
 
 def test_in_wall_clock_mode_too(tmp_path: Path) -> None:
-    """Without recorder and viewer: two cores that others use too do not carry them in real time."""
+    """Without recorder and viewer, which two shared cores cannot run in real time."""
     killed = kill_in_contact("control", tmp_path, "--wallclock", "--record", "none")
     assert killed.status == 3, killed.lines
     assert killed.named_after_s < 2.0, killed.lines
     report = json.loads((killed.folder / "report.json").read_text(encoding="utf-8"))
     print(f"named after {killed.named_after_s:.2f} s, largest force of the examination {report['max_force_N']:.2f} N")
     assert report["max_force_N"] < 15.0
+
+
+MORE_N = 2.0
+CLEAR_M = 0.005
+
+
+ATTEMPTS = 3
+
+
+def kill(processes: Mapping[str, psutil.Process]) -> None:
+    processes[CONDUCTOR].kill()
+
+
+def freeze(processes: Mapping[str, psutil.Process]) -> None:
+    processes[CONDUCTOR].suspend()
+    time.sleep(FREEZE_S)
+    processes[CONDUCTOR].resume()
+
+
+def kill_with_planning(processes: Mapping[str, psutil.Process]) -> None:
+    for role in ("planning", CONDUCTOR):
+        processes[role].kill()
+
+
+def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
+    """Retry, because on a busy machine a wall-clock run may be stopped before contact."""
+    for attempt in range(ATTEMPTS):
+        rate = calm_rate() if runtime == "wallclock" else 1.0
+        struck = strike(folder / str(attempt), runtime, blow, rate=rate)
+        if struck is not None:
+            assert not struck.staying
+            return struck
+    raise AssertionError(f"never at depth in {ATTEMPTS} attempts: see {folder}")
+
+
+def assert_lifted(struck: Struck) -> None:
+    """Planning lifted the arm clear of the patient before the services left, and the force did not rise."""
+    states = struck.recorded("exam/state")
+    reported = next(stamp for stamp, state in states if state.reason == ExamState.REASON_SERVICE_LOST)
+    before = max(force for stamp, force in struck.forces if stamp <= reported)
+    after = max(force for stamp, force in struck.forces if stamp > reported)
+    assert 0.5 < before < 15.0
+    assert after <= before + MORE_N
+    assert struck.forces[-1][1] == 0.0
+    assert states[-1][1].depth < -CLEAR_M
+    assert states[-1][1].phase == ExamState.PHASE_ABORTED
+    print(f"before {before:.2f} N, after {after:.2f} N, left after {struck.left_after_s:.1f} s")
+
+
+@pytest.mark.parametrize("blow", [kill, freeze])
+def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(blow: Blow, tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "wallclock", blow)
+    assert_lifted(struck)
+    if blow is freeze:
+        assert struck.said["failure"]["code"] == FailureCode.CONDUCTOR_LOST
+        assert "stood still for" in struck.said["failure"]["text"]
+
+
+def test_without_planning_the_driver_holds(tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "wallclock", kill_with_planning)
+    statuses = struck.recorded("robot/status")
+    assert statuses[-1][1].mode == RobotStatus.MODE_SAFE_HOLD
+    held = next(stamp for stamp, status in statuses if status.mode == RobotStatus.MODE_SAFE_HOLD)
+    before = max(force for stamp, force in struck.forces if stamp <= held)
+    assert max(force for stamp, force in struck.forces if stamp > held) <= before + MORE_N
+
+
+@pytest.mark.parametrize("blow", [kill, freeze])
+def test_in_lockstep_the_measured_data_are_recovered(blow: Blow, tmp_path: Path) -> None:
+    struck = strike_conductor(tmp_path, "lockstep", blow)
+    last = struck.forces[-1]
+    assert last[1] <= max(force for _, force in struck.forces[:-1]) + MORE_N
+    command = [str(Path(sys.executable).with_name("palpate")), "report", str(struck.folder), "--recover", "--json"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((struck.folder / "report.json").read_text(encoding="utf-8"))
+    assert report["run_hash"] is None
+    assert report["runtime"] == "recovered"
+    assert abs(report["sim_time_s"] - last[0] / 1e9) < 0.2
+    strongest = max(peak_force(contact) for _, contact in struck.recorded("truth/indentation"))
+    assert report["max_force_N"] == pytest.approx(strongest)
+    assert Path(json.loads(done.stdout)["html"]).is_file()

@@ -1,22 +1,38 @@
-"""The pages: command lines parse, links have targets, and the site builds without warnings and without the network."""
+"""The pages: commands, links, examples, tutorials and generated reference."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
 import re
+import runpy
 import shlex
 import subprocess
 import sys
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
 import typer
+from examination import palpate_run
+from typer.testing import CliRunner
 
 from palpate.commands import app_for
+from palpate.report.evidence import samples_of
+from palpate.report.results import sample_columns
+from palpate.run.roles import checked, settings_of
+from palpate_bus.contract import MS, contract
+from palpate_bus.contract.conformance import violations
+from palpate_bus.implementations import create
+from palpate_bus.messages import JointState, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.lockstep import Stepper
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario
+from palpate_tissue.backend import TissueBackend
 
-pytestmark = pytest.mark.pages
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not {".venv", "out", "node_modules"} & set(page.relative_to(ROOT).parts))
 GENERATED = {
@@ -46,11 +62,13 @@ def parse(words: list[str]) -> None:
     command.make_parser(context).parse_args(words)
 
 
+@pytest.mark.pages
 @pytest.mark.parametrize(("page", "line"), lines(), ids=lambda text: text)
 def test_a_documented_command_parses(page: str, line: str) -> None:
     parse(shlex.split(line))
 
 
+@pytest.mark.pages
 def test_a_wrong_command_is_refused() -> None:
     assert len(lines()) > 60
     with pytest.raises(Exception, match="--nosuch"):
@@ -65,6 +83,7 @@ def anchors(page: Path) -> set[str]:
     return {re.sub(r"[^\w\- ]", "", head.lower()).replace(" ", "-") for head in heads}
 
 
+@pytest.mark.pages
 @pytest.mark.parametrize("page", PAGES, ids=lambda page: str(page.relative_to(ROOT)))
 def test_links_have_targets(page: Path) -> None:
     broken = []
@@ -85,12 +104,11 @@ LOADED = re.compile(r'<(?:script|img|source|iframe)[^>]*\ssrc="?(https?://[^">\s
 STYLE = re.compile(r"(?:url\(|@import\s+)[\"']?(https?://[^\"')\s]+)")
 
 
+@pytest.mark.pages
 def test_the_site_builds_without_warnings_or_network(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     for module in ("mkdocs", "mkdocstrings", "jupytext", "nbclient", "nbconvert"):
         pytest.importorskip(module)
     spec = importlib.util.spec_from_file_location("site_pages", ROOT / "docs" / "site.py")
-    assert spec is not None
-    assert spec.loader is not None
     site = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(site)
     monkeypatch.setattr(site, "execute", _titled)  # tests/test_library.py executes the notebooks
@@ -113,3 +131,184 @@ def test_the_site_builds_without_warnings_or_network(tmp_path: Path, monkeypatch
 def _titled(notebook: Path, into: Path) -> None:
     into.mkdir(parents=True, exist_ok=True)
     (into / notebook.with_suffix(".md").name).write_text(f"# {notebook.stem}\n", encoding="utf-8")
+
+
+EXAMPLES = ROOT / "docs" / "examples"
+TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.md"))
+SHOWN = re.compile(r"```(?:python|yaml)\n(.*?)```", re.DOTALL)
+
+
+@pytest.mark.pages
+@pytest.mark.parametrize("page", TUTORIALS, ids=lambda page: page.stem)
+def test_shown_files_are_the_examples(page: Path) -> None:
+    examples = {path.read_text(encoding="utf-8") for path in EXAMPLES.iterdir() if path.is_file()}
+    for shown in SHOWN.findall(page.read_text(encoding="utf-8")):
+        assert shown in examples or shown.startswith("# run"), shown
+
+
+def test_python_of_the_tutorials_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)  # pages assume the root of the repository
+    count = 0
+    for page in TUTORIALS:
+        for shown in SHOWN.findall(page.read_text(encoding="utf-8")):
+            if shown.startswith("# run"):
+                (tmp_path / "shown.py").write_text(shown, encoding="utf-8")
+                runpy.run_path(str(tmp_path / "shown.py"))
+                count += 1
+    assert count >= 3
+
+
+def test_the_example_tissue_resists_a_sphere() -> None:
+    scenario = load_scenario("clean", ["phantom.edge_m=0.015"])
+    service = create("tissue", str(EXAMPLES / "springs.py"), scenario)
+    springs = service.backend  # type: ignore[attr-defined]
+    model = build_phantom(scenario.phantom, scenario.seed)
+    top = int(np.argmin(np.hypot(*model.vertices[:, :2].T)))
+    n, radius = model.normals[top], 0.015
+    forces = []
+    for depth in (-0.001, 0.005, 0.010):
+        force, torque = springs.step(0.0, model.vertices[top] + (radius - depth) * n, np.zeros(3), radius)
+        forces.append(float(force @ n))
+        assert np.isfinite(torque).all()
+    assert forces[0] == 0.0
+    assert 0 < forces[1] < forces[2]
+    vertex, pressed = springs.deepest
+    assert pressed == pytest.approx(0.010, abs=1e-6)
+    assert vertex == top
+    places, normals = model.vertices[[top]], model.normals[[top]]
+    at_once, step_by_step = springs.press(places, normals, radius), TissueBackend.press(springs, places, normals, radius)
+    np.testing.assert_allclose(at_once[0], step_by_step[0], rtol=1e-9)
+
+
+def test_the_example_tissue_conforms() -> None:
+    called = CliRunner().invoke(app_for("check"), ["check", "tissue", "--service", str(EXAMPLES / "springs.py"), "--failures"])
+    assert called.exit_code == 0, called.output
+
+
+QUICK_START = (ROOT / "docs" / "quick-start.md").read_text(encoding="utf-8")
+OVER_THE_LUMP = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.055, -0.055]")
+
+
+def commands() -> list[list[str]]:
+    """Return the arguments of every indented `palpate run`."""
+    lines = [line.partition("#")[0] for line in re.findall(r"^    palpate run(.*)$", QUICK_START, re.MULTILINE)]
+    return [shlex.split(line) for line in lines]
+
+
+@pytest.mark.pages
+def test_the_page_shows_the_example() -> None:
+    (shown,) = re.findall(r"```python\n(.*?)```", QUICK_START, re.DOTALL)
+    assert shown == (EXAMPLES / "threshold_assessment.py").read_text(encoding="utf-8")
+    assert len([line for line in shown.splitlines() if line.strip()]) <= 40
+
+
+@pytest.mark.pages
+def test_every_command_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(ROOT)
+    assert len(commands()) >= 6
+    for words in commands():
+        settings = [value for flag, value in pairwise(words) if flag == "--set"]
+        settings += settings_of([value for flag, value in pairwise(words) if flag == "--service"])
+        name = words[0] if words and not words[0].startswith("--") else "clean"
+        checked(load_scenario(name, settings))
+
+
+def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:
+    target = tmp_path / "my_abdomen.stl"
+    subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(target)], check=True, timeout=120)
+    scenario = load_scenario("healthy", ["phantom.kind=mesh", f"phantom.mesh={target}"])
+    phantom = build_phantom(scenario.phantom, scenario.seed)
+    assert phantom.vertices[:, 2].max() == pytest.approx(0.0, abs=2e-3)
+
+
+@pytest.mark.parametrize(("page", "name"), [("services", "Limp"), ("bus", "Damper")])
+def test_the_service_on_a_page_keeps_the_contract(page: str, name: str, tmp_path: Path) -> None:
+    """Step the service as the runtime does; its messages obey the contract."""
+    (lines,) = re.findall(r"```python\n(.*?)```", (ROOT / page / "README.md").read_text(encoding="utf-8"), re.DOTALL)
+    (tmp_path / "mine.py").write_text(lines, encoding="utf-8")
+    stepper = Stepper(runpy.run_path(str(tmp_path / "mine.py"), run_name="mine")[name](), contract())
+    assert stepper.start() == []
+    for k, t in enumerate((0, MS), 1):
+        joints = JointState(header(t), [f"A{i}" for i in range(1, 8)], np.zeros(7), np.full(7, 0.1), np.zeros(7))
+        stepper.buffers["joint_states"].accept(k, codec.encode(joints, "sensor_msgs/msg/JointState"))
+        ((port, packet),) = stepper.step(t)
+        assert violations(port.topic, codec.decode(packet.payload, port.topic.type), t) == []
+
+
+@pytest.mark.slow
+def test_the_example_assessment_finds_the_lesion(tmp_path: Path) -> None:
+    place = f"assessment={EXAMPLES / 'threshold_assessment.py'}"
+    settings = ("exam.region_m=[0.1, 0.1]", "exam.centre_m=[-0.04, -0.04]", "camera.frames=6")
+    ran = palpate_run("clean", tmp_path, "--composed", "--record", "none", "--service", place, settings=settings)
+    assert ran.status == 0, ran.output
+    assert ran.report["scores"]["matched"] == 1
+    assert ran.report["scores"]["place_error_m"] < 0.02
+    assert (tmp_path / "report.html").is_file()
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(900)
+def test_the_example_patient_and_mesh_are_examined(tmp_path: Path) -> None:
+    patient = palpate_run(
+        str(EXAMPLES / "my_patient.yaml"), tmp_path / "patient", "--composed", "--record", "none",
+        settings=("exam.region_m=[0.08, 0.08]", "exam.centre_m=[-0.05, 0.0]", "camera.frames=6"),
+    )  # fmt: skip
+    assert patient.status == 0, patient.output
+    assert patient.report["scores"]["matched"] == 1
+    mesh = tmp_path / "my_abdomen.stl"
+    subprocess.run([sys.executable, str(EXAMPLES / "make_abdomen.py"), str(mesh)], check=True, timeout=120)
+    ran = palpate_run(
+        *("clean", tmp_path / "mesh", "--composed", "--record", "none"),
+        settings=("phantom.kind=mesh", f"phantom.mesh={mesh}", "camera.frames=6", *OVER_THE_LUMP),
+    )
+    assert ran.status == 0, ran.output
+    assert [finding["quadrant"] for finding in ran.report["findings"]] == ["RLQ"]
+    assert ran.report["scores"]["matched"] == 1
+
+
+@pytest.fixture(scope="module")
+def pages() -> dict[str, str]:
+    sys.path.insert(0, str(ROOT / "docs"))
+    from generate import commands, errors, messages, scenario, settings, topics
+
+    modules = (commands, errors, messages, scenario, settings, topics)
+    return {module.__name__.partition(".")[2]: module.page() for module in modules}
+
+
+def test_topics(pages: dict[str, str]) -> None:
+    from palpate_bus.contract import Edge, contract
+
+    delays = pages["topics"].split("## Delays\n")[1].split("\n## ")[0]
+    for topic in contract().topics.values():
+        section = pages["topics"].split(f"### `{topic.name}`\n")[1].split("\n### ")[0]
+        for fact in (topic.doc, topic.type, topic.type_hash, *topic.readers, *topic.units, *topic.units.values()):
+            assert fact in section
+        late = [role for role, edge in topic.readers.items() if edge is Edge.PREVIOUS]
+        assert (f"| `{topic.name}` | {topic.producer} | {', '.join(late)} |" in delays) == bool(late)
+
+
+def test_scenario_and_errors(pages: dict[str, str]) -> None:
+    from palpate_models.scenario.errors import table
+
+    rows = [line for line in pages["scenario"].splitlines() if line.startswith("| `")]
+    assert any(row.startswith("| `depth_m` | `0.01` | a number at least 0.002, at most 0.02 |") for row in rows)
+    assert "| `xyz_m` | `[0.56, 0.0, 0.93]` |" in pages["scenario"]  # the default of `exam.pose`, not of a pose
+    assert "## `phantom.lesions[]`" in pages["scenario"]
+    for name, fields in table().items():
+        assert all(f"| `{field}` |" in pages["errors"].split(f"## `errors.{name}`")[1] for field in fields)
+
+
+def test_settings_commands_and_messages(pages: dict[str, str]) -> None:
+    from palpate.commands import COMMANDS
+    from palpate_bus.messages.names import PACKAGES
+    from palpate_bus.settings import Settings, variable
+
+    assert all(f"| `{variable(name)}` |" in pages["settings"] for name in Settings.model_fields)
+    assert all(f"### palpate {word}" in pages["commands"] for word in COMMANDS)
+    assert all(f"## {name}\n" in pages["messages"] for name in PACKAGES["palpation_msgs"])
+
+
+def test_every_column_of_the_samples_is_documented() -> None:
+    page = (ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
+    for column in (*sample_columns(samples_of([])), "force_limited", "run"):
+        assert f"| `{column}` |" in page, column

@@ -1,4 +1,4 @@
-"""An examination that is killed or stopped in contact and gone on with: nothing that was felt is lost, the rest is examined."""
+"""An examination that is stopped and released, or interrupted and resumed."""
 
 from __future__ import annotations
 
@@ -12,16 +12,23 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from examination import SHORT, Finished, command, palpate_run
+from examination import SHORT, Finished, command, palpate_run, service_process
 from scipy.spatial import KDTree
 
 from palpate.report.recovery import FOLDER
+from palpate.run.composed import load_services
+from palpate.run.roles import WORKERS
+from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus
 from palpate_bus.messages.geometry import Array
+from palpate_bus.messages.stamps import NS, header
 from palpate_bus.recordings import open_recording
+from palpate_bus.runtime.composed import Composed
+from palpate_bus.service import Inbox, Outbox
+from palpate_conductor.collector import Collected, Collector
+from palpate_models.scenario.load import load_scenario
 from palpate_recorder.recover import recover
 
-SECONDS_SCAN = 2
-"""The blow comes with the second line of the scan."""
+SMALL = (*SHORT, "camera.frames=4", "phantom.edge_m=0.01")
 Blow = Callable[[psutil.Process], None]
 
 
@@ -30,114 +37,161 @@ def kill(run: psutil.Process) -> None:
 
 
 def kill_control(run: psutil.Process) -> None:
-    next(child for child in run.children(recursive=True) if "palpate_control" in child.cmdline()).kill()
+    service_process(run, "control").kill()
 
 
 def interrupt(run: psutil.Process) -> None:
     run.send_signal(signal.SIGINT)
 
 
-def break_off(folder: Path, blow: Blow, *options: str) -> None:
-    """Runs an examination and strikes it when its indenter slides along its second line."""
-    run = subprocess.Popen(command("clean", folder, *options, settings=SHORT), stderr=subprocess.PIPE, text=True)
-    assert run.stderr is not None
+def interrupted(folder: Path, blow: Blow, *options: str) -> None:
+    """Run an examination and strike it while its indenter slides along its second line."""
+    run = subprocess.Popen(command("clean", folder, *options, settings=SMALL), stderr=subprocess.PIPE, text=True)
     scans = 0
     for line in run.stderr:
         scans += " scan " in line
-        if scans == SECONDS_SCAN:
+        if scans == 2:
             scans += 1
             blow(psutil.Process(run.pid))
     assert run.wait(timeout=120) != 0
 
 
-def go_on(folder: Path, *options: str) -> Finished:
-    """Goes on with it."""
-    words = [*command("clean", folder, *options)[:2], "--resume", str(folder), *options]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=600, check=False)
+def resume_words(folder: Path, *options: str) -> list[str]:
+    return [*command("clean", folder)[:2], "--resume", str(folder), *options]
+
+
+def resume(folder: Path, *options: str) -> Finished:
+    done = subprocess.run(resume_words(folder, *options), capture_output=True, text=True, timeout=600, check=False)
     return Finished(done.returncode, done.stdout + done.stderr, folder / FOLDER)
 
 
 def rows(folder: Path) -> list[dict[str, Any]]:
-    """samples.csv."""
+    """Return samples.csv."""
     with (folder / "samples.csv").open(encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 
-def felt(folder: Path) -> tuple[Array, Array]:
-    """Where it was felt, n × 3, m, and the force there, N."""
+def measured(folder: Path) -> tuple[Array, Array]:
+    """Return the places of the samples [m], n × 3, and the forces there [N]."""
     samples = rows(folder)
     places = np.array([[float(row[axis]) for axis in ("x_m", "y_m", "z_m")] for row in samples])
     return places, np.array([float(row["normal_force_N"]) for row in samples])
 
 
 def recorded_samples(folder: Path) -> int:
-    """How many samples the recording of a run holds."""
+    """Return the number of samples in the recording of a run."""
     recording = folder / "recording_mcap"
     whole = recording if (recording / "metadata.yaml").is_file() else recover(recording)
     return open_recording(whole).counts["assessment/samples"]
 
 
 def check(folder: Path, resumed: Finished) -> None:
-    """What was felt before counts as what was felt after; what was reached is not examined again."""
+    """Check that samples from before the interruption count, and that reached targets are not examined again."""
     assert resumed.status == 0, resumed.output
     report = resumed.report
     assert (report["failure"], report["run_hash"], report["resumed"], report["assessed"]) == (None, None, 1, True)
     times = [float(row["time_s"]) for row in rows(resumed.folder)]
-    felt_before = recorded_samples(folder)
-    assert felt_before > 0
-    held_back = sum(time < 0 for time in times) - felt_before
-    assert held_back in (0, 1), "what waited for the breath to be seen when the run broke off counts, too"
+    before = recorded_samples(folder)
+    assert before > 0
+    held_back = sum(time < 0 for time in times) - before
+    assert held_back in (0, 1), "a sample that waited for the measured breath counts, too"
     assert sum(time > 0 for time in times) > 0
     assert len(times) == report["samples"] == report["services"]["assessment"]["facts"]["samples"]
     assert "targets that are left" in resumed.output
 
 
-def test_killed_in_one_process(tmp_path: Path) -> None:
-    """The whole command is gone at once, recorder and all; what goes on finds what an undisturbed one finds."""
+def test_a_killed_examination_is_resumed_once(tmp_path: Path) -> None:
+    """The whole command is killed, with its recorder."""
     folder = tmp_path / "broken"
-    break_off(folder, kill, "--composed")
-    resumed = go_on(folder, "--composed")
-    check(folder, resumed)
-    whole = palpate_run("clean", tmp_path / "whole", "--composed", "--record", "none", settings=SHORT)
-    (places, forces), (all_places, undisturbed) = felt(resumed.folder), felt(whole.folder)
-    away, nearest = KDTree(places).query(all_places)
-    assert max(away) < 0.003, "a place was left out"
-    assert forces[nearest] == pytest.approx(undisturbed, rel=0.15)
-    again = go_on(folder, "--composed")
+    interrupted(folder, kill, "--composed")
+    check(folder, resume(folder, "--composed"))
+    again = resume(folder, "--composed")
     assert again.status == 2
     assert "was completed" in again.output
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("blow", [kill, kill_control, interrupt])
-def test_of_processes(blow: Blow, tmp_path: Path) -> None:
+def test_examinations_in_processes_are_resumed(blow: Blow, tmp_path: Path) -> None:
+    """Forces and places are those of an undisturbed examination."""
     folder = tmp_path / "broken"
-    break_off(folder, blow)
-    check(folder, go_on(folder))
+    interrupted(folder, blow)
+    resumed = resume(folder)
+    check(folder, resumed)
+    whole = palpate_run("clean", tmp_path / "whole", "--composed", "--record", "none", settings=SMALL)
+    (places, forces), (all_places, undisturbed) = measured(resumed.folder), measured(whole.folder)
+    distances, nearest = KDTree(places).query(all_places)
+    assert max(distances) < 0.003, "a place was left out"
+    assert forces[nearest] == pytest.approx(undisturbed, rel=0.15)
 
 
 @pytest.mark.slow
-def test_twice(tmp_path: Path) -> None:
+def test_a_resumed_examination_is_resumed_again(tmp_path: Path) -> None:
     folder = tmp_path / "broken"
-    break_off(folder, interrupt, "--composed")
-    run = subprocess.Popen(
-        [*command("clean", folder)[:2], "--resume", str(folder), "--composed"], stderr=subprocess.PIPE, text=True
-    )
-    assert run.stderr is not None
+    interrupted(folder, interrupt, "--composed")
+    run = subprocess.Popen(resume_words(folder, "--composed"), stderr=subprocess.PIPE, text=True)
     for line in run.stderr:
         if " scan " in line:
             run.send_signal(signal.SIGKILL)
-    resumed = go_on(folder, "--composed")
+    resumed = resume(folder, "--composed")
     assert resumed.status == 0, resumed.output
     report = Finished(0, "", folder / FOLDER / FOLDER).report
     assert report["resumed"] == 2
     assert report["samples"] > recorded_samples(folder / FOLDER) >= recorded_samples(folder)
 
 
-def test_what_cannot_be_gone_on_with(tmp_path: Path) -> None:
-    nothing = go_on(tmp_path / "nowhere")
-    assert nothing.status == 2
-    assert "nowhere" in nothing.output
-    other = go_on(tmp_path, "--seed", "3")
-    assert other.status == 2
-    assert "--seed" in other.output and "cannot be combined" in " ".join(other.output.split())
+class Operator(Collector):
+    """Stops the examination a second after it begins to scan, and sends another request a second later."""
+
+    def __init__(self, request: int | None) -> None:
+        super().__init__()
+        self.request = request
+        self.scan: int | None = None
+        self.sent: list[int] = []
+        self.modes: list[int] = []
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        out: dict[str, Any] = dict(super().step(t, inbox))
+        exam = self.collected.exam
+        if self.scan is None and exam is not None and exam.phase == ExamState.PHASE_SCAN:
+            self.scan = t
+        due = [OperatorRequest.STOP, self.request][len(self.sent) :]
+        if self.request is not None and self.scan is not None and due and t >= self.scan + (1 + len(self.sent)) * NS:
+            self.sent.append(due[0])
+            out["operator/request"] = OperatorRequest(header(t), due[0], "a test")
+        self.modes += [status.mode for status in inbox.new("robot/status")]
+        return out
+
+
+def examine(request: int | None) -> tuple[Collected, Operator]:
+    scenario = load_scenario("clean", SMALL)
+    operator = Operator(request)
+    run = Composed([*load_services(scenario, WORKERS), operator])
+    run.run(lambda: operator.collected.end_tick, 120 * NS)
+    return operator.collected, operator
+
+
+@pytest.mark.slow
+def test_a_released_examination_continues_where_it_was() -> None:
+    undisturbed, _ = examine(None)
+    collected, operator = examine(OperatorRequest.RELEASE)
+    assert operator.sent == [OperatorRequest.STOP, OperatorRequest.RELEASE]
+    assert RobotStatus.MODE_SAFE_HOLD in operator.modes
+    assert operator.modes[-1] == RobotStatus.MODE_ACTIVE
+    assert collected.exam.phase == ExamState.PHASE_DONE, collected.exam.message
+    assert collected.exam.targets_skipped == 0
+    assert len(collected.samples) >= len(undisturbed.samples)
+    assert max(m.normal_force for m in collected.indentation) < 1.2 * max(m.normal_force for m in undisturbed.indentation)
+    (found,), (expected,) = collected.findings.findings, undisturbed.findings.findings
+    assert abs(found.centroid.x - expected.centroid.x) < 3e-3
+    assert abs(found.centroid.y - expected.centroid.y) < 3e-3
+    assert found.ratio == pytest.approx(expected.ratio, rel=0.1)
+
+
+@pytest.mark.slow
+def test_an_examination_that_the_operator_ends_returns_home() -> None:
+    collected, operator = examine(OperatorRequest.END)
+    assert operator.sent == [OperatorRequest.STOP, OperatorRequest.END]
+    assert collected.exam.phase == ExamState.PHASE_ABORTED
+    assert "ended by the operator: a test" in collected.exam.message
+    assert collected.indentation[-1].normal_force == 0.0

@@ -1,18 +1,18 @@
-"""The runtimes against each other and against faults, with a toy dataflow in real processes over zenoh."""
+"""The runtimes against each other and against faults: toy services in real processes over zenoh, placed in any way."""
 
 from __future__ import annotations
 
 import signal
 import tempfile
 import time
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 from rerun.chunk import RrdReader
-from toy_runs import ROLES, Running, assert_failed, at, composed_hash, run_toys, toy_services
+from toy_runs import APART, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services
 
 from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.messages import DiagnosticStatus, ServiceReport, codec
@@ -57,39 +57,73 @@ def test_a_failed_observer_or_tap_does_not_end_a_composed_run() -> None:
     assert set(run.finish()) == {*toy_services.TOYS, "conductor"}
 
 
-def test_composed_and_distributed_give_the_same_run_hash() -> None:
-    outcome = run_toys()
+LOOP = ("robot", "tissue", "control")
+PAIR = ("planning", "perception")
+
+
+def with_own_process(*groups: tuple[str, ...]) -> list[tuple[str, ...]]:
+    """Return these groups of roles, and every other role alone."""
+    return [*groups, *((role,) for role in ROLES if not any(role in group for group in groups))]
+
+
+@pytest.mark.parametrize("groups", [APART, with_own_process(LOOP, PAIR), [ROLES[::2], ROLES[1::2]]])
+def test_every_placement_gives_the_run_hash_of_the_composed_run(groups: Sequence[tuple[str, ...]]) -> None:
+    outcome = run_toys(groups=groups)
     assert outcome.failure is None
     assert outcome.last_tick == toy_services.END
     assert outcome.run_hash == composed_hash()
     assert set(outcome.reports) == set(ROLES)
 
 
-def test_after_a_killed_controller_the_others_run_one_more_second() -> None:
-    done: list[bool] = []
-
-    def kill(running: Running) -> None:
-        if at(running, 0.5, done):
-            running.processes["control"].kill()
-
-    outcome = run_toys(kill, {"TOY_END_S": "30"})
-    assert_failed(outcome, FailureCode.ROLE_LOST, "control")
+def test_all_roles_of_a_killed_process_are_lost_and_the_others_run_one_more_second() -> None:
+    pair = ("control", "planning")
+    outcome = run_toys(
+        once(0.5, lambda running: running.processes["control"].kill()), {"TOY_END_S": "30"}, groups=with_own_process(pair)
+    )
+    assert outcome.lost.keys() == set(pair), outcome.trouble
+    assert_failed(outcome, FailureCode.ROLE_LOST, *pair)
     assert outcome.run_hash is None
     assert abs(outcome.last_tick - outcome.lost["control"] - NS) <= NS // 2
 
 
+def test_a_killed_tissue_ends_the_run_at_once() -> None:
+    outcome = run_toys(once(0.3, lambda running: running.processes["tissue"].kill()), {"TOY_END_S": "30"})
+    assert_failed(outcome, FailureCode.ROLE_LOST, "tissue")
+
+
+def test_in_a_shared_process_the_service_that_raised_is_named() -> None:
+    outcome = run_toys(environment={"TOY_CONTROL_FAILS_AT": "700"}, groups=with_own_process(LOOP))
+    assert outcome.lost.keys() == set(LOOP), outcome.trouble
+    assert outcome.failure is not None
+    assert outcome.failure.code is FailureCode.ROLE_FAILED
+    assert "control: ArithmeticError: toy failure" in str(outcome.failure)
+
+
+def test_all_roles_of_a_frozen_process_are_lost_and_reported_once() -> None:
+    done: list[bool] = []
+    reported: list[str] = []
+
+    def freeze(running: Running) -> None:
+        if at(running, 0.3, done):
+            running.processes["planning"].send_signal(signal.SIGSTOP)
+        reported.extend(text for text in running.conductor.outcome.trouble if text not in reported)
+
+    patience = Patience(soft=0.5, hard=60.0, frozen=1.0)
+    outcome = run_toys(freeze, {"TOY_END_S": "30"}, patience, groups=with_own_process(LOOP, PAIR))
+    assert outcome.lost.keys() == set(PAIR)
+    assert_failed(outcome, FailureCode.FROZEN, *PAIR)
+    assert reported.count(str(outcome.failure)) == 1
+
+
 def test_an_interrupted_run_ends_every_service() -> None:
     def interrupt(running: Running) -> None:
-        if at(running, 0.5, done):
-            raise KeyboardInterrupt
+        raise KeyboardInterrupt
 
-    done: list[bool] = []
-    outcome = run_toys(interrupt, {"TOY_END_S": "300"})
+    outcome = run_toys(once(0.5, interrupt), {"TOY_END_S": "300"})
     assert outcome.interrupted
     assert_failed(outcome, FailureCode.INTERRUPTED)
     assert 0 < outcome.last_tick < 300 * NS, "the machine's speed decides how far it gets"
     assert outcome.run_hash is None
-    assert done
 
 
 def test_a_run_that_was_paused_and_stepped_has_the_same_hash() -> None:
@@ -112,38 +146,6 @@ def test_a_run_that_was_paused_and_stepped_has_the_same_hash() -> None:
     assert outcome.run_hash == composed_hash()
 
 
-def test_a_killed_tissue_ends_the_run() -> None:
-    done: list[bool] = []
-
-    def kill(running: Running) -> None:
-        if at(running, 0.3, done):
-            running.processes["tissue"].kill()
-
-    outcome = run_toys(kill, {"TOY_END_S": "30"})
-    assert_failed(outcome, FailureCode.ROLE_LOST, "tissue")
-
-
-def test_a_service_that_raises_is_reported_with_its_error() -> None:
-    outcome = run_toys(environment={"TOY_CONTROL_FAILS_AT": "700"})
-    assert_failed(outcome, FailureCode.ROLE_FAILED, "control")
-    assert "ArithmeticError: toy failure" in str(outcome.failure)
-
-
-def test_a_frozen_service_ends_the_run_and_is_blamed() -> None:
-    done: list[bool] = []
-
-    def freeze(running: Running) -> None:
-        if at(running, 0.3, done):
-            running.processes["tissue"].send_signal(signal.SIGSTOP)
-        told.extend(text for text in running.conductor.outcome.trouble if text not in told)
-
-    told: list[str] = []
-    outcome = run_toys(freeze, {"TOY_END_S": "30"}, Patience(soft=0.5, hard=60.0, frozen=1.0))
-    assert_failed(outcome, FailureCode.FROZEN, "tissue")
-    assert told.count(str(outcome.failure)) == 1
-    assert outcome.lost.keys() == {"tissue"}
-
-
 def test_a_service_that_computes_for_long_is_not_frozen() -> None:
     outcome = run_toys(environment={"TOY_CONTROL_COMPUTES_AT": "200"}, patience=Patience(frozen=0.2, asleep=0.5))
     assert outcome.failure is None
@@ -151,19 +153,15 @@ def test_a_service_that_computes_for_long_is_not_frozen() -> None:
 
 
 def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
-    done: list[bool] = []
-
     def shout(running: Running) -> None:
-        if at(running, 0.2, done):
-            for topic in contract().topics.values():
-                key = topic_key(topic, 0)
-                running.session.put(key, b"\xff" * 40)
-                running.session.put(key, b"\xff" * 40, attachment=b"not an attachment")
-                running.session.put(key, b"\xff" * 40, attachment=bytes(16) + b"\x10" + bytes(16))
-                numbered = (9).to_bytes(8, "little") + bytes(8) + b"\x10" + bytes(16)
-                running.session.put(key, b"\xff" * 40, attachment=numbered)
+        numbered = (9).to_bytes(8, "little") + bytes(8) + b"\x10" + bytes(16)
+        for topic in contract().topics.values():
+            key = topic_key(topic, 0)
+            running.session.put(key, b"\xff" * 40)
+            for attachment in (b"not an attachment", bytes(16) + b"\x10" + bytes(16), numbered):
+                running.session.put(key, b"\xff" * 40, attachment=attachment)
 
-    outcome = run_toys(shout)
+    outcome = run_toys(once(0.2, shout))
     assert outcome.failure is None
     assert outcome.run_hash == composed_hash()
     assert sum(report["garbage"] for report in outcome.reports.values()) >= 2
@@ -172,18 +170,18 @@ def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
 
 def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -> None:
     topic = contract().topics["diagnostics"]
-    ears: list[Subscription] = []
-    heard: list[tuple[int, bytes]] = []
+    subscriptions: list[Subscription] = []
+    received: list[tuple[int, bytes]] = []
 
     def listen(running: Running) -> None:
-        if not ears:
-            ears.append(Subscription(running.session, topic_key(topic, 0)))
-        while (sample := ears[0].get(0)) is not None:
-            heard.append((sample.sequence, sample.payload))
+        if not subscriptions:
+            subscriptions.append(Subscription(running.session, topic_key(topic, 0)))
+        while (sample := subscriptions[0].get(0)) is not None:
+            received.append((sample.sequence, sample.payload))
 
     outcome = run_toys(listen, {"TOY_END_S": "8"}, faults={"robot": ("robot/status", "nan", "1")})
     assert outcome.failure is None
-    statuses = {status.name: status for status in codec.decode(heard[-1][1], topic.type).status}
+    statuses = {status.name: status for status in codec.decode(received[-1][1], topic.type).status}
     for name in ("palpate/topic/robot/status", "palpate/robot"):
         assert statuses[name].level == DiagnosticStatus.ERROR
         assert "from robot: not finite" in statuses[name].message
@@ -192,7 +190,7 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
     assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
 
     dashboard = DashboardService(Scenario(), tmp_path / "drawn.rrd", Live())
-    draw(((sequence * NS, topic.name, payload) for sequence, payload in heard), dashboard)
+    draw(((sequence * NS, topic.name, payload) for sequence, payload in received), dashboard)
     dashboard.finish()
     drawn: dict[str, list[Any]] = {}
     for chunk in RrdReader(tmp_path / "drawn.rrd").stream():

@@ -1,15 +1,18 @@
-"""Searches on patients under the hand."""
+"""Searches on simulated patients, and their Gymnasium environment."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pandas as pd
 import pytest
 from examination import GATE, palpate_run
+from gymnasium.utils.env_checker import check_env
 
 import palpate
+from palpate.search.environment import ID, SearchEnv
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
 from palpate_search.choice import policy
@@ -28,10 +31,11 @@ def trial(hand: type[PatientHand] | type[SurrogateHand], lump: bool, presses: in
 
 
 @pytest.mark.parametrize("hand", [PatientHand, SurrogateHand])
-def test_ours_finds_a_lump_in_a_dozen_presses_and_none_where_none_is(hand: type[PatientHand] | type[SurrogateHand]) -> None:
+def test_the_informed_policy_finds_a_lump_in_a_dozen_presses_and_no_false_one(
+    hand: type[PatientHand] | type[SurrogateHand],
+) -> None:
     found = trial(hand, True, 15)
     decided = found.decided(0.9)
-    assert decided is not None
     assert decided < 12
     assert np.linalg.norm(found.place[-1] - CENTRE) < 0.010
     assert trial(hand, False, 15).near.max() < 0.9
@@ -81,3 +85,56 @@ def test_a_lump_that_was_missed_counts_as_the_whole_budget() -> None:
     assert "found 1 of 2" in said
     assert "presses 60 (" in said
     assert "no finding 0 of 1" in said
+
+
+pytestmark = pytest.mark.filterwarnings("ignore::UserWarning")
+
+
+def played(env: gymnasium.Env, seed: int, patient: int = 7) -> tuple[list[float], dict]:
+    """Rewards and the last observation of an episode of random presses."""
+    env.reset(seed=seed, options={"patient": patient})
+    rng, rewards, over = np.random.default_rng(seed), [], False
+    while not over:
+        observation, reward, over, _, _ = env.step(rng.uniform(-1, 1, 3).astype(np.float32))
+        rewards.append(float(reward))
+    return rewards, observation
+
+
+@pytest.mark.parametrize("maps", [False, True])
+def test_the_checks_of_gymnasium_pass(maps: bool) -> None:
+    check_env(gymnasium.make(ID, presses=6, patients=2, maps=maps).unwrapped)
+
+
+def test_a_trajectory_is_reproduced() -> None:
+    rewards, observation = played(SearchEnv(presses=8), 5)
+    again, _ = played(SearchEnv(presses=8), 5)
+    assert rewards == again
+    np.testing.assert_allclose(rewards, REWARDS, atol=2e-3)
+    np.testing.assert_allclose(observation["history"][:, 3], LOG_FORCE, atol=2e-3)
+    assert observation["left"] == 0.0
+
+
+def test_vectorised_environments() -> None:
+    envs = gymnasium.make_vec(ID, num_envs=3, presses=4, patients=2)
+    observation, _ = envs.reset(seed=1)
+    assert observation["history"].shape == (3, 4, 5)
+    for _ in range(4):
+        observation, reward, over, _, _ = envs.step(envs.action_space.sample())
+    assert over.all()
+    assert reward.shape == (3,)
+
+
+def test_the_true_tissue_gives_the_same_kind_of_forces() -> None:
+    forces = [played(SearchEnv(hand, presses=6), 3)[1]["history"][:, 3] for hand in ("surrogate", "patient")]
+    assert np.abs(forces[0] - forces[1]).max() < 0.5
+
+
+def test_unusable_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="hand = 'foot': want surrogate or patient"):
+        SearchEnv("foot")
+    with pytest.raises(ValueError, match="presses = 0"):
+        SearchEnv(presses=0)
+
+
+REWARDS = [-0.0381, 0.091, 0.04, -0.6559, 0.0295, -0.086, 0.0551, -1.5069]
+LOG_FORCE = [-0.4774, -0.6806, -1.1326, -1.4268, -0.4181, -0.6051, -0.3554, -1.1691]

@@ -1,4 +1,4 @@
-"""How soon the supervisor stops what planning should never have done: measured on the real services, in simulated time.
+"""Reaction times of the supervisor to faults of planning and other services, measured on the real services in simulated time.
 
 Run as a program it prints the table of docs/faults.md, or writes it there:
 `python tests/test_supervisor_reaction.py --docs FILE`.
@@ -27,11 +27,11 @@ from palpate_models.scenario.load import load_scenario
 MS = 1_000_000
 SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=2")
 OTHERS = ("robot", "tissue", "control", "supervisor", "assessment", "camera", "perception")
-MAD_AFTER = 300 * MS
+FAULT_AFTER = 300 * MS
 
 
-class MadPlanning(Service):
-    """Planning, until it goes mad in contact: it then moves its set-point by itself and heeds nobody."""
+class FaultyPlanning(Service):
+    """Planning that fails in contact: it then moves its set-point and ignores all messages."""
 
     role = "planning"
 
@@ -39,22 +39,22 @@ class MadPlanning(Service):
         """`velocity(n)`: of the set-point [m/s], given the outward normal n."""
         self.planning, self.velocity = planning, velocity
         self.scan: int | None = None
-        self.mad_at: int | None = None
+        self.faulty_at: int | None = None
         self.last: Any = None
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        if self.mad_at is None:
+        if self.faulty_at is None:
             out = dict(self.planning.step(t, inbox))
             self.last = out
             if self.scan is None and out["exam/state"].phase == ExamState.PHASE_SCAN:
                 self.scan = t
-            if self.scan is not None and t - self.scan >= MAD_AFTER:
-                self.mad_at = t
+            if self.scan is not None and t - self.scan >= FAULT_AFTER:
+                self.faulty_at = t
             return out
         state, setpoint = self.last["exam/state"], self.last["planning/setpoint"]
         n = np.array((state.surface_normal.x, state.surface_normal.y, state.surface_normal.z))
         v = self.velocity(n)
-        p, dt = setpoint.pose.position, (t - self.mad_at) / NS
+        p, dt = setpoint.pose.position, (t - self.faulty_at) / NS
         moved = type(p)(p.x + v[0] * dt, p.y + v[1] * dt, p.z + v[2] * dt)
         linear = type(setpoint.twist.linear)(*v.tolist())
         setpoint = dataclasses.replace(
@@ -86,10 +86,10 @@ class Watcher(Collector):
 
 
 class Meddled(Service):
-    """A service whose messages are tampered with once it is told to."""
+    """A service one of whose messages is changed after `strike` is set."""
 
     def __init__(self, service: Service, tamper: Callable[[dict[str, Any]], bool]) -> None:
-        """`tamper(outbox)` changes what is sent, once: it says whether it was there."""
+        """`tamper(outbox)` changes a message and returns True if it was there."""
         self.service, self.tamper = service, tamper
         self.role = service.role  # type: ignore[misc]
         self.strike = False
@@ -106,7 +106,7 @@ class Meddled(Service):
 
 @dataclass
 class Reaction:
-    """What was measured; times in ms of simulated time, forces true."""
+    """Measured reaction: times in ms of simulated time, true forces."""
 
     causes: list[int]
     """Causes of the supervisor's stops, one after the other."""
@@ -124,7 +124,7 @@ class Reaction:
 
 @dataclass(frozen=True)
 class Case:
-    """What goes wrong in contact, and from when on the reaction is counted."""
+    """A fault in contact, and the event from which the reaction is timed."""
 
     cause: int
     """Cause of the first stop."""
@@ -132,9 +132,9 @@ class Case:
     """Velocity of the set-point [m/s], given the outward normal n."""
     settings: tuple[str, ...] = ()
     tamper: tuple[str, Callable[[dict[str, Any]], bool]] | None = None
-    """A role, and what happens to its messages once."""
+    """A role, and the change of one of its messages."""
     breach: Callable[[Any], bool] | None = None
-    """Whether a `truth/indentation` is beyond what is allowed; None: counted from the event."""
+    """True if a `truth/indentation` exceeds the limit; None: timed from the event."""
 
 
 def _blind(out: dict[str, Any]) -> bool:
@@ -174,17 +174,17 @@ def react(name: str) -> Reaction:
     case = CASES[name]
     scenario = load_scenario("clean", (*SHORT, *case.settings))
     (real,) = load_services(scenario, ("planning",))
-    mad = MadPlanning(real, case.velocity)
+    faulty = FaultyPlanning(real, case.velocity)
     watcher = Watcher()
     others = load_services(scenario, OTHERS)
     if case.tamper is not None:
         role, tamper = case.tamper
         others = [Meddled(service, tamper) if service.role == role else service for service in others]
-    run = Composed([mad, *others, watcher])
+    run = Composed([faulty, *others, watcher])
     struck: list[int] = []
 
     def end() -> int | None:
-        if mad.mad_at is None:
+        if faulty.faulty_at is None:
             return 20 * NS if run.t > 20 * NS else None
         if not struck:
             struck.append(run.t)
@@ -195,13 +195,13 @@ def react(name: str) -> Reaction:
             for service in others:
                 if isinstance(service, Meddled):
                     service.strike = True
-        return mad.mad_at + 1500 * MS
+        return faulty.faulty_at + 1500 * MS
 
     run.run(end, 30 * NS)
-    assert mad.mad_at is not None, "it never came into contact"
+    assert faulty.faulty_at is not None, "it never came into contact"
     stops = [s for s in watcher.states if s.level != SupervisorState.LEVEL_OK]
     hold = next(s for s in watcher.statuses if s.mode == RobotStatus.MODE_SAFE_HOLD)
-    begin = mad.mad_at
+    begin = faulty.faulty_at
     truth = {nanoseconds(m.header.stamp): m for m in watcher.collected.indentation}
     force = {t: m.normal_force for t, m in truth.items()}
     breach = case.breach
@@ -214,14 +214,14 @@ def react(name: str) -> Reaction:
         (first - begin) / MS,
         (nanoseconds(hold.header.stamp) - begin) / MS,
         force.get(first, 0.0),
-        max(f for t, f in force.items() if t >= mad.mad_at),
+        max(f for t, f in force.items() if t >= faulty.faulty_at),
         float(watcher.states[-1].speed),
     )
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CASES)
-def test_whatever_goes_wrong_the_arm_is_stopped(name: str) -> None:
+def test_every_fault_stops_the_arm(name: str) -> None:
     reaction = react(name)
     assert reaction.causes[0] == CASES[name].cause, reaction.reason
     assert reaction.peak_force < 25.0, reaction
@@ -229,8 +229,8 @@ def test_whatever_goes_wrong_the_arm_is_stopped(name: str) -> None:
     assert reaction.speed_after < 0.02
 
 
-def test_every_cause_that_simulated_time_knows_is_measured() -> None:
-    """Without SILENT, which only the wall clock knows, and UNHEEDED, which follows another."""
+def test_every_cause_of_simulated_time_has_a_case() -> None:
+    """All but SILENT, which needs wall-clock mode, and UNHEEDED, which follows another cause."""
     causes = {int(value) for name, value in vars(SupervisorState).items() if name.startswith("CAUSE_")}
     others = {SupervisorState.CAUSE_NONE, SupervisorState.CAUSE_SILENT, SupervisorState.CAUSE_UNHEEDED}
     assert {case.cause for case in CASES.values()} == causes - others

@@ -53,7 +53,7 @@ def run_toys(
         meddle: called in every turn of the conductor's loop
         environment: added to that of the services
         patience: time limits of the conductor
-        wallclock: run by the wall clock, not in lockstep
+        wallclock: run in wall-clock mode instead of lockstep
         faults: by role, a fault of its transport (topic, kind, simulated second)
         groups: roles of each process
         router: if given, all processes are clients of it
@@ -98,7 +98,6 @@ def run_toys(
 
 
 def assert_failed(outcome: RunOutcome, code: FailureCode, *roles: str) -> None:
-    assert outcome.failure is not None
     assert outcome.failure.code is code, outcome.failure
     assert set(outcome.failure.roles) == set(roles), outcome.failure
 
@@ -111,9 +110,15 @@ def composed_hash() -> str:
 
 
 def at(running: Running, seconds: float, done: list[bool]) -> bool:
-    """True once, when the simulated time is reached."""
+    """Return True once, when the simulated time is reached."""
     reached = running.conductor.watchdog.progress["robot"].tick > seconds * NS
     if reached and not done:
         done.append(True)
         return True
     return False
+
+
+def once(seconds: float, act: Callable[[Running], None]) -> Callable[[Running], None]:
+    """Return a `meddle` that calls `act` once, when the simulated time is reached."""
+    done: list[bool] = []
+    return lambda running: act(running) if at(running, seconds, done) else None

@@ -1,4 +1,4 @@
-"""What palpate reproduce makes of runs: pictures of what stands there, the graph of the bus, a page of what was measured."""
+"""`palpate reproduce`: pictures of the scene, the graph of the bus, and the page of the measurements."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Renews the references of all services from one short examination: `python tests/commands/make_references.py`.
+"""Renew the references of all services from one short examination: `python tests/commands/make_references.py`.
 
-Needed after a change of a message type, or where the inputs themselves should change. When a service is meant to answer its old
-inputs in a new way, `palpate replay REFERENCE --service ROLE --update-refs REFERENCE` is enough.
+Needed after a change of a message type or of the inputs. If only the output of a service was meant to change,
+`palpate replay REFERENCE --service ROLE --update-refs REFERENCE` is enough.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ SETTINGS = (
 )  # fmt: skip
 """A small examination with small messages: a coarse abdomen and a camera of few pixels."""
 SEARCH = ("exam.region_m=[0.06, 0.06]", "exam.pattern=search", "exam.budget.presses=4")
-"""What is set beside that in the examination that searches."""
+"""Additional settings of the examination that searches."""
 CUTS = {
     "robot": (0.0, 0.1),
     "control": (29.0, 0.1),
@@ -33,11 +33,11 @@ CUTS = {
     "perception": (0.0, 1.5),
     "search": (0.0, 60.0),
 }
-"""What of the run a service is held to: from, and how long [s]."""
+"""The part of the run that a service must reproduce: begin and length [s]."""
 
 
 def main() -> None:
-    """Runs and cuts."""
+    """Run the examinations and cut the references from them."""
     with tempfile.TemporaryDirectory(prefix="palpate-references-") as folder:
         examine(Path(folder, "scan"), SETTINGS)
         examine(Path(folder, "search"), (*SETTINGS, *SEARCH))
@@ -49,7 +49,7 @@ def main() -> None:
 
 
 def examine(folder: Path, settings: tuple[str, ...]) -> None:
-    """Runs an examination and records all of it."""
+    """Run an examination and record all of it."""
     palpate = str(Path(sys.executable).with_name("palpate"))
     words = [word for setting in settings for word in ("--set", setting)]
     command = [palpate, "run", "clean", "--composed", "--record", "full", "--quiet", "--out", str(folder), *words]

@@ -1,20 +1,30 @@
-"""Bad input to the commands that measure for minutes: a sentence and status 2, before anything starts."""
+"""Bad input ends with a line and status 2 before anything starts; the plan of an examination."""
 
 from __future__ import annotations
 
+import re
+import shlex
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
+from PIL import Image
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
 from palpate.console import EXIT_BAD_INPUT
+from palpate.run.inputs import scan_over
+from palpate_models.patient.phantom import build_phantom
+from palpate_models.scenario.load import load_scenario, scenario_names
+from palpate_plugins import PluginError
+
+SPIRAL = Path(__file__).parents[2] / "docs" / "examples" / "spiral.py"
 
 
 @pytest.fixture(autouse=True)
 def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    """No examination is begun, and files land in a scratch folder."""
+    """No process is started, and files are written to a temporary folder."""
 
     def started(*words: object, **_: object) -> None:
         raise AssertionError(f"started {words}")
@@ -26,36 +36,115 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
 
 def refused(*words: str) -> str:
-    """What the command says on its way out, on one line."""
+    """Return the output of a command that refuses its input, on one line."""
     called = CliRunner().invoke(app_for(words[0]), words)
     assert called.exit_code == EXIT_BAD_INPUT, called.output
     return " ".join(called.output.replace("│", " ").split())
 
 
-def test_a_scenario_that_there_is_not() -> None:
-    assert "nosuch: no such scenario; known are" in refused("bench", "nosuch")
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("nosuch", ("nosuch: no such scenario", "clean")),
+        ("--set exam.depth_m=0.5", ("exam.depth_m", "0.5", "less than or equal to 0.02")),
+        ("--set exam.colour=red", ("exam.colour", "red")),
+        ("--set phantom.mesh=missing.stl", ("mesh",)),
+        ("--set 'phantom.lesions=[{centre_m: [-55, 10]}]'", ("phantom.lesions[0]",)),
+        ("--set phantom.kind=mesh --set phantom.mesh=/nowhere.stl", ("phantom.mesh = /nowhere.stl: no such file",)),
+        ("--set exam.centre_m=[0.3,0.0]", ("lie off the body",)),
+        ("--set exam.pattern=nosuch.py", ("there is no such file",)),
+        ("--set services.tissue=none", ("--wallclock",)),
+        ("--set services.tissue=none --composed", ("--wallclock",)),
+        ("--set services.tissue=none --realtime", ("--wallclock",)),
+        ("--service robot=bullet", ("services.robot = 'bullet'",)),
+        ("--service robot=bullet --composed", ("services.robot = 'bullet'",)),
+        ("--service assessment=mine.py --composed --record none", ("line 2: AttributeError",)),
+        ("--service tissue=fmu --set tissue.fmu=nosuch.fmu --composed", ("there is no such file",)),
+        ("--service tissue=fmu --set tissue.fmu=mine.fmu --composed", ("this is not an FMU",)),
+        ("--composed --realtime", ("--composed", "--realtime")),
+        ("--composed --secure", ("--secure",)),
+        ("--secure --keys none", ("ca.pem",)),
+        ("--without arm", ("--without arm: allowed are robot, tissue",)),
+        ("--group robot,arm", ("there is no role 'arm'",)),
+        ("--group ''", ("there is no role ''",)),
+        ("--group robot,robot", ("robot is in a group already",)),
+        ("--group robot,control --group tissue,robot", ("robot is in a group already",)),
+        ("--group robot,dashboard", ("an observer has its own process",)),
+        ("--group robot,tissue --wallclock", ("--wallclock",)),
+        ("--group robot,tissue --without tissue", ("--without tissue",)),
+        ("--processes 0", ("allowed are 1 to 8",)),
+        ("--processes 9", ("allowed are 1 to 8",)),
+        ("--processes 2 --group robot,tissue", ("give one of them",)),
+        ("--processes 2 --composed", ("--composed",)),
+    ],
+)
+def test_a_run_that_cannot_be_is_refused(words: str, said: tuple[str, ...], tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def create(scenario):\n    return scenario.nothing\n")
+    (tmp_path / "mine.fmu").write_text("hello")
+    scenario = [] if words == "nosuch" else ["clean"]
+    output = refused("run", *scenario, "--set", "phantom.edge_m=0.02", *shlex.split(words), "--out", "out")
+    assert all(word in output for word in said), output
+    assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("words", [("reproduce",), ("study", "smoke")])
-def test_a_setting_that_cannot_be(words: tuple[str, ...]) -> None:
-    said = refused(*words, "--set", "exam.depth_m=-1")
-    assert "exam.depth_m" in said
-    assert "-1" in said
-
-
-@pytest.mark.parametrize("command", ["bench", "faults"])
-def test_a_file_that_cannot_be_written(command: str, tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("run --resume nowhere", "nowhere"),
+        ("run --resume . --seed 3", "cannot be combined"),
+        ("plan clean --set exam.centre_m=[0.3,0.0]", "lie off the body"),
+        ("plan clean --set exam.pattern=nosuch.py", "there is no such file"),
+        ("bench nosuch", "nosuch: no such scenario; known are"),
+        ("reproduce --set exam.depth_m=-1", "exam.depth_m"),
+        ("study smoke --set exam.depth_m=-1", "exam.depth_m"),
+        ("bench --out file/figures.json", "file: cannot be made a folder"),
+        ("faults --out file/figures.json", "file: cannot be made a folder"),
+        ("study smoke --out file", "file: cannot be made a folder"),
+        ("reproduce --out file", "file: cannot be made a folder"),
+        ("reproduce --docs file/page.md", "file: cannot be made a folder"),
+        ("validate --docs file/page.md", "file: cannot be made a folder"),
+        ("bench --out .", "is not a writable file"),
+        ("faults --out .", "is not a writable file"),
+        ("faults --docs page.md", "wants the lines"),
+        ("faults", "faults.csv: holds no findings"),
+    ],
+)
+def test_other_commands_refuse_bad_input(words: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    assert "file: cannot be made a folder" in refused(command, "--out", "file/figures.json")
-    assert "isnotawritablefile" in refused(command, "--out", str(tmp_path)).replace(" ", "")
+    (tmp_path / "page.md").write_text("no marks\n")
+    if words == "faults":
+        (tmp_path / "faults.csv").write_text("[1, 2")
+    assert said in refused(*words.split())
 
 
-@pytest.mark.parametrize("words", ["study smoke --out", "reproduce --out", "reproduce --docs", "validate --docs"])
-def test_a_folder_that_cannot_be(words: str, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    assert "file: cannot be made a folder" in refused(*words.split(), "file" if "--out" in words else "file/page.md")
+@pytest.mark.parametrize("name", scenario_names())
+def test_the_region_of_every_scenario_is_on_the_body(name: str) -> None:
+    scenario = load_scenario(name, seed=1000)
+    assert len(scan_over(scenario, build_phantom(scenario.phantom, scenario.seed)).targets) > 100
 
 
-def test_findings_that_are_none(tmp_path: Path) -> None:
-    (tmp_path / "faults.csv").write_text("[1, 2")
-    assert "faults.csv: holds no findings" in refused("faults")
+def test_a_region_off_the_body_is_refused_with_the_extent_of_the_body() -> None:
+    scenario = load_scenario("clean", ["exam.centre_m=[0.3, 0.0]"])
+    said = r"clean: exam\.region_m = .* targets lie off the body, the first at .* body reaches from"
+    with pytest.raises(PluginError, match=said):
+        scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
+
+
+def plan(tmp_path: Path, *settings: str) -> str:
+    words = [word for setting in ("exam.region_m=[0.06, 0.06]", *settings) for word in ("--set", setting)]
+    called = CliRunner().invoke(app_for("plan"), ["plan", "clean", *words, "--out", str(tmp_path / "plan.png")])
+    assert called.exit_code == 0, called.output
+    return called.output
+
+
+def test_the_plan_of_a_user_defined_pattern_is_drawn(tmp_path: Path) -> None:
+    output = plan(tmp_path, "robot.base_height_m=0.8", f"exam.pattern={SPIRAL}")
+    assert "18 targets in 1 line, felt in" in output
+    assert "of simulated time" in output
+    assert np.asarray(Image.open(tmp_path / "plan.png").convert("L")).std() > 10
+
+
+def test_the_plan_of_a_search_states_its_budget_and_no_strokes(tmp_path: Path) -> None:
+    output = plan(tmp_path, "exam.pattern=search", "exam.budget.presses=10")
+    assert re.search(r"\d+ places to choose from, at most 10 presses; .*; at most \d+ s", output)
+    assert "stroke" not in output

@@ -1,19 +1,25 @@
-"""Ctrl-C while an examination is ending."""
+"""Ctrl-C while an examination starts, runs and ends."""
 
 from __future__ import annotations
 
 import signal
+import subprocess
+import sys
 from collections.abc import Iterator
+from pathlib import Path
+from time import monotonic, sleep
 from typing import Any
 
+import psutil
 import pytest
 
+from palpate.run.folder import unless_begun
 from palpate.run.interrupts import all_is_measured, results_first
 
 
 @pytest.fixture
 def interrupts() -> Iterator[None]:
-    """Python's own handler, whatever a shell made of it for a background job."""
+    """Python's own handler, which a shell replaces for a background job."""
     before = signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
@@ -49,7 +55,7 @@ def test_once_all_is_measured_the_first_is_answered(capfd: pytest.CaptureFixture
 
 
 @pytest.mark.usefixtures("interrupts")
-def test_what_else_a_signal_does_is_still_done() -> None:
+def test_an_earlier_handler_is_still_called() -> None:
     done = []
 
     def hung_up(number: int, frame: Any) -> None:
@@ -73,3 +79,57 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
         assert signal.getsignal(signal.SIGINT) == signal.SIG_IGN
     finally:
         signal.signal(signal.SIGINT, before)
+
+
+PATIENCE_S = 120.0
+"""For the first service of the run to be started."""
+LEAVES_S = 2.0
+"""On an idle machine it ends in less. Where other work shares the machine, less than it took to start is enough."""
+
+
+def start(out: Path) -> subprocess.Popen[str]:
+    return subprocess.Popen([sys.executable, "-m", "palpate", "run", "-o", str(out)], stderr=subprocess.PIPE, text=True)
+
+
+def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Path) -> None:
+    out = tmp_path / "out"
+    begin = monotonic()
+    run = start(out)
+    until = begin + PATIENCE_S
+    while not (services := psutil.Process(run.pid).children()) and monotonic() < until:
+        sleep(0.02)
+    started_s = monotonic() - begin
+    sleep(0.5)  # some are importing by now
+    services = psutil.Process(run.pid).children()
+    run.send_signal(signal.SIGINT)
+    begin = monotonic()
+    _, said = run.communicate(timeout=PATIENCE_S)
+    assert monotonic() - begin < max(LEAVES_S, started_s)
+    assert services
+    assert not any(service.is_running() for service in services)
+    assert run.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both
+    assert said.splitlines()[-1] == "palpate: interrupted"
+    assert not out.exists()
+
+
+def test_ctrl_c_in_an_examination_keeps_the_folder(tmp_path: Path) -> None:
+    kept, unbegun = tmp_path / "kept", tmp_path / "unbegun"
+    for folder, begun in ((kept, True), (unbegun, False)):
+        folder.mkdir()
+        with pytest.raises(KeyboardInterrupt), unless_begun(folder, lambda begun=begun: begun):  # type: ignore[misc]
+            raise KeyboardInterrupt
+    assert kept.exists()
+    assert not unbegun.exists()
+
+
+def test_ctrl_c_during_the_start_is_a_line() -> None:
+    """The signal is pending before the interpreter starts."""
+    signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        started = subprocess.Popen([sys.executable, "-m", "palpate", "plan"], stderr=subprocess.PIPE, text=True)
+        started.send_signal(signal.SIGINT)
+    finally:
+        signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
+    _, said = started.communicate(timeout=60)
+    assert started.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both
+    assert len(said.splitlines()) == 1

@@ -1,7 +1,12 @@
-"""What the console of `palpate run` makes of `exam/state`."""
+"""The console of `palpate run`: narration of `exam/state`, and its keys."""
 
 from __future__ import annotations
 
+import os
+import pty
+import sys
+import time
+from types import SimpleNamespace
 from typing import Any
 
 from rich.console import Console
@@ -9,7 +14,7 @@ from rich.console import Console
 from palpate.exam_state import exam_state
 from palpate.run.outlook import Outlook
 from palpate.run.progress import PHASES, Narration, RunDisplay
-from palpate_bus.messages import ExamState
+from palpate_bus.messages import ExamState, OperatorRequest
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
@@ -38,13 +43,13 @@ def examination(before: int = 0) -> list[Any]:
     return [state(Phase.APPROACH, "approaching the first target", before), *touched, *pressed]
 
 
-def told(states: list[Any], narration: Narration | None = None) -> list[tuple[str, str]]:
+def narrated(states: list[Any], narration: Narration | None = None) -> list[tuple[str, str]]:
     narration = narration or Narration(EXAM)
     return [news for s in states if (news := narration.news(s)) is not None]
 
 
-def test_touches_and_scan_are_told_once_each_however_many_strokes_they_have() -> None:
-    names = [name for name, _ in told([*examination(), state(Phase.RETURN, "returning home", 9)])]
+def test_touches_and_scan_are_narrated_once_each() -> None:
+    names = [name for name, _ in narrated([*examination(), state(Phase.RETURN, "returning home", 9)])]
     assert names == ["approach", "touch", "scan", "return"]
 
 
@@ -57,7 +62,7 @@ def test_the_part_counts_the_touches_and_then_is_the_scan() -> None:
     assert list(dict.fromkeys(parts)) == ["approach", *(f"touch {k + 1}/{TOUCHES}" for k in range(TOUCHES)), "scan"]
 
 
-def test_touches_are_no_progress_of_the_scan() -> None:
+def test_touches_are_not_counted_as_progress_of_the_scan() -> None:
     narration = Narration(EXAM)
     shares = []
     for s in examination():
@@ -70,15 +75,15 @@ def test_touches_are_no_progress_of_the_scan() -> None:
 
 def test_a_patient_who_moved_is_touched_again() -> None:
     looks = state(Phase.LOOK, "the patient has moved: looking again", TOUCHES + LINES)
-    names = [name for name, _ in told([*examination(), looks, *examination(TOUCHES + LINES)])]
+    names = [name for name, _ in narrated([*examination(), looks, *examination(TOUCHES + LINES)])]
     assert names == ["approach", "touch", "scan", "look", "approach", "touch", "scan"]
 
 
-def test_what_happens_within_a_stroke_is_told_word_for_word_and_once() -> None:
+def test_an_event_within_a_stroke_is_narrated_once() -> None:
     narration = Narration(EXAM)
-    told(examination(), narration)
+    narrated(examination(), narration)
     lifts = [state(Phase.RETRACT, "no tissue felt", TOUCHES + LINES, ExamState.REASON_NO_TISSUE)] * 3
-    assert told(lifts, narration) == [("scan", "no tissue felt")]
+    assert narrated(lifts, narration) == [("scan", "no tissue felt")]
 
 
 def test_every_reason_has_its_code() -> None:
@@ -90,7 +95,7 @@ def test_every_phase_has_a_name() -> None:
     assert set(PHASES) == {getattr(ExamState, f"PHASE_{phase.name}") for phase in Phase}
 
 
-def test_the_time_left_is_told_by_the_clock() -> None:
+def test_the_time_left() -> None:
     display = RunDisplay(Console(quiet=True), True, EXAM)
     whole = Outlook.of(EXAM).duration_s
 
@@ -100,3 +105,43 @@ def test_the_time_left_is_told_by_the_clock() -> None:
     assert left(whole - 75) == "about 5 min left"
     assert left(whole - 5) == "about 20 s left"
     assert left(whole + 50) == "about 0 s left"
+
+
+def show_keys() -> None:
+    """Show a run in this terminal until three requests were made, and print them."""
+    collected, asked = Collected(), list[int]()
+
+    def request(number: int, reason: str) -> None:
+        asked.append(number)
+        stops = number in (OperatorRequest.STOP, OperatorRequest.SOFT_STOP)
+        collected.supervisor = SimpleNamespace(level=int(stops), reason="an operator" if stops else "")
+
+    with RunDisplay(Console(stderr=True, width=200), False, Exam()) as display:
+        while len(asked) < 3:
+            display.show(RunProgress(0, 1.0, collected, (), request))
+            time.sleep(0.01)
+    print("asked", asked, flush=True)
+
+
+def test_keys_of_palpate_run() -> None:
+    child, end = pty.fork()
+    if child == 0:
+        os.execv(sys.executable, [sys.executable, __file__])
+    text, sent = "", 0
+    while True:
+        try:
+            text += os.read(end, 4096).decode(errors="ignore")
+        except OSError:  # the terminal closes with its process
+            break
+        if "keys: s soft stop" in text and sent == text.count("stop: passed on"):
+            os.write(end, b"ser"[sent : sent + 1])
+            sent += 1
+    _, status = os.waitpid(child, 0)
+    os.close(end)
+    assert status == 0, text
+    assert f"asked {[OperatorRequest.SOFT_STOP, OperatorRequest.STOP, OperatorRequest.RELEASE]}" in text
+    assert "stopped: an operator" in text
+
+
+if __name__ == "__main__":
+    show_keys()

@@ -1,4 +1,4 @@
-"""report.html: made from a run's folder alone, holds nothing from outside, says what the run found, and keeps the truth apart."""
+"""map.png and report.html: made from a run's folder alone, without links to other files."""
 
 from __future__ import annotations
 
@@ -7,14 +7,20 @@ import html
 import json
 import re
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
-from conductor_messages import SETTINGS, collected, findings, result
+from conductor_messages import SETTINGS, collected, findings, result, samples, stiffness_map
+from matplotlib.image import imread
 
 from palpate.report import archive
+from palpate.report.evidence import samples_of
+from palpate.report.figures import draw_map
 from palpate.report.page import verdict, write_page
-from palpate.report.results import Known, assemble, write_results
+from palpate.report.results import Known, assemble, truth_of_run, write_results
+from palpate.report.rows import Report
+from palpate.report.scoring import Truth
 from palpate.run.roles import write_scenario_files
 from palpate_models.scenario.load import load_scenario
 
@@ -34,16 +40,15 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> str:
     return write_page(run_folder(tmp_path_factory.mktemp("run"))).read_text(encoding="utf-8")
 
 
-def test_it_says_what_was_found_and_how_sure(page: str) -> None:
+def test_the_page_states_the_finding_and_its_confidence(page: str) -> None:
     verdict = re.search(r'id="verdict">(.*?)</div>', page)
-    assert verdict is not None
     assert "right lower quadrant, 3.9 times as stiff" in html.unescape(verdict[1])
     assert "over 99 %" in verdict[1]
     assert "0" * 64 in page  # the run hash
     assert "the arm would collide: table_top" in page
 
 
-def test_it_is_self_contained(page: str) -> None:
+def test_the_page_is_self_contained(page: str) -> None:
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "@import" not in page
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
@@ -60,7 +65,6 @@ def test_the_truth_stands_apart(page: str) -> None:
 
 def test_the_surface_in_space_is_the_map(page: str) -> None:
     found = re.search(r'<script type="application/json" id="surface-data">(.*?)</script>', page)
-    assert found is not None
     data = json.loads(found[1])
     positions = np.frombuffer(base64.b64decode(data["layers"][0]["positions"]), "<f4").reshape(-1, 3)
     triangles = np.frombuffer(base64.b64decode(data["triangles"]), "<u2")
@@ -75,7 +79,7 @@ def test_the_surface_in_space_is_the_map(page: str) -> None:
     assert np.abs(beyond).max() < 0.0075  # it runs between vertices 5 mm apart
 
 
-def test_a_run_that_failed_says_so_first(tmp_path: Path) -> None:
+def test_a_failed_run_states_its_failure_first(tmp_path: Path) -> None:
     folder = run_folder(tmp_path, map_too=False, failure="tissue lost at 12.345 s: killed by signal 9")
     page = write_page(folder).read_text(encoding="utf-8")
     assert "did not complete: tissue lost at 12.345 s" in page
@@ -94,48 +98,46 @@ def test_a_run_that_broke_off_did_not_reach_all_targets(tmp_path: Path) -> None:
     assert "targets were reached" not in page
 
 
-def test_too_few_samples_and_skipped_targets_are_no_clean_bill_of_health() -> None:
-    scenario, nothing = load_scenario("clean"), Known(None, None, None)
-    whole = assemble(scenario, result(collected(), failure=None), nothing).model_copy(
-        update={"findings": [], "skipped_targets": 0}
-    )
-    assert verdict(whole) == "No lump was found."
-    blind = verdict(whole.model_copy(update={"skipped_targets": 3}))
-    assert blind.endswith("; 3 targets were skipped, and nothing is known of what lies there.")
-    none = assemble(scenario, result(collected(map_too=False), failure=None), nothing)
+NOTHING = Known(None, None, None)
+
+
+@pytest.fixture(scope="module")
+def whole() -> Report:
+    return assemble(load_scenario("clean"), result(collected()), NOTHING)
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({}, "No lump was found."),
+        ({"skipped_targets": 3}, "; 3 targets were skipped"),
+        ({"unassessed_m2": {"contradicted": 0.0012}, "background_N": 2.4}, "Not assessed: 12 cm², where the samples disagree"),
+        ({"background_N": 7.0}, "The whole region is unusually firm: 7.0 N"),
+    ],
+)
+def test_the_verdict_without_findings_states_its_limits(changes: dict[str, Any], said: str, whole: Report) -> None:
+    assert said in verdict(whole.model_copy(update={"findings": [], "skipped_targets": 0, **changes}))
+
+
+def test_the_verdict_states_a_probable_tensed_muscle(whole: Report) -> None:
+    (lump,) = whole.findings
+    assert "tensed muscle" not in verdict(whole)
+    muscle = lump.model_copy(update={"confidence": 0.12, "guarding": 0.8})
+    assert "probably a tensed muscle (80 %) and no lump (12 %)" in verdict(whole.model_copy(update={"candidates": [muscle]}))
+    doubtful = lump.model_copy(update={"confidence": 0.7, "guarding": 0.2})
+    assert "confidence 70 % (20 % a tensed muscle)" in verdict(whole.model_copy(update={"findings": [doubtful]}))
+
+
+def test_only_touched_tissue_is_assessed() -> None:
+    scenario = load_scenario("clean")
+    none = assemble(scenario, result(collected(map_too=False)), NOTHING)
     assert not none.assessed
     assert verdict(none).startswith(f"Not assessed: {none.samples} samples are too few for a map")
-
-
-def test_an_assessment_without_map_and_samples_has_assessed_what_was_touched() -> None:
-    scenario, nothing = load_scenario("clean"), Known(None, None, None)
     threshold = collected()
     threshold.stiffness_map, threshold.samples = None, []
-    assert assemble(scenario, result(threshold, failure=None), nothing).assessed
+    assert assemble(scenario, result(threshold), NOTHING).assessed
     threshold.exam_states = [state for state in threshold.exam_states if not state.steady]
-    assert not assemble(scenario, result(threshold, failure=None), nothing).assessed
-
-
-def test_what_is_not_assessed_comes_first_and_a_region_that_is_stiff_all_over_is_told() -> None:
-    nothing = assemble(load_scenario("clean"), result(collected(), failure=None), Known(None, None, None))
-    report = nothing.model_copy(
-        update={"findings": [], "skipped_targets": 0, "unassessed_m2": {"contradicted": 0.0012}, "background_N": 2.4}
-    )
-    assert verdict(report).startswith("Not assessed: 12 cm², where the samples disagree")
-    assert verdict(report).endswith("No lump was found.")
-    firm = verdict(report.model_copy(update={"unassessed_m2": {}, "background_N": 7.0}))
-    assert firm.startswith("The whole region is unusually firm: 7.0 N, where 1.2 to 4.8 N are usual.")
-
-
-def test_what_is_rather_a_tensed_muscle_is_told() -> None:
-    whole = assemble(load_scenario("clean"), result(collected(), failure=None), Known(None, None, None))
-    (lump,) = whole.findings
-    muscle = lump.model_copy(update={"confidence": 0.12, "guarding": 0.8})
-    assert "tensed muscle" not in verdict(whole)
-    told = verdict(whole.model_copy(update={"candidates": [muscle]}))
-    assert told.endswith("mm, in RLQ, is probably a tensed muscle (80 %) and no lump (12 %).")
-    doubtful = verdict(whole.model_copy(update={"findings": [lump.model_copy(update={"confidence": 0.7, "guarding": 0.2})]}))
-    assert "confidence 70 % (20 % a tensed muscle)" in doubtful
+    assert not assemble(scenario, result(threshold), NOTHING).assessed
 
 
 def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
@@ -154,8 +156,33 @@ def test_a_folder_that_is_no_run_is_named(tmp_path: Path) -> None:
     with pytest.raises(archive.EvidenceError, match=r"report\.json is not there: give the results folder"):
         write_page(tmp_path)
     (tmp_path / "report.json").write_text('{"seed": 1}', encoding="utf-8")
-    with pytest.raises(archive.EvidenceError, match=r"report\.json is no report of this version: .*scenario: Field required"):
+    with pytest.raises(archive.EvidenceError, match=r"report\.json .*scenario: Field required"):
         write_page(tmp_path)
     (tmp_path / archive.FILE).write_bytes(b"not an archive")
     with pytest.raises(archive.EvidenceError, match=r"evidence\.mcap cannot be read"):
         archive.read_evidence(tmp_path)
+
+
+@pytest.fixture(scope="module")
+def truth() -> Truth:
+    return truth_of_run(load_scenario("clean", SETTINGS, seed=3), collected()).felt
+
+
+@pytest.mark.parametrize(("found", "known"), [(True, True), (False, True), (True, False)])
+def test_the_map_is_drawn_with_or_without_findings_and_truth(found: bool, known: bool, tmp_path: Path, truth: Truth) -> None:
+    path = tmp_path / "map.png"
+    shown = findings() if found else None
+    draw_map(path, stiffness_map(), shown, samples_of(samples()), truth if known else None, "clean, seed 0")
+    image = imread(path)
+    assert image.shape[0] > 1000
+    assert image.shape[1] > 1600
+    assert image[..., :3].std() > 0.15
+    outline = np.abs(image[..., :3] - (0x18 / 255, 0xE0 / 255, 0xD0 / 255)).max(axis=-1) < 0.02
+    assert outline.sum() > 400 if found else outline.sum() < 50
+
+
+def test_nothing_scanned_draws_nothing(tmp_path: Path) -> None:
+    message = stiffness_map()
+    message.scanned = np.zeros(len(message.scanned), dtype=bool)
+    draw_map(tmp_path / "map.png", message, None, samples_of([]), None, "empty")
+    assert not (tmp_path / "map.png").exists()

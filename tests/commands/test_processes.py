@@ -1,25 +1,44 @@
-"""The process list."""
+"""Processes of a run: the compose file, groups, and roles that join or are replaced."""
 
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
 
 from palpate import service
-from palpate.commands import app_for
-from palpate.console import EXIT_BAD_INPUT
-from palpate.run.processes import compose_file, how, override_files, read_processes
-from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers
+from palpate.environment import given
+from palpate.run.group import placement
+from palpate.run.places import Absent, ServicePlace, command_for, place_to_join, place_to_take, write_places
+from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, how, override_files, read_processes
+from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers, write_scenario_files
 from palpate.study.spec import load_study
+from palpate_bus.contract import contract
+from palpate_bus.runs.announcement import Run
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.runtime.group import Group
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
+from palpate_plugins import PluginError
 
-INHERITED = "${PALPATE_SETTINGS:-}"
+ROLES = (*WORKERS, *OBSERVERS)
+LOOP = ("robot", "tissue", "control")
+ROOT = Path(__file__).parents[2]
+
+
+# --- the compose file ----------------------------------------------------------------------------------------------------
 
 
 def test_every_role_of_a_run_is_in_the_compose_file() -> None:
-    processes = read_processes(compose_file(), (*WORKERS, *OBSERVERS))
+    processes = read_processes(compose_file(), ROLES)
     assert processes["robot"].command == service.command("robot")
     assert processes["robot"].environment["OMP_NUM_THREADS"] == "1"
 
@@ -41,16 +60,13 @@ def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: st
     assert error in str(caught.value)
 
 
-def test_a_missing_compose_file_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_compose_file_is_that_of_the_project_or_of_the_environment(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "docker-compose.yml").write_text("services: {}")
+    monkeypatch.chdir(tmp_path)
+    assert compose_file() == ROOT / "docker-compose.yml"
     monkeypatch.setenv("PALPATE_COMPOSE", "no/such/file.yml")
     with pytest.raises(UserError, match=r"no/such/file\.yml"):
         compose_file()
-
-
-def test_the_compose_file_of_whatever_folder_one_is_in_is_not_taken(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (tmp_path / "docker-compose.yml").write_text("services: {}")
-    monkeypatch.chdir(tmp_path)
-    assert compose_file() == Path(__file__).parents[2] / "docker-compose.yml"
 
 
 def test_overrides_are_merged_as_docker_compose_merges_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -65,74 +81,220 @@ def test_overrides_are_merged_as_docker_compose_merges_them(tmp_path: Path, monk
     assert processes["tissue"].command == ("t",)
 
 
-def test_every_swap_is_an_override_whose_settings_choose_what_its_container_runs() -> None:
-    root = compose_file().parent
-    for name in ("tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"):
-        role = name.partition("-")[0]
-        file = root / "compose" / f"{name}.yml"
-        document = yaml.safe_load(file.read_text(encoding="utf-8"))
-        words = document["services"]["prepare"]["environment"]["PALPATE_SETTINGS"].removesuffix(INHERITED).split()
-        settings = dict(setting.split("=", 1) for setting in words)
-        chosen = settings.get(f"services.{role}")
-        method = load_study("swaps").methods.get(name)
-        if method is not None:
-            assert settings == {**method.settings, **{f"services.{role}": choice for role, choice in method.services.items()}}
-        if role == "planning":
-            assert chosen is None
-            continue
-        assert name == f"{role}-{chosen}"
-        entry = document["services"][role]
-        assert choice(checked(load_scenario("healthy", words)), role) == chosen
-        processes = read_processes(compose_file(), (role,), (file,))
-        assert processes[role].command == service.command(role), "which goes by the scenario"
-        assert entry["build"]["args"]["GROUP"] == name
-        assert entry["image"].endswith(f"-{name}"), "else `up` would take the image of what it replaces"
+@pytest.mark.parametrize(
+    "name", ["tissue-fmu", "tissue-elastic", "robot-mujoco", "camera-replay", "planning-raster", "planning-point"]
+)
+def test_a_swap_is_an_override_whose_settings_select_the_service(name: str) -> None:
+    role = name.partition("-")[0]
+    file = ROOT / "compose" / f"{name}.yml"
+    document = yaml.safe_load(file.read_text(encoding="utf-8"))["services"]
+    words = document["prepare"]["environment"]["PALPATE_SETTINGS"].removesuffix("${PALPATE_SETTINGS:-}").split()
+    settings = dict(setting.split("=", 1) for setting in words)
+    chosen = settings.get(f"services.{role}")
+    method = load_study("swaps").methods.get(name)
+    if method is not None:
+        assert settings == {**method.settings, **{f"services.{role}": choice for role, choice in method.services.items()}}
+    if role == "planning":
+        assert chosen is None
+        return
+    assert name == f"{role}-{chosen}"
+    assert choice(checked(load_scenario("healthy", words)), role) == chosen
+    assert read_processes(compose_file(), (role,), (file,))[role].command == service.command(role)
+    assert document[role]["build"]["args"]["GROUP"] == name
+    assert document[role]["image"].endswith(f"-{name}"), "else `up` would use the image of the default service"
 
 
 def test_the_override_for_hardware_starts_no_simulation() -> None:
-    root = compose_file().parent
-    file = root / "compose" / "hardware.yml"
-    document = yaml.safe_load(file.read_text(encoding="utf-8"))
-    words = document["services"]["prepare"]["environment"]["PALPATE_SETTINGS"].split()
+    file = ROOT / "compose" / "hardware.yml"
+    document = yaml.safe_load(file.read_text(encoding="utf-8"))["services"]
+    words = document["prepare"]["environment"]["PALPATE_SETTINGS"].split()
     scenario = load_scenario("clean", [word for word in words if "=" in word])
     roles = workers(scenario)
     assert set(WORKERS) - set(roles) == {"tissue"}
-    assert document["services"]["tissue"]["profiles"] == ["simulated"]
+    assert document["tissue"]["profiles"] == ["simulated"]
     processes = read_processes(compose_file(), (*roles, "search", *OBSERVERS), (file,))
     assert (scenario.services.robot, scenario.services.camera) == ("lbr", "ros")
     assert {process.command for process in processes.values()} == {service.command(role) for role in processes}
     assert {process.environment["PALPATE_RUNTIME"] for process in processes.values()} == {"wallclock"}
-    assert "--wallclock" in document["services"]["conductor"]["command"]
+    assert "--wallclock" in document["conductor"]["command"]
 
 
-@pytest.mark.parametrize("words", [["run"], ["run", "--composed"], ["run", "--realtime"]])
-def test_real_tissue_waits_for_no_simulated_time(words: list[str], tmp_path: Path) -> None:
-    called = CliRunner().invoke(app_for("run"), [*words, "--set", "services.tissue=none", "--out", str(tmp_path / "out")])
-    assert called.exit_code == EXIT_BAD_INPUT
-    assert "--wallclock" in called.output
-    assert not (tmp_path / "out").exists()
-
-
-def test_how_a_process_ended_is_said_in_its_own_words(tmp_path: Path) -> None:
+def test_the_end_of_a_process_is_described_by_its_log(tmp_path: Path) -> None:
     log = tmp_path / "tissue.log"
     log.write_text("Traceback (most recent call last):\n  File ...\nMeshError: two holes\n\n")
     assert how(3, log) == "left with status 3: MeshError: two holes"
     assert how(-9, log) == "killed by signal 9"
     log.write_text("")
     assert how(1, log) == "left with status 1: its log is empty"
-    assert how(0, log).endswith("?")
 
 
-@pytest.mark.parametrize(
-    ("settings", "words"),
-    [
-        (["phantom.lesions=[{centre_m: [-55, 10]}]"], "phantom.lesions[0]"),
-        (["phantom.kind=mesh", "phantom.mesh=/nowhere.stl"], "phantom.mesh = /nowhere.stl: no such file"),
-    ],
-)
-def test_a_phantom_that_cannot_be_made_is_named_before_anything_starts(settings: list[str], words: str, tmp_path: Path) -> None:
-    options = [word for setting in settings for word in ("--set", setting)]
-    called = CliRunner().invoke(app_for("run"), ["run", *options, "--out", str(tmp_path / "out")])
-    assert called.exit_code == EXIT_BAD_INPUT
-    assert words in called.output
-    assert not (tmp_path / "out").exists()
+# --- groups --------------------------------------------------------------------------------------------------------------
+
+
+def test_a_group_shares_a_process_and_all_others_have_their_own() -> None:
+    groups = placement(ROLES, ["robot, tissue,control", "camera,perception"], None)
+    assert groups[:2] == (LOOP, ("camera", "perception"))
+    assert all(len(group) == 1 for group in groups[2:])
+    assert {role for group in groups for role in group} == set(ROLES)
+
+
+@pytest.mark.parametrize("number", range(1, len(WORKERS) + 1))
+def test_any_number_of_processes_holds_every_service_once(number: int) -> None:
+    groups = placement(ROLES, (), number)
+    assert sorted(role for group in groups for role in group) == sorted(ROLES)
+    assert len([group for group in groups if not set(group) & set(OBSERVERS)]) == number
+    assert any(set(LOOP) <= set(group) for group in groups) == (number <= len(WORKERS) - 2)
+
+
+def test_a_foreign_program_shares_no_process() -> None:
+    with pytest.raises(UserError, match=r"tissue is played by `\./my_tissue`"):
+        ServiceProcess("tissue", ("./my_tissue",), {}).shared_words()
+    assert ServiceProcess("tissue", service.command("tissue", "elastic"), {}).shared_words() == ("elastic",)
+
+
+class Idle(Service):
+    """A service that is never stepped."""
+
+    def __init__(self, role: str) -> None:
+        self.role = role  # type: ignore[misc]
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        raise NotImplementedError
+
+
+def test_every_group_steps_in_the_order_of_all_roles() -> None:
+    """Otherwise two groups could wait for each other for ever."""
+    rules = contract()
+    whole = list(Group([Idle(role) for role in WORKERS], rules).steppers)
+    for pair in ((a, b) for a in WORKERS for b in WORKERS if a != b):
+        assert sorted(pair, key=whole.index) == list(Group([Idle(role) for role in pair], rules).steppers)
+
+
+# --- local processes -----------------------------------------------------------------------------------------------------
+
+
+class Forks:
+    """Records the command and the environment of each process instead of starting it."""
+
+    def __init__(self) -> None:
+        self.started: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {}
+
+    def start(self, command: tuple[str, ...], environment: dict[str, str], log: Path) -> None:
+        self.started[log.stem] = (command, environment)
+
+
+@pytest.fixture
+def forks() -> Forks:
+    return Forks()
+
+
+@pytest.fixture
+def local(tmp_path: Path, forks: Forks, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalProcesses]:
+    for name in ("PALPATE_SCENARIO", "PALPATE_VIEWER"):
+        monkeypatch.delenv(name, raising=False)
+    groups = placement(ROLES, [",".join(LOOP)], None)
+    files = write_scenario_files(load_scenario("clean"), tmp_path)
+    processes = LocalProcesses(groups, tmp_path, files, Timing(), forks=forks)  # type: ignore[arg-type]
+    yield processes
+    processes.stop()
+
+
+def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProcesses, forks: Forks) -> None:
+    processes = read_processes(compose_file(), ROLES)
+    local.start(*(processes[role] for role in LOOP))
+    local.running.clear()
+    command, environment = forks.started["robot+tissue+control"]
+    rows = json.loads(Path(command[-1]).read_text(encoding="utf-8"))
+    assert local.bus["robot"] == local.bus["tissue"] != local.bus["planning"]
+    assert local.bus["robot"].lowlatency
+    assert "PALPATE_SCENARIO" not in environment
+    seen = {role: Path(row["environment"]["PALPATE_SCENARIO"]).name for role, row in rows.items()}
+    assert seen == {"robot": "plant.yaml", "tissue": "scenario.yaml", "control": "exam.yaml"}
+
+
+def test_the_dashboard_has_a_port_only_on_request(local: LocalProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
+    dashboard = read_processes(compose_file(), ("dashboard",))["dashboard"]
+    assert not local.environment(dashboard).get("PALPATE_VIEWER")
+    monkeypatch.setenv("PALPATE_VIEWER", "serve:9900")
+    assert local.environment(dashboard)["PALPATE_VIEWER"] == "serve:9900"
+
+
+def test_a_stopped_process_is_continued_at_the_end_and_closes_its_files(local: LocalProcesses, tmp_path: Path) -> None:
+    closed = tmp_path / "closed"
+    words = "import os, pathlib, signal, sys; os.kill(os.getpid(), signal.SIGSTOP); pathlib.Path(sys.argv[1]).touch()"
+    process = subprocess.Popen([sys.executable, "-c", words, str(closed)])
+    os.waitid(os.P_PID, process.pid, os.WSTOPPED | os.WNOWAIT)
+    local.running["recorder"] = process
+    local.stop()
+    assert process.returncode == 0
+    assert closed.exists()
+
+
+def test_temporary_variables_are_restored(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_A", "before")
+    with given({"PALPATE_A": "within", "PALPATE_B": "new"}):
+        assert (os.environ["PALPATE_A"], os.environ["PALPATE_B"]) == ("within", "new")
+    assert os.environ["PALPATE_A"] == "before"
+    assert "PALPATE_B" not in os.environ
+
+
+# --- roles that join or are replaced -------------------------------------------------------------------------------------
+
+ENVIRONMENT = {"PALPATE_LISTEN": "unixsock-stream//tmp/x/control.sock", "PALPATE_SCENARIO": "/out/exam.yaml"}
+COMMAND = service.command("control")
+PLACE = ServicePlace(COMMAND, ENVIRONMENT, True)
+
+
+def absent(folder: Path) -> tuple[Absent, str]:
+    """Return the absent role control of a run, and its announcement."""
+    said: list[str] = []
+    waiting = Absent(("control",), 30.0, said.append)
+    write_places(folder, {"control": PLACE})
+    waiting.call(folder, {"control": PLACE})
+    (sentence,) = said
+    return waiting, sentence
+
+
+def run(folder: Path, runtime: str = "lockstep") -> Run:
+    return Run(folder.name, {"camera": "tcp/a:1", "robot": "tcp/b:2"}, 0, runtime, None, str(folder))
+
+
+def test_an_absent_role_is_announced_and_named_if_it_does_not_answer(tmp_path: Path) -> None:
+    waiting, sentence = absent(tmp_path)
+    for words in ("control is awaited", ENVIRONMENT["PALPATE_LISTEN"], "30 s", f"palpate join control --run {tmp_path.name}"):
+        assert words in sentence
+    lost = Failure(FailureCode.ROLE_LOST, "control lost at 8.000 s: killed", ("control",))
+    assert waiting.explain(lost) == lost
+    assert sentence in waiting.explain(Failure(FailureCode.NO_ANSWER, "not ready after 30 s", ("control",))).text
+
+
+def test_a_process_that_joins_is_given_command_and_environment(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="palpate run --without robot"):
+        place_to_join("robot", run(tmp_path))
+    absent(tmp_path)
+    assert place_to_join("control", run(tmp_path)) == PLACE
+    with pytest.raises(UserError, match="does not wait for 'robot', but for control"):
+        place_to_join("robot", run(tmp_path))
+
+
+def test_implementations_of_a_place(tmp_path: Path) -> None:
+    assert command_for("control", PLACE, None) == COMMAND
+    assert command_for("control", PLACE, "default") == (*COMMAND, "default")
+    with pytest.raises(PluginError, match=r"services\.robot = 'bullet': want one of dart"):
+        command_for("robot", PLACE, "bullet")
+    with pytest.raises(PluginError, match="no such file"):
+        command_for("robot", PLACE, str(tmp_path / "mine.py"))
+
+
+def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="robot: only assessment, camera can change hands"):
+        place_to_take("robot", run(tmp_path, "wallclock"))
+    with pytest.raises(UserError, match="in wall-clock runs only"):
+        place_to_take("camera", run(tmp_path))
+    with pytest.raises(UserError, match="--handover 60"):
+        place_to_take("camera", run(tmp_path, "wallclock"))
+    write_places(tmp_path, {"camera": PLACE._replace(awaited=False)})
+    environment = place_to_take("camera", run(tmp_path, "wallclock")).environment
+    assert environment["PALPATE_SCENARIO"] == ENVIRONMENT["PALPATE_SCENARIO"]
+    assert environment["PALPATE_LISTEN"] == ""
+    assert environment["PALPATE_CONNECT"] == "tcp/b:2"

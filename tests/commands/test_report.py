@@ -1,4 +1,4 @@
-"""The report of a run, from messages as the bus carries them."""
+"""The report of a run, from messages as the bus carries them, and the end of an examination."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 from conductor_messages import FOUND, SETTINGS, collected, result
 from rich.console import Console
 
@@ -17,12 +18,16 @@ from palpate.report.evidence import samples_of, steady_contact
 from palpate.report.page import write_page
 from palpate.report.results import Known, assemble, clean_world, in_words, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
+from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
+from palpate_bus.messages import RobotStatus, Vector3, Wrench
+from palpate_bus.messages.stamps import header
+from palpate_conductor.collector import Collected
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 
-ISSUE_FIELDS = [
+REPORT_FIELDS = [
     *("scenario", "seed", "runtime", "platform", "sim_time_s", "wall_time_s", "real_time_factor", "run_hash", "samples"),
     *("skipped_targets", "max_force_N", "mean_force_N", "depth_rms_error_m", "surface_rms_error_m"),
     *("findings", "truth", "scores", "blame"),
@@ -37,20 +42,20 @@ SCORE_FIELDS = [
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """The patient of the hand-made messages, on a coarse mesh so that he is pressed quickly."""
+    """The patient of the synthetic messages, with a coarse mesh."""
     return load_scenario("clean", SETTINGS, seed=3)
 
 
 @pytest.fixture(scope="module")
 def felt(scenario: Scenario) -> Known:
-    """What is known of the truth of a whole run."""
+    """The truth of a whole run."""
     return truth_of_run(scenario, collected())
 
 
 def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     report = write_results(tmp_path, scenario, result(collected()))
     written = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert set(ISSUE_FIELDS) <= set(written)
+    assert set(REPORT_FIELDS) <= set(written)
     assert set(FINDING_FIELDS) <= set(written["findings"][0])
     assert set(SCORE_FIELDS) <= set(written["scores"])
     assert Report.model_validate(written) == report
@@ -70,6 +75,14 @@ def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     assert written["scores"]["findings"][0]["lump"] == 0
     assert written["surface_rms_error_m"] == pytest.approx(0.0005, abs=1e-5)
     assert (tmp_path / "map.png").stat().st_size > 50_000
+    rows = list(csv.DictReader((tmp_path / "samples.csv").open(encoding="utf-8")))
+    messages = collected()
+    samples = samples_of(messages.samples)
+    assert len(rows) == len(samples.time)
+    assert float(rows[3]["normal_force_N"]) == pytest.approx(samples.force[3])
+    assert float(rows[3]["x_m"]) == pytest.approx(samples.position[3, 0])
+    assert float(rows[3]["depth_uncertainty_m"]) == pytest.approx(messages.samples[3].depth_uncertainty)
+    assert float(rows[3]["stroke"]) == messages.samples[3].stroke
 
 
 def test_depth_error_is_of_the_true_depth_in_steady_contact(scenario: Scenario, felt: Known) -> None:
@@ -90,63 +103,35 @@ def test_states_without_a_truth_of_their_stamp_are_left_out() -> None:
     assert 0 < len(half.true) < len(whole.true)
 
 
-def test_a_run_that_ended_early_has_a_report_all_the_same(scenario: Scenario, tmp_path: Path) -> None:
-    early = collected(map_too=False)
-    report = write_results(tmp_path, scenario, result(early, failure="tissue lost at 12.345 s: killed by signal 9"))
+@pytest.mark.parametrize("messages", [collected(map_too=False), Collected()], ids=["ended early", "never ticked"])
+def test_a_run_that_failed_has_a_report(messages: Collected, scenario: Scenario, tmp_path: Path) -> None:
+    report = write_results(tmp_path, scenario, result(messages, failure="tissue lost at 12.345 s: killed by signal 9"))
     assert report.failure is not None
-    assert report.scores is None
-    assert report.findings == []
+    assert (report.scores, report.findings) == (None, [])
+    assert (report.max_force_N is None) == (report.truth is None) == (not messages.exam_states)
     assert not (tmp_path / "map.png").exists()
     assert (tmp_path / "samples.csv").exists()
 
 
-def test_a_run_that_never_ticked_has_a_report_all_the_same(scenario: Scenario, tmp_path: Path) -> None:
-    from palpate_conductor.collector import Collected
-
-    report = write_results(tmp_path, scenario, result(Collected(), failure="robot never answered"))
-    assert report.max_force_N is None
-    assert report.depth_rms_error_m is None
-    assert report.truth is None
-
-
-def test_growing_findings_are_no_findings(scenario: Scenario, felt: Known) -> None:
+def test_findings_that_are_not_final_are_left_out(scenario: Scenario, felt: Known) -> None:
     c = collected()
     c.findings.final = False
     assert assemble(scenario, result(c), felt).findings == []
     c.findings.final = True
 
 
-def test_samples_csv_has_a_row_a_sample(scenario: Scenario, tmp_path: Path) -> None:
-    c = collected()
-    write_results(tmp_path, scenario, result(c))
-    rows = list(csv.DictReader((tmp_path / "samples.csv").open(encoding="utf-8")))
-    samples = samples_of(c.samples)
-    assert len(rows) == len(samples.time)
-    assert float(rows[3]["normal_force_N"]) == pytest.approx(samples.force[3])
-    assert float(rows[3]["x_m"]) == pytest.approx(samples.position[3, 0])
-    assert float(rows[3]["depth_uncertainty_m"]) == pytest.approx(c.samples[3].depth_uncertainty)
-    assert float(rows[3]["stroke"]) == c.samples[3].stroke
-
-
-def test_findings_in_words(scenario: Scenario, felt: Known) -> None:
+def test_findings_on_the_console(scenario: Scenario, felt: Known) -> None:
+    report = assemble(scenario, result(collected()), felt)
     text = io.StringIO()
-    print_findings(Console(file=text, width=120), assemble(scenario, result(collected()), felt))
+    print_findings(Console(file=text, width=120), report)
     assert "RLQ" in text.getvalue()
     assert "1 matched, 0 missed, 0 false" in text.getvalue()
-
-
-def test_a_ratio_outside_its_band_is_told(scenario: Scenario, felt: Known) -> None:
-    scores = assemble(scenario, result(collected()), felt).scores
-    assert scores is not None
-    told = {}
     for held in (True, False):
-        findings = [replace(finding, ratio_held=held) for finding in scores.findings]
-        told[held] = in_words(replace(scores, findings=findings))
-    assert "outside" not in told[True]
-    assert "outside its 90 % band" in told[False]
+        findings = [replace(finding, ratio_held=held) for finding in report.scores.findings]
+        assert ("outside its 90 % band" in in_words(replace(report.scores, findings=findings))) == (not held)
 
 
-def test_where_no_copy_can_be_made_nothing_is_scored(scenario: Scenario, felt: Known, tmp_path: Path) -> None:
+def test_without_a_copy_of_the_tissue_nothing_is_scored(scenario: Scenario, felt: Known, tmp_path: Path) -> None:
     theirs = Scenario.model_validate(
         {
             **scenario.model_dump(),
@@ -171,7 +156,7 @@ def test_where_no_copy_can_be_made_nothing_is_scored(scenario: Scenario, felt: K
         ("errors.arm.zero_rad=0.001", False),
     ],
 )
-def test_a_clean_world_is_called_one(setting: str, clean: bool) -> None:
+def test_clean_worlds(setting: str, clean: bool) -> None:
     assert clean_world(load_scenario("clean", [setting])) == clean
 
 
@@ -188,3 +173,50 @@ def test_a_real_abdomen_is_assessed_without_a_truth(scenario: Scenario, tmp_path
     print_findings(Console(file=text, width=120), report)
     assert "RLQ" in text.getvalue()
     assert "truth" not in text.getvalue()
+
+
+@pytest.fixture
+def folder(scenario: Scenario, tmp_path: Path) -> Path:
+    write_scenario_files(scenario, tmp_path)
+    return tmp_path
+
+
+def concluded(folder: Path, scenario: Scenario, messages: Collected, failure: str | None = None) -> None:
+    conclude(Console(quiet=True), folder, scenario, result(messages, failure), quiet=True)
+
+
+def test_findings_that_break_the_contract_are_reported(
+    scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    messages = collected()
+    messages.findings.findings[0].confidence = 80.0
+    concluded(folder, scenario, messages)
+    assert "findings.confidence" in capsys.readouterr().err
+
+
+def test_a_held_arm_is_reported_once_with_the_failure(
+    scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    messages = collected()
+    why = "emergency stop of the supervisor: planning is silent"
+    zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0)
+    messages.status_changes.append(held)
+    for failure in ("planning lost at 17.780 s", f"planning lost at 17.780 s: {why}"):
+        with pytest.raises(typer.Exit):
+            concluded(folder, scenario, messages, failure)
+        said = capsys.readouterr().err
+        assert said.count(why) == 1
+        assert "findings.confidence" not in said
+
+
+def test_a_map_that_cannot_be_drawn_leaves_all_other_results(
+    scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    messages = collected()
+    messages.stiffness_map.triangles = np.full_like(messages.stiffness_map.triangles, 999_999)
+    with pytest.raises(typer.Exit) as left:
+        concluded(folder, scenario, messages)
+    assert left.value.exit_code == 3
+    assert "assessment/map cannot be used" in " ".join(capsys.readouterr().err.split())
+    assert {path.name for path in folder.iterdir()} >= {"report.json", "evidence.mcap", "samples.csv", "report.html"}

@@ -1,34 +1,51 @@
-"""A results folder belongs to one run."""
+"""The results folder: it belongs to one run, files are written whole, and its disk has room."""
 
 from __future__ import annotations
 
+import re
 import shutil
 import subprocess
 import sys
+from collections import namedtuple
 from pathlib import Path
 
 import pytest
+import typer
 from conductor_messages import SETTINGS, collected, result
 from PIL import Image
+from rich.console import Console
 
+from palpate.console import EXIT_FAILED
 from palpate.report.archive import EvidenceError, read_evidence
+from palpate.report.files import write_part, write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
-from palpate.run.folder import _locked, results_folder, unless_begun
+from palpate.run.conclusion import conclude
+from palpate.run.folder import WatchedRoom, _locked, another_folder, check_room, results_folder, unless_begun, what_it_takes
+from palpate.run.outlook import Outlook
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_name import name_run, run_of
+from palpate_conductor.collector import Collected
+from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Exam, Mode
+
+BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
 
-def test_a_folder_with_anything_in_it_is_refused_and_left_alone(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(UserError, match=r"it holds thesis\.tex"), results_folder(tmp_path):
+@pytest.mark.parametrize(
+    ("name", "overwrite", "said"),
+    [("thesis.tex", False, r"it holds thesis\.tex"), ("thesis.tex", True, "not removed"), ("scenario.yaml", True, "not removed")],
+)
+def test_a_folder_with_files_of_the_user_is_refused_and_kept(tmp_path: Path, name: str, overwrite: bool, said: str) -> None:
+    (tmp_path / name).write_text("name: mine\n", encoding="utf-8")
+    with pytest.raises(UserError, match=said), results_folder(tmp_path, overwrite=overwrite):
         pass
-    assert [path.name for path in tmp_path.iterdir()] == ["thesis.tex"]
+    assert [path.name for path in tmp_path.iterdir()] == [name]
 
 
-def test_preparing_containers_keeps_the_results_of_the_run_before(tmp_path: Path) -> None:
+def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Path) -> None:
     write_scenario_files(load_scenario("clean"), tmp_path)
     (tmp_path / "report.json").write_text("{}", encoding="utf-8")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
@@ -46,38 +63,17 @@ def test_preparing_containers_keeps_the_results_of_the_run_before(tmp_path: Path
     assert len(list(tmp_path.glob("2*"))) == 1
 
 
-def test_overwriting_removes_an_earlier_run_whole(tmp_path: Path) -> None:
+def test_overwriting_removes_an_earlier_run_or_restores_it_when_the_new_one_cannot_begin(tmp_path: Path) -> None:
     out = tmp_path / "out"
     (out / "logs").mkdir(parents=True)
-    name_run(out)
-    with results_folder(out, overwrite=True):
-        assert [path.name for path in out.iterdir()] == ["run.lock"]
-    assert list(out.iterdir()) == []
-    assert list(tmp_path.iterdir()) == [out]
-
-
-def test_what_was_to_be_overwritten_comes_back_when_the_run_cannot_begin(tmp_path: Path) -> None:
-    out = tmp_path / "out"
-    out.mkdir()
     run = name_run(out)
     with pytest.raises(ValueError, match="no key"), results_folder(out, overwrite=True), unless_begun(out, lambda: False):
         raise ValueError("no key")
     assert run_of(out) == run
+    with results_folder(out, overwrite=True):
+        assert [path.name for path in out.iterdir()] == ["run.lock"]
+    assert list(out.iterdir()) == []
     assert list(tmp_path.iterdir()) == [out]
-
-
-def test_a_folder_with_a_scenario_of_its_user_is_not_removed(tmp_path: Path) -> None:
-    (tmp_path / "scenario.yaml").write_text("name: mine\n", encoding="utf-8")
-    with pytest.raises(UserError, match="not removed"), results_folder(tmp_path, overwrite=True):
-        pass
-    assert (tmp_path / "scenario.yaml").exists()
-
-
-def test_overwriting_removes_nothing_that_is_not_of_a_run(tmp_path: Path) -> None:
-    (tmp_path / "thesis.tex").write_text("years of work", encoding="utf-8")
-    with pytest.raises(UserError, match="not removed"), results_folder(tmp_path, overwrite=True):
-        pass
-    assert (tmp_path / "thesis.tex").exists()
 
 
 @pytest.mark.parametrize("overwrite", [False, True])
@@ -89,30 +85,114 @@ def test_two_runs_cannot_have_one_folder_at_a_time(tmp_path: Path, overwrite: bo
         assert (out / "scenario.yaml").exists()
 
 
-def test_every_result_names_the_run_it_belongs_to(tmp_path: Path) -> None:
+def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_path: Path) -> None:
     scenario = load_scenario("clean", SETTINGS, seed=3)
-    write_scenario_files(scenario, tmp_path)
-    report = write_results(tmp_path, scenario, result(collected()))
-    write_page(tmp_path)
-    run = run_of(tmp_path)
+    one, two = tmp_path / "one", tmp_path / "two"
+    reports = []
+    for folder in (one, two):
+        write_scenario_files(scenario, folder)
+        reports.append(write_results(folder, scenario, result(collected())))
+    write_page(one)
+    run = run_of(one)
     assert len(run) == 12
-    assert report.run == run == read_evidence(tmp_path).run
+    assert reports[0].run == run == read_evidence(one).run
     for name in ("run.json", "scenario.yaml", "report.json", "report.html", "samples.csv"):
-        assert run in (tmp_path / name).read_text(encoding="utf-8"), name
-    assert run in Image.open(tmp_path / "map.png").info["Comment"]
-
-
-def test_results_of_two_runs_are_not_taken_for_one(tmp_path: Path) -> None:
-    scenario = load_scenario("clean", SETTINGS, seed=3)
-    for name in ("one", "two"):
-        write_scenario_files(scenario, tmp_path / name)
-        write_results(tmp_path / name, scenario, result(collected()))
-    shutil.copy(tmp_path / "one" / "evidence.mcap", tmp_path / "two")
+        assert run in (one / name).read_text(encoding="utf-8"), name
+    assert run in Image.open(one / "map.png").info["Comment"]
+    shutil.copy(one / "evidence.mcap", two)
     with pytest.raises(EvidenceError, match="these are two runs"):
-        write_page(tmp_path / "two")
+        write_page(two)
 
 
 def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
     (tmp_path / "out").write_text("", encoding="utf-8")
     with pytest.raises(UserError, match="cannot be made a folder"), results_folder(tmp_path / "out"):
         pass
+
+
+# --- files ---------------------------------------------------------------------------------------------------------------
+
+
+def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
+    path = tmp_path / "report.json"
+    path.write_text("old")
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "new \ud800")
+    assert path.read_text() == "old"
+    write_text(path, "new")
+    assert path.read_text() == "new"
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_only_the_part_between_the_marks_is_replaced(tmp_path: Path) -> None:
+    path = tmp_path / "doc.md"
+    path.write_text(f"before\n{BEGIN}old\n{END}after\n")
+    write_part(path, "faults", "new\n")
+    assert path.read_text() == f"before\n{BEGIN}new\n{END}after\n"
+
+
+@pytest.mark.parametrize("text", ["nothing\n", f"{BEGIN}no end\n", f"{END}{BEGIN}wrong order\n"])
+def test_a_document_without_both_marks_is_refused_and_kept(tmp_path: Path, text: str) -> None:
+    path = tmp_path / "doc.md"
+    path.write_text(text)
+    with pytest.raises(typer.BadParameter, match="has no part to replace"):
+        write_part(path, "faults", "new\n")
+    assert path.read_text() == text
+
+
+# --- room on the disk ----------------------------------------------------------------------------------------------------
+
+Usage = namedtuple("Usage", "total used free")
+
+
+def leave(megabytes: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, megabytes * 1_000_000))
+
+
+def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    leave(40, monkeypatch)
+    with pytest.raises(UserError, match=r"40 MB are free there, and this run needs about \d{2} MB; without recordings"):
+        check_room(tmp_path, Exam(), "normal")
+    check_room(tmp_path, Exam(), "none")
+    leave(100, monkeypatch)
+    check_room(tmp_path, Exam(), "normal")
+    with pytest.raises(UserError, match=r"100 MB are free there, and this run needs about \d{3} MB"):
+        check_room(tmp_path, Exam(), "full")
+
+
+def test_a_larger_region_and_points_take_longer() -> None:
+    small, whole, points = (Outlook.of(exam).duration_s for exam in (Exam(region_m=(0.1, 0.1)), Exam(), Exam(mode=Mode.POINT)))
+    assert small < whole < points
+    assert re.search(r"about \d min .* up to \d\d MB", what_it_takes(Exam(), "normal"))
+    assert re.search(r"about 14 min .* up to 10 MB", what_it_takes(Exam(mode=Mode.POINT), "none"))
+
+
+def test_a_disk_that_fills_up_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    progress: list[RunProgress] = []
+    room = WatchedRoom(tmp_path, progress.append, said.append)
+    for megabytes in (500, 10, 5):
+        leave(megabytes, monkeypatch)
+        room.check(RunProgress(0, 1.0, Collected(), ()))
+    assert len(progress) == 3
+    assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
+
+
+@pytest.mark.parametrize("other", ["", "nor here"])
+def test_results_that_a_folder_does_not_take_go_to_another_or_to_the_console(
+    other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / other))
+    scenario = load_scenario("clean", SETTINGS, seed=3)
+    with pytest.raises(typer.Exit) as left:
+        conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected()), quiet=True)
+    assert left.value.exit_code == EXIT_FAILED
+    out, err = capsys.readouterr()
+    assert "RLQ" in out
+    if other:
+        assert "nothing is kept but what is printed here" in err.replace("\n", "")
+    else:
+        (folder,) = tmp_path.glob("palpate-results-*")
+        assert {"report.json", "report.html", "map.png"} <= {path.name for path in folder.iterdir()}
+        assert str(folder) in err.replace("\n", "")
+        assert another_folder() != folder

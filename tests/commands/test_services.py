@@ -1,4 +1,4 @@
-"""Which implementation plays a role: what the scenario may choose, what is refused, and what takes our service's place."""
+"""Implementations of roles: the scenario selects them, unusable ones are refused, a file replaces a service."""
 
 from __future__ import annotations
 
@@ -6,11 +6,8 @@ from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
-from typer.testing import CliRunner
 
 import palpate_plugins
-from palpate.commands import app_for
-from palpate.console import EXIT_BAD_INPUT
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus.implementations import check, check_libraries, create, create_for, names
@@ -37,13 +34,13 @@ def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
     assert names("camera") == ("kinect", "replay", "ros")
 
 
-@pytest.mark.parametrize("option", ["assessment", "nobody=a.py", "conductor=a.py"])
-def test_a_role_that_is_none_is_named(option: str) -> None:
+@pytest.mark.parametrize("option", ["assessment", "tisue=a.py", "conductor=a.py"])
+def test_an_unknown_role_is_named(option: str) -> None:
     with pytest.raises(PluginError, match=rf"--service {option}: want ROLE=NAME_OR_FILE with ROLE one of robot, tissue"):
         settings_of([option])
 
 
-def test_a_name_that_is_none_is_refused_with_scenario_field_value_and_what_is_allowed() -> None:
+def test_an_unknown_implementation_is_refused_with_the_allowed_ones() -> None:
     with pytest.raises(PluginError, match=r"healthy: services\.robot = 'bullet': want one of dart, lbr, mujoco, or the path"):
         chosen("robot=bullet")
     with pytest.raises(PluginError, match=r"services\.robot = 'none'"):
@@ -61,7 +58,7 @@ def test_a_name_that_is_none_is_refused_with_scenario_field_value_and_what_is_al
         ("import os\nfrom nosuch.part import x\ndef create(scenario): ...\n", "line 2: the module nosuch is not installed"),
     ],
 )
-def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, said: str) -> None:
+def test_a_file_without_a_service_is_refused(tmp_path: Path, text: str | None, said: str) -> None:
     file = tmp_path / "mine.py"
     if text is not None:
         file.write_text(text)
@@ -76,14 +73,14 @@ def test_a_file_that_is_no_service_is_refused(tmp_path: Path, text: str | None, 
         ("import math\ndef create(scenario):\n    return math.nosuch", "line 3: AttributeError"),
     ],
 )
-def test_what_goes_wrong_in_a_file_is_told_with_its_line(tmp_path: Path, text: str, said: str) -> None:
+def test_an_error_in_a_file_is_reported_with_its_line(tmp_path: Path, text: str, said: str) -> None:
     file = tmp_path / "mine.py"
     file.write_text(text)
     with pytest.raises(PluginError, match=said):
         load_services(chosen(f"assessment={file}"), ("assessment",))
 
 
-def test_an_exception_in_a_step_is_told_with_its_line(tmp_path: Path) -> None:
+def test_an_exception_in_a_step_is_reported_with_its_line(tmp_path: Path) -> None:
     file = tmp_path / "mine.py"
     file.write_text(
         "from palpate_bus.service import Service\nclass Mine(Service):\n    role = 'assessment'\n"
@@ -97,36 +94,6 @@ def test_an_exception_in_a_step_is_told_with_its_line(tmp_path: Path) -> None:
     )
 
 
-@pytest.mark.parametrize("words", [["run"], ["run", "--composed"]])
-def test_nothing_starts_with_a_service_that_there_is_not(words: list[str], tmp_path: Path) -> None:
-    called = CliRunner().invoke(app_for("run"), [*words, "--service", "robot=bullet", "--out", str(tmp_path / "out")])
-    assert called.exit_code == EXIT_BAD_INPUT
-    assert "services.robot = 'bullet'" in called.output
-    assert not (tmp_path / "out").exists()
-
-
-@pytest.mark.parametrize(("content", "said"), [(None, "there is no such file"), ("hello", "this is not an FMU")])
-def test_nothing_starts_with_an_fmu_that_is_none(content: str | None, said: str, tmp_path: Path) -> None:
-    file = tmp_path / "mine.fmu"
-    if content:
-        file.write_text(content)
-    settings = ["--service", "tissue=fmu", "--set", f"tissue.fmu={file}"]
-    called = CliRunner().invoke(app_for("run"), ["run", "--composed", *settings, "--out", str(tmp_path / "out")])
-    assert called.exit_code == EXIT_BAD_INPUT, called.output
-    assert said in called.output
-    assert not (tmp_path / "out").exists()
-
-
-def test_a_service_that_cannot_be_made_leaves_no_folder_behind(tmp_path: Path) -> None:
-    file = tmp_path / "mine.py"
-    file.write_text("def create(scenario):\n    return scenario.nothing\n")
-    settings = ["--composed", "--record", "none", "--service", f"assessment={file}"]
-    called = CliRunner().invoke(app_for("run"), ["run", "clean", *settings, "--out", str(tmp_path / "out")])
-    assert called.exit_code == EXIT_BAD_INPUT, called.output
-    assert "line 2: AttributeError" in called.output
-    assert not (tmp_path / "out").exists()
-
-
 def test_a_file_takes_the_place_of_ours(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(EXAMPLE.parent)
     scenario = chosen(f"assessment={EXAMPLE.name}")
@@ -135,9 +102,9 @@ def test_a_file_takes_the_place_of_ours(monkeypatch: pytest.MonkeyPatch) -> None
     assert type(service).__name__ == "Threshold"
 
 
-def test_a_file_may_import_what_is_beside_it(tmp_path: Path) -> None:
-    (tmp_path / "beside_mine.py").write_text(EXAMPLE.read_text(encoding="utf-8"))
-    (tmp_path / "mine.py").write_text("from beside_mine import create\n")
+def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
+    (tmp_path / "module_of_mine.py").write_text(EXAMPLE.read_text(encoding="utf-8"))
+    (tmp_path / "mine.py").write_text("from module_of_mine import create\n")
     assert create("assessment", str(tmp_path / "mine.py"), load_scenario("healthy")).role == "assessment"
 
 

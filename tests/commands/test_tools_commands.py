@@ -1,4 +1,4 @@
-"""The commands on a live bus that somebody else started and that is found without an endpoint."""
+"""The live commands on the bus of an announced run."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+import threading
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import typer
-from small_bus import RULES, SmallRobot, small_bus
+import zenoh
 from typer.testing import CliRunner, Result
 
 from palpate.console import CommandGroup, TimeLeft
@@ -23,8 +24,59 @@ from palpate.live.doctor import doctor
 from palpate.live.graph import app as node
 from palpate.live.graph import missing
 from palpate.live.topic import app as topic
+from palpate_bus.contract import MS, contract
+from palpate_bus.messages import JointState, String, Vector3, Wrench, WrenchStamped, codec
+from palpate_bus.messages.stamps import header
 from palpate_bus.runs.announcement import Announcement, Run, live
 from palpate_bus.wire.liveliness import NodeTokens
+from palpate_bus.wire.rmw import topic_key
+from palpate_bus.wire.transport import Publisher
+from palpate_bus.wire.zenoh_config import mesh, session
+
+RULES = contract()
+DOMAIN = 7
+ENDPOINT_VARIABLES = ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG")
+NAMES = [f"lbr_A{i}" for i in range(1, 8)]
+
+
+def joint_state(t: int) -> Any:
+    return JointState(header(t), NAMES, np.linspace(0, 0.6, 7), np.zeros(7), np.zeros(7))
+
+
+def wrench(t: int) -> Any:
+    return WrenchStamped(header(t, "ft_sensor"), Wrench(Vector3(1.0, -2.0, 3.5), Vector3(0.0, 0.0, 0.0)))
+
+
+class SmallRobot:
+    """Publishes `joint_states` and `ft/wrench` in ticks of 1 ms, one per 5 ms, and its description."""
+
+    def __init__(self, bus: zenoh.Session) -> None:
+        self.bus = bus
+        self.change: Callable[[Any], Any] = lambda message: message
+        """Changes a joint state before it is sent."""
+        self._tokens = tokens = NodeTokens(bus, "robot", DOMAIN)  # kept, because tokens are withdrawn with their last reference
+        self._publishers = {}
+        for name in ("joint_states", "ft/wrench", "robot_description"):
+            row = RULES.topics[name]
+            qos = RULES.qos[row.qos]
+            self._publishers[name] = Publisher(bus, topic_key(row, DOMAIN), qos, tokens.publisher(row, qos))
+        self.stop = threading.Event()
+        self.thread = threading.Thread(target=self._run, daemon=True)
+        self.thread.start()
+
+    def _run(self) -> None:
+        self._put("robot_description", String("<robot/>"), 1)
+        sequence = 0
+        while not self.stop.wait(0.01):
+            for _ in range(2):
+                sequence += 1
+                t = (sequence - 1) * MS
+                self._put("joint_states", self.change(joint_state(t)), sequence)
+                self._put("ft/wrench", wrench(t), sequence)
+
+    def _put(self, name: str, message: Any, sequence: int) -> None:
+        self._publishers[name].put(codec.encode(message, RULES.topics[name].type), sequence)
+
 
 tools = typer.Typer(cls=CommandGroup)
 tools.add_typer(topic, name="topic")
@@ -44,15 +96,24 @@ def output_of(*words: str) -> Any:
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[SmallRobot]:
+    """A robot on an announced bus; control and tissue of the run do not answer."""
     with tempfile.TemporaryDirectory(prefix="small-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("PALPATE_RUNS", folder)
-        for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG"):
+        for name in ENDPOINT_VARIABLES:
             patch.delenv(name, raising=False)
-        with small_bus(Path(folder), domain=7) as small:
+        options = mesh(["robot"], Path(folder))["robot"]
+        absent = {role: options.listen[0].replace("robot", role) for role in ("control", "tissue")}
+        announced = Run(name="small", endpoints={"robot": options.listen[0], **absent}, domain=DOMAIN)
+        with session(options) as bus:
+            announcement = Announcement(announced)
+            small = SmallRobot(bus)
             yield small
+            small.stop.set()
+            small.thread.join()
+            announcement.withdraw()
 
 
-def test_topics_of_a_bus_that_nobody_named(robot: SmallRobot) -> None:
+def test_topics_of_the_announced_bus(robot: SmallRobot) -> None:
     rows = {row["topic"]: row for row in output_of("topic", "list")}
     assert set(rows) == {"joint_states", "ft/wrench", "robot_description"}
     assert rows["joint_states"]["publishers"] == ["robot"]
@@ -60,7 +121,7 @@ def test_topics_of_a_bus_that_nobody_named(robot: SmallRobot) -> None:
     assert "joint_states" in run("topic", "list").stdout
 
 
-def test_info_is_the_row_and_who_is_there(robot: SmallRobot) -> None:
+def test_info_shows_the_row_and_its_endpoints(robot: SmallRobot) -> None:
     facts = output_of("topic", "info", "/ft/wrench")
     assert facts["contract"]["frame"] == "ft_sensor"
     assert [(end["node"], end["kind"]) for end in facts["endpoints"]] == [("robot", "publisher")]
@@ -68,8 +129,8 @@ def test_info_is_the_row_and_who_is_there(robot: SmallRobot) -> None:
 
 
 def test_echo_prints_what_is_sent(robot: SmallRobot) -> None:
-    heard = output_of("topic", "echo", "ft/wrench", "--once")
-    assert heard["message"]["wrench"]["force"] == {"x": 1.0, "y": -2.0, "z": 3.5}
+    received = output_of("topic", "echo", "ft/wrench", "--once")
+    assert received["message"]["wrench"]["force"] == {"x": 1.0, "y": -2.0, "z": 3.5}
     text = run("topic", "echo", "ft/wrench", "--once", "--field", "wrench.force").stdout
     assert text == "x: 1.0\ny: -2.0\nz: 3.5\n---\n"
 
@@ -78,7 +139,7 @@ def test_echo_of_a_latched_topic_shows_what_was_sent_before(robot: SmallRobot) -
     assert output_of("topic", "echo", "robot_description", "--once")["message"] == {"data": "<robot/>"}
 
 
-def test_echo_names_the_fields_there_are(robot: SmallRobot) -> None:
+def test_echo_names_the_known_fields(robot: SmallRobot) -> None:
     result = run("topic", "echo", "ft/wrench", "--once", "--field", "wrench.power")
     assert result.exit_code == 2
     assert "no 'power' among force, torque" in result.stderr
@@ -99,26 +160,26 @@ def test_bw_counts_bytes(robot: SmallRobot) -> None:
     assert row["bytes_per_s"] > 0
 
 
-def test_nodes_and_who_is_missing(robot: SmallRobot) -> None:
+def test_nodes_and_missing_roles(robot: SmallRobot) -> None:
     found = output_of("node", "list")
     assert [row["node"] for row in found["nodes"]] == ["robot"]
     assert found["missing"][:2] == ["tissue", "control"]
     assert "search" not in found["missing"], "the run does without it"
 
 
-def test_doctor_finds_what_is_wrong(robot: SmallRobot) -> None:
-    def spoil(message: Any) -> Any:
+def test_doctor_names_each_fault(robot: SmallRobot) -> None:
+    def change(message: Any) -> Any:
         message.position[2] = np.nan
         return message
 
     outdated = RULES.topics["joint_states"].model_copy(update={"type": "geometry_msgs/msg/WrenchStamped"})
-    tokens = NodeTokens(robot.bus, "rviz", 7)
+    tokens = NodeTokens(robot.bus, "rviz", DOMAIN)
     tokens.subscription(outdated, RULES.qos["control"])
-    robot.spoil = spoil
+    robot.change = change
     try:
         found = output_of("doctor", "--seconds", "2")
     finally:
-        robot.spoil = lambda message: message
+        robot.change = lambda message: message
         tokens.undeclare()
     assert not found["healthy"]
     about = {(finding["about"], finding["level"]) for finding in found["findings"]}
@@ -140,7 +201,6 @@ def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> 
         tool = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=dict(os.environ))
     finally:
         signal.signal(signal.SIGINT, before)
-    assert tool.stdout is not None
     first = tool.stdout.readline()
     tool.send_signal(signal.SIGINT)
     rest, errors = tool.communicate(timeout=30)
@@ -149,9 +209,9 @@ def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> 
     assert all(json.loads(line) for line in [first, *rest.splitlines()])
 
 
-def test_without_a_run_it_says_where_it_looked(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_a_run_the_searched_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    for name in ("PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_ZENOH_CONFIG"):
+    for name in ENDPOINT_VARIABLES:
         monkeypatch.delenv(name, raising=False)
     result = run("topic", "list")
     assert result.exit_code == 2
@@ -159,7 +219,7 @@ def test_without_a_run_it_says_where_it_looked(tmp_path: Path, monkeypatch: pyte
     assert "palpate run" in result.stderr
 
 
-def test_of_two_runs_one_must_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_of_two_runs_must_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
     both = [Announcement(Run(name=name, endpoints={}, pid=pid)) for pid, name in enumerate(("left", "right"), 1)]
     result = run("topic", "list")
@@ -175,7 +235,6 @@ def test_a_killed_run_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPat
     code = "from palpate_bus.runs.announcement import *; a = Announcement(Run('x', {})); print('on', flush=True)"
     code += "; import time; time.sleep(60)"
     child = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
-    assert child.stdout is not None
     assert child.stdout.readline() == "on\n"
     assert [found.name for found in live()] == ["x"]
     child.kill()

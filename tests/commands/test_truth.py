@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -34,9 +35,12 @@ LESION = Lesion(centre_m=(0.005, 0.0), radii_m=(0.015, 0.015), contrast=4.0)
 REGION = "exam.region_m=[0.08, 0.08]"
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+@pytest.fixture(autouse=True, scope="module")
+def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
+    """A new cache, shared by the tests of this file."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
+        yield
 
 
 def flat(folder: Path, *lesions: Lesion, k_w: float = 1.7e5) -> Scenario:
@@ -49,8 +53,6 @@ def flat(folder: Path, *lesions: Lesion, k_w: float = 1.7e5) -> Scenario:
 def felt(scenario: Scenario) -> tuple[Pressed, Felt]:
     found = press_patient(scenario)
     tissue = Copies(scenario).with_lesions(())
-    assert found is not None
-    assert tissue is not None
     surface = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4)))
     return found, Felt(found, surface, scenario.exam)
 
@@ -71,8 +73,14 @@ def test_felt_contrast_is_that_of_a_direct_pair_of_presses(tmp_path: Path) -> No
     assert forces[0][0] / forces[1][0] > 2.0
 
 
-def test_a_lump_is_felt_about_where_it_is(tmp_path: Path) -> None:
-    _, what = felt(flat(tmp_path, LESION))
+def test_a_lump_is_felt_at_its_place_and_places_are_fine_about_its_outline(tmp_path: Path) -> None:
+    found, what = felt(flat(tmp_path, LESION))
+    xy = found.places[:, :2]
+    assert (xy.min(), xy.max()) == (pytest.approx(-0.05), pytest.approx(0.05))
+    nearest = np.sort(np.linalg.norm(xy[:, None] - xy, axis=2), axis=1)[:, 1]
+    rim = np.abs(np.linalg.norm(xy - LESION.centre_m, axis=1) - 0.015) < 0.004
+    assert nearest[rim].max() == pytest.approx(0.005)
+    assert nearest.max() == pytest.approx(0.010)
     (lump,) = what.lumps
     assert lump.palpable
     assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.002)
@@ -88,7 +96,7 @@ def test_a_soft_lump(tmp_path: Path) -> None:
     assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.003)
 
 
-def test_of_a_pair_each_is_removed_alone(tmp_path: Path) -> None:
+def test_each_lump_of_a_pair_is_removed_alone(tmp_path: Path) -> None:
     left, right = (Lesion(centre_m=(x, 0.0), radii_m=(0.010, 0.010), contrast=5.0) for x in (-0.016, 0.016))
     found, what = felt(flat(tmp_path, left, right))
     centres = [lump.centroid[0] for lump in what.lumps]
@@ -101,8 +109,8 @@ def test_of_a_pair_each_is_removed_alone(tmp_path: Path) -> None:
     assert found.alone[0][there] == pytest.approx(single.force[same], rel=1e-6)
 
 
-def test_guarding_is_felt_where_the_muscle_is_and_is_no_lump(tmp_path: Path) -> None:
-    """A lump lies on the other side: what the muscle does and what the lump does are told apart."""
+def test_guarding_is_felt_at_the_muscle_and_not_counted_as_a_lump(tmp_path: Path) -> None:
+    """A lump on the other side is not counted as guarding."""
     muscle = (-0.03, 0.0)
     guarding = f"{{centre_m: {list(muscle)}, radii_m: [0.03, 0.03], ratio: 2.6, kind: involuntary}}"
     scenario = load_scenario("clean", [REGION, f"phantom.guarding=[{guarding}]"])
@@ -118,8 +126,8 @@ def test_guarding_is_felt_where_the_muscle_is_and_is_no_lump(tmp_path: Path) -> 
     assert what.in_lump(np.array([muscle, lump.centre_m])).tolist() == [False, True]
 
 
-def test_the_truth_of_guarding_is_what_the_press_meets(tmp_path: Path) -> None:
-    """Step by step, on the whole wall: of a muscle that stays, and of one that gives way meanwhile."""
+def test_the_truth_of_guarding_is_that_of_a_slow_press(tmp_path: Path) -> None:
+    """Step by step, on the whole wall: a muscle that stays tense, and one that relaxes."""
     middle = np.array((-0.01, 0.0))
     felt_there = {}
     for kind in ("involuntary", "voluntary"):
@@ -127,8 +135,6 @@ def test_the_truth_of_guarding_is_what_the_press_meets(tmp_path: Path) -> None:
         scenario = load_scenario("clean", [REGION, "phantom.lesions=[]", f"phantom.guarding=[{guarding}]"])
         found = press_patient(scenario)
         tissue = Copies(scenario).with_lesions(())
-        assert found is not None
-        assert tissue is not None
         at = np.linalg.norm(found.places[:, :2] - middle, axis=1).argsort()[:2]
         normals = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4))).points(found.places[at, :2])[1]
         slow, _ = TissueBackend.press(tissue, found.places[at], normals, scenario.robot.indenter_radius_m)
@@ -139,7 +145,7 @@ def test_the_truth_of_guarding_is_what_the_press_meets(tmp_path: Path) -> None:
     assert (felt_there["voluntary"] > 1.5).all()
 
 
-def test_a_lump_that_is_hardly_stiffer_is_not_palpable(tmp_path: Path) -> None:
+def test_a_slightly_stiffer_lump_is_not_palpable(tmp_path: Path) -> None:
     _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 1.04})))
     (lump,) = what.lumps
     assert (lump.palpable, lump.area) == (False, 0.0)
@@ -155,22 +161,20 @@ def test_a_press_ends_at_its_limit(tmp_path: Path) -> None:
     assert (found.force <= LIMIT_N).all()
 
 
-def test_it_is_pressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_patient_is_pressed_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     first = press_patient(flat(tmp_path, LESION))
-    assert first is not None
 
     def refuse(*_: object) -> None:
         raise AssertionError("pressed again")
 
     monkeypatch.setattr(WinklerTissue, "press", refuse)
     again = press_patient(flat(tmp_path, LESION))
-    assert again is not None
     assert np.array_equal(again.force, first.force)
     with pytest.raises(AssertionError, match="pressed again"):
         press_patient(flat(tmp_path, LESION.model_copy(update={"contrast": 3.0})))
 
 
-def test_no_copy_can_be_made_of_what_is_somebody_elses_or_real(tmp_path: Path) -> None:
+def test_no_copy_is_made_of_a_foreign_or_a_real_tissue(tmp_path: Path) -> None:
     assert press_patient(load_scenario("healthy", ["services.tissue=none"])) is None
     assert press_patient(load_scenario("healthy", ["services.tissue=fmu", "tissue.fmu=theirs.fmu"])) is None
     file = tmp_path / "own.py"
@@ -182,29 +186,16 @@ def test_no_copy_can_be_made_of_what_is_somebody_elses_or_real(tmp_path: Path) -
     assert press_patient(load_scenario("healthy", [f"services.tissue={file}"])) is None
 
 
-def test_our_own_fmu_is_pressed_as_the_tier_whose_equations_it_has(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_our_fmu_is_pressed_as_the_native_tissue(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(
         pressed, "_places", lambda skin, *_: tuple(a[:2] for a in skin.points(np.array(((0.0, 0.0), (0.03, 0.0)))))
     )
     settings = ["phantom.edge_m=0.012", REGION]
     native, fmu = (press_patient(load_scenario("healthy", [*settings, f"services.tissue={name}"])) for name in ("winkler", "fmu"))
-    assert native is not None
-    assert fmu is not None
     assert np.array_equal(native.force, fmu.force)
 
 
-def test_places_are_fine_about_the_outline_and_cover_the_region(tmp_path: Path) -> None:
-    found, _ = felt(flat(tmp_path, LESION))
-    xy = found.places[:, :2]
-    assert xy.min() == pytest.approx(-0.05)
-    assert xy.max() == pytest.approx(0.05)
-    nearest = np.sort(np.linalg.norm(xy[:, None] - xy, axis=2), axis=1)[:, 1]
-    rim = np.abs(np.linalg.norm(xy - LESION.centre_m, axis=1) - 0.015) < 0.004
-    assert nearest[rim].max() == pytest.approx(0.005)
-    assert nearest.max() == pytest.approx(0.010)
-
-
-def test_where_the_tool_truly_touched() -> None:
+def test_true_places_of_the_touches() -> None:
     believed = np.array([(0.0, 0.0, 0.0), (0.1, 0.0, 0.0), (0.0, 0.1, 0.0), (0.1, 0.1, 0.0), (0.05, 0.05, 0.0)])
     shift = np.array((0.004, -0.002, 0.0))
     places = Touched(believed, believed + shift).places(np.array(((0.02, 0.03), (0.0, 0.0))))
@@ -215,9 +206,7 @@ def test_where_the_tool_truly_touched() -> None:
     assert nowhere.places(np.array(((0.02, 0.03),))).tolist() == [[0.02, 0.03]]
 
 
-def test_a_patient_who_moves_is_pressed_where_he_lay() -> None:
+def test_a_patient_who_moves_is_pressed_at_the_first_place() -> None:
     settings = [REGION, "phantom.edge_m=0.01"]
     moving, still = (press_patient(load_scenario(name, settings)) for name in ("restless", "healthy"))
-    assert moving is not None
-    assert still is not None
     np.testing.assert_array_equal(moving.force, still.force)

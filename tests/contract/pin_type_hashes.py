@@ -1,4 +1,4 @@
-"""Writes type_hashes.yaml anew: run it when a message is meant to change, and say in the commit why.
+"""Write type_hashes.yaml: run this when a message is meant to change, and give the reason in the commit.
 
 A changed message cannot be read by those who have the old definition; a new type name lets both live side by side.
 """
@@ -12,7 +12,7 @@ from palpate_bus.messages import codec
 
 HEAD = """\
 # RIHS01 hashes of every type on the bus. A test fails when one changes by accident.
-# Changed on purpose? `python tests/contract/pin_type_hashes.py` writes this file anew.
+# Changed on purpose? `python tests/contract/pin_type_hashes.py` writes this file.
 """
 
 

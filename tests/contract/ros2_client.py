@@ -3,7 +3,7 @@
     python tests/contract/ros2_client.py PORT DEFINITIONS [--domain 0] [--seconds 120]
 
 PORT is a router's on this host; DEFINITIONS a folder <package>/msg/<Name>.msg, so that nothing is cloned. Discovers nodes and
-topics, hears joint states, a wrench and a depth image, asks an operator's stop, and waits until the robot says that it holds.
+topics, receives joint states, a wrench and a depth image, asks an operator's stop, and waits until the robot says that it holds.
 Prints one JSON line for each, and leaves with 0 when all came.
 """
 
@@ -24,7 +24,7 @@ from zenoh_ros2_sdk import (
     get_topic_names_and_types,
 )
 
-HEARD = {
+TOPICS = {
     "/joint_states": "sensor_msgs/msg/JointState",
     "/ft/wrench": "geometry_msgs/msg/WrenchStamped",
     "/camera/depth/image_raw": "sensor_msgs/msg/Image",
@@ -54,15 +54,15 @@ def main():
     get_registry(options.definitions)
     end = time.monotonic() + options.seconds
     lock = threading.Lock()
-    heard = {}
+    received = {}
     held = threading.Event()
 
-    def hear(topic):
+    def receive(topic):
         def callback(message):
             with lock:
-                if topic not in heard:
-                    heard[topic] = summary(topic, message)
-                    print(json.dumps({"heard": topic, **heard[topic]}), flush=True)
+                if topic not in received:
+                    received[topic] = summary(topic, message)
+                    print(json.dumps({"received": topic, **received[topic]}), flush=True)
 
         return callback
 
@@ -72,10 +72,10 @@ def main():
                 print(json.dumps({"robot": message.reason}), flush=True)
             held.set()
 
-    subscribers = [ROS2Subscriber(topic, kind, hear(topic), **where) for topic, kind in HEARD.items()]
+    subscribers = [ROS2Subscriber(topic, kind, receive(topic), **where) for topic, kind in TOPICS.items()]
     subscribers.append(ROS2Subscriber("/robot/status", "palpation_msgs/msg/RobotStatus", watch, **where))
-    print(json.dumps({"listening": sorted(HEARD)}), flush=True)
-    while len(heard) < len(HEARD) and time.monotonic() < end:
+    print(json.dumps({"listening": sorted(TOPICS)}), flush=True)
+    while len(received) < len(TOPICS) and time.monotonic() < end:
         time.sleep(0.1)
     names = dict(get_topic_names_and_types(domain_id=options.domain, router_port=options.port, timeout=2.0))
     info = get_topic_info("/joint_states", domain_id=options.domain, router_port=options.port, timeout=2.0, verbose=True)
@@ -90,7 +90,7 @@ def main():
     for subscriber in subscribers:
         subscriber.close()
     publisher.close()
-    return 0 if held.is_set() and len(heard) == len(HEARD) else 1
+    return 0 if held.is_set() and len(received) == len(TOPICS) else 1
 
 
 if __name__ == "__main__":

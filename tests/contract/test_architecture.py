@@ -1,10 +1,11 @@
-"""The architecture's walls: who imports whom, who may know the phantom, what a step may not touch. By reading the source."""
+"""Rules of the architecture, read from the sources: imports, secrets, steps, class names."""
 
 import ast
 import subprocess
 import sys
 import tomllib
-from collections.abc import Iterator
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 
 import pytest
@@ -16,7 +17,7 @@ STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 """Roles that step in simulated time."""
 MAY_KNOW_THE_PHANTOM = {"tissue"}
 SHARED_VALUES = {"palpate_bus.setpoint"}
-"""What planning makes and control follows: arrays, which know of their message."""
+"""Arrays that planning makes and control follows, with their conversion to a message."""
 MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py", "bench.py"}
 NOT_IN_A_STEP = {
     "zenoh",
@@ -41,7 +42,7 @@ def modules(role: str) -> list[tuple[Path, ast.Module]]:
 
 
 def imports(tree: ast.Module) -> Iterator[tuple[str, str]]:
-    """(module, name) of every import, wherever it stands."""
+    """Yield (module, name) of every import."""
     for node in ast.walk(tree):
         if isinstance(node, ast.Import):
             yield from ((alias.name, "") for alias in node.names)
@@ -100,3 +101,32 @@ def test_plant_and_controller_share_no_dynamics() -> None:
     for role, others in (("robot", {"pinocchio", "coal"}), ("control", {"dartpy"})):
         for path, tree in modules(role):
             assert not {module.partition(".")[0] for module, _ in imports(tree)} & others, path
+
+
+ROOT = Path(__file__).resolve().parents[1]
+FOLDERS = ("benchmarks", "bus", "dashboards", "docs", "fmus", "models", "palpate", "services")
+
+
+def sources() -> Iterable[Path]:
+    for folder in FOLDERS:
+        yield from (path for path in sorted((ROOT / folder).rglob("*.py")) if "tests" not in path.parts)
+
+
+def used_twice(files: Iterable[Path]) -> dict[str, list[str]]:
+    """Return the files of each public class name that is defined more than once at top level."""
+    found: dict[str, list[str]] = defaultdict(list)
+    for path in files:
+        for node in ast.parse(path.read_text(encoding="utf-8")).body:
+            if isinstance(node, ast.ClassDef) and not node.name.startswith("_"):
+                found[node.name].append(path.name)
+    return {name: where for name, where in found.items() if len(where) > 1}
+
+
+def test_no_two_public_classes_share_a_name() -> None:
+    assert not used_twice(sources())
+
+
+def test_a_name_that_is_used_twice_is_found(tmp_path: Path) -> None:
+    (tmp_path / "wall.py").write_text("class Wall:\n    class Inner:\n        pass\n")
+    (tmp_path / "kernel.py").write_text("class Wall:\n    class Inner:\n        pass\n\n\nclass _Own:\n    pass\n")
+    assert used_twice(sorted(tmp_path.glob("*.py"))) == {"Wall": ["kernel.py", "wall.py"]}

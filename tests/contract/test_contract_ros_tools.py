@@ -1,4 +1,4 @@
-"""What RViz, rqt and `ros2 bag play` look for, in a recorded examination: clock, frames, description, diagnostics, QoS."""
+"""Clock, frames, description, diagnostics and QoS of a recorded examination, as RViz, rqt and `ros2 bag play` need them."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ TRANSIENT_LOCAL = ("/tf_static", "/robot_description")
 
 @pytest.fixture(scope="module")
 def bag(distributed: Finished) -> Iterator[AnyReader]:
-    """The recording of a short examination, opened by what has nothing of ours."""
+    """The recording of a short examination, opened without Palpate."""
     with AnyReader([distributed.folder / "recording_mcap"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         yield reader
 
@@ -76,7 +76,6 @@ def test_keys_and_tokens_are_rmw_zenohs(topic: str) -> None:
             if reply.ok is not None and (entity := parse_token(str(reply.ok.key_expr))).endpoint is not None
         ]
         tokens.undeclare()
-    assert seen is not None
     assert (seen.topic.strip("/"), seen.type) == (row.name, TYPES[topic])
     assert seen.qos.split(":")[:2] == ["", "1" if topic in TRANSIENT_LOCAL else ""]
 

@@ -1,12 +1,16 @@
-"""Every row of the contract: what it says holds together, and its messages survive the wire."""
+"""Every row of the contract is consistent, its messages survive the wire, and `palpation_msgs` is a ROS 2 package."""
+
+from __future__ import annotations
 
 import re
 from pathlib import Path
+from xml.etree import ElementTree
 
 import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Edge, Role, Topic, Visibility, contract, parse
 from palpate_bus.contract.conformance import leaves, numbers, violations
@@ -39,12 +43,12 @@ def test_a_message_survives_the_round_trip(topic: Topic, data: st.DataObject) ->
 
 @pytest.mark.parametrize("name", all_types())
 def test_type_hash_is_the_pinned_one(name: str) -> None:
-    """A changed message is a new type name. If you mean it: `python tests/contract/pin_type_hashes.py`."""
+    """A changed message needs a new type name. For an intended change: `python tests/contract/pin_type_hashes.py`."""
     pinned = yaml.safe_load(PINNED.read_text(encoding="utf-8"))
     assert codec.type_hash(name) == pinned.get(name), f"{name} changed, or is not pinned in {PINNED.name}"
 
 
-def test_nothing_is_pinned_that_is_gone() -> None:
+def test_every_pinned_type_exists() -> None:
     assert sorted(yaml.safe_load(PINNED.read_text(encoding="utf-8"))) == all_types()
 
 
@@ -64,10 +68,10 @@ def test_units_and_ranges_name_numbers_of_the_type(topic: Topic) -> None:
 def test_every_physical_quantity_of_our_own_types_has_a_unit(topic: Topic) -> None:
     if not topic.type.startswith("palpation_msgs/"):
         return
-    told = [*topic.units]
+    known = [*topic.units]
     for leaf in leaves(topic.type):
         path = leaf.path
-        if leaf.base.startswith("float") and not any(path == known or path.startswith(known + ".") for known in told):
+        if leaf.base.startswith("float") and not any(path == unit or path.startswith(unit + ".") for unit in known):
             comment = _comment(topic.type, path)
             assert "[" in comment or "unit" in comment or "orientation" in path, (
                 f"{path}: neither the row nor the .msg has a unit"
@@ -75,7 +79,7 @@ def test_every_physical_quantity_of_our_own_types_has_a_unit(topic: Topic) -> No
 
 
 def _comment(type_name: str, path: str) -> str:
-    """The comment at a field's line in its .msg, or at the outer field that holds it."""
+    """Return the comment of a field in its .msg, and of the outer fields."""
     definitions = codec.palpation_definitions()
     found = ""
     description = type_name
@@ -91,30 +95,32 @@ def _comment(type_name: str, path: str) -> str:
 
 
 @TOPICS
-def test_frame_is_a_known_one_and_only_where_a_header_is(topic: Topic) -> None:
-    paths = [leaf.path for leaf in leaves(topic.type)]
-    has_header = any(path.endswith("header.frame_id") for path in paths)
+def test_a_row_is_consistent(topic: Topic) -> None:
+    has_header = any(leaf.path.endswith("header.frame_id") for leaf in leaves(topic.type))
     assert topic.frame is None or (has_header and topic.frame in FRAMES)
-
-
-@TOPICS
-def test_key_space_tells_who_may_know(topic: Topic) -> None:
     prefix = {Visibility.SIM: "sim/", Visibility.TRUTH: "truth/"}.get(topic.visibility)
-    if prefix is None:
-        assert not topic.name.startswith(("sim/", "truth/"))
-    else:
-        assert topic.name.startswith(prefix)
+    assert topic.name.startswith(prefix or topic.name)
+    assert prefix or not topic.name.startswith(("sim/", "truth/"))
+    assert topic.latched or topic.period % RULES.roles[topic.producer].period == 0
+    assert topic.hashed == (not RULES.roles[topic.producer].observer and not topic.latched)
+    assert RULES.qos[topic.qos].transient_local == topic.latched
+    assert "recorder" in topic.readers
+    assert topic.producer not in topic.readers
+    for role, edge in topic.readers.items():
+        assert (edge is Edge.LATCHED) <= topic.latched, f"{role} waits for {topic.name} as latched"
+        if RULES.roles[role].observer:
+            assert edge is Edge.OBSERVE, f"{role} is an observer and must not delay {topic.producer}"
 
 
 WHO_MAY_KNOW = {
     Visibility.SIM: {"robot", "tissue", "camera", "dashboard", "recorder"},
     Visibility.TRUTH: {"conductor", "dashboard", "recorder"},
 }
-"""Stated here anew, so that a change of the contract's own table is noticed. Architecture: «Who may know what»."""
+"""Stated here again, so that a change of the contract's table is noticed. Architecture: «Who may know what»."""
 
 
 @TOPICS
-def test_secrets_reach_only_those_who_may_know(topic: Topic) -> None:
+def test_secrets_reach_only_permitted_roles(topic: Topic) -> None:
     if topic.visibility in WHO_MAY_KNOW:
         assert set(topic.readers) <= WHO_MAY_KNOW[topic.visibility]
         assert topic.producer in {"robot", "tissue"}
@@ -135,28 +141,8 @@ def test_a_row_that_leaks_a_secret_is_refused(secret: str, reader: str) -> None:
         Contract.model_validate(rows)
 
 
-@TOPICS
-def test_period_is_a_multiple_of_the_producers(topic: Topic) -> None:
-    if not topic.latched:
-        assert topic.period % RULES.roles[topic.producer].period == 0
-
-
-@TOPICS
-def test_edges_fit_the_kind_of_topic(topic: Topic) -> None:
-    assert topic.producer not in topic.readers
-    for role, edge in topic.readers.items():
-        assert (edge is Edge.LATCHED) <= topic.latched, f"{role} waits for {topic.name} as latched"
-        if RULES.roles[role].observer:
-            assert edge is Edge.OBSERVE, f"{role} is an observer and must not hold up {topic.producer}"
-    assert (RULES.qos[topic.qos].transient_local) == topic.latched
-
-
-def test_every_topic_is_read_and_recorded() -> None:
-    assert all("recorder" in topic.readers for topic in RULES.topics.values())
-
-
-def test_nobody_waits_for_what_it_does_not_use() -> None:
-    """Looked for by name in the sources of whatever plays the role: such an edge would hold the run up for nothing."""
+def test_no_role_waits_for_a_topic_that_it_does_not_use() -> None:
+    """Topics are searched by name in the sources of a role. An unused edge would delay the run."""
     unused = []
     for role in RULES.roles:
         players = (ROOT / "services").glob(f"{role}*/palpate_*/**/*.py")
@@ -182,16 +168,9 @@ def test_a_cycle_of_same_tick_edges_is_named() -> None:
         Contract.model_validate(rows)
 
 
-def test_everything_that_the_physics_and_the_examination_send_is_hashed() -> None:
-    for topic in RULES.topics.values():
-        observer = RULES.roles[topic.producer].observer
-        assert topic.hashed == (not observer and not topic.latched), topic.name
-
-
 def test_commands_expire() -> None:
     for name in ("control/joint_torque", "planning/setpoint"):
         topic = RULES.topics[name]
-        assert topic.expiry_ms is not None
         assert topic.expiry_ms >= 2 * topic.period_ms
 
 
@@ -224,7 +203,7 @@ def test_a_broken_row_is_refused(change: str, message: str) -> None:
         parse(broken)
 
 
-def test_a_message_that_breaks_its_row_is_told_how() -> None:
+def test_violations_of_a_row_are_described() -> None:
     topic = RULES.topics["ft/wrench"]
     good = WrenchStamped(header(5, "ft_sensor"), Wrench(Vector3(0.0, 0.0, 3.0), Vector3(0.0, 0.0, 0.0)))
     assert violations(topic, good, 5) == []
@@ -239,3 +218,57 @@ def test_a_message_that_breaks_its_row_is_told_how() -> None:
     assert violations(topic, Vector3(0.0, 0.0, 0.0)) == [
         "ft/wrench: message: expected geometry_msgs/msg/WrenchStamped, got geometry_msgs/msg/Vector3"
     ]
+
+
+PACKAGE = Path(__file__).parents[2] / "bus" / "palpation_msgs"
+MANIFEST = ElementTree.parse(PACKAGE / "package.xml").getroot()
+BUILD = (PACKAGE / "CMakeLists.txt").read_text(encoding="utf-8")
+
+
+def used_packages() -> set[str]:
+    """Packages of the types within our messages."""
+    used = set()
+    for name in codec.palpation_definitions():
+        for _, described in codec.store.get_msgdef(name).fields:
+            description = described
+            while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
+                description = description[1][0]
+            if description[0] == Nodetype.NAME:
+                used.add(description[1].split("/")[0])
+    return used - {"palpation_msgs"}
+
+
+def texts(tag: str) -> set[str]:
+    return {str(element.text) for element in MANIFEST.findall(tag)}
+
+
+def test_the_manifest_depends_on_what_the_messages_use() -> None:
+    assert texts("depend") == used_packages()
+    assert texts("buildtool_depend") == {"ament_cmake", "rosidl_default_generators"}
+    assert texts("exec_depend") == {"rosidl_default_runtime"}
+    assert texts("member_of_group") == {"rosidl_interface_packages"}
+    assert MANIFEST.findtext("export/build_type") == "ament_cmake"
+
+
+def test_the_build_finds_and_names_them() -> None:
+    found = set(re.findall(r"find_package\((\w+) REQUIRED\)", BUILD))
+    assert found == {"ament_cmake", "rosidl_default_generators"} | used_packages()
+    named = re.search(r"DEPENDENCIES ([\w ]+)\)", BUILD)
+    assert set(named.group(1).split()) == used_packages()
+    assert "ament_package()" in BUILD
+
+
+def test_names_are_those_that_rosidl_takes() -> None:
+    for name, text in codec.palpation_definitions().items():
+        assert re.fullmatch(r"palpation_msgs/msg/[A-Z][A-Za-z0-9]*", name)
+        for line in text.splitlines():
+            words = line.partition("#")[0].split()
+            if not words or "=" in line.partition("#")[0]:
+                continue
+            assert re.fullmatch(r"[a-z](_?[a-z0-9]+)*", words[1]), f"{name}: {words[1]}"
+
+
+def test_every_message_of_ours_on_the_bus_is_in_the_package() -> None:
+    rows = [*contract().topics.values(), *contract().internal.values()]
+    ours = {row.type for row in rows if row.type.startswith("palpation_msgs/")}
+    assert {f"palpation_msgs/msg/{path.stem}" for path in (PACKAGE / "msg").glob("*.msg")} >= ours

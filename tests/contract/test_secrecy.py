@@ -1,4 +1,4 @@
-"""What a role is given - files, environment, arguments - tells those who may not know the patient nothing of his or her seed."""
+"""Files, environment and arguments of a role that may not know the patient do not depend on the patient's seed."""
 
 from __future__ import annotations
 
@@ -23,19 +23,19 @@ from palpate_models.scenario.schema import Scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 SEEDS = (11, 4711)
-EVERYBODY = ["exam.pattern=search"]
-"""With which every role of the contract takes part."""
-ROLES = (*workers(load_scenario("poor_errors", EVERYBODY)), *OBSERVERS)
+ALL_ROLES = ["exam.pattern=search"]
+"""Settings with which every role takes part."""
+ROLES = (*workers(load_scenario("poor_errors", ALL_ROLES)), *OBSERVERS)
 UNKNOWING = tuple(role for role in ROLES if view_of(role) == "exam")
 DRAWING = {"draw_errors", "draw_arm", "true_pose", "plant_input", "PlantInput"}
 
 
 @dataclass(frozen=True)
 class Handout:
-    """All that a role is given at its start."""
+    """Everything that a role is given at its start."""
 
     files: Mapping[str, bytes]
-    """By name: the scenario file, and all that stands in its folder."""
+    """By name: the scenario file and all files of its folder."""
     environment: Mapping[str, str]
     arguments: Sequence[str]
 
@@ -44,8 +44,8 @@ Hand = Callable[[Scenario, Path], Mapping[str, Handout]]
 """The handouts of a run of a scenario, by role."""
 
 
-class Witness:
-    """Stands where processes are forked, and keeps what each was given."""
+class Forked:
+    """Records what each process is given instead of forking it."""
 
     def __init__(self) -> None:
         self.handouts: dict[str, Handout] = {}
@@ -60,23 +60,23 @@ class Witness:
 
 
 def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[str, Path]], None] | None = None) -> Any:
-    """Those of processes. `leak` may tamper with the files."""
+    """Return the handouts of processes. `leak` may change the files."""
     files = write_scenario_files(scenario, out)
     if leak is not None:
         leak(scenario, files)
-    witness = Witness()
-    local = LocalProcesses(apart(ROLES), out, files, Timing(), record="full", forks=cast("Forks", witness))
+    forked = Forked()
+    local = LocalProcesses(apart(ROLES), out, files, Timing(), record="full", forks=cast("Forks", forked))
     try:
         for process in read_processes(compose_file(), ROLES).values():
             local.start(process)
     finally:
         local.running.clear()
         local.stop()
-    return witness.handouts
+    return forked.handouts
 
 
 def in_one_process(scenario: Scenario, out: Path) -> Any:
-    """Those of services in one process: what `create` is called with."""
+    """Return the handouts of services in one process: the arguments of `create`."""
     handouts = {}
 
     class StopError(Exception):
@@ -95,10 +95,10 @@ def in_one_process(scenario: Scenario, out: Path) -> Any:
     return handouts
 
 
-def told_apart(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
-    """What differs for each role between two patients who differ in seed alone, as do the names of their folders."""
+def differences(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
+    """Return the differences for each role between two patients who differ only in their seed."""
     one, other = (
-        hand(load_scenario("poor_errors", EVERYBODY, seed=seed), tmp_path / f"patient-{seed}-of-{hand.__name__}")
+        hand(load_scenario("poor_errors", ALL_ROLES, seed=seed), tmp_path / f"patient-{seed}-of-{hand.__name__}")
         for seed in SEEDS
     )
     found = {}
@@ -112,7 +112,7 @@ def told_apart(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
 
 
 def leaking_file(scenario: Scenario, out: Path) -> Any:
-    """All are given the file of the plant."""
+    """All roles are given the file of the plant."""
     return distributed(scenario, out, lambda _, files: files.update(dict.fromkeys(UNKNOWING, files["robot"])))
 
 
@@ -122,14 +122,14 @@ def leaking_seed(scenario: Scenario, out: Path) -> Any:
 
 
 def leaking_folder(scenario: Scenario, out: Path) -> Any:
-    """Every process is told the results folder."""
+    """Every process is given the results folder."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(processes, "OBSERVERS", frozenset(ROLES))
         return distributed(scenario, out)
 
 
 def leaking_environment(scenario: Scenario, out: Path) -> Any:
-    """The seed stands in the environment."""
+    """The environment holds the seed."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("PATIENT", str(scenario.seed))
         return in_one_process(scenario, out)
@@ -137,25 +137,23 @@ def leaking_environment(scenario: Scenario, out: Path) -> Any:
 
 @pytest.mark.parametrize("hand", [distributed, in_one_process])
 def test_two_patients_who_differ_in_seed_alone_are_the_same_to_who_may_not_know(hand: Hand, tmp_path: Path) -> None:
-    found = told_apart(hand, tmp_path)
+    found = differences(hand, tmp_path)
     assert {role: found[role] for role in UNKNOWING} == {role: [] for role in UNKNOWING}
-    assert all(found[role] for role in ROLES if role not in UNKNOWING), (
-        "these are told who the patient is, or what the errors are"
-    )
+    assert all(found[role] for role in ROLES if role not in UNKNOWING), "these know the patient or the errors"
 
 
 @pytest.mark.parametrize("hand", [leaking_file, leaking_seed, leaking_folder, leaking_environment])
 def test_a_leak_is_noticed(hand: Hand, tmp_path: Path) -> None:
-    found = told_apart(hand, tmp_path)
+    found = differences(hand, tmp_path)
     assert all(found[role] for role in UNKNOWING)
 
 
-def test_who_may_not_know_is_everybody_but_tissue_plant_and_observers() -> None:
+def test_all_but_tissue_plant_and_observers_may_not_know() -> None:
     assert set(ROLES) == set(contract().roles) - {"conductor"}
     assert set(UNKNOWING) == {"control", "planning", "perception", "assessment", "search", "supervisor"}
 
 
-def test_no_file_of_those_who_may_not_know_mentions_a_secret() -> None:
+def test_files_of_roles_that_may_not_know_mention_no_secret() -> None:
     scenario = load_scenario("poor_errors", seed=4711)
     exam, plant = (dump_scenario(scenario, view) for view in ("exam", "plant"))
     assert not [word for word in ("4711", "lesions", "phantom", "poor", "errors", "paper") if word in exam]
@@ -164,7 +162,7 @@ def test_no_file_of_those_who_may_not_know_mentions_a_secret() -> None:
 
 
 @pytest.mark.parametrize("role", [role for role in contract().roles if role in UNKNOWING])
-def test_who_may_not_know_draws_no_errors(role: str) -> None:
+def test_roles_that_may_not_know_draw_no_errors(role: str) -> None:
     for path in (ROOT / "services" / role / f"palpate_{role}").rglob("*.py"):
         tree = ast.parse(path.read_text(encoding="utf-8"))
         for node in ast.walk(tree):

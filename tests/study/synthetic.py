@@ -1,7 +1,8 @@
-"""Tables of studies whose truth is known."""
+"""A study of seconds, and tables of studies whose truth is known."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,16 +11,31 @@ from numpy.typing import NDArray
 from scipy.special import expit
 from scipy.stats import norm
 
+from palpate.study.spec import Study
 from palpate.study.statistics.reading import Tables, tables_of
+
+TOY: dict[str, Any] = {
+    "name": "toy",
+    "tier": "quick",
+    "populations": {
+        "clean": {"scenario": "clean", "number": {"tune": 2, "test": 3}, "settings": {"exam.region_m": [0.03, 0.03]}},
+    },
+}
+
+
+def study(**changes: Any) -> Study:
+    """Return the toy study with other fields."""
+    return Study.model_validate({**TOY, **changes})
+
 
 SLOPES = {"felt_contrast": 4.0, "felt_radius_m": 300.0, "depth_m": -60.0}
 """Of the log odds of detection against the logarithm of felt contrast, felt radius [1/m] and depth [1/m]."""
 AT = {"felt_contrast": 1.4, "felt_radius_m": 0.012, "depth_m": 0.010}
-"""Where a lump is found with probability 1/2, without lapses."""
+"""A lump that is found with probability 1/2, without lapses."""
 
 
 def true_probability(lumps: pd.DataFrame, lapse: float = 0.0) -> NDArray[np.float64]:
-    """The psychometric function that the lumps of `study` are found by."""
+    """Return the probability with which each lump is found."""
     odds = SLOPES["felt_contrast"] * np.log(lumps["felt_contrast"] / AT["felt_contrast"])
     odds += SLOPES["felt_radius_m"] * (lumps["felt_radius_m"] - AT["felt_radius_m"])
     odds += SLOPES["depth_m"] * (lumps["depth_m"] - AT["depth_m"])
@@ -27,7 +43,7 @@ def true_probability(lumps: pd.DataFrame, lapse: float = 0.0) -> NDArray[np.floa
 
 
 def true_radius(chance: float, felt_contrast: float, depth_m: float, lapse: float = 0.0) -> float:
-    """Felt radius [m] at which a lump is found with probability `chance`."""
+    """Return the felt radius [m] at which a lump is found with probability `chance`."""
     reach = chance / (1 - lapse)
     odds = np.log(reach / (1 - reach))
     odds -= SLOPES["felt_contrast"] * np.log(felt_contrast / AT["felt_contrast"]) + SLOPES["depth_m"] * (depth_m - AT["depth_m"])
@@ -70,19 +86,26 @@ def lump(case_id: str, **fields: Any) -> dict[str, Any]:
 
 
 def tables(cases: list[dict[str, Any]], findings: list[dict[str, Any]], lumps: list[dict[str, Any]]) -> Tables:
-    """Tables of rows."""
+    """Return tables of rows."""
     return tables_of(*frames(cases, findings, lumps))
 
 
 def frames(
     cases: list[dict[str, Any]], findings: list[dict[str, Any]], lumps: list[dict[str, Any]]
 ) -> tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]:
-    """Rows as frames, with all columns where there is no row."""
+    """Return rows as frames, with all columns even without a row."""
     samples = (case(0, "none"), finding("none", 0.0, -1), lump("none"))
     found = [pd.DataFrame(rows, columns=list(sample)) for rows, sample in zip((cases, findings, lumps), samples, strict=True)]
     found[1] = found[1].astype({"reported": bool, "lump": int, "confidence": float})
     found[2] = found[2].astype({"palpable": bool, "found": bool, "confidence": float})
     return found[0], found[1], found[2]
+
+
+def write(folder: Path, found: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]) -> Path:
+    """Write frames as a study's folder."""
+    for name, frame in zip(("cases", "findings", "lumps"), found, strict=True):
+        frame.to_parquet(folder / f"{name}.parquet")
+    return folder
 
 
 def binormal(rng: np.random.Generator, ill: int, healthy: int, separation: float) -> tuple[Tables, float]:

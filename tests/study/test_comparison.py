@@ -15,7 +15,7 @@ from palpate.study.statistics.reading import Tables
 
 
 def _two(gain: float, seed: int, n: int = 60) -> Tables:
-    """Two methods whose scores share what the patient gives them; the second tells lumps apart `gain` better."""
+    """Two methods whose scores share a part per patient; the second separates lumps `gain` better."""
     rng = np.random.default_rng(seed)
     cases: list[dict[str, Any]] = []
     findings, lumps = [], []
@@ -42,30 +42,24 @@ def test_the_first_method_of_the_table_is_the_reference() -> None:
     assert (compared.reference, compared.other, compared.patients) == ("palpate", "other", 120)
 
 
-def test_the_interval_of_the_difference_holds_the_truth_as_often_as_it_says() -> None:
+def test_the_interval_of_the_difference_has_its_nominal_coverage() -> None:
     held = 0
     true = norm.cdf(1.8 / np.sqrt(2)) - norm.cdf(1.0 / np.sqrt(2))
-    for seed in range(25):
+    for seed in range(12):
         tables = _two(0.8, seed)
         auc = compare(*tables.variants, Bootstrap.draw(tables.patients["population"].to_numpy(dtype=str), 200, seed)).auc
-        assert auc is not None
-        assert auc.low is not None
-        assert auc.high is not None
         held += auc.low <= true <= auc.high
-    assert 21 <= held <= 25
+    assert 10 <= held <= 12
 
 
 def test_pairing_sees_what_two_separate_samples_would_not() -> None:
     tables = _two(0.4, 2, n=150)
     paired = _compared(tables).auc
-    assert paired is not None
-    assert paired.low is not None
-    assert paired.high is not None
     assert paired.low > 0
     assert paired.high - paired.low < 0.1
 
 
-def test_mcnemar_is_the_exact_binomial_test_of_those_who_differ() -> None:
+def test_mcnemar_is_the_exact_binomial_test_of_discordant_patients() -> None:
     compared = _compared(_two(1.0, 3)).sensitivity
     a, b = compared.only_reference, compared.only_other
     assert b > a
@@ -84,7 +78,6 @@ def test_methods_that_agree_everywhere_may_still_differ_in_patients_not_seen() -
     assert compared.sensitivity.difference.high == pytest.approx(0.0876, abs=1e-3)
     found = compared.quantities["lumps_found"]
     assert found.equivalent
-    assert found.high_90 is not None
     assert found.high_90 > 0
 
 
@@ -98,7 +91,6 @@ def test_equivalence_is_shown_only_within_the_margin(shift: float, noise: float,
         cases.append(synthetic.case(number, "lumps", method="b", peak_force_n=force + shift + noise * rng.normal()))
     found = _compared(synthetic.tables(cases, [], [])).quantities["peak_force_n"]
     assert found.equivalent is equivalent
-    assert found.p_equivalence is not None
     assert (found.p_equivalence < 0.05) is equivalent
 
 

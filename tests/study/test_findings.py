@@ -37,8 +37,6 @@ def test_bias_and_limits_of_agreement() -> None:
     errors = finding_errors(tables.variants[0], tables.bootstrap).figures
     for line, true in ((errors.radius_m.bias, 1e-3), (errors.radius_m.lower, 1e-3 - 0.98e-3), (errors.radius_m.upper, 1.98e-3)):
         assert line.value == pytest.approx(true, abs=1e-4)
-        assert line.low is not None
-        assert line.high is not None
         assert line.low <= true <= line.high
         assert line.high - line.low < 3e-4
     assert errors.log_ratio.bias.value == pytest.approx(np.log(0.95), abs=0.005)
@@ -71,26 +69,20 @@ def _areas(n: int, power: float, seed: int = 0) -> Tables:
 
 def test_confidences_that_are_right() -> None:
     held, less = 0, 0
-    for seed in range(20):
+    for seed in range(10):
         calibrated = calibration(_areas(200, 1.0, seed).variants[0], Bootstrap.draw(["lumps"] * 200, 80, seed))
-        assert calibrated is not None
         found = calibrated.figures
-        assert found.slope.low is not None
-        assert found.slope.high is not None
         held += found.slope.low <= 1.0 <= found.slope.high
         less += (found.expected_error.value or 0) < found.expected_error_by_chance
         assert sum(part.n for _, part in calibrated.bins) == 400
-    assert held >= 16
-    assert less >= 16
+    assert held >= 8
+    assert less >= 8
 
 
 def test_confidences_that_are_too_sure() -> None:
-    tables = _areas(600, 2.0)
-    calibrated = calibration(tables.variants[0], tables.bootstrap)
-    assert calibrated is not None
+    calibrated = calibration(_areas(600, 2.0).variants[0], Bootstrap.draw(["lumps"] * 600, 80))
     found = calibrated.figures
     assert found.slope.value == pytest.approx(0.5, abs=0.08)
-    assert found.slope.high is not None
     assert found.slope.high < 0.8
     assert (found.expected_error.value or 0) > 2 * found.expected_error_by_chance
 
@@ -100,11 +92,10 @@ def test_probabilities_of_a_tensed_muscle_are_judged_by_the_areas_on_muscles() -
     cases = [synthetic.case(i, "guarding") for i in range(400)]
     findings = []
     for case in cases:
-        told = float(rng.uniform(0.0, 1.0))
-        findings.append(synthetic.finding(case["case_id"], 0.1, -1, guarding=told, on_guarding=bool(rng.random() < told)))
+        stated = float(rng.uniform(0.0, 1.0))
+        findings.append(synthetic.finding(case["case_id"], 0.1, -1, guarding=stated, on_guarding=bool(rng.random() < stated)))
     tables = synthetic.tables(cases, findings, [])
-    calibrated = guarding(tables.variants[0], tables.bootstrap)
-    assert calibrated is not None
+    calibrated = guarding(tables.variants[0], Bootstrap.draw(["guarding"] * 400, 80))
     assert calibrated.figures.slope.value == pytest.approx(1.0, abs=0.2)
     assert abs(calibrated.figures.in_the_large.value or 0) < 0.05
 

@@ -1,4 +1,4 @@
-"""What counts against a method, and what tables are refused."""
+"""Tables of studies: failed cases count against a method, and unusable tables are refused."""
 
 from __future__ import annotations
 
@@ -16,13 +16,7 @@ from palpate_errors import UserError
 FAILED = {"status": "failed", "completed": False, "score": np.nan, "palpable": np.nan, "not_palpable": np.nan}
 
 
-def _write(folder: Path, frames: tuple[pd.DataFrame, pd.DataFrame, pd.DataFrame]) -> Path:
-    for name, frame in zip(("cases", "findings", "lumps"), frames, strict=True):
-        frame.to_parquet(folder / f"{name}.parquet")
-    return folder
-
-
-def test_a_failed_case_misses_its_lump_and_alarms_where_there_is_none() -> None:
+def test_a_failed_case_counts_as_a_miss_or_a_false_finding() -> None:
     cases = [synthetic.case(i, "lumps", palpable=1, score=0.9) for i in range(4)]
     cases += [synthetic.case(i, "healthy", score=0.1) for i in range(4)]
     lumps = [synthetic.lump(case["case_id"], found=True, confidence=0.9) for case in cases[:4]]
@@ -36,7 +30,6 @@ def test_a_failed_case_misses_its_lump_and_alarms_where_there_is_none() -> None:
     assert after.lump_sensitivity.value == 0.75
     assert after.false_findings_of_healthy.value == 0.25
     curve = roc(tables.variants[0], tables.bootstrap)
-    assert curve is not None
     assert curve.auc.value == pytest.approx(9 / 16), "each failed case is beyond all others on the wrong side"
 
 
@@ -50,7 +43,7 @@ def test_an_examination_that_did_not_come_to_its_end_counts_as_failed() -> None:
 
 
 def test_a_patient_of_a_failed_case_is_known_from_another_method() -> None:
-    """He has two lumps of which one cannot be felt."""
+    """The patient has two lumps, of which one cannot be felt."""
     ok, bad = (synthetic.case(0, "lumps", method=m, palpable=1, not_palpable=1) for m in ("a", "b"))
     bad |= FAILED
     lumps = [synthetic.lump(case["case_id"], lump=i) for case in (ok, bad) for i in range(2)]
@@ -58,7 +51,7 @@ def test_a_patient_of_a_failed_case_is_known_from_another_method() -> None:
     assert [variant.cases["lumps"].sum() for variant in tables.variants] == [1, 1]
 
 
-def test_a_patient_known_from_nowhere_has_all_his_lumps() -> None:
+def test_a_patient_known_from_nowhere_has_all_their_lumps() -> None:
     case = synthetic.case(0, "lumps") | FAILED
     lumps = [synthetic.lump(case["case_id"], lump=i, palpable=None, felt_contrast=np.nan) for i in range(2)]
     frames = synthetic.frames([case], [], [])
@@ -93,6 +86,6 @@ def test_tables_that_are_missing_or_of_another_version_are_named(tmp_path: Path)
         read_tables(tmp_path)
     frames = synthetic.frames([synthetic.case(0, "healthy")], [], [])
     with pytest.raises(UserError, match="confidence"):
-        read_tables(_write(tmp_path, (frames[0], frames[1].drop(columns="confidence"), frames[2])))
+        read_tables(synthetic.write(tmp_path, (frames[0], frames[1].drop(columns="confidence"), frames[2])))
     with pytest.raises(UserError, match="no case"):
-        read_tables(_write(tmp_path, (frames[0].iloc[:0], frames[1], frames[2])))
+        read_tables(synthetic.write(tmp_path, (frames[0].iloc[:0], frames[1], frames[2])))

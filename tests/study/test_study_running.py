@@ -18,7 +18,7 @@ import pandas as pd
 import psutil
 import pytest
 import yaml
-from toy_study import TOY, study
+from synthetic import TOY, study
 
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
@@ -31,12 +31,6 @@ from palpate_models.scenario.load import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]
 CASES = cases_of(study())
-
-
-def examined(path: Path, cases: list[Case], count: int = 1) -> Path:
-    """The folder of the toy study after these cases were run."""
-    run(path, CASES, cases, count)
-    return path
 
 
 def run(path: Path, every: list[Case], cases: list[Case], count: int = 1, runs: bool = False) -> Folder:
@@ -52,8 +46,6 @@ def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
     hashes = []
     for keep in (True, False):
         outcome = run(tmp_path / str(keep), one, one, runs=keep).outcome(one[0].case_id)
-        assert outcome is not None
-        assert outcome.report is not None
         hashes.append(outcome.report.run_hash)
     kept = tmp_path / "True" / "runs" / one[0].case_id
     assert {"scenario.yaml", "evidence.mcap", "report.html"} <= {path.name for path in kept.iterdir()}
@@ -61,8 +53,14 @@ def test_results_of_whole_examinations_can_stay(tmp_path: Path) -> None:
     assert hashes[0] == hashes[1] != ""
 
 
+def examined(path: Path, cases: list[Case], count: int = 1) -> Path:
+    """Return the folder of the toy study after these cases were run."""
+    run(path, CASES, cases, count)
+    return path
+
+
 def digest_of(folder: Path) -> str:
-    """The digest of a folder that holds all cases."""
+    """Return the digest of a folder that holds all cases."""
     outcomes = Folder(folder).outcomes(manifest_of("toy", CASES))
     assert [outcome.case.case_id for outcome in outcomes] == [case.case_id for case in CASES]
     assert all(outcome.completed and outcome.attempts == 1 for outcome in outcomes)
@@ -121,7 +119,7 @@ def test_parts_of_different_studies_are_not_put_together(folder: Path, tmp_path:
 
 
 def command(tmp_path: Path, *options: str) -> list[str]:
-    """The toy by the command line, into `tmp_path / "out"`."""
+    """Return the command of the toy study with the results folder `tmp_path / "out"`."""
     (tmp_path / "toy.yaml").write_text(yaml.safe_dump(TOY))
     return [sys.executable, "-m", "palpate", "study", str(tmp_path / "toy.yaml"), "-o", str(tmp_path / "out"), *options]
 
@@ -135,7 +133,7 @@ def test_a_killed_case_process_costs_an_attempt_and_no_case(folder: Path, tmp_pa
     assert digest(outcomes) == digest_of(folder)
 
 
-def test_a_study_goes_on_after_its_scheduler_was_killed(
+def test_a_study_continues_after_its_scheduler_was_killed(
     folder: Path, tmp_path: Path, scheduler: tuple[str, subprocess.Popen[bytes]]
 ) -> None:
     address, head = scheduler
@@ -148,7 +146,7 @@ def test_a_study_goes_on_after_its_scheduler_was_killed(
     assert digest_of(examined(tmp_path, CASES)) == digest_of(folder)
 
 
-def test_a_study_goes_on_after_its_command_was_killed(folder: Path, tmp_path: Path) -> None:
+def test_a_study_continues_after_its_command_was_killed(folder: Path, tmp_path: Path) -> None:
     """Killed when the first case is done, then called again; what is done is not done again."""
     out = tmp_path / "out"
     words = command(tmp_path, "--shard", "1/1", "--workers", "1")
@@ -172,7 +170,6 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     cases = cases_of(mine)[:1]
     own = run(tmp_path, cases, cases)
     outcome = own.outcome(cases[0].case_id)
-    assert outcome is not None
     assert (outcome.status, outcome.attempts, outcome.completed) == ("failed", ATTEMPTS, False)
     causes = own.failures(cases[0].case_id)
     assert len(causes) == ATTEMPTS
@@ -195,25 +192,18 @@ def test_a_case_can_be_examined_again(folder: Path, tmp_path: Path) -> None:
     patient.write_text(printed.stdout)
     again = CASES[1].model_copy(update={"scenario": load_scenario(str(patient)).model_dump(mode="json")})
     first, second = (Folder(place).outcome(CASES[1].case_id) for place in (folder, examined(tmp_path / "again", [again])))
-    assert first is not None
-    assert second is not None
-    assert first.report is not None
-    assert second.report is not None
     assert first.report.run_hash == second.report.run_hash
 
 
 def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
     outcome = Folder(folder).outcome(CASES[0].case_id)
-    assert outcome is not None
     report = outcome.report
-    assert report is not None
-    assert report.scores is not None
     area = FindingRow(
         centroid_m=(0, 0, 0), quadrant="RLQ", area_m2=1e-3, ratio=1.4, ratio_90=(1.1, 1.8), confidence=0.3, guarding=0.1
     )
     score = FindingScore(0, None, 0.002, 0.002, 0.1, None, None, None, on_guarding=False)
-    beside = dataclasses.replace(score, lump=None, on_guarding=True)
-    scores = dataclasses.replace(report.scores, findings=(), candidates=(score, beside))
+    on_muscle = dataclasses.replace(score, lump=None, on_guarding=True)
+    scores = dataclasses.replace(report.scores, findings=(), candidates=(score, on_muscle))
     weighed = [area, area.model_copy(update={"confidence": 0.1})]
     report = report.model_copy(update={"findings": [], "candidates": weighed, "scores": scores})
     write_tables(tmp_path, "toy", [outcome.model_copy(update={"report": report})])
@@ -226,7 +216,7 @@ def test_candidates_are_in_the_tables(folder: Path, tmp_path: Path) -> None:
     assert case["score"] == 0.3
 
 
-def test_a_service_that_is_changed_in_mid_study_is_not_examined_with(tmp_path: Path) -> None:
+def test_a_service_that_is_changed_during_a_study_is_not_examined_with(tmp_path: Path) -> None:
     own = tmp_path / "own.py"
     own.write_text("from palpate_assessment.service import create\n")
     cases = cases_of(study(methods={"own": {"services": {"assessment": str(own)}}}))[:1]
@@ -241,7 +231,6 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
     own.open(manifest_of("toy", CASES))
     path = own.case_file(CASES[0].case_id)
     outcome = Folder(folder).outcome(CASES[0].case_id)
-    assert outcome is not None
     assert Folder(folder).of_other_code(CASES) == []
     path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
     assert own.of_other_code(CASES) == [CASES[0]]
@@ -254,7 +243,7 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
 
 
 def _case_process() -> psutil.Process | None:
-    """A process that examines a case, of those that this test has started or their workers."""
+    """Return a process of this test or its workers that examines a case."""
     for process in psutil.process_iter(["cmdline"]):
         words = process.info["cmdline"] or []
         if "palpate.study.case" in words and psutil.Process() in process.parents():
@@ -263,7 +252,7 @@ def _case_process() -> psutil.Process | None:
 
 
 def _strike(find: Callable[[], psutil.Process | None], strike: Callable[[psutil.Process], None]) -> threading.Event:
-    """As soon as `find` finds a process that has worked for a moment, `strike` hits; says when it has."""
+    """Call `strike` on the first process that `find` returns and that has computed for 2 s; the event is set after that."""
     struck = threading.Event()
 
     def watch() -> None:

@@ -1,9 +1,11 @@
-"""`docker compose up` on a real engine: the images are built, the examination runs, and it found what a local run finds."""
+"""Dockerfiles and compose files, and an examination by `docker compose` on a Docker engine."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+import sys
 import urllib.request
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,11 +13,91 @@ from time import monotonic, sleep
 from typing import Any
 
 import pytest
+import yaml
 from examination import SHORT, Finished, palpate_run
 
 from palpate.run.options import DEFAULT_SCENARIO
+from palpate_bus.contract import contract
+from palpate_bus.settings import COMPOSE_VARIABLES
+from palpate_models.scenario.load import view_of
 
 ROOT = Path(__file__).parents[2]
+DOCKERFILE = (ROOT / "compose/Dockerfile").read_text(encoding="utf-8")
+COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))["services"]
+IPC: dict[str, Any] = yaml.safe_load((ROOT / "compose/ipc.yml").read_text(encoding="utf-8"))["services"]
+
+
+def test_an_image_is_pinned_and_runs_as_no_root() -> None:
+    assert "# syntax=" not in DOCKERFILE
+    assert DOCKERFILE.rstrip().endswith("USER 1000:1000")
+    for line in DOCKERFILE.splitlines():
+        if "pip install" in line and "--no-index" not in line:
+            assert "-c constraints.txt" in line, line
+
+
+def builds() -> list[tuple[str, str]]:
+    """Return (GROUP, BASE) of the images of all compose files."""
+    found = set()
+    for path in (ROOT / "docker-compose.yml", *sorted((ROOT / "compose").glob("*.yml"))):
+        for service in yaml.safe_load(path.read_text(encoding="utf-8"))["services"].values():
+            if "build" in service:
+                words = service["build"]["args"]
+                found.add((words["GROUP"], words.get("BASE", "models")))
+    return sorted(found)
+
+
+@pytest.fixture(scope="module")
+def lists(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The libraries of every image, as the image's build writes them."""
+    folder = tmp_path_factory.mktemp("requirements") / "lists"
+    subprocess.run([sys.executable, str(ROOT / "compose/requirements.py"), str(folder)], cwd=ROOT, check=True, timeout=60)
+    return folder
+
+
+@pytest.mark.parametrize(("image", "base"), builds())
+def test_the_base_stage_installs_only_what_the_image_needs(image: str, base: str, lists: Path) -> None:
+    assert f"\nFROM models AS {base}\n" in DOCKERFILE or base in ("bus", "models")
+    needed, staged = (
+        {re.split("[<>=]", line)[0] for line in (lists / f"{name}.txt").read_text(encoding="utf-8").split()}
+        for name in (image, {"pinocchio": "control", "opengl": "models"}.get(base, base))
+    )
+    assert staged <= needed
+    assert not any(line.startswith("palpate") for line in needed)
+    assert any(line.startswith("eclipse-zenoh") for line in needed)
+
+
+def test_every_role_has_a_service_an_image_and_shared_memory_by_override() -> None:
+    roles = {*contract().roles, "conductor"}
+    assert roles <= COMPOSE.keys()
+    for role in roles:
+        assert (ROOT / COMPOSE[role]["build"]["dockerfile"]).is_file()
+        assert IPC[role]["ipc"] == "service:router"
+
+
+def test_each_container_has_the_scenario_file_of_its_role_and_no_other() -> None:
+    folders = {"scenario": "/results", "plant": "/plant", "exam": "/exam"}
+    for role in contract().roles:
+        if role != "conductor":
+            view = view_of(role)
+            assert COMPOSE[role]["environment"]["PALPATE_SCENARIO"] == f"{folders[view]}/{view}.yaml"
+            assert [volume.split(":")[-1 if view == "scenario" else -2] for volume in COMPOSE[role]["volumes"]] == [folders[view]]
+
+
+def test_the_default_scenario_of_containers_is_that_of_palpate_run() -> None:
+    assert COMPOSE["prepare"]["environment"]["PALPATE_SCENARIO_NAME"] == f"${{PALPATE_SCENARIO_NAME:-{DEFAULT_SCENARIO}}}"
+    assert COMPOSE_VARIABLES["PALPATE_SCENARIO_NAME"][0] == DEFAULT_SCENARIO
+
+
+def test_no_container_takes_a_machine_for_itself() -> None:
+    for role, service in COMPOSE.items():
+        assert service["mem_limit"].endswith("g"), role
+        assert service["pids_limit"] <= 256
+        assert service["cpus"] <= 1.0
+        assert service["logging"]["options"] == {"max-size": "10m", "max-file": "3"}
+        assert service["cap_drop"] == ["ALL"]
+        assert service["read_only"] is True
+
+
 PROJECT = "palpate-test"
 USER = str(os.getuid() or 1000)
 SHARED_MEMORY = ("-f", "docker-compose.yml", "-f", "compose/ipc.yml")
@@ -26,11 +108,11 @@ with session() as opened:
         pass
     print("shared memory:", all(transport.is_shm for transport in opened.info.transports()))
 """
-"""Whether a container's link to the router can carry messages through shared memory."""
+"""Prints True if a container's link to the router uses shared memory."""
 
 
 def missing() -> str | None:
-    """Why nothing here can run; None when it can."""
+    """Return the reason for skipping, or None."""
     for words in (["docker", "info"], ["docker", "compose", "version"]):
         try:
             done = subprocess.run(words, capture_output=True, text=True, timeout=60, check=False)
@@ -50,7 +132,7 @@ def engine() -> Iterator[None]:
 
 
 def compose(*words: str, results: Path | None = None, settings: tuple[str, ...] = SHORT, timeout: float = 1500) -> Finished:
-    """Runs `docker compose` on the repository's files; the folder is the run's."""
+    """Run `docker compose` on the files of the repository."""
     environment = {
         **os.environ,
         "PALPATE_RESULTS": str(results or ROOT / "out"),
@@ -85,7 +167,7 @@ def attached(images: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 def same_platform(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """Whether two reports promise equal hashes: the same C library, processor and versions of what both have installed."""
+    """True if equal hashes are expected: the same C library, processor and versions of common packages."""
     one, other = a["platform"], b["platform"]
     common = one["packages"].keys() & other["packages"].keys()
     return all(one[key] == other[key] for key in ("libc", "cpu")) and all(
@@ -145,7 +227,7 @@ def test_detached_with_shared_memory_it_finds_the_same_and_the_dashboard_stays(
 
 
 def page(address: str, patience_s: float = 60.0) -> bytes:
-    """What a browser gets there, once it is served."""
+    """Return the page once it is served."""
     end = monotonic() + patience_s
     while True:
         try:

@@ -1,22 +1,35 @@
-"""Keys and hashes are rmw_zenoh's of ROS 2 Jazzy, and a program with nothing of ours reads the bus."""
+"""Keys and hashes are those of rmw_zenoh, and independent programs read the bus and stop the robot."""
+
+from __future__ import annotations
 
 import ast
 import json
+import shlex
 import subprocess
 import sys
+import threading
 import time
+from contextlib import ExitStack
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from palpate.check.live_rig import LiveRig
+from palpate.check.perform import started
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import RigSettings
+from palpate.check.suites.camera import plane
+from palpate.check.suites.robot import quiet
 from palpate_bus.contract import contract
-from palpate_bus.messages import Image, JointState, Vector3, Wrench, WrenchStamped, codec
+from palpate_bus.messages import CameraTrigger, Image, JointState, Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.transport import Publisher
-from palpate_bus.wire.zenoh_config import mesh, session
+from palpate_bus.wire.zenoh_config import BusOptions, free_port, mesh, session
+from palpate_models.scenario.load import load_scenario
 
 RULES = contract()
 LISTENER = Path(__file__).with_name("foreign_listener.py")
@@ -55,7 +68,7 @@ def test_key_of_joint_states() -> None:
     assert topic_key(RULES.topics["joint_states"], 0) == expected
 
 
-def test_the_listener_imports_nothing_of_ours() -> None:
+def test_the_listener_imports_nothing_of_palpate() -> None:
     imported = set()
     for node in ast.walk(ast.parse(LISTENER.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
@@ -97,11 +110,73 @@ def test_a_stranger_reads_joint_states_wrench_and_depth_image(tmp_path: Path) ->
             time.sleep(0.02)
         out, error = listener.communicate(timeout=30)
     assert listener.returncode == 0, error
-    heard = {line["topic"]: line for line in map(json.loads, out.splitlines()[1:])}
-    assert heard["joint_states"]["names"][-1] == "lbr_A7"
-    assert heard["joint_states"]["position"] == list(range(7))
-    assert heard["ft/wrench"]["force"] == [1.0, -2.0, 3.5]
-    assert heard["ft/wrench"]["frame"] == "ft_sensor"
-    image = heard["camera/depth/image_raw"]
+    received = {line["topic"]: line for line in map(json.loads, out.splitlines()[1:])}
+    assert received["joint_states"]["names"][-1] == "lbr_A7"
+    assert received["joint_states"]["position"] == list(range(7))
+    assert received["ft/wrench"]["force"] == [1.0, -2.0, 3.5]
+    assert received["ft/wrench"]["frame"] == "ft_sensor"
+    image = received["camera/depth/image_raw"]
     assert (image["shape"], image["encoding"], image["valid"]) == ([48, 64], "32FC1", 100)
     assert (image["least"], image["most"]) == pytest.approx((0.8, 1.2))
+
+
+CLIENT = Path(__file__).with_name("ros2_client.py")
+TYPES = ("sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped", "sensor_msgs/msg/Image",
+         "palpation_msgs/msg/RobotStatus", "palpation_msgs/msg/OperatorRequest")  # fmt: skip
+
+
+def write_definitions(folder: Path) -> None:
+    """Write the message definitions, which the client would clone otherwise."""
+    for name in TYPES:
+        for file, text in codec.interface_files(name).items():
+            path = folder / file
+            path.parent.mkdir(parents=True, exist_ok=True)
+            path.write_text(text, encoding="utf-8")
+
+
+def test_the_client_imports_nothing_of_palpate() -> None:
+    tree = list(ast.walk(ast.parse(CLIENT.read_text(encoding="utf-8"))))
+    modules = {alias.name for node in tree if isinstance(node, ast.Import) for alias in node.names}
+    modules |= {str(node.module) for node in tree if isinstance(node, ast.ImportFrom)}
+    assert not [name for name in modules if name.startswith("palpat")]
+    assert "zenoh_ros2_sdk" in modules
+
+
+@pytest.mark.slow
+def test_a_ros_2_user_receives_robot_and_camera_and_stops_the_robot(tmp_path: Path) -> None:
+    write_definitions(tmp_path / "definitions")
+    port = free_port()
+    where = f"tcp/127.0.0.1:{port}"
+    settings = RigSettings(load_scenario("clean"), slack_ms=3000)
+    with ExitStack() as stack:
+        bus = stack.enter_context(session(BusOptions(mode="router", listen=(where,))))
+        words = [sys.executable, str(CLIENT), str(port), str(tmp_path / "definitions"), "--seconds", "150"]
+        client = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+        lines = [client.stdout.readline()]  # it listens from before the hellos on
+        rigs = {}
+        for role in ("camera", "robot"):
+            rig = rigs[role] = LiveRig(bus, role, settings)
+            stack.callback(rig.close)
+            stack.enter_context(started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0))
+        for role, rig in rigs.items():
+            rig.await_implementation(120, ConformanceReport(role))
+        reading = threading.Thread(target=lambda: lines.extend(client.stdout or ()), daemon=True)
+        reading.start()
+        surface = {"sim/surface": plane(np.array(settings.scenario.camera.look_at_m))}
+        while client.poll() is None:
+            rigs["camera"].send("planning/camera_trigger", CameraTrigger(header(rigs["camera"].t), 2))
+            rigs["camera"].run(0.4, surface)
+            rigs["robot"].run(0.4, quiet(rigs["robot"]))
+        reading.join()
+        errors = client.stderr.read() if client.stderr else ""
+    said = [json.loads(line) for line in lines if line.startswith("{")]
+    assert client.returncode == 0, (said, errors[-2000:])
+    assert "ERROR" not in errors, errors[-2000:]
+    received = {row["received"]: row for row in said if "received" in row}
+    assert received["/joint_states"]["names"] == [f"lbr_A{i}" for i in range(1, 8)]
+    assert received["/ft/wrench"]["frame"] == "ft_sensor"
+    assert received["/camera/depth/image_raw"]["size"] == [480, 640]
+    graph: dict[str, Any] = next(row for row in said if "topics" in row)
+    assert {f"/{topic.name}" for role in ("robot", "camera") for topic in RULES.outputs(role)} <= set(graph["topics"])
+    assert graph["publishers"] == ["robot"]
+    assert "asked from ROS 2" in next(row["robot"] for row in said if "robot" in row)

@@ -1,0 +1,181 @@
+"""Intervals, ROC and FROC of scores whose statistics are known."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import synthetic
+from sklearn.metrics import roc_auc_score
+
+from palpate.study.statistics.detection import GRID, RATES, by_contrast, froc, rates, roc
+from palpate.study.statistics.estimate import Bootstrap, bounded, percentiles, wilson
+
+
+def test_the_wilson_interval_of_twenty_in_twenty() -> None:
+    rate = wilson(20, 20, "patients")
+    assert rate.low == pytest.approx(0.8389, abs=1e-4)
+    assert rate.high == 1.0
+
+
+def test_every_resampling_has_as_many_patients_of_each_population() -> None:
+    populations = ["a"] * 7 + ["b"] * 3
+    counts = Bootstrap.draw(populations, folds=50).counts
+    assert (counts[:, :7].sum(axis=1) == 7).all()
+    assert (counts[:, 7:].sum(axis=1) == 3).all()
+    assert len(np.unique(counts, axis=0)) > 40
+
+
+def test_the_same_seed_draws_the_same() -> None:
+    a, b, other = (Bootstrap.draw(["a"] * 9, seed=seed).counts for seed in (3, 3, 4))
+    assert (a == b).all()
+    assert (a != other).any()
+
+
+def test_replicates_of_a_mean_spread_as_the_standard_error() -> None:
+    values = np.random.default_rng(1).normal(size=200)
+    replicates = Bootstrap.draw(["a"] * 200, folds=4000).ratio(values, np.ones(200))
+    assert replicates.mean() == pytest.approx(values.mean(), abs=0.01)
+    assert replicates.std() == pytest.approx(values.std() / np.sqrt(200), rel=0.05)
+
+
+def test_findings_of_one_patient_are_drawn_together() -> None:
+    """Ten equal findings a patient say no more than one."""
+    rng = np.random.default_rng(2)
+    each = rng.normal(size=30)
+    bootstrap = Bootstrap.draw(["a"] * 30)
+    one = bootstrap.quantile(each, np.arange(30), 0.5)
+    ten = bootstrap.quantile(np.repeat(each, 10), np.repeat(np.arange(30), 10), 0.5)
+    assert one.std() == pytest.approx(ten.std(), rel=1e-9)
+
+
+def test_a_rate_of_one_has_no_interval_of_width_zero() -> None:
+    found = bounded(1.0, np.ones(1000), 40, "lumps", 20)
+    assert found.low == wilson(20, 20, "patients").low
+    assert "Wilson" in found.interval
+
+
+def test_replicates_that_mostly_do_not_exist_give_no_interval() -> None:
+    assert percentiles(np.where(np.arange(100) < 60, np.nan, 1.0)) is None
+
+
+def test_the_interval_of_lumps_found_has_its_nominal_coverage() -> None:
+    """Two lumps a patient that are found or missed together: an interval over lumps instead of patients would be too narrow."""
+    held = 0
+    for seed in range(100):
+        found = np.random.default_rng(seed).random(60) < 0.7
+        both = 2.0 * found
+        bootstrap = Bootstrap.draw(["a"] * 60, folds=300, seed=seed)
+        low, high = percentiles(bootstrap.ratio(both, np.full(60, 2.0))) or (1, 0)
+        held += low <= 0.7 <= high
+    assert 90 <= held <= 99
+
+
+def test_no_false_finding_in_a_hundred_healthy_has_an_upper_limit() -> None:
+    cases = [synthetic.case(number, "healthy") for number in range(100)]
+    tables = synthetic.tables(cases, [], [])
+    false = rates(tables.variants[0], tables.bootstrap).false_findings_of_healthy
+    assert false.value == 0.0
+    assert false.high == pytest.approx(-np.log(0.025) / 100, rel=1e-6)
+
+
+def test_the_interval_of_the_auc_has_its_nominal_coverage() -> None:
+    held, widths = 0, []
+    for seed in range(30):
+        tables, true = synthetic.binormal(np.random.default_rng(seed), 40, 60, 1.2)
+        populations = tables.patients["population"].to_numpy(dtype=str)
+        curve = roc(tables.variants[0], Bootstrap.draw(populations, folds=200, seed=seed))
+        held += curve.auc.low <= true <= curve.auc.high
+        widths.append(curve.auc.high - curve.auc.low)
+    assert 26 <= held <= 30
+    q1, q2 = true / (2 - true), 2 * true**2 / (1 + true)
+    variance = (true * (1 - true) + 39 * (q1 - true**2) + 59 * (q2 - true**2)) / (40 * 60)
+    assert np.mean(widths) == pytest.approx(2 * 1.96 * np.sqrt(variance), rel=0.12), "Hanley and McNeil's standard error"
+
+
+def test_replicates_are_the_auc_of_the_drawn_patients() -> None:
+    tables, _ = synthetic.binormal(np.random.default_rng(0), 15, 20, 1.0)
+    curve, cases = roc(tables.variants[0], tables.bootstrap), tables.variants[0].cases
+    for fold in range(5):
+        count = tables.bootstrap.counts[fold][cases["patient"]]
+        drawn = cases.loc[cases.index.repeat(count)]
+        assert curve.replicates[fold] == pytest.approx(roc_auc_score(drawn["ill"], drawn["worst_score"]), abs=1e-12)
+
+
+def test_the_band_of_the_roc_is_about_the_true_curve() -> None:
+    tables, true = synthetic.binormal(np.random.default_rng(3), 300, 300, 1.5)
+    curve = roc(tables.variants[0], tables.bootstrap)
+    inner = (GRID > 0.02) & (GRID < 0.9)
+    here = np.interp(GRID, curve.false_rate, curve.true_rate)
+    assert (curve.low[inner] <= here[inner] + 0.02).all()
+    assert (curve.high[inner] >= here[inner] - 0.02).all()
+    assert np.trapezoid(curve.low, GRID) < true < np.trapezoid(curve.high, GRID)
+
+
+def _by_hand() -> synthetic.Tables:
+    """Four examinations, three lumps; areas by falling confidence: hit, false, hit, false, false; the third lump is not hit."""
+    cases = [synthetic.case(i, "lumps", palpable=1) for i in range(3)] + [synthetic.case(3, "healthy")]
+    ids = [case["case_id"] for case in cases]
+    hits = [synthetic.finding(ids[0], 0.9, 0), synthetic.finding(ids[1], 0.7, 0)]
+    false = [synthetic.finding(ids[3], 0.8, -1), synthetic.finding(ids[3], 0.3, -1), synthetic.finding(ids[0], 0.2, -1)]
+    lumps = [
+        synthetic.lump(ids[i], confidence=confidence, found=confidence > 0.5) for i, confidence in enumerate((0.9, 0.7, 0.0))
+    ]
+    return synthetic.tables(cases, hits + false, lumps)
+
+
+def test_froc_by_hand() -> None:
+    tables = _by_hand()
+    curve = froc(tables.variants[0], tables.bootstrap)
+    assert curve.at_zero.value == pytest.approx(1 / 3)
+    assert curve.at[1 / 4].value == pytest.approx(2 / 3), "one false finding in four examinations, at the confidence 0.7"
+    assert curve.at[1 / 8].value == pytest.approx(1 / 3), "between none and one in four: the hit above it"
+    assert curve.at[8.0].value == pytest.approx(2 / 3), "level beyond the last"
+    assert curve.mean.value == pytest.approx((1 / 3 + 6 * 2 / 3) / 7)
+    assert curve.mean.n == 3
+
+
+def test_equal_confidences_count_at_once() -> None:
+    cases = [synthetic.case(0, "lumps", palpable=1), synthetic.case(1, "healthy")]
+    areas = [synthetic.finding(cases[0]["case_id"], 0.6, 0), synthetic.finding(cases[1]["case_id"], 0.6, -1)]
+    tables = synthetic.tables(cases, areas, [synthetic.lump(cases[0]["case_id"], confidence=0.6, found=True)])
+    curve = froc(tables.variants[0], tables.bootstrap)
+    assert curve.at_zero.value == 0.0
+    assert curve.at[1 / 4].value == pytest.approx(0.5), "half way from none to one of both"
+
+
+def test_a_failed_examination_of_a_healthy_person_is_a_false_finding_at_every_threshold() -> None:
+    tables = _by_hand()
+    frames = tables.variants[0]
+    frames.cases.loc[frames.cases["population"] == "healthy", "failed"] = True
+    after = froc(frames, tables.bootstrap)
+    assert after.at_zero.value == 0.0
+    assert after.at[RATES[1]].value == pytest.approx(1 / 3)
+
+
+def test_lumps_are_counted_in_the_class_of_what_they_feel_like() -> None:
+    cases, lumps = [], []
+    made = [
+        (1.2, 0.02, False, 0.1),
+        (1.4, 0.02, True, 0.9),
+        (1.4, 0.01, False, 0.3),
+        (0.5, 0.02, True, 0.8),
+        (3.0, 0.01, True, 0.9),
+    ]
+    for number, (contrast, radius, found, score) in enumerate(made):
+        cases.append(synthetic.case(number, "lumps", palpable=1, score=score))
+        lumps.append(
+            synthetic.lump(cases[-1]["case_id"], felt_contrast=contrast, felt_radius_m=radius, found=found, confidence=score)
+        )
+    cases += [synthetic.case(number, "healthy", score=0.2) for number in range(4)]
+    tables = synthetic.tables(cases, [], lumps)
+    rows = by_contrast(tables.variants[0], tables.bootstrap)
+    assert {name: (row.found.value, row.found.n, row.found_wide.n) for name, row in rows.items()} == {
+        "below 1.3": (0.0, 1, 1),
+        "1.3 to 1.5": (0.5, 2, 1),
+        "1.5 to 2": (None, 0, 0),
+        "2 and more": (1.0, 2, 1),
+    }
+    areas = {name: None if row.auc is None else row.auc.value for name, row in rows.items()}
+    assert areas["1.5 to 2"] is None
+    assert areas["below 1.3"] == pytest.approx(0.0)
+    assert areas["1.3 to 1.5"] == pytest.approx(1.0)

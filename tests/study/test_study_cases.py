@@ -1,0 +1,199 @@
+"""Study files, the cases made from them, their identifiers and the seeds of their patients."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+import yaml
+from synthetic import TOY, study
+
+from palpate.study.cases import Request, cases_of, command_of, patient_seeds, secret_of
+from palpate.study.folder import Folder, manifest_of
+from palpate.study.spec import Grid, Lumps, StudyError, load_study, study_names
+
+PLAIN = "populations: {a: {scenario: person}}\n"
+
+
+def written(tmp_path: Path, text: str) -> str:
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("populations: {a: {scenario: person, nmber: 3}}", ("mine.yaml", "populations.a.nmber", "3")),
+        ("tier: slow\npopulations: {a: {scenario: person}}", ("mine.yaml", "tier", "'slow'", "'whole' or 'quick'")),
+        ("populations: {}", ("mine.yaml", "populations", "at least 1")),
+        ("populations: {a: {scenario: person, number: {test: -1}}}", ("populations.a.number.test", "-1", "or equal to 0")),
+        (
+            "populations: {a: {scenario: person, lumps: {radius_m: [0.02, 0.01]}}}",
+            ("populations.a.lumps", "radius_m = 0.02 to 0.01", "0.005 <= least"),
+        ),
+        (PLAIN + "methods: {m: {services: {assesment: x.py}}}", ("methods.m", "assesment", "assessment")),
+        (PLAIN + "errors: {bad: awful}", ("errors.bad", "awful", "typical")),
+        (PLAIN + "errors: {t: typical}\neach_error: [force.x]\neach_error_at: [poor]", ("force.x", "force.gain")),
+        (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations is given twice")),
+        (PLAIN + "tier: quick\nmethods: {m: {runtime: wallclock}}", ("mine.yaml", "wallclock", "tier: whole")),
+        (PLAIN + "record: all", ("record", "'all'", "'none'")),
+        ("[1, 2]", ("mine.yaml", "mapping")),
+    ],
+)  # fmt: skip
+def test_a_wrong_study_is_refused_by_file_field_and_value(tmp_path: Path, text: str, words: tuple[str, ...]) -> None:
+    with pytest.raises(StudyError) as caught:
+        load_study(written(tmp_path, text))
+    for word in words:
+        assert word in str(caught.value)
+
+
+def test_an_unknown_study_is_answered_with_the_known_ones() -> None:
+    with pytest.raises(StudyError, match="known are detectability"):
+        load_study("nosuch")
+
+
+@pytest.mark.parametrize(
+    ("changes", "words"),
+    [
+        ({"settings": {"exam.depth_m": -1}}, ("populations.clean", "exam.depth_m", "-1")),
+        ({"scenario": "nosuch"}, ("populations.clean", "nosuch: no such scenario")),
+        ({"lumps": {}}, ("populations.clean", "draw belongs to kind: person")),
+        ({"settings": {"services.tissue": "jelly"}}, ("services.tissue", "jelly", "winkler")),
+    ],
+)
+def test_a_scenario_that_cannot_be_is_named_with_its_population(changes: dict[str, object], words: tuple[str, ...]) -> None:
+    population = {**TOY["populations"]["clean"], **changes}
+    with pytest.raises(StudyError) as caught:
+        cases_of(study(populations={"clean": population}))
+    for word in words:
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("name", study_names())
+def test_the_studies_that_come_with_the_project_can_be_made(name: str) -> None:
+    mine = load_study(name)
+    assert len(cases_of(mine, Request("test", number=1))) == len(mine.populations) * len(mine.methods) * len(mine.error_levels())
+
+
+def test_grids_give_every_combination_in_turn() -> None:
+    lumps = Lumps(radius_m=Grid(grid=(0.01, 0.02)), contrast=Grid(grid=(2, 4, 8)))
+    assert len(lumps.cells()) == 6
+    population = {"scenario": "person", "number": {"test": 7}, "lumps": lumps.model_dump()}
+    cases = cases_of(study(populations={"lumps": population}))
+    contrasts = [case.scenario["phantom"]["lesions"][0]["contrast"] for case in cases]
+    assert contrasts == pytest.approx([2, 4, 8, 2, 4, 8, 2])
+
+
+def test_one_error_at_a_time_changes_that_error_alone() -> None:
+    mine = study(errors={"typical": "typical"}, each_error=["force.gain", "camera"], each_error_at=["none", "typical", "poor"])
+    levels = mine.error_levels()
+    assert list(levels) == ["typical", "force.gain=none", "force.gain=poor", "camera=none", "camera=poor"]
+    base, changed = levels["typical"], levels["force.gain=poor"]
+    assert changed.model_copy(update={"force": changed.force.model_copy(update={"gain": base.force.gain})}) == base
+
+
+def test_files_are_looked_for_beside_the_study(tmp_path: Path) -> None:
+    (tmp_path / "mine.py").write_text("def create(scenario): ...")
+    text = yaml.safe_dump({**TOY, "methods": {"mine": {"services": {"assessment": "mine.py"}}}})
+    assert load_study(written(tmp_path, text)).methods["mine"].services == {"assessment": str(tmp_path / "mine.py")}
+
+
+def test_ids_do_not_depend_on_what_things_are_called() -> None:
+    (one, *_), (other, *_) = cases_of(study()), cases_of(study(methods={"another-name": {}}))
+    assert one.case_id == other.case_id
+    assert one.method != other.method
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {"tier": "quick"},
+        {"errors": {"poor": "poor"}},
+        {"methods": {"m": {"settings": {"exam.depth_m": 0.008}}}},
+        {"methods": {"m": {"periods": {"control": 5}}}},
+        {"salt": "another"},
+    ],
+)
+def test_ids_depend_on_everything_that_decides_a_result(changes: dict[str, object]) -> None:
+    ids = {case.case_id for case in cases_of(study(tier="whole"))}
+    assert ids.isdisjoint(case.case_id for case in cases_of(study(**{"tier": "whole", **changes})))
+
+
+@pytest.mark.parametrize("field", ["services.assessment", "exam.pattern", "search.policy"])
+def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, field: str) -> None:
+    found = []
+    for folder, text in (("a", "1"), ("b", "1"), ("c", "2")):
+        path = tmp_path / folder / "mine.py"
+        path.parent.mkdir()
+        path.write_text(f"def create(scenario): return {text}\nscan = next_press = create\n")
+        settings = {"exam.pattern": "search"} if field == "search.policy" else {}
+        found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
+    assert found[0] == found[1] != found[2]
+
+
+def test_the_command_states_every_option() -> None:
+    request = Request("tune", 8, ("search.policy=my own.py", "errors=poor"), "secret")
+    words = "--set 'search.policy=my own.py' --set errors=poor --seeds-file FILE"
+    assert command_of("mine.yaml", request, ["a"], ["assessment=b.py"]) == (
+        f"palpate study mine.yaml --split tune --number 8 --method a --service assessment=b.py {words}"
+    )
+    assert command_of("release", Request()) == "palpate study release --split test"
+
+
+def test_patients_are_the_same_for_all_methods_and_errors() -> None:
+    cases = cases_of(
+        study(errors={"none": "none", "poor": "poor"}, methods={"a": {}, "b": {"settings": {"exam.depth_m": 0.008}}})
+    )
+    for number in range(3):
+        assert len({case.seed for case in cases if case.number == number}) == 1
+    assert len({case.case_id for case in cases}) == len(cases) == 12
+
+
+def test_two_names_for_one_examination_are_refused() -> None:
+    with pytest.raises(StudyError, match="clean 0 b none and clean 0 a none are the same examination"):
+        cases_of(study(methods={"a": {}, "b": {}}))
+
+
+def test_splits_share_no_patient_and_more_patients_change_none() -> None:
+    tune, test = (patient_seeds("s", "p", split, 300, "salt") for split in ("tune", "test"))
+    assert len(set(tune)) == len(set(test)) == 300
+    assert max(tune) < 1000 <= min(test)
+    assert patient_seeds("s", "p", "tune", 100, "salt") == tune[:100]
+    assert len(set(patient_seeds("s", "p", "tune", 1000, ""))) == 1000
+
+
+@pytest.mark.parametrize("split", ["tune", "test"])
+def test_a_salt_changes_the_patients_of_the_split_test_alone(split: str) -> None:
+    same = patient_seeds("s", "p", split, 5, "one") == patient_seeds("s", "p", split, 5, "two")
+    assert same == (split == "tune")
+
+
+def test_a_held_out_study_needs_its_own_file_of_seeds(tmp_path: Path) -> None:
+    secret, wrong = tmp_path / "secret", tmp_path / "wrong"
+    secret.write_bytes(b"0123456789")
+    wrong.write_bytes(b"9876543210")
+    held_out = study(seeds_sha256="84d89877f0d4041efb6bf91a16f0248f2fd573e6af05c19f96bedb9f882f7882")
+    with pytest.raises(StudyError, match="--seeds-file"):
+        cases_of(held_out)
+    with pytest.raises(StudyError, match="its SHA-256 is"):
+        secret_of(wrong, held_out)
+    hidden = cases_of(held_out, Request(secret=secret_of(secret, held_out)))
+    assert {case.seed for case in hidden}.isdisjoint(case.seed for case in cases_of(study()))
+    assert [case.seed for case in cases_of(held_out, Request("tune"))] == [
+        case.seed for case in cases_of(study(), Request("tune"))
+    ]
+
+
+def test_no_patient_at_all_is_refused() -> None:
+    empty = {**TOY["populations"]["clean"], "number": {}}
+    with pytest.raises(StudyError, match=r"number\.test"):
+        cases_of(study(populations={"clean": empty}))
+
+
+def test_a_folder_holds_the_cases_of_one_request(tmp_path: Path) -> None:
+    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 1))))
+    Folder(tmp_path).open(manifest_of("toy", cases_of(study(), Request("test", 3))))
+    poor = cases_of(study(), Request("test", 3, ("errors=poor",)))
+    with pytest.raises(StudyError, match="other settings or patients: give this one another folder with -o"):
+        Folder(tmp_path).open(manifest_of("toy", poor))
