@@ -171,7 +171,7 @@ class CaseDisplay(Progress):
         )
         self._task = self.add_task(unit, total=None, last="")
 
-    def tell(self, done: int, total: int, last: str) -> None:
+    def show(self, done: int, total: int, last: str) -> None:
         """Shows the number of finished cases and the name of the last one."""
         self.update(self._task, completed=done, total=total, last=last)
         if self._lines and done:

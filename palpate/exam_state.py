@@ -1,4 +1,4 @@
-"""`exam/state` of an examination that planning does not conduct: a quick one, touches of one's own, a conformance check."""
+"""`exam/state` of an examination without planning: a quick one, touches in a program, a conformance check."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ AT_REST: Final[dict[str, Any]] = {
     "patient_moved": False,
     "reason": ExamState.REASON_NONE,
 }
-"""Fields of an arm that touches nothing."""
+"""Fields without contact."""
 
 
 def exam_state(
     t: int, phase: int, p_W: Iterable[float] = (0.0, 0.0, 0.0), n_W: Iterable[float] = (0.0, 0.0, 1.0), **fields: Any
 ) -> Message:
-    """`palpation_msgs/ExamState` at `t` [ns] over a place p_W of the skin [m] with the outward normal n_W, each of three numbers.
+    """Return `palpation_msgs/ExamState` at `t` [ns] over a point of the skin p_W [m] with outward normal n_W.
 
-    Other fields than `fields` are `AT_REST`.
+    Fields that are not in `fields` have the values of `AT_REST`.
     """
     point, normal = Point(*map(float, p_W)), Vector3(*map(float, n_W))
     return ExamState(header(t, "world"), phase=phase, surface_point=point, surface_normal=normal, **(AT_REST | fields))

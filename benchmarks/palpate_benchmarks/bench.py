@@ -64,7 +64,7 @@ def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out
     if "runs" in groups:
         cases += [("runs", name, run) for name, run in run_cases(scenario).items()]
     for done, (group, name, case) in enumerate(cases):
-        display.tell(done, len(cases), name)
+        display.show(done, len(cases), name)
         figures[group][name] = case()
         write_text(out, json.dumps(figures, indent=2))
     return figures

@@ -58,14 +58,14 @@ def faults(  # noqa: PLR0913 - the options of a command
     todo = todo[:limit]
     started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
-        display.tell(0, len(todo), "")
+        display.show(0, len(todo), "")
         for number, case in enumerate(todo, 1):
             finding = run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by)
             same = (finding.kind, finding.where, finding.mode, finding.at_s)
             found = [f for f in found if (f.kind, f.where, f.mode, f.at_s) != same] + [finding]
             write_text(out, csv_text(found))
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
-            display.tell(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
+            display.show(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDE, Console().width)).print(table(found))
     if docs is not None:
         write_part(docs, "faults", markdown(found))

@@ -43,7 +43,7 @@ def reproduce(
         with CaseDisplay(console, quiet, "steps") as display:
 
             def tell(words: str) -> None:
-                display.tell(next(begun), steps, words)
+                display.show(next(begun), steps, words)
 
             for case in cases:
                 if again or completed(out / case.name) is None:

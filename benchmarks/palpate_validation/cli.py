@@ -60,7 +60,7 @@ def validate(
     wanted = [name for name in SECTIONS if not only or name in only]
     with CaseDisplay(console, False, "sections") as display:
         for number, name in enumerate(wanted):
-            display.tell(number, len(wanted), f"measuring {name}")
+            display.show(number, len(wanted), f"measuring {name}")
             sections.append(run_section(name))
     try:
         write(sections, out)

@@ -14,13 +14,15 @@ LISTEN = "tcp/127.0.0.1:7447"
 def check_command(  # noqa: PLR0913 - the options of a command
     role: Annotated[str, typer.Argument(help="A role, such as tissue. An unknown one gives a list of all.")],
     connect: Connect = None,
-    listen: Annotated[str, typer.Option(help="Where the check waits for the implementation, as a router.")] = LISTEN,
+    listen: Annotated[str, typer.Option(help="Endpoint at which the check waits for the implementation, as a router.")] = LISTEN,
     start: Annotated[str | None, typer.Option(metavar="COMMAND", help="Start the implementation with this command.")] = None,
     service: Annotated[
         str | None,
-        typer.Option(metavar="NAME_OR_FILE", help="Check an installed one or a Python file in this process, in simulated time."),
+        typer.Option(
+            metavar="NAME_OR_FILE", help="Check an installed implementation or a Python file in this process, in simulated time."
+        ),
     ] = None,
-    scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds the breath.")] = "clean",
+    scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds their breath.")] = "clean",
     motion: Annotated[bool, typer.Option("--motion", help="It may move; most checks of the robot need this.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
@@ -30,8 +32,8 @@ def check_command(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Test an implementation of a role: rates, ranges, signs, frames, limits, expiry, safe hold, invalid and missing messages.
 
-    The check plays the conductor and all other roles. The exit status is 0 when everything passed, 1 when something failed, 2
-    when no implementation joined. docs/conformance.md says what an implementation has to do.
+    The check plays the conductor and all other roles. The exit status is 0 if everything passed, 1 if something failed, 2 if no
+    implementation joined. docs/conformance.md lists the requirements.
     """
     from palpate.check.perform import check_here, check_live, print_report
     from palpate.check.rig import RigSettings

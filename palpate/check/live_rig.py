@@ -1,20 +1,21 @@
-"""The rig for an unknown implementation on a live bus: this process is its conductor and every other role, by the wall clock.
+"""The rig for an unknown implementation on a live bus, in wall-clock mode: this process plays conductor and all other roles.
 
-The conversation is that of a wall-clock run: hello on every edge until the implementation reports READY, the common start as a
-grant, a word at least every half second, and the end.
+The protocol is that of a wall-clock run: hello on every edge until the implementation reports READY, a grant with the common
+start, a control message at least every half second, and the end.
 """
 
 from __future__ import annotations
 
 import gc
 import json
+from dataclasses import dataclass
 from time import monotonic, sleep, time_ns
 from typing import Any
 
 import zenoh
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, HeardMessage, Rig, RigSettings
+from palpate.check.rig import Feed, ReceivedMessage, Rig, RigSettings
 from palpate.live.topic import TopicReader
 from palpate_bus.contract import MS
 from palpate_bus.messages import RunControl, ServiceReport, codec
@@ -25,12 +26,22 @@ from palpate_bus.wire.liveliness import EntityKind, GraphWatch, NodeTokens, gid
 from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
 
-HELLO_S = 0.05
-READY_S = 20.0
-"""For an implementation that is there to answer on every edge."""
-LEAD = 200 * MS
-WORD_S = 0.4
-FINISH_S = 10.0
+
+@dataclass(frozen=True)
+class ProtocolTiming:
+    """Intervals and limits of the run protocol."""
+
+    hello_s: float = 0.05
+    ready_s: float = 20.0
+    """For an implementation on the bus to answer on every edge."""
+    lead_ns: int = 200 * MS
+    """From the grant to the common start."""
+    control_s: float = 0.4
+    """Between control messages."""
+    finish_s: float = 10.0
+
+
+TIMING = ProtocolTiming()
 CONTROL, REPORT = "palpation_msgs/msg/RunControl", "palpation_msgs/msg/ServiceReport"
 
 
@@ -54,33 +65,35 @@ class LiveRig(Rig):
         key = message_key("palpate/control", CONTROL, domain)
         self._control = Publisher(session, key, self.rules.qos["event"], conductor.node.gid)
         self._reports = Subscription(session, message_key(f"palpate/report/{role}", REPORT, domain))
-        self._ears = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._readers = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
-        self._spoke = 0.0
+        self._last_control = 0.0
         self.ready = False
         self.finished = False
         self.facts: dict[str, Any] = {}
-        """What the implementation reported at its end."""
+        """Facts that the implementation reported at its end."""
         self.error = ""
-        """What it reported when it failed."""
+        """Error that it reported if it failed."""
 
-    # -- the conversation
+    # -- protocol
 
     def await_implementation(self, seconds: float, report: ConformanceReport) -> None:
-        """Waits for the role to appear, greets it and starts it. Raises NoBus when it does not appear within `seconds`."""
+        """Waits for the role to appear, sends hello and starts it. Raises NoBus if it does not appear within `seconds`."""
         report.section("protocol")
-        gc.freeze()  # a full collection in mid-check would keep commands back longer than they are valid
+        gc.freeze()  # a full collection during a check would delay commands beyond their validity
         end = monotonic() + seconds
         while self.role.name not in self._others():
             if monotonic() > end:
-                raise NoBus(f"no node {self.role.name!r} came within {seconds:.0f} s; it needs a liveliness token of that name")
+                raise NoBus(
+                    f"no node {self.role.name!r} appeared within {seconds:.0f} s; it needs a liveliness token of that name"
+                )
             self._say(RunControl.HELLO)
-            sleep(HELLO_S)
+            sleep(TIMING.hello_s)
         report.expect("joins as a node of its role", True, self.role.name, self.role.name)
         self._greet(report)
         self._check_graph(report)
-        self._epoch = time_ns() + LEAD
+        self._epoch = time_ns() + TIMING.lead_ns
         self._say(RunControl.GRANT, self._epoch)
         while time_ns() < self._epoch:
             sleep(0.002)
@@ -91,18 +104,20 @@ class LiveRig(Rig):
         return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
 
     def _greet(self, report: ConformanceReport) -> None:
-        end = monotonic() + READY_S
+        end = monotonic() + TIMING.ready_s
         missing: list[str] | None = None
         while missing != [] and monotonic() < end:
             self._say(RunControl.HELLO)
             for publisher in self._publishers.values():
                 publisher.hello()
-            sleep(HELLO_S)
-            for message in self._heard_reports():
+            sleep(TIMING.hello_s)
+            for message in self._received_reports():
                 if message.state == ServiceReport.READY:
                     missing = list(json.loads(message.detail or "{}").get("missing", []))
         self.ready = missing == []
-        got = "READY" if self.ready else "nothing" if missing is None else f"READY, but it hears nothing on {', '.join(missing)}"
+        got = (
+            "READY" if self.ready else "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
+        )
         report.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
 
     def _check_graph(self, report: ConformanceReport) -> None:
@@ -121,32 +136,32 @@ class LiveRig(Rig):
         report.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
 
     def finish(self, report: ConformanceReport) -> None:
-        """Disturbs it, ends it, and judges how it takes that."""
+        """Sends garbage to it, ends it, and checks its reactions."""
         report.section("garbage")
         self._disturb(report)
         report.section("end")
         self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
-        end = monotonic() + FINISH_S
+        end = monotonic() + TIMING.finish_s
         while not self.finished and monotonic() < end:
-            self._heard_reports()
+            self._received_reports()
             self._drain()
             sleep(0.02)
         got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
-        report.expect("reports FINISHED at the end", self.finished, f"within {FINISH_S:.0f} s", got)
+        report.expect("reports FINISHED at the end", self.finished, f"within {TIMING.finish_s:.0f} s", got)
         self._say(RunControl.END)
 
     def close(self) -> None:
-        """Leaves the bus; an implementation that still runs is told to stop."""
+        """Aborts an implementation that still runs, and leaves the bus."""
         self._say(RunControl.ABORT, reason="the conformance check is over")
         for tokens in self._tokens.values():
             tokens.undeclare()
         self.graph.close()
-        for ear in self._ears.values():
-            ear.close()
+        for reader in self._readers.values():
+            reader.close()
         self._reports.close()
 
     def _disturb(self, report: ConformanceReport) -> None:
-        """Bytes that are no messages, and messages of a stranger, on every input."""
+        """Sends undecodable bytes and messages of an unknown sender on every input."""
         stranger = AttachmentWriter(gid("a stranger")).pack
         for name in self._publishers:
             topic = self.rules.topics[name]
@@ -156,7 +171,7 @@ class LiveRig(Rig):
             self._session.put(key, b"\xff" * 40, attachment=stranger(1, time_ns()))
             self._next(name, b"\x00\x01\x00\x00\xff")
         after = self.run(0.6, {})
-        self._heard_reports()
+        self._received_reports()
         silent = [t.name for t in self.rules.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
         there = self.role.name in self._others()
         got = (
@@ -166,28 +181,28 @@ class LiveRig(Rig):
             if silent
             else f"failed: {self.error}"
             if self.error
-            else "goes on"
+            else "continues"
         )
-        report.expect("garbage on its inputs does not stop it", got == "goes on", "goes on", got)
+        report.expect("garbage on its inputs does not stop it", got == "continues", "continues", got)
 
-    def _heard_reports(self) -> list[Any]:
-        heard = []
+    def _received_reports(self) -> list[Any]:
+        received = []
         while (sample := self._reports.get(0)) is not None:
             try:
                 message = codec.decode(sample.payload, REPORT)
             except codec.CodecError as error:
                 self.undecodable.append(f"palpate/report: {error}")
                 continue
-            heard.append(message)
+            received.append(message)
             if message.state == ServiceReport.FINISHED:
                 self.finished = True
                 self.facts = json.loads(message.detail or "{}")
             elif message.state == ServiceReport.FAILED:
                 self.error = message.detail
-        return heard
+        return received
 
     def _say(self, command: int, tick: int = 0, last: bool = False, role: str = "", reason: str = "") -> None:
-        self._spoke = monotonic()
+        self._last_control = monotonic()
         self._sequences["control"] += 1
         message = RunControl(command, tick, last, role, reason)
         self._control.put(codec.encode(message, CONTROL), self._sequences["control"])
@@ -207,19 +222,19 @@ class LiveRig(Rig):
                         self.send(name, message)
             self.t = now
             self._drain()
-            if monotonic() - self._spoke > WORD_S:
+            if monotonic() - self._last_control > TIMING.control_s:
                 self._say(RunControl.GRANT, self._epoch)
-                self._heard_reports()
+                self._received_reports()
             if now >= end:
                 return
             sleep(max(0.0, (MS - (time_ns() - self._epoch) % MS) / NS))
 
     def send(self, topic: str, message: Message) -> None:
-        """Publishes a message as its rightful producer."""
+        """Publishes a message as its producer."""
         self._next(topic, codec.encode(message, self.rules.topics[topic].type))
 
     def lose(self, role: str) -> None:
-        """Says that a role is lost, as a conductor does."""
+        """Reports a role as lost, as a conductor does."""
         self._say(RunControl.LOST, self.t, role=role, reason="conformance check")
 
     def _next(self, topic: str, payload: bytes) -> None:
@@ -227,12 +242,12 @@ class LiveRig(Rig):
         self._publishers[topic].put(payload, self._sequences[topic])
 
     def _drain(self) -> None:
-        for name, ear in self._ears.items():
+        for name, reader in self._readers.items():
             kind = self.rules.topics[name].type
-            while (heard := ear.get()) is not None:
+            while (received := reader.get()) is not None:
                 try:
-                    message = codec.decode(heard.payload, kind)
+                    message = codec.decode(received.payload, kind)
                 except codec.CodecError as error:
                     self.undecodable.append(f"{name}: {error}")
                     continue
-                self.log[name].append(HeardMessage(self.t, message, heard.sequence, heard.sent_ns))
+                self.log[name].append(ReceivedMessage(self.t, message, received.sequence, received.sent_ns))

@@ -18,7 +18,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRe
 from palpate.check.live_rig import LiveRig
 from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import Rig, RigSettings, ServiceRig
-from palpate.check.suites import LASTS_S, check
+from palpate.check.suites import DURATION_S, check
 from palpate.console import table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
@@ -28,9 +28,9 @@ from palpate_models.scenario.load import dump_scenario, view_of
 
 
 @contextmanager
-def started(words: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
-    """Starts the implementation for the time of the check, if its command was given."""
-    if words is None:
+def started(command: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
+    """Starts the implementation for the duration of the check, if a command was given."""
+    if command is None:
         yield
         return
     with tempfile.TemporaryDirectory(prefix="palpate-check-") as folder:
@@ -41,11 +41,11 @@ def started(words: str | None, role: str, settings: RigSettings, endpoint: str, 
             **os.environ, "PALPATE_ROUTER": endpoint, "PALPATE_RUNTIME": "wallclock", "PALPATE_SCENARIO": str(file),
             "PALPATE_OUT": folder, "PALPATE_RECORD": "none", "ROS_DOMAIN_ID": str(domain),
         }  # fmt: skip
-        split = shlex.split(words)
+        split = shlex.split(command)
         try:
             child = subprocess.Popen([sys.executable if split[0] == "python" else split[0], *split[1:]], env=environment)
         except OSError as error:
-            raise NoBus(f"--start {words}: {error}") from error
+            raise NoBus(f"--start {command}: {error}") from error
         try:
             yield
             child.wait(timeout=5)
@@ -60,7 +60,7 @@ def started(words: str | None, role: str, settings: RigSettings, endpoint: str, 
 
 
 class CheckDisplay(Progress):
-    """A bar that follows the clock of a rig, for a `with` block; nothing where there is no terminal."""
+    """A bar that follows the clock of a rig, for a `with` block; nothing without a terminal."""
 
     def __init__(self, rig: Rig, report: ConformanceReport) -> None:
         """Reads rig and report about ten times a second while the suite runs."""
@@ -69,7 +69,7 @@ class CheckDisplay(Progress):
         columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
         self._rig, self._report = rig, report
-        self._shown = self.add_task(rig.role.name, total=LASTS_S[rig.role.name], checks=0)
+        self._shown = self.add_task(rig.role.name, total=DURATION_S[rig.role.name], checks=0)
 
     def get_renderables(self) -> Iterable[RenderableType]:
         """Updates the task and returns what to draw; rich calls it at each refresh."""
@@ -84,7 +84,7 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED
 
 
 def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
-    """Checks an implementation in this process, in simulated time. Raises PluginError for one that there is not."""
+    """Checks an implementation in this process, in simulated time. Raises PluginError for an unknown one."""
     rig, report = ServiceRig(implementations.create(role, choice, settings.scenario), settings), ConformanceReport(role)
     with CheckDisplay(rig, report):
         return check(rig, report)
@@ -130,5 +130,7 @@ def print_report(report: ConformanceReport, failures: bool) -> None:
     verdict = "[green]conforms[/]" if report.passed else "[bold red]does not conform[/]"
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     if not report.passed and load > 1:
-        out.print(f"\n[yellow]this machine is overloaded (load {load:.1f} a processor): rates and reactions say little[/]")
+        out.print(
+            f"\n[yellow]this machine is overloaded (load {load:.1f} per processor): rates and reaction times are unreliable[/]"
+        )
     out.print(f"\n{report.role}: {verdict}, {summary}")

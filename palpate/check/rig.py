@@ -1,7 +1,7 @@
-"""What a conformance suite drives: one implementation of a role, with the suite in place of all other roles.
+"""Rigs that a conformance suite drives: one implementation of a role, with the suite in place of all other roles.
 
-`ServiceRig` holds a service of ours in this process, in simulated time. `LiveRig` in `live_rig` talks to an unknown
-implementation on a bus, by the wall clock. The same suites run on both.
+`ServiceRig` runs a service in this process, in simulated time. `LiveRig` in `live_rig` connects to an unknown implementation on
+a bus, in wall-clock mode. The same suites run on both.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from palpate_models.scenario.schema import Scenario
 Source = Callable[[int], "Message | None"]
 """The message of a topic at a time [ns] on the rig's clock; None for silence."""
 Feed = Mapping[str, Source]
-"""What the suite sends, by topic; a topic that is not in it is silent."""
+"""Messages that the suite sends, by topic; other topics are silent."""
 
 
-class HeardMessage(NamedTuple):
+class ReceivedMessage(NamedTuple):
     """A message of the implementation."""
 
     t: int
@@ -56,7 +56,7 @@ class Rig(ABC):
         self.rules = rules or contract()
         self.role = self.rules.roles[role]
         self.settings = settings
-        self.log: dict[str, list[HeardMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}
+        self.log: dict[str, list[ReceivedMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}
         """All messages of the implementation, by topic."""
         self.undecodable: list[str] = []
         """Descriptions of payloads that could not be decoded."""
@@ -70,16 +70,16 @@ class Rig(ABC):
         """Allowance for transport and scheduling [ns]; 0 in simulated time."""
         return round(self.settings.slack_ms * MS) if self.live else 0
 
-    def run(self, seconds: float, feed: Feed) -> dict[str, list[HeardMessage]]:
+    def run(self, seconds: float, feed: Feed) -> dict[str, list[ReceivedMessage]]:
         """Advances by `seconds` while `feed` is sent; returns the messages received in this time, by topic."""
-        before = {name: len(heard) for name, heard in self.log.items()}
+        before = {name: len(received) for name, received in self.log.items()}
         self._advance(self.t + round(seconds * 1e9), feed)
-        return {name: heard[before[name] :] for name, heard in self.log.items()}
+        return {name: received[before[name] :] for name, received in self.log.items()}
 
     def last(self, topic: str) -> Any:
-        """The newest message of a topic, None before the first."""
-        heard = self.log[topic]
-        return heard[-1].message if heard else None
+        """Return the newest message of a topic, None before the first."""
+        received = self.log[topic]
+        return received[-1].message if received else None
 
     @abstractmethod
     def _advance(self, end: int, feed: Feed) -> None:
@@ -95,7 +95,7 @@ class Rig(ABC):
 
 
 class ServiceRig(Rig):
-    """A service of ours in this process: simulated time, exact."""
+    """A service in this process, in simulated time."""
 
     def __init__(self, service: Service, settings: RigSettings) -> None:
         super().__init__(service.role, settings)
@@ -114,7 +114,7 @@ class ServiceRig(Rig):
             self.t += MS
 
     def send(self, topic: str, message: Message) -> None:
-        """Delivers a message, by its bytes as the wire would."""
+        """Delivers a message as bytes, like the wire."""
         self._sequences[topic] += 1
         buffer = self._stepper.buffers[topic]
         buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic]))
@@ -126,4 +126,4 @@ class ServiceRig(Rig):
     def _take(self, sent: list[Sent]) -> None:
         for port, packet in sent:
             message = codec.decode(packet.payload, port.topic.type)
-            self.log[port.topic.name].append(HeardMessage(self.t, message, packet.sequence, self.t))
+            self.log[port.topic.name].append(ReceivedMessage(self.t, message, packet.sequence, self.t))

@@ -1,1 +1,1 @@
-"""Fuzzing of all that takes bytes or words from others."""
+"""Fuzzes everything that reads bytes or text from other processes and users."""

@@ -1,8 +1,8 @@
-"""Fuzzing of everything that takes bytes or words from others.
+"""Fuzzes everything that reads bytes or text from other processes and users.
 
-    palpate fuzz --inputs 1000000     mutations of valid inputs, shared out among the targets; same seed, same inputs
+    palpate fuzz --inputs 1000000     mutations of valid inputs, divided among the targets; equal seeds give equal inputs
 
-A find is printed with its input in hexadecimal and the exception; it belongs into a test, and then it is fixed.
+A find is printed with its input in hexadecimal and the exception. Write a test with it, then fix the cause.
 """
 
 from __future__ import annotations
@@ -16,9 +16,9 @@ from time import perf_counter, thread_time
 from palpate.fuzz.targets import FuzzTarget, bus_targets, scenario_targets
 
 SLOW_S = 1.0
-"""An input that takes more processor time [s] is a find too, since it would hold up a service."""
+"""Processor time above which an input is a find, since it would delay a service."""
 KEPT = 64
-"""How many inputs of a target are kept for splicing."""
+"""Inputs per target that are kept for splicing."""
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
 
 
@@ -33,7 +33,7 @@ class Find:
 
 @dataclass
 class FuzzCampaign:
-    """What a campaign did."""
+    """Results of a campaign."""
 
     seed: int
     inputs: dict[str, int] = field(default_factory=dict)
@@ -42,7 +42,7 @@ class FuzzCampaign:
 
 
 def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
-    """One to four random changes: bits, bytes, lengths at multiples of four, cuts, copies, and pieces of other inputs."""
+    """Return data with one to four random changes: bits, bytes, lengths, cuts, copies, and pieces of other inputs."""
     changed = bytearray(data)
     for _ in range(rng.randint(1, 4)):
         at = rng.randrange(len(changed) + 1)
@@ -69,7 +69,7 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
 
 
 def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | None:
-    """Runs one input."""
+    """Runs one input; returns a find or None."""
     begin = thread_time()
     try:
         target.check(data)
@@ -83,13 +83,13 @@ def campaign(
     chosen: Sequence[FuzzTarget],
     inputs: int,
     seed: int = 0,
-    tell: Callable[[int, int, str], None] = lambda *_: None,
+    progress: Callable[[int, int, str], None] = lambda *_: None,
     most: int = 100,
     slow_s: float = SLOW_S,
 ) -> FuzzCampaign:
-    """Runs `inputs` inputs, shared out among the targets. A target stops after `most` finds; one of each kind is kept.
+    """Runs `inputs` inputs, divided among the targets. A target stops after `most` finds; one of each kind is kept.
 
-    `tell` hears how many targets are done, how many there are, and what became of the last.
+    Calls `progress` after each target with the number of finished targets, the number of all, and the result as text.
     """
     done = FuzzCampaign(seed)
     begin = perf_counter()
@@ -102,7 +102,7 @@ def campaign(
         for number in range(share):
             data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
             if number % 997 == 0:
-                pool[rng.randrange(len(pool))] = data  # wander off, so that changes add up
+                pool[rng.randrange(len(pool))] = data  # so that changes accumulate
                 pool += target.seeds(rng)[: max(KEPT - len(pool), 0)]
             find = attempt(target, data, slow_s)
             if find is None:
@@ -114,18 +114,18 @@ def campaign(
                 break
         done.finds += mine
         done.inputs[target.name] = share
-        tell(index + 1, len(chosen), f"{target.name}: {share} inputs, {found} finds")
+        progress(index + 1, len(chosen), f"{target.name}: {share} inputs, {found} finds")
     done.seconds = perf_counter() - begin
     return done
 
 
 def all_targets() -> list[FuzzTarget]:
-    """The readers of the bus and of scenarios."""
+    """Return all targets: readers of the bus and of scenarios."""
     return [*bus_targets(), *scenario_targets()]
 
 
 def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
-    """The targets whose names match one of the patterns; all without any. Raises ValueError naming a pattern without a match."""
+    """Return the targets whose names match a pattern, all without patterns. Raises ValueError for one without a match."""
     known = all_targets()
     for pattern in patterns:
         if not any(fnmatch(target.name, pattern) for target in known):

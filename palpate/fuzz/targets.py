@@ -1,7 +1,7 @@
-"""What is fuzzed of the bus: everything that takes bytes or words from others, with what must hold for any of them.
+"""Targets of fuzzing: readers of messages, attachments, keys, tokens, options, scenarios and settings.
 
-A target is a callable on bytes. It returns quietly when the input was refused with the error that is documented, or accepted
-consistently; anything else that it raises is a find. `seeds()` gives valid inputs to start from.
+A target is a callable on bytes. It returns if the input was refused with the documented error, or accepted consistently; any
+exception is a find. `seeds()` returns valid inputs to start from.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scen
 
 @dataclass(frozen=True)
 class FuzzTarget:
-    """A function under test and valid inputs of it."""
+    """A function under test and its valid inputs."""
 
     name: str
     check: Callable[[bytes], None]
@@ -40,11 +40,11 @@ class FuzzTarget:
 
 
 class Broken(AssertionError):
-    """A property does not hold for an input that was accepted."""
+    """A property does not hold for an accepted input."""
 
 
 def bus_targets() -> list[FuzzTarget]:
-    """All targets of the bus."""
+    """Return the targets of the bus."""
     return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS]
 
 
@@ -62,16 +62,16 @@ def _codec_check(name: str) -> Callable[[bytes], None]:
     decode, encode = codec.decoder(name), codec.encoder(name)
 
     def check(data: bytes) -> None:
-        """Refused with CodecError, or its canonical bytes are a fixed point, and rosbags agrees on them."""
+        """Checks that data is refused with CodecError, or that its canonical bytes are a fixed point, also for rosbags."""
         try:
             message = decode(data)
         except codec.CodecError:
             return
         canonical = encode(message)
         if encode(decode(canonical)) != canonical:
-            raise Broken(f"{name}: encoding what was decoded changes it")
+            raise Broken(f"{name}: encoding the decoded message changes it")
         if bytes(codec.store.serialize_cdr(codec.store.deserialize_cdr(canonical, name), name)) != canonical:
-            raise Broken(f"{name}: rosbags has other bytes")
+            raise Broken(f"{name}: rosbags returns other bytes")
 
     return check
 
@@ -81,7 +81,7 @@ def _payloads(name: str, rng: random.Random) -> list[bytes]:
 
 
 def random_payload(name: str, rng: random.Random) -> bytes:
-    """A valid message of a type with random content, in CDR."""
+    """Return a valid message of a type with random content, in CDR."""
     return codec.encode(_message(name, rng), name)
 
 
@@ -127,7 +127,7 @@ def _attachment(data: bytes) -> None:
     except WireError:
         return
     if len(data) != ATTACHMENT_SIZE or AttachmentWriter(gid).pack(sequence, sent) != data:
-        raise Broken("attachment: packing what was unpacked changes it")
+        raise Broken("attachment: packing the unpacked values changes it")
 
 
 ATTACHMENT = FuzzTarget(
@@ -142,7 +142,7 @@ def _key(data: bytes) -> None:
     except WireError:
         return
     if parse_key(str(key)) != key:
-        raise Broken("key: parsing what was written changes it")
+        raise Broken("key: parsing the written text changes it")
 
 
 KEY = FuzzTarget("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
@@ -154,7 +154,7 @@ def _token(data: bytes) -> None:
     except WireError:
         return
     if parse_token(entity.token) != entity:
-        raise Broken("token: parsing what was written changes it")
+        raise Broken("token: parsing the written text changes it")
 
 
 _ENDPOINT = (
@@ -184,7 +184,7 @@ def _options(data: bytes) -> None:
     except BusConfigError:
         return
     if BusOptions.from_settings(Settings.read(options.to_env())) != options:
-        raise Broken("options: the environment that they make gives others")
+        raise Broken("options: their environment yields other options")
 
 
 OPTIONS = FuzzTarget(
@@ -203,7 +203,7 @@ def _texts(_: random.Random) -> list[bytes]:
 
 
 def _scenario(data: bytes) -> None:
-    """Refused with ScenarioError, or written and read again the same."""
+    """Checks that data is refused with ScenarioError, or that a scenario is equal after writing and reading it."""
     file = Path(_FOLDER.name) / "fuzz.yaml"
     file.write_bytes(data)
     try:
@@ -212,7 +212,7 @@ def _scenario(data: bytes) -> None:
         return
     file.write_text(dump_scenario(scenario), encoding="utf-8")
     if load_scenario(str(file)) != scenario:
-        raise AssertionError("scenario: reading what was written changes it")
+        raise AssertionError("scenario: reading the written file changes it")
 
 
 def _setting(data: bytes) -> None:
@@ -230,5 +230,5 @@ _SETTINGS = (
 
 
 def scenario_targets() -> list[FuzzTarget]:
-    """Scenario files, and `--set` words."""
+    """Return the targets for scenario files and `--set` options."""
     return [FuzzTarget("scenario", _scenario, _texts), FuzzTarget("setting", _setting, lambda _: _SETTINGS)]

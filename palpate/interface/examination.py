@@ -22,7 +22,7 @@ from palpate.interface.scenarios import scenario as scenario_of
 from palpate.report.archive import Evidence, read_evidence
 from palpate.report.page import FILE as PAGE
 from palpate.report.page import read_report
-from palpate.report.results import clean_words, in_words
+from palpate.report.results import clean_world_note, scores_text
 from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
@@ -113,7 +113,7 @@ class Examination:
         parts += [f"<p>the examination failed: {escape(report.failure)}</p>"] if report.failure else []
         parts += [findings_html(self.findings)] if report.assessed else ["<p>not assessed</p>"]
         if report.scores is not None:
-            parts.append(f"<p>against the truth{clean_words(report)}: {escape(in_words(report.scores))}</p>")
+            parts.append(f"<p>against the truth{clean_world_note(report)}: {escape(scores_text(report.scores))}</p>")
         if picture := self._file("map.png"):
             parts.append(html_of(picture.read_bytes(), "100%"))
         return "".join(parts)

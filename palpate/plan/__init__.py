@@ -1,1 +1,1 @@
-"""`palpate plan`: what an examination is going to do, before it does it."""
+"""`palpate plan`: draws the plan of an examination."""

@@ -19,15 +19,15 @@ def plan(
     seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
     settings: Settings = None,
 ) -> None:
-    """Draw what an examination will do: its targets, their order, the time, and what is out of reach.
+    """Draw the plan of an examination: its targets, their order, the duration, and targets out of reach.
 
-    The plan is that of the examination, but on the patient's true surface, which a camera sees with an error of some millimetres.
+    It is planned as in the examination, but on the patient's true surface; a camera has an error of some millimetres.
 
     [bold]Examples[/]
 
       palpate plan                                        the default examination
 
-      palpate plan --set exam.pattern=spiral.py           a scan pattern of your own
+      palpate plan --set exam.pattern=spiral.py           a custom scan pattern
 
       palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
     """

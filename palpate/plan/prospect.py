@@ -1,4 +1,4 @@
-"""What the planner plans for an examination on the true surface: strokes, what is out of reach, how long it takes."""
+"""The plan of an examination on the true surface: strokes, touches, skipped targets, duration."""
 
 from __future__ import annotations
 
@@ -18,13 +18,12 @@ from palpate_models.robot.lbr import HOME
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import Scan
 from palpate_models.scenario.schema import Exam, Mode, Scenario
-from palpate_planning.motion.planner import NoPathError
 from palpate_planning.reasons import Cause
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 from palpate_planning.wall.surface import PerceivedSurface
 
 PERIOD_S = 0.010
-"""Of the planner's trajectories."""
+"""Time step of the planner's trajectories."""
 
 
 @dataclass(frozen=True)
@@ -33,22 +32,22 @@ class Prospect:
 
     scan: Scan
     strokes: tuple[Array, ...]
-    """Where the indenter slides at depth or presses, xy in A [m], each (n, 2), in order."""
+    """Paths of the indenter at depth, xy in A [m], shape (n, 2) each, in order."""
     touches: Array
-    """Where the skin is touched before the scan, shape (k, 2)."""
+    """Places of the touches before the scan, xy in A [m], shape (k, 2)."""
     skipped: dict[int, Cause]
-    """Targets that are left out, and why."""
+    """Reason for each skipped target."""
     duration_s: float
-    """About how long it takes, in simulated time."""
+    """Estimated duration in simulated time."""
 
     @property
     def length_m(self) -> float:
-        """Way in contact [m]."""
+        """Path length in contact."""
         return float(sum(np.linalg.norm(np.diff(stroke, axis=0), axis=1).sum() for stroke in self.strokes))
 
 
 def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
-    """Plans on the true rest surface, as registered. Raises PluginError, and NoPathError when no target is in reach."""
+    """Return the plan on the true rest surface, as registered. Raises PluginError, and NoPathError if no target is in reach."""
     scan = scan_over(scenario, phantom)
     known = exam_input(scenario)
     X_WA = np.array(known.X_WA)
@@ -67,7 +66,7 @@ def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
 
 
 def summary(exam: Exam, planned: Prospect) -> str:
-    """The plan as one line: how many targets or presses, how many touches, and how long it takes."""
+    """Return the numbers of targets or presses, lines, strokes and touches, and the duration, as a line."""
     targets, touches = len(planned.scan.targets), _counted(len(planned.touches), "touch", "touches")
     if exam.searched:
         return (
@@ -77,7 +76,7 @@ def summary(exam: Exam, planned: Prospect) -> str:
     lines, strokes = _counted(len(planned.scan.lines), "line"), _counted(len(planned.strokes), "stroke")
     slides = f"{planned.length_m:.2f} m of sliding" if exam.mode is Mode.CONTINUOUS else "pressed one by one"
     return (
-        f"{targets} targets in {lines}, felt in {strokes}; {slides}, {touches} before; "
+        f"{targets} targets in {lines}, palpated in {strokes}; {slides}, {touches} before; "
         f"about {planned.duration_s:.0f} s of simulated time"
     )
 
@@ -86,15 +85,12 @@ def _counted(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
-__all__ = ["NoPathError", "Prospect", "prospect", "summary"]
-
-
 MM = 1e3
 CONTOURS = "#c9d1d4"
 
 
 def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospect) -> None:
-    """Writes the picture: the body from above, its head at the top, its left to the right. Raises OSError."""
+    """Draws the plan on the body, seen from the front with the head at the top, into a PNG file. Raises OSError."""
     figure = Figure(figsize=(8.5, 8.0), dpi=110, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
     front = phantom.normals[:, 2] > 0.1

@@ -1,1 +1,1 @@
-"""What a run leaves: scores, report, map, page."""
+"""Results of a run: scores, report, map, page."""

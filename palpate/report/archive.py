@@ -1,8 +1,8 @@
-"""A run as its results folder keeps it.
+"""Reads and writes a run's messages in its results folder.
 
-evidence.mcap has the messages that the conductor collected, as any recording has them, and as an attachment what is known of the
-truth. A report is made from it, with or without a recording of the whole run. A run that was killed has no evidence.mcap: then
-the same messages are read from its recording.
+evidence.mcap has the messages that the conductor collected and, as an attachment, the truth of a simulated run. The report is
+built from it, with or without a recording of the whole run. A run that was killed has no evidence.mcap; then the same messages
+are read from its recording.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from palpate_recorder.recover import salvage
 
 FILE: Final = "evidence.mcap"
 _TRUTH: Final = "truth.npz"
-"""Attachment: name of the run, where the tool touched the skin, forces of the pressed copy of the patient."""
+"""Attachment: name of the run, touched places, forces of the pressed copy of the patient."""
 _TOPICS: Final = {
     "exam_states": "exam/state",
     "indentation": "truth/indentation",
@@ -128,7 +128,7 @@ class Evidence:
     phantom: Any | None
     targets: Any | None
     touched: Touched
-    """Where the tool was believed to touch the skin, and where it did."""
+    """Estimated and true places on the skin under the indenter."""
     pressed: Pressed | None
     """Forces of a pressed copy of the patient; None if none can be made."""
     run: str = ""
@@ -143,7 +143,7 @@ class Evidence:
 def write_evidence(
     path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
 ) -> None:
-    """Writes the messages that were collected of the run called `run`, complete or not, and what is known of its truth."""
+    """Writes the collected messages of the run named `run`, complete or not, and its truth if known."""
     known: dict[str, Any] = {"run": np.array(run)}
     if touched is not None:
         known |= {"touched_believed": touched.believed, "touched_true": touched.true}
@@ -156,7 +156,7 @@ def write_evidence(
 
 
 def _messages(c: Collected) -> Iterator[RecordedMessage]:
-    """Yields everything that was collected, topic by topic."""
+    """Yield all collected messages, topic by topic."""
     for field, topic in _TOPICS.items():
         encode = codec.encoder(contract().topics[topic].type)
         kept = getattr(c, field)
@@ -171,7 +171,7 @@ _SEQUENCES: Final = ("exam_states", "indentation", "motions", "samples", "status
 
 
 def _collected(evidence: Recording) -> Collected:
-    """Return what `_messages` wrote."""
+    """Return the messages that `_messages` wrote."""
     evidence.check(contract(), list(evidence.types))
     fields = {topic: field for field, topic in _TOPICS.items()}
     kept: dict[str, Any] = {field: [] for field in _SEQUENCES}
@@ -186,7 +186,7 @@ def _collected(evidence: Recording) -> Collected:
 
 
 def collect(recording: Recording) -> Collected:
-    """Return what the conductor would have collected, or has. Raises RecordingError."""
+    """Return the messages of a recording that a conductor collects. Raises RecordingError."""
     collector = Collector()
     end = tick_after(recording.last, collector.role)
     for _ in rerun(collector, contract(), inputs(recording, collector.role), end):
@@ -201,7 +201,7 @@ def tick_after(t: int, role: str) -> int:
 
 
 def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
-    """Yields the recorded inputs of a role, in order. Raises RecordingError."""
+    """Return the recorded inputs of a role, in order. Raises RecordingError."""
     rules = contract()
     topics = [topic.name for topic, _ in rules.inputs(role) if topic.name in recording.types]
     recording.check(rules, topics)
@@ -234,7 +234,7 @@ def read_evidence(folder: Path) -> Evidence:
 
 
 def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: str) -> Evidence:
-    """Return the columns of what was collected of the run called `run`."""
+    """Return the collected messages of the run named `run` as columns."""
     states = _columns(c.exam_states)
     contacts = columns_of(((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in c.indentation), _CONTACT)
     known, uncertainty = _depth_known(c, states)
@@ -333,7 +333,7 @@ def completed(folder: Path) -> dict[str, Any] | None:
 
 @dataclass(frozen=True)
 class InterruptedRun:
-    """A run without results, or with those of a failure, as its recorder or its conductor left it."""
+    """A run without results or with those of a failure."""
 
     folder: Path
     scenario: Scenario
@@ -344,11 +344,11 @@ class InterruptedRun:
 def interrupted_run(folder: Path) -> InterruptedRun:
     """Reads the folder of a run.
 
-    Raises EvidenceError if the run is still on or its files cannot be read, NothingRecordedError if it has no recording.
+    Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
     """
     try:
         if in_use(folder) or any(Path(run.out).resolve() == folder.resolve() for run in live()):
-            raise EvidenceError(f"{folder}: its run is still on; stop that first")
+            raise EvidenceError(f"{folder}: its run is still active; stop it first")
     except OSError as error:
         raise EvidenceError(f"{folder}: cannot be read: {error}") from error
     try:
@@ -361,7 +361,7 @@ def interrupted_run(folder: Path) -> InterruptedRun:
 
 
 def _recording(run: Path) -> Recording:
-    """Return the recording of a run, as far as it was written, or else its evidence."""
+    """Return the recording of a run, which may be incomplete, or else its evidence."""
     folder = run / RECORDING
     parts = sorted(folder.glob("*.mcap"))
     if not parts:

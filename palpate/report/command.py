@@ -42,9 +42,7 @@ def write_pdf(page: Path) -> Path:
 def report(
     folder: Annotated[Path, typer.Argument(metavar="DIR", help="Results folder of a run.")],
     pdf: Annotated[bool, typer.Option("--pdf", help="Also write report.pdf; needs Chromium.")] = False,
-    recover: Annotated[
-        bool, typer.Option("--recover", help="Make the results of a run that was killed, from its recording.")
-    ] = False,
+    recover: Annotated[bool, typer.Option("--recover", help="Make the results of a killed run from its recording.")] = False,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print only errors.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
@@ -57,7 +55,7 @@ def report(
         if recover:
             scenario, result = recovered(folder)
             shown = Console(stderr=as_json)
-            print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # at once: the truth takes longer
+            print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # first, since the truth takes longer
             print_scores(shown, write_results(folder, scenario, result))
         from palpate.report.page import write_page
 

@@ -26,12 +26,12 @@ from palpate_models.scenario.schema import Scenario
 
 Mask = NDArray[np.bool_]
 xyz: Final = attrgetter("x", "y", "z")
-"""Of a point or vector of a message."""
+"""Coordinates of a point or vector of a message."""
 
 
 @dataclass(frozen=True)
 class Samples:
-    """The samples of a run, in A; m of them."""
+    """The m samples of a run, in A."""
 
     time: Array
     """[s], shape (m,)."""
@@ -48,7 +48,7 @@ class Samples:
     time_in_contact: Array
     """[s]"""
     depth_uncertainty: Array
-    """One sigma of the depth, as the examination tells it [m]."""
+    """Reported SD of the depth [m]."""
     stroke: Array
     """Number of the descent."""
     force_limited: Mask
@@ -56,10 +56,10 @@ class Samples:
 
 @dataclass(frozen=True)
 class ContactRecord:
-    """Measured and true contact at equal stamps while the examination says it is steady; m instants."""
+    """Measured and true contact at m equal stamps while the contact is reported steady."""
 
     measured: Array
-    """Depth as the examination measures it [m]."""
+    """Measured depth [m]."""
     true: Array
     """True depth [m]."""
     wanted: Array
@@ -69,10 +69,10 @@ class ContactRecord:
     touched: Touched
     """Rest surface points under the indenter."""
     limited: Mask
-    """Depth yields to the force limit."""
+    """True where depth yields to the force limit."""
 
     def then(self, later: ContactRecord) -> ContactRecord:
-        """The record, and after it that of an examination that went on with this one."""
+        """Return this record followed by that of the examination that continued this one."""
         both = {
             name: np.concatenate((getattr(self, name), getattr(later, name)))
             for name in ("measured", "true", "wanted", "force", "limited")
@@ -82,30 +82,30 @@ class ContactRecord:
 
 
 def columns_of(rows: Iterable[tuple[Any, ...]], kinds: np.dtype[Any]) -> dict[str, NDArray[Any]]:
-    """An array for each field of `kinds`. The rows are never in memory all at once."""
+    """Return an array for each field of `kinds`, without holding all rows in memory."""
     table = np.fromiter(rows, kinds)
     return {name: np.ascontiguousarray(table[name]) for name in kinds.names or ()}
 
 
 def points(message: Any, field: str = "vertices") -> Array:
-    """A flat array of a message as points, shape (n, 3)."""
+    """Return a flat array of a message as points, shape (n, 3)."""
     return np.asarray(getattr(message, field), dtype=np.float64).reshape(-1, 3)
 
 
 def body_of(message: Any) -> TrueBody:
-    """`palpation_msgs/PhantomTruth`."""
+    """Return the body of a `palpation_msgs/PhantomTruth`."""
     triangles = np.asarray(message.surface.triangles, dtype=np.int32).reshape(-1, 3)
     return TrueBody(points(message.surface), triangles, pose_matrix(message.pose))
 
 
 def felt_truth(scenario: Scenario, body: TrueBody, pressed: Pressed, touched: Touched) -> Truth:
-    """What is true of a run whose patient was pressed."""
+    """Return the truth of a run whose patient was pressed."""
     felt = Felt(pressed, TrueSurface(body), scenario.exam)
     return Truth(body, felt, touched, np.array(exam_input(scenario).X_WA))
 
 
 def map_of(message: Any) -> Map:
-    """`palpation_msgs/StiffnessMap`: where it says that it does not know, nothing counts as scanned."""
+    """Return the map of a `palpation_msgs/StiffnessMap`; unassessed places do not count as scanned."""
     return Map(
         vertices=points(message),
         apparent=np.asarray(message.apparent, dtype=np.float64),
@@ -117,7 +117,7 @@ def map_of(message: Any) -> Map:
 
 
 def unassessed_of(message: Any) -> dict[str, float]:
-    """Area of the map of which nothing is said although the arm was there, by reason [m^2]; only reasons that there are."""
+    """Return the scanned but unassessed area of the map by reason [m^2], without reasons that do not occur."""
     p, triangles = points(message), np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
     a, b, c = (p[triangles[:, k]] for k in range(3))
     third = np.linalg.norm(np.cross(b - a, c - a), axis=1) / 6
@@ -128,7 +128,7 @@ def unassessed_of(message: Any) -> dict[str, float]:
 
 
 def found_of(areas: Sequence[Any]) -> list[Found]:
-    """Findings or candidates, each a `palpation_msgs/Finding`."""
+    """Return findings or candidates from their `palpation_msgs/Finding`."""
     return [
         Found(np.array((f.centroid.x, f.centroid.y, f.centroid.z)), f.area, f.ratio, (f.ratio_lower, f.ratio_upper))
         for f in areas
@@ -136,7 +136,7 @@ def found_of(areas: Sequence[Any]) -> list[Found]:
 
 
 def samples_of(messages: list[Any]) -> Samples:
-    """`palpation_msgs/PalpationSample`, in order."""
+    """Return the samples of a list of `palpation_msgs/PalpationSample`."""
 
     def column(values: list[Any], width: int = 0) -> Array:
         return np.array(values, dtype=np.float64).reshape((-1, width) if width else -1)
@@ -156,33 +156,40 @@ def samples_of(messages: list[Any]) -> Samples:
 
 
 def peak_force(message: Any) -> float:
-    """Greatest contact force [N] since the `palpation_msgs/IndentationTruth` before, at least that of its own moment."""
+    """Return the greatest contact force [N] since the previous `palpation_msgs/IndentationTruth`, including its current one."""
     return max(float(message.peak_force), hypot(message.normal_force, message.tangential_force))
 
 
 def steady_contact(
     exam_states: Iterable[Any], indentation: Iterable[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
 ) -> ContactRecord:
-    """Exam states that count, with the true contact at the same stamp, in order of time; of messages with one stamp the first.
+    """Return the steady exam states with the true contact at the same stamp, in order of time.
 
-    Poses of A in world: the true one at first, how the body moves from there, and the registered one.
+    Args:
+        exam_states: `exam/state`; of several with one stamp the first counts.
+        indentation: `truth/indentation`.
+        X_WA: true pose of A in world at the start.
+        motion: motion of the body from there.
+        registered_X_WA: registered pose of A in world.
     """
 
     def shared(m: Any) -> tuple[Any, ...]:
         return nanoseconds(m.header.stamp), m.depth, xyz(m.surface_point)
 
-    told = columns_of(((*shared(s), s.depth_setpoint, s.normal_force, s.force_limited) for s in exam_states if s.steady), _STEADY)
+    reported = columns_of(
+        ((*shared(s), s.depth_setpoint, s.normal_force, s.force_limited) for s in exam_states if s.steady), _STEADY
+    )
     true = columns_of(map(shared, indentation), _SHARED)
-    stamps, at, truly = np.intersect1d(told["stamp"], true["stamp"], return_indices=True)
-    believed = apply(inverse(registered_X_WA), told["place"][at])
+    stamps, at, truly = np.intersect1d(reported["stamp"], true["stamp"], return_indices=True)
+    believed = apply(inverse(registered_X_WA), reported["place"][at])
     touched = motion.on_body(stamps / NS, apply(inverse(X_WA), true["place"][truly]))
     return ContactRecord(
-        measured=told["depth"][at],
+        measured=reported["depth"][at],
         true=true["depth"][truly],
-        wanted=told["wanted"][at],
-        force=told["force"][at],
+        wanted=reported["wanted"][at],
+        force=reported["force"][at],
         touched=Touched(believed, touched),
-        limited=told["limited"][at],
+        limited=reported["limited"][at],
     )
 
 

@@ -1,6 +1,6 @@
-"""map.png: what the examination felt and what it concludes, next to the truth (figures 7 and 8 of the paper).
+"""map.png: measured force, estimated stiffness and the truth (figures 7 and 8 of the paper).
 
-Seen from the front, the patient's head up: the patient's right is on the viewer's left, as in every clinical drawing.
+The view is from the front with the patient's head up: the patient's right is on the viewer's left, as in clinical drawings.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ _LOG_TICKS = [m * 10.0**e for e in range(-1, 3) for m in (1, 1.5, 2, 3, 4, 5, 7)
 
 
 def drawable(message: Any) -> bool:
-    """Whether a `palpation_msgs/StiffnessMap` has a scanned triangle."""
+    """Return True if a `palpation_msgs/StiffnessMap` has a scanned triangle."""
     triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
     return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
 
@@ -43,15 +43,15 @@ class MapQuantity(NamedTuple):
     """A quantity over the map."""
 
     values: Array
-    """At the nodes, shape (n,); NaN where it is not known."""
+    """At the nodes, shape (n,); NaN where unknown."""
     cmap: str
     norm: Normalize
     label: str
-    """Of its colour bar."""
+    """Label of its colour bar."""
 
 
 class Drawing:
-    """One map on its axes: triangulations of the scanned part, in millimetres."""
+    """Draws one map on axes, with triangulations of the scanned part in millimetres."""
 
     def __init__(self, message: Any, findings: Any | None, truth: Truth | None) -> None:
         self.map: Map = map_of(message)
@@ -65,7 +65,7 @@ class Drawing:
         self.xyz, self.triangles = xyz, triangles
         self.tri = Triangulation(xyz[:, 0], xyz[:, 1], triangles)
         self.true: Array | None = None
-        """Apparent stiffness where the tool truly touched [N], shape (n,)."""
+        """True apparent stiffness at the touched places [N], shape (n,)."""
         self.lump: Array | None = None
         """1 in the areas of lumps, shape (n,)."""
         if truth is not None:
@@ -75,7 +75,7 @@ class Drawing:
 
     @property
     def apparent_norm(self) -> LogNorm:
-        """One colour scale [N] for the estimate and the truth."""
+        """Common colour scale of estimate and truth [N]."""
         shown = [self.map.apparent[self.map.scanned]]
         if self.true is not None:
             shown.append(self.true[self.map.scanned & np.isfinite(self.true)])
@@ -90,26 +90,26 @@ class Drawing:
 
     @property
     def spread_layer(self) -> MapQuantity:
-        """Half width of the 90 % band of the apparent stiffness, over its middle."""
+        """Half width of the 90 % band of the apparent stiffness, relative to its middle."""
         half = 100 * half_width(self.map.lower, self.map.upper)
         norm = Normalize(0.0, float(np.quantile(half[self.map.scanned], 0.995)))
         return MapQuantity(half, UNCERTAINTY_COLOURS, norm, "± [%]")
 
     def stiffness_layer(self, values: Array) -> MapQuantity:
-        """Apparent stiffness [N], estimated or true."""
+        """Return the layer of the apparent stiffness [N], estimated or true."""
         return MapQuantity(values, STIFFNESS_COLOURS, self.apparent_norm, "[N]")
 
     def panel(
-        self, axes: Axes, layer: MapQuantity, letter: str, words: str, small: str, *, truth: bool = False, labels: bool = False
+        self, axes: Axes, layer: MapQuantity, letter: str, title: str, small: str, *, truth: bool = False, labels: bool = False
     ) -> None:
-        """A quantity seen from the front, with the outlines of findings, a heading and a colour bar."""
+        """Draws a quantity seen from the front, with the outlines of findings, a title and a colour bar."""
         image = self.plane(axes, layer)
         self.outlines(axes, truth, labels)
-        panel_title(axes, letter, words, small)
+        panel_title(axes, letter, title, small)
         colour_bar(image, axes, layer.label)
 
     def plane(self, axes: Axes, layer: MapQuantity) -> ScalarMappable:
-        """A quantity seen from the front, with quadrants, where it is known."""
+        """Draws a quantity, where known, seen from the front, with quadrants."""
         values, cmap, norm, _ = layer
         known = np.isfinite(values)[self.triangles].all(axis=1)
         tri = Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles[known])
@@ -136,7 +136,7 @@ class Drawing:
         return image
 
     def rounded(self, member: Array) -> Array:
-        """Membership averaged over neighbours, so that its half level is an outline and not a staircase."""
+        """Return membership averaged over neighbours, so that its half level is a smooth outline."""
         edges = np.concatenate((self.triangles[:, [0, 1]], self.triangles[:, [1, 2]], self.triangles[:, [2, 0]]))
         for _ in range(3):
             total, count = 2.0 * member, np.full(len(member), 2.0)
@@ -147,7 +147,7 @@ class Drawing:
         return member
 
     def outlines(self, axes: Axes, truth: bool, labels: bool = False) -> None:
-        """Findings, and the areas of true lumps when asked for and known."""
+        """Draws the outlines of findings and, with `truth`, of true lumps if known."""
         for i, f in enumerate(self.findings):
             member = (self.map.finding == i).astype(float)
             if not member.any():
@@ -157,9 +157,8 @@ class Drawing:
             x, y = f.centroid.x * 1e3, f.centroid.y * 1e3
             axes.plot(x, y, "+", color=_FINDING, ms=9, mew=2, path_effects=[withStroke(linewidth=3.6, foreground=INK)])
             if labels:
-                words = f"{f.ratio:.1f} ×\n{f.area * 1e4:.0f} cm²"
                 axes.annotate(
-                    words,
+                    f"{f.ratio:.1f} ×\n{f.area * 1e4:.0f} cm²",
                     (x, y),
                     xytext=(0, 12),
                     textcoords="offset points",
@@ -176,7 +175,7 @@ class Drawing:
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
     def space(self, axes: Any, height: Array, layer: MapQuantity, label: str) -> None:
-        """The map as a surface in space: `height` above the xy plane, coloured by a quantity."""
+        """Draws the map as a surface in space: `height` above the xy plane, coloured by a quantity."""
         z = height.copy()
         surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)
         surface.set_cmap(layer.cmap)
@@ -199,9 +198,9 @@ class Drawing:
 def draw_map(
     path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str, run: str = ""
 ) -> None:
-    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A) with the truth, where known, into a PNG file.
+    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
 
-    The file's metadata name the run. Nothing is drawn of a map that is not `drawable`.
+    The file's metadata has the name of the run. Writes nothing for a map that is not `drawable`.
     """
     if not drawable(message):
         return
@@ -241,20 +240,20 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:
         true.set_axis_off()
-        true.text(0.5, 0.5, "truth not known", ha="center", va="center", color=QUIET, fontsize=13)
+        true.text(0.5, 0.5, "truth unknown", ha="center", va="center", color=QUIET, fontsize=13)
         return
     drawing.panel(true, drawing.stiffness_layer(drawing.true), "f", "Apparent stiffness, true", WHERE_FELT, truth=True)
 
 
-def panel_title(axes: Any, letter: str, words: str, small: str) -> None:
-    """The heading of a panel: what it shows, and under it in small what to know of it."""
-    axes.set_title(f"({letter}) {words}\n", fontsize=12, weight="bold", color=INK, loc="left")
+def panel_title(axes: Any, letter: str, title: str, small: str) -> None:
+    """Writes the title of a panel with a note in small letters below it."""
+    axes.set_title(f"({letter}) {title}\n", fontsize=12, weight="bold", color=INK, loc="left")
     place = axes.text2D if hasattr(axes, "text2D") else axes.text
     place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=QUIET)
 
 
 def colour_bar(image: ScalarMappable, axes: Axes, label: str) -> None:
-    """A colour bar beside `axes`; on a logarithmic scale with round numbers."""
+    """Draws a colour bar next to `axes`, with round numbers on a logarithmic scale."""
     figure = axes.get_figure()
     assert figure is not None
     bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)

@@ -1,4 +1,4 @@
-"""Files that others read: written whole or not at all."""
+"""Atomic writes of files that other programs read, and of marked parts of pages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import typer
 
 @contextmanager
 def drafted(path: Path) -> Iterator[Path]:
-    """Where to write what takes the place of `path` in the end: readers have the old file or the new one, also after a kill."""
+    """Yields the path of a draft that replaces `path` at the end: readers see the old file or the new one, even after a kill."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield draft
@@ -23,24 +23,26 @@ def drafted(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file whole. Raises OSError."""
+    """Writes a text file atomically. Raises OSError."""
     with drafted(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 
 def docs_option(name: str) -> Any:
-    """The option `--docs` of a command; its file is looked at before anything is measured."""
+    """Return the option `--docs` of a command, whose file is checked before anything is measured."""
 
     def check(path: Path | None) -> Path | None:
         if path is not None:
             _around(path, name)
         return path
 
-    return typer.Option(help="Page in which the marked part is replaced; all rows go to a CSV file beside it.", callback=check)
+    return typer.Option(
+        help="Page in which to replace the marked part; all rows go to a CSV file in the same folder.", callback=check
+    )
 
 
 def write_part(path: Path, name: str, text: str) -> None:
-    """Replaces the part `name` of a document. Raises typer.BadParameter where it has none or cannot be written."""
+    """Replaces the part `name` of a page. Raises typer.BadParameter if the page has none or cannot be written."""
     before, after = _around(path, name)
     try:
         write_text(path, f"{before}{text}{after}")
@@ -56,5 +58,5 @@ def _around(path: Path, name: str) -> tuple[str, str]:
         raise typer.BadParameter(f"{path}: {error}") from None
     _, last, after = rest.partition(end)
     if not (first and last):
-        raise typer.BadParameter(f"{path} has no part to replace: it wants the lines {begin.strip()} and {end.strip()}")
+        raise typer.BadParameter(f"{path} has no part to replace: it needs the lines {begin.strip()} and {end.strip()}")
     return before + begin, end + after

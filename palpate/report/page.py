@@ -1,6 +1,6 @@
-"""report.html: one self-contained page for a clinician or an engineer. Made from a run's folder.
+"""report.html: one self-contained page for a clinician or an engineer, built from a run's folder.
 
-What the examination found stands first; what the simulation knows of the truth stands apart, at the end.
+The findings come first; the comparison with the truth is a section at the end.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from palpate.report.archive import FILE as EVIDENCE
 from palpate.report.archive import Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
 from palpate.report.files import write_text
-from palpate.report.results import clean_words, unassessed
+from palpate.report.results import clean_world_note, unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
 from palpate_models.numerics.frames import Array, apply, inverse
@@ -39,26 +39,28 @@ QUADRANTS: Final = {
 
 
 def read_report(folder: Path) -> Report:
-    """report.json of the run in `folder`. Raises EvidenceError that says what is wrong with it."""
+    """Return report.json of the run in `folder`. Raises EvidenceError that names file and fault."""
     path = folder / "report.json"
     try:
         return Report.model_validate_json(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise EvidenceError(
-            f"{path} is not there: give the results folder of a run; where the run broke off without a report, add --recover"
+            f"{path} is not there: give the results folder of a run; for an interrupted run without a report, add --recover"
         ) from error
     except (OSError, UnicodeDecodeError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
-        raise EvidenceError(f"{path} is no report of this version: {'; '.join(wrong)}") from error
+        raise EvidenceError(f"{path} is not a report of this version: {'; '.join(wrong)}") from error
 
 
 def write_page(folder: Path) -> Path:
     """Writes report.html into the results folder of a run; returns its path. Raises EvidenceError."""
     report, evidence = read_report(folder), read_evidence(folder)
     if report.run != evidence.run:
-        raise EvidenceError(f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of {evidence.run}: these are two runs")
+        raise EvidenceError(
+            f"{folder}: report.json is of the run {report.run}, {EVIDENCE} of the run {evidence.run}; want files of one run"
+        )
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
     except ScenarioError as error:
@@ -69,7 +71,7 @@ def write_page(folder: Path) -> Path:
 
 
 def sample_places(folder: Path) -> Array:
-    """Where samples were taken, xy of A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
+    """Return the xy positions of the samples in A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
     path = folder / "samples.csv"
     try:
         _, *rows = path.read_text(encoding="utf-8").splitlines()
@@ -79,7 +81,7 @@ def sample_places(folder: Path) -> Array:
 
 
 def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: Array) -> str:
-    """The page as HTML."""
+    """Return the page as HTML."""
     environment = Environment(loader=PackageLoader("palpate.report"), autoescape=True, undefined=StrictUndefined)
     environment.filters["mm"] = lambda metres, digits=0: f"{1e3 * metres:.{digits}f} mm"
     environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
@@ -105,20 +107,20 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         record=_image(page_figures.record(evidence, scenario.limits.force_working_n)),
         force_depth=_image(page_figures.force_depth(evidence)),
         truth=_image(page_figures.truth(evidence, known_truth(scenario, evidence))),
-        of_clean_world=clean_words(report),
+        of_clean_world=clean_world_note(report),
         version=version("palpate"),
     )
 
 
 def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
-    """What can truly be felt of the patient of a run; None where that is not known."""
+    """Return the truth of a run; None if unknown."""
     if evidence.phantom is None or evidence.pressed is None:
         return None
     return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
 
 
 def verdict(report: Report) -> str:
-    """The result in a sentence."""
+    """Return the result as a sentence."""
     if report.failure:
         return f"The examination did not complete: {report.failure}."
     if not report.assessed:
@@ -126,11 +128,11 @@ def verdict(report: Report) -> str:
     muscles = rows.tensed(report.candidates)
     if not report.findings:
         return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
-    return f"{unassessed(report)}{' '.join(map(_in_words, report.findings))} {muscles}".rstrip()
+    return f"{unassessed(report)}{' '.join(map(_finding_text, report.findings))} {muscles}".rstrip()
 
 
 def _reached(report: Report, evidence: Evidence) -> int:
-    """How many targets the indenter came to."""
+    """Return the number of targets that the indenter reached."""
     if not report.failure:
         return evidence.target_count - report.skipped_targets
     return int(evidence.visited[-1]) if evidence.visited.size else 0
@@ -138,10 +140,10 @@ def _reached(report: Report, evidence: Evidence) -> int:
 
 def _unreached(report: Report) -> str:
     n = report.skipped_targets
-    return f"; {n} target{'s were' if n > 1 else ' was'} skipped, and nothing is known of what lies there" if n else ""
+    return f"; {n} target{'s were' if n > 1 else ' was'} skipped, and the tissue there was not examined" if n else ""
 
 
-def _in_words(f: FindingRow) -> str:
+def _finding_text(f: FindingRow) -> str:
     low, high = f.ratio_90
     where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
     return (
@@ -151,12 +153,12 @@ def _in_words(f: FindingRow) -> str:
 
 
 def _image(png: bytes | None) -> str | None:
-    """A PNG as a data URL."""
+    """Return a PNG as a data URL."""
     return None if png is None else "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
 def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dict[str, Any]]:
-    """The targets that were given up: number, reason, and where they are in A, if it is known."""
+    """Return the skipped targets: number, reason, and position in A if known."""
     reasons = report.services.get("planning", {}).get("facts", {}).get("skipped_targets", {})
     X_AW = inverse(np.array(exam_input(scenario).X_WA))
     known = [] if evidence.targets is None else evidence.targets.positions
@@ -173,7 +175,7 @@ def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dic
 
 
 def _safety(report: Report, evidence: Evidence) -> list[tuple[float, str, str]]:
-    """Time [s], source and words of what a safety review wants to see: changes of the driver, losses, rejected commands."""
+    """Return time [s], source and text of events for a safety review: changes of the driver and lost services."""
     rows = [(event.time_s, event.source, event.text) for event in evidence.events if event.source == "driver"]
-    rows += [(t, role, "lost: it fell silent") for role, t in report.lost.items()]
+    rows += [(t, role, "lost: it stopped sending") for role, t in report.lost.items()]
     return sorted(rows)

@@ -1,4 +1,4 @@
-"""The still figures of report.html, each as the bytes of a PNG. The truth is drawn by `truth` alone."""
+"""The figures of report.html: PNG images, and the data of its three-dimensional viewer. Only `truth` draws the truth."""
 
 from __future__ import annotations
 
@@ -50,9 +50,9 @@ _PHASE_TINTS: Final = {
     ExamState.PHASE_ABORTED: ("aborted", "#fecaca"),
 }
 _FREE_MM: Final = -20.0
-"""Depth is not drawn where the tool is farther than this from the surface."""
+"""Depth below which the tool is clear of the surface; not drawn."""
 _SHOWN_MM: Final = -5.0
-"""Figures of the contact begin at this depth."""
+"""Least depth in figures of the contact."""
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -68,7 +68,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
-    """Labels and a light grid."""
+    """Draws labels and a light grid."""
     axes.set_ylabel(ylabel, color=INK, fontsize=9)
     axes.set_xlabel(xlabel, color=INK, fontsize=9)
     axes.tick_params(labelsize=8.5, colors=INK)
@@ -79,9 +79,9 @@ def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
 
 
 def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | None:
-    """Force, stiffness and uncertainty from the front; `samples_xy`, `skipped_xy`: where was pressed and where not, in A [m].
+    """Return force, stiffness and uncertainty seen from the front, with samples and skipped targets in A [m].
 
-    None when there is no map.
+    None if there is no map.
     """
     message = evidence.stiffness_map
     if message is None or not drawable(message):
@@ -94,21 +94,21 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
     small = f"{len(samples_xy)} samples (dots){skipped}"
     drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", small)
-    words, small = "Apparent stiffness", "times the background; findings outlined"
-    drawing.panel(middle, _ratio_layer(drawing), "b", words, small, labels=True)
+    small = "times the background; findings outlined"
+    drawing.panel(middle, _ratio_layer(drawing), "b", "Apparent stiffness", small, labels=True)
     drawing.panel(right, drawing.spread_layer, "c", "Uncertainty", "half width of the 90 % band of the apparent stiffness")
     return _png(figure)
 
 
 def _ratio_layer(drawing: Drawing) -> MapQuantity:
-    """Apparent stiffness over that of the background."""
+    """Return the layer of apparent stiffness relative to the background."""
     ratio = drawing.map.apparent / drawing.background
     low, high = np.quantile(ratio[drawing.map.scanned], (0.002, 0.998))
     return MapQuantity(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
 
 
 def record(evidence: Evidence, limit_n: float) -> bytes | None:
-    """Force and depth over simulated time, with the phases behind them; None when nothing happened."""
+    """Return force and depth over simulated time with the phases in the background; None without exam states."""
     if not len(evidence.time):
         return None
     figure = _figure(15.5, 5.2)
@@ -139,8 +139,8 @@ def record(evidence: Evidence, limit_n: float) -> bytes | None:
 
 
 def force_depth(evidence: Evidence) -> bytes | None:
-    """Force against depth in contact, coloured by time; None without contact."""
-    held = evidence.in_contact & (evidence.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet feels contact in the air
+    """Return force against depth in contact, coloured by time; None without contact."""
+    held = evidence.in_contact & (evidence.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet reports contact in the air
     if not held.any():
         return None
     figure = _figure(5.6, 4.4)
@@ -154,7 +154,7 @@ def force_depth(evidence: Evidence) -> bytes | None:
 
 
 def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
-    """True apparent stiffness with the findings' outlines, and the error of the depth; None when either is not known."""
+    """Return true apparent stiffness with outlines of findings, and the depth error; None if either is unknown."""
     message = evidence.stiffness_map
     if known is None or message is None or not drawable(message):
         return None
@@ -167,7 +167,7 @@ def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
     layer = MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")
-    small = "estimated over true apparent stiffness, less one"
+    small = "estimated over true apparent stiffness, minus one"
     drawing.panel(middle, layer, "e", "Error of the estimate", small, truth=True)
     _depth_errors(right, evidence)
     return _png(figure)
@@ -178,8 +178,8 @@ def _depth_errors(axes: Axes, evidence: Evidence) -> None:
     steady = evidence.steady
     bins = np.linspace(-0.6, 0.6, 61)
     for values, color, label in (
-        (true - evidence.setpoint, TRUE, "true depth less set-point"),
-        (evidence.depth - true, MEASURED, "measured less true depth"),
+        (true - evidence.setpoint, TRUE, "true depth minus set-point"),
+        (evidence.depth - true, MEASURED, "measured minus true depth"),
     ):
         axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
     plain(axes, "readings in steady contact", "depth error [mm]")
@@ -190,25 +190,25 @@ def _depth_errors(axes: Axes, evidence: Evidence) -> None:
 MAX_VERTICES = 65_535
 """The viewer's indices have 16 bits."""
 _UNKNOWN = 0.80
-ABOVE_SKIN_M = np.array((0.0, 0.0, 0.001))
-"""The findings' outline is drawn so far above the surface."""
+ABOVE_SURFACE_M = np.array((0.0, 0.0, 0.001))
+"""Offset of the findings' outline above the surface."""
 AXIS_M = 0.05
 """Length of the axes of the abdomen frame."""
 
 
 @dataclass(frozen=True)
 class Layer:
-    """One way to look at the surface."""
+    """A colouring of the surface."""
 
     name: str
     colors: tuple[str, ...]
-    """Colours of its scale, from low to high, as #rrggbb."""
+    """Colours of the scale, from low to high, as #rrggbb."""
     ticks: tuple[str, ...]
-    """Words of the scale, evenly spaced from low to high."""
+    """Labels of the scale, evenly spaced from low to high."""
 
 
 def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
-    """Layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None when there is nothing to see."""
+    """Return layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None if there is nothing to show."""
     mapped = map_of(message)
     triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
     whole = mapped.scanned[triangles].all(axis=1)
@@ -244,7 +244,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
         "radius": radius,
         "triangles": _text(triangles.astype(np.uint16)),
         **_labels(shape, known, middle),
-        "outline": _text((outline + ABOVE_SKIN_M).astype(np.float32)),
+        "outline": _text((outline + ABOVE_SURFACE_M).astype(np.float32)),
         "layers": [
             {
                 "positions": _text(positions.astype(np.float32)),
@@ -260,30 +260,29 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
 
 
 def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, Any]:
-    """Axes of the abdomen frame A at the corner of the scanned region, as segments, and words with their places.
+    """Return the axes of the abdomen frame A at the corner of the scanned region, as segments, and labels with positions.
 
     `shape`: vertices about `middle`, which is a point in A, shape (n, 3) [m]; x points to the patient's left, y to the head.
     """
     (left, feet, _), (right, head, _) = shape[known].min(axis=0), shape[known].max(axis=0)
 
-    def on_skin(at_x: float, at_y: float) -> Array:
+    def on_surface(at_x: float, at_y: float) -> Array:
         nearest = int(np.argmin(np.hypot(shape[:, 0] - at_x, shape[:, 1] - at_y)))
         return np.array((at_x, at_y, shape[nearest, 2] + 0.002))
 
-    beside = 0.16 * max(right - left, head - feet)
-    x, y, _ = beside * np.eye(3)
-    corner = on_skin(left, feet) - 0.3 * (x + y)
+    x, y, _ = 0.16 * max(right - left, head - feet) * np.eye(3)
+    corner = on_surface(left, feet) - 0.3 * (x + y)
     ends = corner + AXIS_M * np.eye(3)
     words = {
-        "head": on_skin(0.0, head) + y,
-        "feet": on_skin(0.0, feet) - y,
-        "patient's right": on_skin(left, 0.0) - x,
-        "patient's left": on_skin(right, 0.0) + x,
+        "head": on_surface(0.0, head) + y,
+        "feet": on_surface(0.0, feet) - y,
+        "patient's right": on_surface(left, 0.0) - x,
+        "patient's left": on_surface(right, 0.0) + x,
         **{f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)},
     }
     navel = -middle
     if left <= navel[0] <= right and feet <= navel[1] <= head:
-        words["navel"] = on_skin(navel[0], navel[1])
+        words["navel"] = on_surface(navel[0], navel[1])
     axes = np.array([(corner, end) for end in ends], dtype=np.float32)
     return {"axes": _text(axes), "words": [[word, *(round(float(v), 4) for v in place)] for word, place in words.items()]}
 

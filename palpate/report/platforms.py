@@ -1,4 +1,4 @@
-"""What a run hash depends on besides scenario, seed and code: the platform's fingerprint."""
+"""Fingerprint of the platform, on which a run hash depends besides scenario, seed and code."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ def _version(package: str) -> str | None:
 
 
 def fingerprint() -> dict[str, Any]:
-    """Operating system, processor, Python and library versions."""
+    """Return the versions of operating system, processor, Python and libraries."""
     return {
         "system": platform.platform(),
         "libc": " ".join(platform.libc_ver()),

@@ -1,6 +1,6 @@
-"""Interrupted runs: results from what was recorded (`palpate report --recover`), and their continuation (`palpate run --resume`).
+"""Interrupted runs: results from their recording (`palpate report --recover`) and continuation (`palpate run --resume`).
 
-A run that continues DIR has its results in DIR/resumed, and one that continues that in DIR/resumed/resumed.
+A run that continues DIR has its results in DIR/resumed; the continuation of that run has them in DIR/resumed/resumed.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
 
     If it ended before the findings, the assessment that the scenario names processes the recorded examination again.
 
-    Raises EvidenceError if the run is still on, is complete, or has no recording.
+    Raises EvidenceError if the run is still active, is complete, or has no recording.
     """
     if completed(folder) is not None:
         raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
@@ -90,7 +90,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
 
 
 def _assess(run: InterruptedRun) -> None:
-    """Runs the assessment to its end on what was recorded."""
+    """Runs the assessment to its end on the recorded examination."""
     scenario, recording, collected = run.scenario, run.recording, run.collected
     exam = collected.exam
     if exam is None:
@@ -122,15 +122,15 @@ class Resumption:
 
     @property
     def summary(self) -> str:
-        """What is continued, for the user."""
+        """Text for the user: the run, its samples, its remaining targets."""
         left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
         return f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples are there{left}"
 
 
 def resumption(folder: Path) -> Resumption:
-    """Return how to continue the run in `folder`, or the latest continuation of it.
+    """Return the continuation of the run in `folder`, or of its latest continuation.
 
-    Raises EvidenceError if it was completed, is still on, or has no recording, no samples, or no targets left.
+    Raises EvidenceError if it was completed, is still active, or has no recording, no samples, or no targets left.
     """
     while _holds_run(folder / FOLDER):
         folder /= FOLDER
@@ -146,7 +146,7 @@ def resumption(folder: Path) -> Resumption:
 
 
 def _holds_run(folder: Path) -> bool:
-    """True if a folder has a run that can be continued, or that is completed or still on; not one killed at its start."""
+    """Return True if a folder has a run that is not one killed at its start. Raises EvidenceError if it is still active."""
     if not (folder / "scenario.yaml").is_file():
         return False
     try:
@@ -165,7 +165,7 @@ def _before(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
 
 @contextmanager
 def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Passes a checkpoint to services that are made meanwhile. Its path is neutral: the results folder may name the patient."""
+    """Passes a checkpoint to services created within it, by a neutral path: the results folder may name the patient."""
     if checkpoint is None:
         yield
         return
@@ -177,7 +177,7 @@ def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
 
 
 def _runs(folder: Path) -> list[InterruptedRun]:
-    """Return the run in a folder, and before it those that it continued."""
+    """Return the run in a folder, preceded by those that it continued."""
     folders = [folder.resolve()]
     while folders[0].name == FOLDER and (folders[0].parent / "scenario.yaml").is_file():
         folders.insert(0, folders[0].parent)
@@ -185,7 +185,7 @@ def _runs(folder: Path) -> list[InterruptedRun]:
 
 
 def _reached(runs: list[InterruptedRun]) -> Checkpoint:
-    """Return the checkpoint at the end of the last of some runs, each of which continued the one before."""
+    """Return the checkpoint at the end of a sequence of runs, each of which continued its predecessor."""
     reached: Checkpoint | None = None
     for run in runs:
         reached = _after(run, reached)

@@ -1,4 +1,4 @@
-"""What a run leaves in its folder for people and programs: report.json, samples.csv, map.png, evidence.mcap."""
+"""Results in a run's folder: report.json, samples.csv, map.png, evidence.mcap; and the findings on the terminal."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True)
 class Known:
-    """What is known of the truth of a run, as far as it is."""
+    """Known parts of the truth of a run; None if unknown."""
 
     body: TrueBody | None
     contact: ContactRecord | None
@@ -55,7 +55,7 @@ class Known:
 
 
 def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] = ()) -> Known:
-    """The truth of a run, and of those `earlier` that it went on with. It takes seconds to press a patient for the first time."""
+    """Return the truth of a run and of the `earlier` runs that it continued. The first press of a patient takes seconds."""
     if c.phantom is None:
         return Known(None, None, None)
     body = body_of(c.phantom)
@@ -65,21 +65,21 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     contact = reduce(ContactRecord.then, runs)
     try:
         pressed = press_patient(scenario)
-    except Exception:  # a tissue of the user's own, which was changed meanwhile or can be made only once
-        log.exception("what there is to be felt is not known: the patient cannot be pressed")
+    except Exception:  # a user-defined tissue that was changed during the run, or that can be created only once
+        log.exception("palpable truth unknown: the patient cannot be pressed")
         pressed = None
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
 
 
 def clean_world(scenario: Scenario) -> bool:
-    """Whether the patient is still, and nothing is wrong with the equipment but white noise."""
+    """Return True if the patient is still and the equipment has no errors except white noise."""
     phantom = scenario.phantom
     still = phantom.breathing.kind == "none" and phantom.motion.kind == "none"
     return still and scenario.errors.clean
 
 
 def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
-    """The report of a run, complete or not."""
+    """Return the report of a run, complete or not."""
     c = result.collected
     found = None if c.stiffness_map is None else map_of(c.stiffness_map)
     final = c.findings if c.findings is not None and c.findings.final else None
@@ -114,7 +114,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
-        assessed=final is not None and (found is not None or (_draws_no_map(c) and len(steady) > 0)),
+        assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
         unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
@@ -126,8 +126,8 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     )
 
 
-def _draws_no_map(c: Collected) -> bool:
-    """Whether the assessment is one that tells findings alone; ours tells samples before its map, and no map of too few."""
+def _has_no_map(c: Collected) -> bool:
+    """Return True if the assessment publishes findings only. The default one publishes samples before its map."""
     return c.stiffness_map is None and not c.samples
 
 
@@ -151,7 +151,7 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report
 
 
 def sample_columns(samples: Samples) -> dict[str, Array]:
-    """The columns of samples.csv by name, in the abdomen frame, each of shape (m,)."""
+    """Return the columns of samples.csv by name, in the abdomen frame, each of shape (m,)."""
     x, y, z = samples.position.T
     nx, ny, nz = samples.normal.T
     return {
@@ -172,7 +172,7 @@ def sample_columns(samples: Samples) -> dict[str, Array]:
 
 
 def write_samples(path: Path, samples: Samples, run: str = "") -> None:
-    """samples.csv: one row a sample of the run called `run`, in the abdomen frame."""
+    """Writes samples.csv: one row per sample of the run named `run`, in the abdomen frame."""
     columns = sample_columns(samples)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -183,34 +183,32 @@ def write_samples(path: Path, samples: Samples, run: str = "") -> None:
 
 REASONS = {
     "contradicted": "where the samples disagree by more than stiffness and the known errors explain",
-    "yielded": "where the force limit was met before the depth, as over bone",
+    "yielded": "where the force limit was reached before the depth, as over bone",
 }
-
-
 USUAL_N = (1.2, 4.8)
-"""Level of a person's apparent stiffness: the measured median of 2.4 N, and twice 0.35 in the logarithm, which is 0.12 between
-those people, who are alike [V], 0.2 between places of one [V], and something for all others [A]."""
+"""Usual range of a person's apparent stiffness: the measured median of 2.4 N, plus and minus two SD of 0.35 in the logarithm. The
+SD has 0.12 between the measured people, who are similar [V], 0.2 between places of one person [V], and a margin [A]."""
 
 
 def unassessed(report: Report) -> str:
-    """What is not known, which comes first."""
+    """Return sentences on unassessed areas and on an unusual level of stiffness; empty without either."""
     parts = report.unassessed_m2.items()
     return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts) + _level(report)
 
 
 def _level(report: Report) -> str:
-    """A region that is unusual all over, in which nothing can stand out."""
+    """Return a warning if the whole region is unusually firm or soft."""
     level, (low, high) = report.background_N, USUAL_N
     if level is None or low <= level <= high:
         return ""
     return (
-        f"The whole region is unusually {'firm' if level > high else 'soft'}: {level:.1f} N, where {low:g} to {high:g} N are "
-        "usual. A lump or a guarded muscle that fills it cannot be told from the person's own stiffness: examine a wider region. "
+        f"The whole region is unusually {'firm' if level > high else 'soft'}: {level:.1f} N; usual are {low:g} to {high:g} N. A "
+        "lump or a guarded muscle that fills it cannot be distinguished from the person's own stiffness: examine a wider region. "
     )
 
 
 def print_findings(console: Console, report: Report) -> None:
-    """What is not assessed, the findings as a table, and their scores in a line."""
+    """Prints unassessed areas, the findings as a table, and their scores in a line."""
     if unknown := unassessed(report):
         console.print(unknown.rstrip(), highlight=False, soft_wrap=True)
     if report.findings:
@@ -226,7 +224,7 @@ def print_findings(console: Console, report: Report) -> None:
             )
         console.print(table)
     elif report.assessed:
-        console.print("no finding" if report.failure is None else "no finding in what was scanned")
+        console.print("no finding" if report.failure is None else "no finding in the scanned part")
     else:
         console.print(f"not assessed: {report.samples} samples are too few for a map")
     if muscles := rows.tensed(report.candidates):
@@ -239,18 +237,20 @@ def print_findings(console: Console, report: Report) -> None:
 
 
 def print_scores(console: Console, report: Report) -> None:
-    """The scores against the truth in a line, where anything was assessed that could be right or wrong."""
+    """Prints the scores against the truth in a line, if anything was assessed."""
     if report.scores is not None and report.assessed:
-        console.print(f"against the truth{clean_words(report)}: {in_words(report.scores)}", highlight=False, soft_wrap=True)
+        console.print(
+            f"against the truth{clean_world_note(report)}: {scores_text(report.scores)}", highlight=False, soft_wrap=True
+        )
 
 
-def clean_words(report: Report) -> str:
-    """A warning that figures are of a clean world, where they are."""
+def clean_world_note(report: Report) -> str:
+    """Return a note if the figures are of a clean world, else an empty text."""
     return " of a clean world" if report.clean_world else ""
 
 
-def in_words(s: scoring.Scores) -> str:
-    """Scores in a line."""
+def scores_text(s: scoring.Scores) -> str:
+    """Return the scores as a line."""
     parts = [f"{s.matched} matched, {s.missed} missed"]
     parts += [f"{s.not_palpable} not palpable in the region"] if s.not_palpable else []
     parts += [f"{s.false_findings} false" + (f" ({s.on_guarding} on guarding)" if s.on_guarding else "")]
@@ -266,7 +266,7 @@ def in_words(s: scoring.Scores) -> str:
 
 
 def _beyond_bands(s: scoring.Scores) -> str:
-    """How many of the ratios lie outside the bands that were told with them."""
+    """Return how many ratios lie outside their bands, as text."""
     outside = sum(finding.ratio_held is False for finding in s.findings)
     if not outside:
         return ""
@@ -274,7 +274,7 @@ def _beyond_bands(s: scoring.Scores) -> str:
 
 
 def finding_row(f: Any) -> FindingRow:
-    """`palpation_msgs/Finding`."""
+    """Return the row of a `palpation_msgs/Finding`."""
     return FindingRow(
         centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
         quadrant=f.quadrant,
@@ -315,10 +315,10 @@ def _depth(known: Known) -> DepthRow:
     perception = scoring.depth_errors(contact.measured, contact.true, in_lump)
     return DepthRow(
         true_against_setpoint_m=regulation["all"],
-        true_against_setpoint_beside_m=regulation["beside"],
+        true_against_setpoint_beside_m=regulation["outside"],
         true_against_setpoint_lump_m=regulation["lump"],
         measured_against_true_m=perception["all"],
-        measured_against_true_beside_m=perception["beside"],
+        measured_against_true_beside_m=perception["outside"],
         measured_against_true_lump_m=perception["lump"],
         force_limited=float(contact.limited.mean()),
     )

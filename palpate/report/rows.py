@@ -1,4 +1,4 @@
-"""What report.json says of a run: models that write it and read it back."""
+"""Models of report.json."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class _Row(BaseModel):
 
 
 class FindingRow(_Row):
-    """One area that the examination found, or weighed."""
+    """A finding or a candidate of the examination."""
 
     centroid_m: Point
     """In the abdomen frame [m]: x to the patient's left, y to the head, z outward, from the umbilicus."""
@@ -36,28 +36,28 @@ class FindingRow(_Row):
 
 
 class LumpRow(_Row):
-    """What can truly be felt of a lump."""
+    """Palpable truth of a lump."""
 
     centroid_m: Point
-    """Centre of its area, xy of the abdomen frame [m]; where it is felt most when it is not palpable."""
+    """Centre of its area, xy of the abdomen frame [m]; of a lump that is not palpable the place of its greatest effect."""
     quadrant: str
     area_m2: float
-    """Where its effect is at least half of its greatest; 0 when it is not palpable."""
+    """Area where its effect is at least half of its greatest; 0 if it is not palpable."""
     felt_contrast: float
-    """Apparent stiffness with it over that without it, where it is felt most."""
+    """Apparent stiffness with it divided by that without it, at the place of its greatest effect."""
     palpable: bool
 
 
 class TruthRow(_Row):
-    """What can truly be felt of the patient, found out by pressing a copy of him."""
+    """Palpable truth of the patient, measured by pressing a copy of them."""
 
     felt: bool
-    """Whether a copy could be made: not of a foreign FMU, nor of real tissue. Without it nothing is scored."""
+    """True if a copy could be pressed; not possible for a foreign FMU or real tissue, which are not scored."""
     lumps: list[LumpRow]
 
 
 class DepthRow(_Row):
-    """RMS depth errors in steady contact [m]; null where there was none."""
+    """RMS depth errors in steady contact [m]; null without steady contact."""
 
     true_against_setpoint_m: float | None
     """True depth against the set-point: regulation and perception together."""
@@ -66,7 +66,7 @@ class DepthRow(_Row):
     true_against_setpoint_lump_m: float | None
     """In their areas."""
     measured_against_true_m: float | None
-    """What the examination believes against the truth: perception alone."""
+    """Measured against true depth: perception alone."""
     measured_against_true_beside_m: float | None
     measured_against_true_lump_m: float | None
     force_limited: float | None
@@ -77,37 +77,37 @@ class Report(_Row):
     """report.json."""
 
     run: str = ""
-    """Name of the run, which every result in its folder repeats."""
+    """Name of the run, also in all other result files of its folder."""
     scenario: str
     seed: int
     clean_world: bool
-    """Whether the patient was still and nothing was set wrong with registration: then figures are not those of the real world."""
+    """True if the patient was still and the equipment had no errors except white noise: the figures are optimistic."""
     runtime: str
-    """distributed, composed or wallclock; recovered where the results were made of a recording alone."""
+    """distributed, composed, wallclock, or recovered: from a recording."""
     platform: dict[str, Any]
-    """Operating system, processor, Python and library versions: equal run hashes are promised on one platform only."""
+    """Versions of operating system, processor, Python and libraries: run hashes are reproducible on one platform only."""
     sim_time_s: float
     wall_time_s: float
     """From the first tick to the last."""
     real_time_factor: float
-    """0 where the wall time is not known: of what was recovered."""
+    """0 for a recovered run, whose wall time is unknown."""
     start_time_s: float
     """Wall time from the command to the first tick."""
     run_hash: str | None
     digests: dict[str, str]
-    """Of each hashed topic: where two runs differ, they say in which."""
+    """Digest of each hashed topic; shows in which topics two runs differ."""
     resumed: int = 0
-    """How many examinations that broke off this one went on with; their samples and forces count here, times are of the last."""
+    """Number of interrupted examinations that this one continued; samples and forces include theirs, times do not."""
     failure: str | None
     """Service and cause; null when the run completed."""
     failure_code: FailureCode | None = None
     """The same for programs, such as `role_lost`."""
     lost: dict[str, float]
-    """Services that died, with the simulated time at which they fell silent [s]."""
+    """Lost services, with the simulated time of their last message [s]."""
     samples: int
     skipped_targets: int
     max_force_N: float | None
-    """Greatest true contact force of the run, every step of the tissue counted; without a truth, the measured normal force."""
+    """Greatest true contact force over all steps of the tissue; without a truth, greatest measured normal force."""
     mean_force_N: float | None
     """Mean measured normal force in steady contact."""
     depth_rms_error_m: float | None
@@ -116,27 +116,27 @@ class Report(_Row):
     surface_rms_error_m: float | None
     """RMS distance of the perceived from the true rest surface in the examined region, along the normal."""
     assessed: bool
-    """Whether there are findings that are final, though it be none."""
+    """True if there is a final list of findings, which may be empty."""
     findings: list[FindingRow]
     candidates: list[FindingRow] = []
-    """Areas that were weighed and not reported, the most probable first."""
+    """Areas that were considered and not reported, the most probable first."""
     unassessed_m2: dict[str, float] = {}
-    """Area that the arm scanned and of which nothing is said, by reason: `contradicted`, the samples disagree by more than
-    stiffness and the known errors explain; `yielded`, the force limit was met before the depth."""
+    """Scanned area without an assessment, by reason: `contradicted`, the samples disagree by more than stiffness and the known
+    errors explain; `yielded`, the force limit was reached before the depth."""
     background_N: float | None = None
-    """Apparent stiffness of the region where there is no finding."""
+    """Apparent stiffness of the region outside of findings."""
     truth: TruthRow | None
     scores: Scores | None
-    """Null when the run ended before there was anything to score, or nothing is known of what could be felt."""
+    """Null if the run ended before there was anything to score, or if the truth is unknown."""
     blame: dict[str, Any]
-    """Where each service's time goes."""
+    """Time budget of each service."""
     services: dict[str, Any]
-    """What each service says of itself at its end."""
+    """Facts that each service reported at its end."""
 
 
 _SURE: Final = 0.99
-_WORTH_TELLING: Final = 0.05
-"""Probability of a tensed muscle from which it is told."""
+_REPORTED: Final = 0.05
+"""Least probability of a tensed muscle that is reported."""
 _LIKELY: Final = 0.5
 
 
@@ -148,18 +148,18 @@ class Probable(Protocol):
 
 
 def percent(probability: float) -> str:
-    """A probability: no finding is certain."""
+    """Return a probability as text; no finding is certain."""
     return f"over {100 * _SURE:.0f} %" if probability > _SURE else f"{100 * probability:.0f} %"
 
 
 def confidence(found: Probable) -> str:
-    """How probable a lump is there; and a tensed muscle, where that may be."""
-    muscle = f" ({percent(found.guarding)} a tensed muscle)" if found.guarding >= _WORTH_TELLING else ""
+    """Return the probability of a lump as text, with that of a tensed muscle if it is not negligible."""
+    muscle = f" ({percent(found.guarding)} a tensed muscle)" if found.guarding >= _REPORTED else ""
     return percent(found.confidence) + muscle
 
 
 def tensed(candidates: Iterable[FindingRow]) -> str:
-    """The areas that are probably tensed muscle, and no finding, in a sentence each."""
+    """Return a sentence for each area that is not a finding and probably a tensed muscle."""
     return "".join(
         f"The stiff area about ({1e3 * f.centroid_m[0]:+.0f}, {1e3 * f.centroid_m[1]:+.0f}) mm, in {f.quadrant}, is probably "
         f"a tensed muscle ({percent(f.guarding)}) and no lump ({percent(f.confidence)}). "

@@ -1,9 +1,9 @@
-"""Scores of findings and map against what can truly be felt. The examination sees nothing of this.
+"""Scores of findings and map against the palpable truth, which the examination does not receive.
 
-A finding matches a lump when their areas overlap by a Dice coefficient of MATCHING_DICE, or its centroid lies in the lump's area;
-each counts once, so that most match and overlap best. A candidate, which the map shows no area of, matches by its centroid, and
-only a lump that no finding matches. All is compared at the places that the tool truly touched, in the xy plane
-of the abdomen frame A; areas are on the skin. The same rule holds everywhere.
+A finding matches a lump if their areas overlap by a Dice coefficient of MATCHING_DICE, or if its centroid lies in the lump's
+area. The assignment is one to one, with most matches first and best overlap second. A candidate, which has no area on the map,
+matches by its centroid, and only a lump that no finding matches. Places are those that the tool truly touched, in the xy plane
+of the abdomen frame A; areas are on the skin.
 """
 
 from __future__ import annotations
@@ -42,26 +42,26 @@ class Map:
     scanned: Mask
     """Within reach of a sample."""
     finding: NDArray[np.int32]
-    """Index of the finding that a vertex belongs to, -1 where none."""
+    """Index of the finding of each vertex, -1 if none."""
 
 
 @dataclass(frozen=True)
 class Found:
-    """A finding as the examination reports it."""
+    """A finding as reported by the examination."""
 
     centroid: Array
     """[m], shape (3,), in A as registered."""
     area: float
     """On the surface [m^2]."""
     ratio: float
-    """Apparent stiffness over that of the surroundings [1]."""
+    """Apparent stiffness relative to the surroundings [1]."""
     band: tuple[float, float]
     """Its 90 % band."""
 
 
 @dataclass(frozen=True)
 class Truth:
-    """What is true of a run, for its scores."""
+    """Truth of a run, for its scores."""
 
     body: TrueBody
     felt: Felt
@@ -75,28 +75,28 @@ class FindingScore:
     """A finding against the truth."""
 
     lump: int | None
-    """The lump that it matches."""
+    """The matched lump."""
     dice: float | None
     """Overlap with it."""
     place_error_m: float | None
-    """Distance of its centroid, where the tool truly touched it, from the lump's, in xy of A."""
+    """Distance of its centroid, at the place truly touched, from the lump's, in xy of A."""
     absolute_error_m: float | None
-    """The same where both are in world, across the outward direction: with the errors of kinematics and registration."""
+    """The same in world, perpendicular to the outward direction: includes the errors of kinematics and registration."""
     size_error: float | None
-    """Its area over the lump's, less one."""
+    """Its area divided by the lump's, minus one."""
     true_ratio: float | None
-    """Felt contrast of all lumps over its area, the mean in logarithms; None without a map."""
+    """Felt contrast of all lumps over its area, mean of the logarithm; None without a map."""
     ratio_error: float | None
-    """Its ratio over the true one, less one."""
+    """Its ratio divided by the true one, minus one."""
     ratio_held: bool | None
-    """Whether its band holds the true ratio."""
+    """True if its band includes the true ratio."""
     on_guarding: bool
-    """Whether it is false and overlaps guarded muscle; of a candidate, whether its centroid lies on it."""
+    """True if it is false and overlaps guarded muscle; for a candidate, if its centroid lies on it."""
 
 
 @dataclass(frozen=True)
 class Scores:
-    """How good findings and map are. Means are over matched findings, None where there is none."""
+    """Quality of findings and map. Means are over matched findings, None without any."""
 
     matched: int
     missed: int
@@ -104,30 +104,30 @@ class Scores:
     """Lumps that the standard press cannot feel: neither matched nor missed."""
     false_findings: int
     on_guarding: int
-    """Those of them that overlap guarded muscle."""
+    """False findings that overlap guarded muscle."""
     place_error_m: float | None
     absolute_error_m: float | None
     dice: float | None
     size_error: float | None
     ratio_error: float | None
-    """Mean magnitudes of the errors, as those of size."""
+    """Mean magnitude, as for size."""
     ratio_coverage_90: float | None
-    """Part of the matched findings whose own band holds their true ratio."""
+    """Share of the matched findings whose band includes their true ratio."""
     coverage_90: float | None
-    """Part of the scanned area on which the map's 90 % band holds the true apparent stiffness; None without a map."""
+    """Share of the scanned area on which the map's 90 % band includes the true apparent stiffness; None without a map."""
     coverage_90_in_lumps: float | None
     """The same within the areas of lumps."""
     findings: tuple[FindingScore, ...]
     coverage_90_on_guarding: float | None = None
-    """The coverage where guarding is felt."""
+    """The same on guarded muscle."""
     candidates: tuple[FindingScore, ...] = ()
-    """Of the areas that were weighed and not reported: no figure above counts them."""
+    """Scores of candidates, which do not count in the fields above."""
 
 
 def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidates: Sequence[Found] = ()) -> Scores:
-    """Scores of findings, of the map that holds their areas, and of candidates, the most probable first.
+    """Return the scores of findings, of the map with their areas, and of candidates, the most probable first.
 
-    Without a map a finding is no more than a place, as a candidate always is.
+    Without a map a finding has only a place, like a candidate.
     """
     felt = truth.felt
     owner = np.full(len(felt.raster), -1) if found_map is None else _owner(found_map, felt.raster)
@@ -169,18 +169,18 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidate
 
 
 def depth_errors(depth: Array, wanted: Array, in_lump: Mask) -> dict[str, float | None]:
-    """RMS of `depth` - `wanted` [m], over all and apart outside and inside of lumps; None where there is nothing."""
+    """Return the RMS of `depth` - `wanted` [m] over all, outside and inside of lumps; None without values."""
 
     def rms(chosen: Mask) -> float | None:
         return float(np.sqrt(np.mean((depth - wanted)[chosen] ** 2))) if chosen.any() else None
 
-    return {"all": rms(np.ones(len(depth), dtype=bool)), "beside": rms(~in_lump), "lump": rms(in_lump)}
+    return {"all": rms(np.ones(len(depth), dtype=bool)), "outside": rms(~in_lump), "lump": rms(in_lump)}
 
 
 def surface_error(perceived: Array, body: TrueBody, low: Array, high: Array) -> float | None:
-    """RMS distance [m] of perceived points, shape (n, 3), in A, from the true rest surface along its normal.
+    """Return the RMS distance [m] of perceived points, shape (n, 3), in A, from the true rest surface along its normal.
 
-    Over the rectangle `low` to `high` [m] of the xy plane; None where no point lies in it.
+    Over the rectangle `low` to `high` [m] of the xy plane; None without points in it.
     """
     surface = TrueSurface(body)
     inside = perceived[np.all((perceived[:, :2] >= low) & (perceived[:, :2] <= high), axis=1)]
@@ -190,7 +190,7 @@ def surface_error(perceived: Array, body: TrueBody, low: Array, high: Array) -> 
 
 
 def _dice(felt: Felt, mask: Mask, places: Array, lump: Lump) -> float:
-    """Overlap of a finding's area, by its raster points, with a lump's, at the places truly touched."""
+    """Return the overlap of a finding's area, given by raster points, with a lump's, at the places truly touched."""
     if not lump.palpable or not mask.any():
         return 0.0
     both = float(felt.cells[mask & felt.inside(lump.inside, places)].sum())
@@ -198,7 +198,7 @@ def _dice(felt: Felt, mask: Mask, places: Array, lump: Lump) -> float:
 
 
 def _within(found: Sequence[Found], truth: Truth) -> Mask:
-    """Whether the centroid of each area lies in the area of each lump, shape (findings, lumps)."""
+    """Return True where the centroid of an area lies in the area of a lump, shape (findings, lumps)."""
     lumps = truth.felt.lumps
     if not found or not lumps:
         return np.zeros((len(found), len(lumps)), dtype=bool)
@@ -207,7 +207,7 @@ def _within(found: Sequence[Found], truth: Truth) -> Mask:
 
 
 def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth) -> tuple[FindingScore, ...]:
-    """Scores of candidates: each matches the first lump about its centroid that no finding and no earlier candidate has."""
+    """Return the scores of candidates. Each matches the first lump around its centroid that is not matched yet."""
     rows = []
     felt = truth.felt
     for candidate, within in zip(candidates, _within(candidates, truth), strict=True):
@@ -220,7 +220,7 @@ def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth
 
 
 def _match(found: Sequence[Found], dice: Array, within: Mask) -> dict[int, int]:
-    """Which lump each matched finding matches."""
+    """Return the lump of each matched finding."""
     if not within.size:
         return {}
     fits = (dice >= MATCHING_DICE) | within
@@ -254,9 +254,9 @@ def _finding_score(
 
 
 def _coverage(found: Map, truth: Truth) -> tuple[float | None, ...]:
-    """Part of the scanned area, and of what of it lies in lumps and on guarding, on which the band holds the true stiffness.
+    """Return the share of the scanned area, and of its parts in lumps and on guarding, whose band includes the true stiffness.
 
-    Where the press ended at its limit the band holds the truth when it reaches as far.
+    Where the standard press ended at its force limit, the upper end of the band decides.
     """
     felt, xy = truth.felt, truth.touched.places(found.vertices[found.scanned, :2])
     true, lower, upper = felt.force(xy), found.lower[found.scanned], found.upper[found.scanned]
@@ -267,13 +267,13 @@ def _coverage(found: Map, truth: Truth) -> tuple[float | None, ...]:
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
-    """The mean of the magnitudes; None where there is none."""
+    """Return the mean of the magnitudes; None without any."""
     known = [abs(value) for value in values if value is not None]
     return float(np.mean(known)) if known else None
 
 
 def _owner(found: Map, points: Array) -> NDArray[np.int32]:
-    """The finding that each point belongs to, -1 where none: half level of the interpolated membership."""
+    """Return the finding of each point, -1 if none, by the half level of the interpolated membership."""
     owner = np.full(len(points), -1, dtype=np.int32)
     mesh = Delaunay(found.vertices[:, :2])
     for i in range(int(found.finding.max(initial=-1)) + 1):

@@ -1,7 +1,7 @@
-"""The cases of a study: every patient, with every entry of errors, by every method; each under a name made from its content.
+"""The cases of a study: every patient, with every entry of errors, by every method; the name of a case is a hash of its content.
 
-A patient's seed is a hash of study, population, split, number and salt, and of nothing else: neither method nor errors, so that
-comparisons are paired, and neither worker nor order, so that every way to run the study examines the same patients.
+A patient's seed is a hash of study, population, split, number and salt. It does not depend on method and errors, so that
+comparisons are paired, nor on worker and order, so that every way to run the study examines the same patients.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ from palpate_plugins import PluginError, is_file
 
 ID_DIGITS: Final = 16
 TUNE_SEEDS: Final = 1000
-"""Seeds below this are for tuning alone."""
+"""Seeds below this are for tuning only."""
 MOST_SEEDS: Final = 2**31
-MATTERS_NOT: Final = ("name", "description")
-"""Fields of a scenario that decide nothing of a result."""
+IRRELEVANT: Final = ("name", "description")
+"""Fields of a scenario that do not change a result."""
 
 
 class Case(Section):
@@ -39,16 +39,16 @@ class Case(Section):
     population: str
     method: str
     errors: str
-    """What is wrong with the equipment: the name in the study."""
+    """Name of the equipment errors in the study."""
     split: Split
     number: int
-    """Which patient of the population, from 0."""
+    """Index of the patient in the population."""
     seed: int
     tier: Tier
     runtime: Runtime
     periods: dict[str, int]
     scenario: dict[str, Any]
-    """All of the scenario, with everything drawn that a person is made of."""
+    """The complete scenario, with the drawn person."""
     files: dict[str, str]
     """SHA-256 of each file that the scenario names, by its path."""
 
@@ -59,19 +59,19 @@ class Case(Section):
 
 
 class Request(NamedTuple):
-    """What of a study is asked for."""
+    """The requested part of a study and its changes."""
 
     split: Split = "test"
     number: int | None = None
-    """Patients of each population that has any, instead of the study's own numbers."""
+    """Patients of each population that is not empty; None for the study's numbers."""
     settings: Sequence[str] = ()
-    """Overrides `a.b=c` of every scenario, after all others."""
+    """Overrides `a.b=c` of every scenario, applied last."""
     secret: str | None = None
-    """What the file of secret seeds holds: it takes the place of the study's salt in the split `test`."""
+    """Content of the file of secret seeds, which replaces the study's salt in the split `test`."""
 
 
 def command_of(name: str, request: Request, methods: Sequence[str] = (), services: Sequence[str] = ()) -> str:
-    """The command that runs a study again, by its name or file. FILE stands for the file of secret seeds."""
+    """Return the command that runs a study again, by its name or file, with FILE for the file of secret seeds."""
     options: dict[str, Sequence[str]] = {
         "--split": [request.split],
         "--number": [] if request.number is None else [str(request.number)],
@@ -80,14 +80,14 @@ def command_of(name: str, request: Request, methods: Sequence[str] = (), service
         "--set": request.settings,
         "--seeds-file": [] if request.secret is None else ["FILE"],
     }
-    words = [word for option, values in options.items() for value in values for word in (option, value)]
-    return shlex.join(["palpate", "study", name, *words])
+    arguments = [argument for option, values in options.items() for value in values for argument in (option, value)]
+    return shlex.join(["palpate", "study", name, *arguments])
 
 
 def patient_seeds(study: str, population: str, split: Split, count: int, salt: str) -> list[int]:
-    """The seeds of the first patients of a population, no two alike: 0 to 999 to tune, others to test.
+    """Return the distinct seeds of the first patients of a population: 0 to 999 for tuning, others for tests.
 
-    More patients of a population never change the seeds of those before them.
+    The first seeds do not depend on `count`.
     """
     first, room = (0, TUNE_SEEDS) if split == "tune" else (TUNE_SEEDS, MOST_SEEDS - TUNE_SEEDS)
     found: dict[int, None] = {}
@@ -104,20 +104,20 @@ def patient_seeds(study: str, population: str, split: Split, count: int, salt: s
 
 
 def cases_of(study: Study, request: Request = Request()) -> list[Case]:  # noqa: B008 - immutable
-    """The cases in the order of the study. Raises StudyError naming the field of the study that cannot be used."""
+    """Return the cases in the order of the study. Raises StudyError that names the invalid field of the study."""
     _check_secret(study, request)
     found: dict[str, Case] = {}
     for case in _cases(study, request):
         twin = found.setdefault(case.case_id, case)
         if twin is not case:
-            raise StudyError(f"{study.name}: {case.label} and {twin.label} are the same examination: leave one of them out")
+            raise StudyError(f"{study.name}: {case.label} and {twin.label} are the same examination: remove one of them")
     if not found:
         raise StudyError(f"{study.name}: no patient in the split {request.split}: want populations.*.number.{request.split} >= 1")
     return list(found.values())
 
 
 def secret_of(path: Path, study: Study) -> str:
-    """What a file of secret seeds holds. Raises StudyError when it is not the one that the study wants."""
+    """Return the content of a file of secret seeds. Raises StudyError if it is not the file of the study."""
     try:
         content = path.read_bytes()
     except OSError as error:
@@ -132,7 +132,9 @@ def secret_of(path: Path, study: Study) -> str:
 
 def _check_secret(study: Study, request: Request) -> None:
     if study.seeds_sha256 is not None and request.split == "test" and request.secret is None:
-        raise StudyError(f"{study.name}: seeds_sha256 = {study.seeds_sha256}: its split test needs that file, --seeds-file FILE")
+        raise StudyError(
+            f"{study.name}: seeds_sha256 = {study.seeds_sha256}: the split test needs the file of that hash, --seeds-file FILE"
+        )
 
 
 def _cases(study: Study, request: Request) -> Iterator[Case]:
@@ -148,7 +150,7 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                 for key, method in study.methods.items():
                     where = f"{study.name}: populations.{name} by methods.{key}"
                     scenario = _scenario(where, (population, method, wrong), (number, seed), request.settings)
-                    if where not in usable:  # looking for what is installed takes a tenth of a second
+                    if where not in usable:  # the search for installed services takes 0.1 s
                         usable[where] = _usable(where, scenario)
                     scenario = scenario.model_copy(update={"services": usable[where].services, "search": usable[where].search})
                     files = _files(scenario)
@@ -171,7 +173,7 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
 def _scenario(
     where: str, parts: tuple[Population, Method, Errors | None], patient: tuple[int, int], settings: Sequence[str]
 ) -> Scenario:
-    """The scenario of a patient, by number and seed."""
+    """Return the scenario of a patient, given by number and seed."""
     population, method, wrong = parts
     number, seed = patient
     changes: dict[str, Any] = dict(population.settings)
@@ -189,7 +191,7 @@ def _scenario(
 
 
 def _usable(where: str, scenario: Scenario) -> Scenario:
-    """The scenario with files of services by their absolute path, after its phantom could be made and its services were found."""
+    """Return the scenario with absolute paths of services, after its phantom and its services were checked."""
     try:
         build_phantom(scenario.phantom, scenario.seed)
         return checked(scenario)
@@ -198,7 +200,7 @@ def _usable(where: str, scenario: Scenario) -> Scenario:
 
 
 def _files(scenario: Scenario) -> dict[str, str]:
-    """SHA-256 of the files that decide a result, by path."""
+    """Return the SHA-256 of each file that a result depends on, by path."""
     named = [scenario.phantom.mesh, scenario.tissue.fmu, scenario.tissue.fmu_map]
     functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy)
     named += [word for word in functions if is_file(word)]
@@ -207,7 +209,7 @@ def _files(scenario: Scenario) -> dict[str, str]:
 
 @cache
 def file_hash(path: str) -> str:
-    """SHA-256 of a file. Raises StudyError when it cannot be read."""
+    """Return the SHA-256 of a file. Raises StudyError if it cannot be read."""
     try:
         return hashlib.sha256(Path(path).read_bytes()).hexdigest()
     except OSError as error:
@@ -215,9 +217,9 @@ def file_hash(path: str) -> str:
 
 
 def _case_id(scenario: Scenario, files: Mapping[str, str], tier: Tier, method: Method) -> str:
-    """The first digits of the SHA-256 over everything that decides the result, files by their content."""
+    """Return the first digits of the SHA-256 over everything that the result depends on, files by their content."""
     content = {
-        "scenario": _by_content(scenario.model_dump(mode="json", exclude=set(MATTERS_NOT)), files),
+        "scenario": _by_content(scenario.model_dump(mode="json", exclude=set(IRRELEVANT)), files),
         "tier": tier,
         "runtime": method.runtime,
         "periods": method.periods,

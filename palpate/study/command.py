@@ -191,12 +191,12 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
             console.print(f"{todo} cases, {count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
             if workers.client.dashboard_link:
                 console.print(f"[dim]workers: {workers.client.dashboard_link}[/]", highlight=False, soft_wrap=True)
-            display.tell(0, todo, "")
+            display.show(0, todo, "")
 
             def done(outcome: Outcome) -> None:
                 nonlocal finished
                 finished += 1
-                display.tell(finished, todo, f"{outcome.case.label}{'' if outcome.completed else f': {outcome.why}'}")
+                display.show(finished, todo, f"{outcome.case.label}{'' if outcome.completed else f': {outcome.why}'}")
 
             run_cases(folder, cases, workers, done, runs=runs)
     except (StudyStopped, KeyboardInterrupt) as error:

@@ -1,4 +1,4 @@
-"""How well human examiners find lumps, for every plot of detection: published figures with sources and limits."""
+"""Detection of lumps by human examiners, for plots of detection: published figures with sources and limits."""
 
 from __future__ import annotations
 
@@ -10,11 +10,11 @@ SOURCE: Final = (
     " doi:10.1001/jama.1985.03350390066027"
 )
 CAVEAT: Final = (
-    "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no abdomen that breathes."
-    " The line says what trained hands reach where it was measured; it is no comparison on equal patients."
+    "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no breathing."
+    " The line shows what trained hands achieved there; it is not a comparison on equal patients."
 )
 FOUND: Final = 0.44
-"""Part of all lumps that the 80 physicians found, the mean (range 0.17 to 0.83)."""
+"""Mean share of lumps found by the 80 physicians (range 0.17 to 0.83)."""
 BY_HARDNESS: Final = {"hard": 0.56, "soft": 0.40}
 
 RESIDENTS: Final = (
@@ -27,20 +27,20 @@ class HumanPoint:
     """A rate of detection by hand at one size of lump."""
 
     size_m: float
-    """As the source gives it, 0.3 and 1.0 cm lumps; drawn here as their diameter, which is what lumps of models are sold by."""
+    """Size of the lumps in the source, 0.3 and 1.0 cm; taken as their diameter, by which lumps of models are sold."""
     found: float
 
 
 BY_SIZE: Final = (HumanPoint(0.003, 0.14), HumanPoint(0.010, 0.87))
 
 RESIDENTS_SENSITIVITY: Final = 0.58
-"""Part of 18 lumps in six silicone models that 62 residents found."""
+"""Share of 18 lumps in six silicone models that 62 residents found."""
 RESIDENTS_SPECIFICITY: Final = 0.52
-"""Part of the models that they examined without a false finding."""
+"""Share of the models that they examined without a false finding."""
 
 
 def as_json() -> dict[str, object]:
-    """The same for study.json."""
+    """Return the figures for study.json."""
     return {
         "source": SOURCE,
         "caveat": CAVEAT,

@@ -1,4 +1,4 @@
-"""study.html: a study's figures and plots on one self-contained page, in the look of report.html."""
+"""study.html: a study's figures and plots on one self-contained page, in the style of report.html."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from palpate.study.statistics.detectability import FELT, MADE
 
 TORNADOES = ("lumps_found", "false_findings", "score", "place_error_m")
 FEWEST_FOR_TORNADO = 2
-"""Methods beside the reference from which their differences are drawn as a tornado."""
+"""Number of compared methods from which differences are drawn as a tornado plot."""
 
 
 def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons: Sequence[Comparison]) -> str:
-    """The page as HTML. `summary` is what study.json holds."""
+    """Return the page as HTML. `summary` has the content of study.json."""
     loader = ChoiceLoader([PackageLoader("palpate.study"), PackageLoader("palpate.report")])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"figure": figure, "percent": percent, "mm": millimetres, "p": p_value, "words": covariate_words}
@@ -44,37 +44,37 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
 
 
 def _safe(svg: str | None) -> Markup | None:
-    """An SVG that we made ourselves, with names escaped by matplotlib."""
+    """Return an SVG of `plots`, in which matplotlib has escaped names."""
     return None if svg is None else Markup(svg)
 
 
 def figure(estimate: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> Markup:
-    """A figure with its interval and sample size."""
+    """Return a figure with its interval and sample size."""
     if estimate is None or estimate["value"] is None:
         why = "" if estimate is None or estimate["interval"].startswith(("bootstrap", "Wilson")) else f": {estimate['interval']}"
         n = "" if estimate is None else f" (n = {estimate['n']})"
         return Markup("<span class=quiet>not known{}{}</span>").format(n, why)
     value, low, high = (None if estimate[k] is None else f"{scale * estimate[k]:.{digits}f}" for k in ("value", "low", "high"))
     ends = "no interval" if low is None else f"{low} to {high}"
-    words = Markup("<b>{}{}</b> <span class=quiet title='{}'>({}; n = {})</span>")
-    return words.format(value, unit, f"{estimate['n']} {estimate['of']}; {estimate['interval']}", ends, estimate["n"])
+    template = Markup("<b>{}{}</b> <span class=quiet title='{}'>({}; n = {})</span>")
+    return template.format(value, unit, f"{estimate['n']} {estimate['of']}; {estimate['interval']}", ends, estimate["n"])
 
 
 def percent(estimate: Mapping[str, Any] | None, digits: int = 1) -> Markup:
-    """A rate in per cent."""
+    """Return a rate in per cent."""
     return figure(estimate, 100.0, digits, " %")
 
 
 def millimetres(estimate: Mapping[str, Any] | None, digits: int = 1) -> Markup:
-    """A length in millimetres."""
+    """Return a length in millimetres."""
     return figure(estimate, 1e3, digits, " mm")
 
 
 def p_value(value: float | None) -> str:
-    """A p value."""
+    """Return a p value as text."""
     return "" if value is None else "p < 0.001" if value < 0.001 else f"p = {value:.3f}"
 
 
 def covariate_words(name: str) -> str:
-    """A covariate for people."""
+    """Return the label of a covariate."""
     return plots.COVARIATES[name][0]

@@ -1,4 +1,4 @@
-"""The plots of study.html, each as SVG that takes its colours from the page and so follows light and dark."""
+"""The plots of study.html as SVG with the page's colour variables, for its light and dark themes."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ MOST: Final = len(COLOURS)
 VARIABLES: Final = {INK: "--ink", QUIET: "--quiet", GRID: "--line", HUMAN: "--bad"} | {
     colour: f"--c{i}" for i, colour in enumerate(COLOURS)
 }
-"""The page's own names of the colours."""
+"""The page's names of the colours."""
 COVARIATES: Final = {
     "felt_contrast": ("felt contrast, force with the lump over force without", 1.0),
     "felt_radius_m": ("felt radius [mm]", 1e3),
@@ -58,7 +58,7 @@ def _axes(figure: Figure, columns: int = 1) -> list[Axes]:
 
 
 def _svg(figure: Figure) -> str:
-    """The figure as an element of the page: text stays text, colours are the page's variables."""
+    """Return the figure as an element of the page: text stays text, colours are the page's variables."""
     stream = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "palpate"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Type": None, "Format": None}, dpi=150)
@@ -74,7 +74,7 @@ def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "b
 
 
 def _human(axes: Axes) -> None:
-    """The line of what people find."""
+    """Draws the detection rate of human examiners."""
     label = f"80 physicians, breast models: {human_line.FOUND:.0%} (Fletcher 1985)"
     axes.axhline(human_line.FOUND, color=HUMAN, ls="--", lw=1.2, label=label)
 
@@ -84,7 +84,7 @@ def _title(axes: Axes, words: str) -> None:
 
 
 def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: str, label: str) -> None:
-    """Estimates with their intervals."""
+    """Draws estimates with their intervals."""
     known = [(at, e.value, e.low, e.high) for at, e in zip(x, rows, strict=True) if e.value is not None]
     if known:
         at, value, low, high = np.array([[np.nan if v is None else v for v in row] for row in known], dtype=float).T
@@ -93,7 +93,7 @@ def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: s
 
 
 def roc(analyses: Sequence[Analysis]) -> str | None:
-    """ROC per patient of the first MOST methods; None where none has a curve."""
+    """Return the ROC per patient of the first MOST methods; None if none has a curve."""
     shown = [(a.name, a.roc) for a in analyses[:MOST] if a.roc is not None]
     if not shown:
         return None
@@ -115,7 +115,7 @@ def roc(analyses: Sequence[Analysis]) -> str | None:
 
 
 def froc(analyses: Sequence[Analysis]) -> str | None:
-    """FROC of the first MOST methods; None where none has a curve."""
+    """Return the FROC of the first MOST methods; None if none has a curve."""
     shown = [(a.name, a.froc) for a in analyses[:MOST] if a.froc is not None]
     if not shown:
         return None
@@ -140,7 +140,7 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
 
 
 def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
-    """Probability of detection against each covariate: what was found, in bins, and the surface at quartiles of another one.
+    """Return the probability of detection against each covariate: binned rates, and the surface at quartiles of another one.
 
     None where no lump is known.
     """
@@ -173,21 +173,21 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
 
 
 def _sections(axes: Axes, surface: Surface, name: str) -> None:
-    """The surface along one covariate, at the quartiles of the one that is told apart beside it, else typical."""
-    beside = next((other for other in surface.names if other != name), None)
+    """Draws the surface along one covariate, at the quartiles of another one, with the rest at their medians."""
+    second = next((other for other in surface.names if other != name), None)
     _, scale = COVARIATES[name]
     x = np.geomspace(*surface.range[name], 60) if name in LOGARITHMIC else np.linspace(*surface.range[name], 60)
-    for i, level in enumerate(surface.quartiles[beside] if beside else (0.0,)):
-        at = {name: x} | ({beside: np.full(len(x), level)} if beside else {})
+    for i, level in enumerate(surface.quartiles[second] if second else (0.0,)):
+        at = {name: x} | ({second: np.full(len(x), level)} if second else {})
         value, low, high = surface.probability(at)
-        words, unit = COVARIATES[beside] if beside else ("fitted", 1.0)
-        label = f"{words.split(',')[0].split(' [')[0]} {unit * level:.3g}{' mm' if unit > 1 else ''}" if beside else "fitted"
+        words, unit = COVARIATES[second] if second else ("fitted", 1.0)
+        label = f"{words.split(',')[0].split(' [')[0]} {unit * level:.3g}{' mm' if unit > 1 else ''}" if second else "fitted"
         axes.plot(scale * x, value, color=COLOURS[i], lw=1.5, label=label)
         axes.fill_between(scale * x, low, high, color=COLOURS[i], alpha=0.12, lw=0)
 
 
 def errors(analysis: Analysis) -> str | None:
-    """Place errors, and the agreement of size and stiffness; None without a matched finding."""
+    """Return place errors and the agreement of size and stiffness; None without a matched finding."""
     e = analysis.errors
     if not len(e.place_m.values):
         return None
@@ -222,7 +222,7 @@ def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
 
 
 def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
-    """Reliability diagram of the first MOST methods; None without any."""
+    """Return the reliability diagram of the first MOST methods; None without any."""
     if not rows:
         return None
     figure = _figure(6.2, 5.2)
@@ -243,7 +243,7 @@ def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
 
 
 def effort(analyses: Sequence[Analysis]) -> str:
-    """Distribution of greatest force and time of the first MOST methods."""
+    """Return the distributions of greatest force and duration of the first MOST methods."""
     figure = _figure(11, 4.2)
     for axes, column, words in zip(
         _axes(figure, 2), ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
@@ -258,7 +258,7 @@ def effort(analyses: Sequence[Analysis]) -> str:
 
 
 def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str | None:
-    """Paired differences of one quantity from the reference, greatest first; None where none is known.
+    """Return the paired differences of one quantity from the reference, greatest first; None if none is known.
 
     Levels of one error, `error=level`, share a row.
     """

@@ -1,4 +1,4 @@
-"""real_time.md: how late messages and ticks were by the wall clock, beside what the same examinations found in lockstep."""
+"""real_time.md: delays of messages and ticks in wall-clock mode, and a comparison with the same examinations in lockstep."""
 
 from __future__ import annotations
 
@@ -13,15 +13,15 @@ from palpate.study.folder import Outcome
 FILE: Final = "real_time.md"
 FAST: Final = ("robot", "tissue", "control")
 LEGS: Final = (("state to controller", "control", "joint_states"), ("command to robot", "robot", "control/joint_torque"))
-"""Ways of a message: what it is, who looks at it, topic."""
+"""Transfers of messages: name, receiving role, topic."""
 PARTS: Final = ("p50", "p99", "max")
 
 Named = Sequence[tuple[str, Report]]
-"""Reports, each with what it is called in a table."""
+"""Reports with their names in the tables."""
 
 
 def write_real_time(folder: Path, outcomes: Sequence[Outcome]) -> None:
-    """Writes real_time.md into the folder of a study, if it has examinations by the wall clock."""
+    """Writes real_time.md into the folder of a study if it has examinations in wall-clock mode."""
     named = [(one.case.label, one.report) for one in outcomes if one.report is not None]
     clocked = [(name, report) for name, report in named if report.runtime == "wallclock" and report.failure is None]
     if clocked:
@@ -35,18 +35,18 @@ def _row(*cells: object) -> str:
 
 
 def _latencies(reports: Named) -> str:
-    """From a state to the command that acts, and how much of that is which way.
+    """Return a table of the delay from a state to the command that results, by transfer.
 
-    A way is a message's age when its reader takes it up: transport, and waiting for the reader's next tick.
+    The delay of a transfer is the age of a message when it is read: transport, and waiting for the reader's next tick.
     """
     text = _row("examination", *(f"{what}: p50, p99, largest [ms]" for what, _, _ in LEGS), "mean step of control [ms]",
                 "together: sum of p50, of p99, of largest [ms]")  # fmt: skip
     text += _row(*["---"] * 5)
     for name, report in reports:
-        ways = [[report.services[role]["age_ms"][topic][part] for part in PARTS] for _, role, topic in LEGS]
+        delays = [[report.services[role]["age_ms"][topic][part] for part in PARTS] for _, role, topic in LEGS]
         computing = report.blame["control"]["compute"] / 1e3
-        sums = [sum(part) + computing for part in zip(*ways, strict=True)]
-        text += _row(name, *map(_three, ways), f"{computing:.2f}", _three(sums))
+        sums = [sum(part) + computing for part in zip(*delays, strict=True)]
+        text += _row(name, *map(_three, delays), f"{computing:.2f}", _three(sums))
     return text
 
 
@@ -55,7 +55,7 @@ def _three(figures: Sequence[float]) -> str:
 
 
 def _ticks(reports: Named) -> str:
-    """Ticks that came late by more than a period in the fast loop."""
+    """Return a table of the ticks of the fast loop that were late by more than a period."""
     text = _row("examination", *(f"{role}: late ticks, times skipped ahead" for role in FAST)) + _row(*["---"] * (1 + len(FAST)))
     for name, report in reports:
         cells = []
@@ -68,7 +68,7 @@ def _ticks(reports: Named) -> str:
 
 
 def _comparison(reports: Named) -> str:
-    """What was found, and how hard and how deep it pressed."""
+    """Return a table of findings, forces, depths and durations."""
     text = _row("examination", "found, missed, false", "centre off [mm]", "Dice", "apparent stiffness", "largest force [N]",
                 "depth RMS [mm]", "exam [s]", "wall [s]")  # fmt: skip
     text += _row(*["---"] * 9)

@@ -1,4 +1,4 @@
-"""A study: which patients are examined, with what errors of the equipment, and by which methods. YAML, as strict as a scenario.
+"""The specification of a study: its patients, equipment errors and methods. YAML, as strict as a scenario.
 
     name: mine
     populations:
@@ -27,7 +27,7 @@ from palpate_models.scenario.load import ScenarioError, explain, parse_yaml
 from palpate_models.section import Length, Section
 
 Split = Literal["tune", "test"]
-"""`tune`: patients on whom thresholds may be chosen. `test`: patients whose figures are reported."""
+"""`tune`: patients for choosing thresholds. `test`: patients whose figures are reported."""
 Tier = Literal["whole", "quick"]
 """`whole`: the composed run of all services. `quick`: the indenter without an arm (`palpate.quick`)."""
 Runtime = Literal["lockstep", "wallclock"]
@@ -39,27 +39,27 @@ SUFFIX: Final = ".yaml"
 
 
 class StudyError(UserError):
-    """A study that cannot be used. The message names file, field, value and what is allowed."""
+    """An invalid study. The message names file, field, value and what is allowed."""
 
 
 class Numbers(Section):
-    """How many patients of each split."""
+    """Number of patients per split."""
 
     tune: Annotated[int, Field(ge=0, le=1000)] = 0
     test: Annotated[int, Field(ge=0, le=1_000_000)] = 0
 
 
 class Grid(Section):
-    """Values that patients get in turn; with several grids, every combination of their values."""
+    """Values that are assigned to patients in turn; with several grids, all combinations of their values."""
 
     grid: Annotated[tuple[float, ...], Field(min_length=1)]
 
 
 class Lumps(Section):
-    """Lumps that are drawn for each patient from his seed. Ranges are (least, most), as in `phantom.draw` of a scenario."""
+    """Lumps that are drawn for each patient from their seed. Ranges are (least, greatest), as in `phantom.draw`."""
 
     count: tuple[Annotated[int, Field(ge=0, le=MOST_LUMPS)], Annotated[int, Field(ge=0, le=MOST_LUMPS)]] = (1, 1)
-    """How many a patient has."""
+    """Number of lumps per patient."""
     radius_m: Range | Grid = Draw().radius_m
     elongation: Range | Grid = Draw().elongation
     depth_m: Range | Grid = Draw().depth_m
@@ -75,7 +75,7 @@ class Lumps(Section):
         return self
 
     def cells(self) -> list[dict[str, Any]]:
-        """`phantom.draw` of each combination of the grids; one if there is no grid."""
+        """Return `phantom.draw` for each combination of the grids; one without grids."""
         grids = {name: value.grid for name in type(self).model_fields if isinstance(value := getattr(self, name), Grid)}
         plain = self.model_dump(mode="json", exclude={"count", *grids})
         return [
@@ -88,21 +88,21 @@ class Population(Section):
     """Patients of one kind."""
 
     scenario: str
-    """Name of a scenario, or a YAML file, beside the study's own file if its path is relative."""
+    """Name of a scenario, or a YAML file; a relative path starts from the folder of the study's file."""
     number: Numbers = Numbers()
     settings: Settings = Field(default_factory=dict)
     lumps: Lumps | None = None
-    """Lumps beside those of the scenario, which must be of `kind: person`."""
+    """Lumps in addition to those of the scenario, which must have `kind: person`."""
 
 
 class Method(Section):
-    """A way to examine: whatever of the scenario is changed for it."""
+    """A method of examination, as changes of the scenario."""
 
     settings: Settings = Field(default_factory=dict)
     services: dict[str, str] = Field(default_factory=dict)
-    """Who plays a role: an installed implementation, or a Python file, beside the study's own file if its path is relative."""
+    """Implementation by role: an installed one, or a Python file; a relative path starts from the folder of the study's file."""
     runtime: Runtime = "lockstep"
-    """`wallclock`: a process a service, each on its own timer. Its results depend on the machine, so that it has no digest."""
+    """`wallclock`: one process per service, each on its own timer. Results depend on the machine, so there is no digest."""
     periods: dict[str, Annotated[int, Field(ge=1, le=1000)]] = Field(default_factory=dict)
     """Other periods of roles [ms], such as `control: 5`."""
 
@@ -116,7 +116,7 @@ class Method(Section):
 
 
 class Study(Section):
-    """All of a study."""
+    """A study."""
 
     name: Name
     description: str = ""
@@ -124,23 +124,23 @@ class Study(Section):
     salt: str = ""
     """Changes every patient of the split `test`."""
     seeds_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """For a held-out study: SHA-256 of the file of secret seeds, without which its split `test` cannot be made."""
+    """For a held-out study: SHA-256 of the file of secret seeds, which the split `test` needs."""
     populations: Annotated[dict[Name, Population], Field(min_length=1)]
     errors: dict[Name, Errors] = Field(default_factory=dict)
-    """What is wrong with the equipment, by a name for it; as the scenarios have it where there is none."""
+    """Equipment errors by name; without any, those of the scenarios."""
     each_error: tuple[str, ...] = ()
-    """Besides, each of these alone, a section of the errors such as `camera` or a field such as `force.tare_n` ..."""
+    """Errors that are also examined one at a time: a section such as `camera`, or a field such as `force.tare_n`."""
     each_error_at: tuple[Level, ...] = ()
-    """... at each of these levels, with all others as in the first of `errors`."""
+    """Levels of `each_error`; all other errors are those of the first entry of `errors`."""
     methods: Annotated[dict[Name, Method], Field(min_length=1)] = Field(default_factory=lambda: {"palpate": Method()})
     record: Literal["none"] = "none"
-    """Nothing is recorded: a recording of one examination has 57 MB."""
+    """Nothing is recorded: the recording of one examination has 57 MB."""
 
     @model_validator(mode="after")
     def _each(self) -> Self:
         if bool(self.each_error) != bool(self.each_error_at) or (self.each_error and not self.errors):
             raise ValueError(
-                "each_error and each_error_at need each other, and errors: its first entry is what all other errors are"
+                "each_error and each_error_at need each other, and errors, whose first entry has the values of all other errors"
             )
         allowed = [*table(), *(f"{section}.{field}" for section, rows in table().items() for field in rows)]
         if wrong := [name for name in self.each_error if name not in allowed]:
@@ -150,9 +150,9 @@ class Study(Section):
         return self
 
     def error_levels(self) -> dict[str, Errors | None]:
-        """What is wrong with the equipment, by name: `errors`, and `name=level` for each error of its own.
+        """Return the equipment errors by name: `errors`, and `name=level` for each single error.
 
-        None stands for what the scenario says. An error that a level leaves as it is in the first of `errors` is left out.
+        None stands for the errors of the scenario. A level that equals the first entry of `errors` is left out.
         """
         if not self.errors:
             return {"": None}
@@ -168,13 +168,13 @@ class Study(Section):
 
 
 def study_names() -> tuple[str, ...]:
-    """Names of the studies that come with the project."""
+    """Return the names of the studies that come with Palpate."""
     folder = resources.files("palpate.study").joinpath("studies")
     return tuple(sorted(item.name.removesuffix(SUFFIX) for item in folder.iterdir() if item.name.endswith(SUFFIX)))
 
 
 def load_study(source: str) -> Study:
-    """A study by name or YAML file, with paths of files made absolute. Raises StudyError."""
+    """Return a study by name or YAML file, with absolute paths of files. Raises StudyError."""
     if source in study_names():
         path = Path(str(resources.files("palpate.study").joinpath("studies", source + SUFFIX)))
     else:
@@ -192,14 +192,14 @@ def load_study(source: str) -> Study:
 
 
 def with_methods(study: Study, only: Sequence[str] | None) -> Study:
-    """The study with these of its methods, or with all. Raises StudyError for one that it does not have."""
+    """Return the study with only these methods, or with all. Raises StudyError for an unknown one."""
     if wrong := [name for name in only or () if name not in study.methods]:
         raise StudyError(f"{study.name}: there is no method {wrong[0]!r}: want one of {', '.join(study.methods)}")
     return study.model_copy(update={"methods": {name: own for name, own in study.methods.items() if not only or name in only}})
 
 
 def checked_study(raw: Mapping[str, Any], name: str, folder: Path, text: str = "") -> Study:
-    """The study of these fields, read from the file `name` in `folder`, which says `text`. Raises StudyError."""
+    """Return the study of these fields, from the file `name` in `folder` with the content `text`. Raises StudyError."""
     try:
         study = Study.model_validate(raw)
     except ValidationError as error:
@@ -216,5 +216,5 @@ def checked_study(raw: Mapping[str, Any], name: str, folder: Path, text: str = "
 
 
 def _file(word: str, folder: Path, suffix: str) -> str:
-    """A name as it is, and a file by its absolute path."""
+    """Return a name unchanged, a file as absolute path."""
     return str((folder / word).resolve()) if word.endswith(suffix) else word

@@ -40,15 +40,15 @@ class SurfaceRow(Row, allow_inf_nan=False):
     """Lumps."""
     found: int
     weights: tuple[float, ...]
-    """Intercept, then one for each covariate: log odds by standard deviation."""
+    """Intercept, then one per covariate: log odds per standard deviation."""
     centre: tuple[float, ...]
     scale: tuple[float, ...]
     lapse: float
     quartiles: dict[str, tuple[float, float, float]]
     threshold_90: dict[str, Estimate]
-    """Value of each covariate from which lumps are found with 90 %, the others at their medians."""
+    """Value of each covariate from which 90 % of lumps are found, the others at their medians."""
     smallest_90: dict[str, Estimate]
-    """Radius [m] from which lumps are found with 90 %, by contrast (its quartiles), depth at its median."""
+    """Radius [m] from which 90 % of lumps are found, by quartile of contrast, depth at its median."""
 
 
 class MethodRow(Row):
@@ -61,16 +61,16 @@ class MethodRow(Row):
     auc: Estimate | None
     froc_mean: Estimate | None
     froc: dict[str, Estimate]
-    """Sensitivity by false findings an examination."""
+    """Sensitivity by false findings per examination."""
     sensitivity_at_zero: Estimate | None
     felt: SurfaceRow | None
-    """Detectability by what reaches the skin."""
+    """Detectability by the effect on the surface."""
     made: SurfaceRow | None
     """Detectability by the lumps themselves."""
     errors: ErrorsRow
     calibration: CalibrationRow | None
     guarding: CalibrationRow | None = None
-    """Of the probabilities of a tensed muscle; None where no area lies on one."""
+    """Calibration of the probabilities of a tensed muscle; None without an area on one."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 
@@ -81,27 +81,27 @@ class StudySummary(Row):
     study: str
     splits: tuple[str, ...]
     version: str
-    """Of Palpate, by which the statistics were made."""
+    """Version of Palpate that computed the statistics."""
     command: str
-    """That runs the study again."""
+    """Command that runs the study again."""
     patients: dict[str, int]
     """By population."""
     reference: str
-    """The method that others are compared with."""
+    """Method that the others are compared with."""
     methods: dict[str, MethodRow]
     comparisons: tuple[Comparison, ...]
     assumed: bool
-    """Whether the errors of quick cases are of too few whole examinations: then no figure may be quoted."""
+    """True if the errors of quick cases were fitted to too few whole examinations; then no figure may be quoted."""
     level: float
-    """Of the intervals."""
+    """Level of the intervals."""
     bootstrap_folds: int
     human: dict[str, object]
-    """What people find, with its source."""
+    """Detection by human examiners, with sources."""
 
 
 @dataclass(frozen=True)
 class Analysed:
-    """A study's figures, and the curves for its plots."""
+    """A study's figures and the curves for its plots."""
 
     summary: StudySummary
     analyses: tuple[Analysis, ...]
@@ -122,9 +122,12 @@ def conclude(folder: Folder, manifest: Manifest) -> tuple[RunRecord, list[Outcom
 
 
 def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
-    """Reads cases.parquet, findings.parquet and lumps.parquet of `folder`; writes study.json and study.html beside them.
+    """Writes study.json and study.html from cases.parquet, findings.parquet and lumps.parquet in `folder`. Raises UserError.
 
-    `command` runs the study again. Intervals are of `folds` resamplings. Raises UserError.
+    Args:
+        folder: folder of the study.
+        command: command that runs the study again.
+        folds: resamplings of the bootstrap.
     """
     analysed = analysed_tables(read_tables(folder, folds), command)
     write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
@@ -132,18 +135,18 @@ def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
 
 
 def read_summary(path: Path) -> StudySummary:
-    """A study.json. Raises UserError."""
+    """Return a study.json. Raises UserError."""
     try:
         return StudySummary.model_validate_json(path.read_text(encoding="utf-8"))
     except (OSError, UnicodeDecodeError) as error:
         raise UserError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
-        raise UserError(f"{path} is no study.json of this version: {'; '.join(wrong)}") from error
+        raise UserError(f"{path} is not a study.json of this version: {'; '.join(wrong)}") from error
 
 
 def analysed_tables(tables: Tables, command: str) -> Analysed:
-    """All statistics of a study."""
+    """Return all statistics of a study."""
     analyses = tuple(analyse(variant, tables.bootstrap) for variant in tables.variants)
     reference, *others = tables.variants
     summary = StudySummary(
@@ -164,7 +167,7 @@ def analysed_tables(tables: Tables, command: str) -> Analysed:
 
 
 def _patients(tables: Tables) -> dict[str, int]:
-    """How many patients there are, by population."""
+    """Return the number of patients by population."""
     return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
 
 

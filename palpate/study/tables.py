@@ -1,4 +1,4 @@
-"""The tables of a study: one row per case, one row per finding, one row per lump, as Parquet. Statistics read nothing else."""
+"""The tables of a study as Parquet: one row per case, per finding and per lump. Statistics read only these."""
 
 from __future__ import annotations
 
@@ -54,11 +54,12 @@ CASES: Final = pa.schema(
         "loop_examinations": pa.int64(),
     }
 )
-"""A row a case. Counts are null and figures NaN where a case has no report. `score`: greatest confidence of any finding or
-candidate, 0 without one. `exam_time_s` is simulated time; `sim_time_s` real time of the simulation, in whole examinations with
-the assessment, `assess_time_s` that of the assessment (in quick cases the processor's), `wall_time_s` all of it with the truth,
-`core_s` the processor's.
-`loop_examinations`: from how many whole examinations the errors of a quick case are; null of a whole one."""
+"""One row per case. Counts are null and figures NaN for a case without a report.
+
+`score`: greatest confidence of any finding or candidate, 0 without one. `exam_time_s`: simulated time. `sim_time_s`: wall time of
+the simulation, in whole examinations with the assessment. `assess_time_s`: wall time of the assessment (processor time in quick
+cases). `wall_time_s`: all wall time, including the truth. `core_s`: processor time. `loop_examinations`: number of whole
+examinations that the errors of a quick case were fitted to; null for a whole one."""
 FINDINGS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -80,8 +81,8 @@ FINDINGS: Final = pa.schema(
         "on_guarding": pa.bool_(),
     }
 )
-"""A row a finding, and a row a candidate that was weighed and not reported. `lump`: the lump that it matches, -1 if none.
-`guarding`: the probability of a tensed muscle that it tells. `on_guarding`: whether it lies on one and hits no lump."""
+"""One row per finding and per candidate. `lump`: the matched lump, -1 if none. `guarding`: reported probability of a tensed
+muscle. `on_guarding`: True if it lies on one and matches no lump."""
 LUMPS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -97,8 +98,8 @@ LUMPS: Final = pa.schema(
         "place_error_m": pa.float64(),
     }
 )
-"""A row a lump, of failed cases too. `felt_radius_m`, `radius_m`: of the circles whose areas are those of what is felt and
-of the outline. `found`: by a reported finding. `confidence`: of the surest finding or candidate that hits it, 0 without one."""
+"""One row per lump, also of failed cases. `felt_radius_m`, `radius_m`: radius of the circle with the felt area and with the area
+of the outline. `found`: by a reported finding. `confidence`: greatest one of its findings and candidates, 0 without any."""
 
 
 def write_tables(folder: Path, study: str, outcomes: Iterable[Outcome]) -> None:
@@ -162,7 +163,7 @@ def _findings(outcome: Outcome) -> Iterator[Row]:
 
 
 def _scored(rows: Sequence[FindingRow], scores: Sequence[FindingScore]) -> list[tuple[FindingRow, FindingScore | None]]:
-    """Each row with its score; None where nothing could be scored."""
+    """Return each row with its score; None without scores."""
     return list(zip(rows, scores or (None,) * len(rows), strict=True))
 
 

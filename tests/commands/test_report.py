@@ -168,7 +168,7 @@ def test_a_real_abdomen_is_assessed_without_a_truth(scenario: Scenario, tmp_path
     assert report.assessed
     assert report.findings[0].quadrant == "RLQ"
     assert (report.truth, report.scores, report.depth_rms_error_m) == (None, None, None)
-    assert "nothing is known of it" in write_page(tmp_path).read_text(encoding="utf-8").lower()
+    assert "unknown: the tissue was not simulated" in write_page(tmp_path).read_text(encoding="utf-8").lower()
     text = io.StringIO()
     print_findings(Console(file=text, width=120), report)
     assert "RLQ" in text.getvalue()

@@ -1,4 +1,4 @@
-"""The suites: what an implementation of each role has to do, by the contract and by the docs of its messages."""
+"""Suites: requirements on an implementation of each role, from the contract and the documentation of its messages."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ SUITES: dict[str, Callable[[Rig, ConformanceReport], None]] = {
     "supervisor": supervisor.suite,
 }
 """The suite of each role."""
-LASTS_S = {
+DURATION_S = {
     "robot": 9.0,
     "tissue": 4.0,
     "control": 7.0,
@@ -31,11 +31,11 @@ LASTS_S = {
     "search": 7.5,
     "supervisor": 26.0,
 }
-"""How long each suite takes on the rig's clock with an implementation that conforms [s]; for the progress display."""
+"""Duration of each suite on the rig's clock with a conforming implementation; for the progress display."""
 
 
 def check(rig: Rig, report: ConformanceReport | None = None) -> ConformanceReport:
-    """Runs the suite of a rig's role, then what holds for every role, and returns the report."""
+    """Runs the suite of a rig's role, then the common checks, and returns the report."""
     report = report or ConformanceReport(rig.role.name)
     SUITES[rig.role.name](rig, report)
     common.suite(rig, report)

@@ -20,10 +20,10 @@ SAMPLES, MAP, FINDINGS = "assessment/samples", "assessment/map", "assessment/fin
 STIFF_AT = np.array((0.02, -0.015))
 STIFF_RADIUS = 0.022
 CONTRAST = 3.0
-SPEED = 0.03
-LINES = 0.0125
+SPEED_MPS = 0.03
+LINES_M = 0.0125
 FORCE_N = 3.0
-"""At the depth of the scan on unremarkable tissue."""
+"""Force at the depth of the scan on unremarkable tissue."""
 ANSWER_S = 30.0
 
 
@@ -32,15 +32,15 @@ class PlayedScan:
 
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
         self._X_WA, self._depth, self._start = X_WA, depth, start
-        line = np.arange(-half, half, SPEED * 0.01)
+        line = np.arange(-half, half, SPEED_MPS * 0.01)
         rows = []
-        for i, y in enumerate(np.arange(-half, half + 1e-9, LINES)):
+        for i, y in enumerate(np.arange(-half, half + 1e-9, LINES_M)):
             rows.append(np.column_stack((line if i % 2 == 0 else line[::-1], np.full(len(line), y))))
         self.path = np.vstack(rows)
         self.duration = len(self.path) * 0.01 + 1.0
 
     def state(self, t: int) -> Any:
-        """The state at `t` [ns]."""
+        """Return the state at `t` [ns]."""
         i = (t - self._start) // (10 * MS) - 50
         phase = ExamState.PHASE_INDENT if i < 0 else ExamState.PHASE_SCAN if i < len(self.path) else ExamState.PHASE_ASSESS
         x, y = self.path[int(np.clip(i, 0, len(self.path) - 1))]
@@ -67,13 +67,13 @@ class PlayedScan:
 
     @staticmethod
     def stiffness(x: float, y: float) -> float:
-        """Against unremarkable tissue."""
+        """Return the stiffness relative to unremarkable tissue."""
         r = float(np.hypot(x - STIFF_AT[0], y - STIFF_AT[1]))
         return 1.0 + (CONTRAST - 1.0) / (1.0 + float(np.exp((r - STIFF_RADIUS) / 0.004)))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Silence before contact, samples, the map, findings."""
+    """Checks silence before contact, samples, map and findings."""
     exam = rig.settings.scenario.exam
     half = min(0.05, exam.region_m[0] / 2, exam.region_m[1] / 2)
     X_WA = np.array(exam_input(rig.settings.scenario).X_WA)
@@ -95,17 +95,17 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
     report.section("samples")
-    heard = [item.message for item in rig.log[SAMPLES]]
-    if not report.expect("takes samples", len(heard) > 20, "many", len(heard)):
+    received = [item.message for item in rig.log[SAMPLES]]
+    if not report.expect("takes samples", len(received) > 20, "many", len(received)):
         return
-    p = np.array([(m.position.x, m.position.y, m.position.z) for m in heard])
+    p = np.array([(m.position.x, m.position.y, m.position.z) for m in received])
     off = float(np.max(np.abs(p[:, 2] - shapes.height(p[:, 0], p[:, 1]))))
-    report.expect("on the surface, in the abdomen's frame", off < 0.003, "within 3 mm", f"{off * 1e3:.2f} mm")
+    report.expect("on the surface, in the abdomen frame", off < 0.003, "within 3 mm", f"{off * 1e3:.2f} mm")
     inside = float(np.max(np.abs(p[:, :2]))) <= half + 0.003
     report.expect(
         "where the indenter was", inside, f"within {half * 1e3:.0f} mm of the umbilicus", np.abs(p[:, :2]).max(axis=0).round(3)
     )
-    force = np.array([m.normal_force for m in heard])
+    force = np.array([m.normal_force for m in received])
     ok = bool(np.all((force > 0.5 * FORCE_N) & (force < 1.5 * CONTRAST * FORCE_N)))
     report.expect(
         "with the force that was measured",
@@ -151,10 +151,10 @@ def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
             len(last.scanned),
             len(last.finding),
         }
-        report.expect("one value a vertex", sizes == {n}, n, sorted(sizes))
+        report.expect("one value per vertex", sizes == {n}, n, sorted(sizes))
         ordered = bool(np.all(last.lower <= last.apparent)) and bool(np.all(last.apparent <= last.upper))
-        report.expect("bands hold their value", ordered, "lower <= apparent <= upper", "so" if ordered else "not so")
+        report.expect("bands include their value", ordered, "lower <= apparent <= upper", "so" if ordered else "not so")
         scanned, member = np.asarray(last.scanned, dtype=bool), np.asarray(last.finding) >= 0
         rest = float(np.median(last.apparent[scanned & ~member]))
         near = 0.5 * FORCE_N < rest < 2 * FORCE_N
-        report.expect("in newtons of the standard press", near, f"about {FORCE_N:g} N beside the findings", f"{rest:.2f} N")
+        report.expect("in newtons of the standard press", near, f"about {FORCE_N:g} N outside the findings", f"{rest:.2f} N")

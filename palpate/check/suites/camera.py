@@ -1,4 +1,4 @@
-"""Role camera: frames on request, with intrinsics; where it renders `sim/surface`, the geometry is checked on a plane."""
+"""Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import HeardMessage, Rig, Source
+from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger
@@ -21,14 +21,14 @@ SMALL_IMAGE, SMALL_INFO = "camera/follow/depth", "camera/follow/camera_info"
 SMALL_WIDTHS = (48, 192)
 FRAME = "camera_depth_optical_frame"
 FRAMES = 5
-HALF = 0.15
-"""Half the side of the plane [m]."""
-PITCH = 0.01
+HALF_M = 0.15
+"""Half the side of the plane."""
+PITCH_M = 0.01
 TOLERANCE_M = 0.01
 
 
 def pose_of(message: Any) -> Array | None:
-    """X_WC of the optical frame in a tf_static, shape (4, 4)."""
+    """Return X_WC of the optical frame in a tf_static, shape (4, 4)."""
     for item in message.transforms:
         if item.child_frame_id == FRAME and item.header.frame_id == "world":
             return transform_matrix(item.transform)
@@ -36,18 +36,18 @@ def pose_of(message: Any) -> Array | None:
 
 
 def depths(message: Any) -> Array:
-    """Depth [m], shape (height, width); NaN where invalid."""
+    """Return depth [m], shape (height, width); NaN where invalid."""
     rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8).reshape(message.height, message.step)
     return rows[:, : 4 * message.width].copy().view("<f4").astype(float)
 
 
 def plane(centre: Array) -> Source:
-    """A level square about `centre`, in world."""
-    return lambda t: level(t, HALF, PITCH, centre)
+    """Return the source of a level square about `centre`, in world."""
+    return lambda t: level(t, HALF_M, PITCH_M, centre)
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Pose, bursts, format, geometry."""
+    """Checks pose, bursts, format and geometry."""
     report.section("pose")
     centre = np.array(rig.settings.scenario.camera.look_at_m)
     feed = {"sim/surface": plane(centre)}
@@ -63,7 +63,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("small images")
     _small(silent[SMALL_IMAGE], silent[SMALL_INFO], report)
     report.section("bursts")
-    report.expect("takes no whole frame unasked", not silent[IMAGE], "none", len(silent[IMAGE]))
+    report.expect("takes no full frame without a request", not silent[IMAGE], "none", len(silent[IMAGE]))
     burst = _burst(rig, feed)
     images, infos = burst[IMAGE], burst[INFO]
     report.expect("takes as many frames as asked", len(images) == FRAMES, FRAMES, len(images))
@@ -87,9 +87,9 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         _geometry(depth, infos[-1].message, X_WC, centre, rig, report)
 
 
-def _small(images: list[HeardMessage], infos: list[HeardMessage], report: ConformanceReport) -> None:
-    """Perception follows the wall by them: they come all the time, with intrinsics of their own."""
-    if not report.expect("come unasked", bool(images), "some in half a second", len(images)):
+def _small(images: list[ReceivedMessage], infos: list[ReceivedMessage], report: ConformanceReport) -> None:
+    """Checks the small images, by which perception follows the wall: sent continuously, with their own intrinsics."""
+    if not report.expect("sent without a request", bool(images), "some in half a second", len(images)):
         return
     same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
     report.expect("intrinsics with every one, of the same stamp", same, f"{len(images)} pairs", f"{len(infos)} camera_info")
@@ -100,12 +100,12 @@ def _small(images: list[HeardMessage], infos: list[HeardMessage], report: Confor
         _format(images[-1], infos[-1], report)
 
 
-def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[HeardMessage]]:
+def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[ReceivedMessage]]:
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
     return rig.run(0.1 * FRAMES + 0.5 + rig.slack / 1e9, feed)
 
 
-def _format(image: HeardMessage, info: HeardMessage, report: ConformanceReport) -> Array | None:
+def _format(image: ReceivedMessage, info: ReceivedMessage, report: ConformanceReport) -> Array | None:
     m, k = image.message, np.asarray(info.message.k, np.float64).reshape(3, 3)
     report.expect("encoding", m.encoding == "32FC1" and not m.is_bigendian, "32FC1 [m], little-endian", f"{m.encoding}")
     fits = m.step >= 4 * m.width and len(m.data) == m.step * m.height
@@ -114,7 +114,7 @@ def _format(image: HeardMessage, info: HeardMessage, report: ConformanceReport) 
     report.expect("camera_info is of that size", size == (m.height, m.width), (m.height, m.width), size)
     good = k[0, 0] > 0 and k[1, 1] > 0 and 0 < k[0, 2] < m.width and 0 < k[1, 2] < m.height and k[2, 2] == 1
     report.expect(
-        "intrinsics make sense", bool(good), "positive focal lengths, principal point in the image", k.round(1).tolist()
+        "intrinsics are plausible", bool(good), "positive focal lengths, principal point in the image", k.round(1).tolist()
     )
     if m.encoding != "32FC1" or not fits:
         return None
@@ -131,7 +131,7 @@ def _format(image: HeardMessage, info: HeardMessage, report: ConformanceReport) 
 
 
 def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: ConformanceReport) -> None:
-    """Pixels that look at the plane show it where it is."""
+    """Checks the depth of the pixels that see the plane."""
     if not rig.settings.motion:
         report.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")
         return
@@ -140,7 +140,7 @@ def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, rep
     rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones(depth.shape)), axis=-1) @ X_WC[:3, :3].T
     expected = (centre[2] - X_WC[2, 3]) / rays[..., 2]
     hit = X_WC[:3, 3] + rays * expected[..., None]
-    on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF) & (expected > 0)
+    on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF_M) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF_M) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
     seen = error.size / max(int(on.sum()), 1)
     bias = float(np.median(error)) if error.size else np.inf

@@ -1,4 +1,4 @@
-"""What every implementation owes, by the contract alone: judged over all that it sent during its suite."""
+"""Requirements of the contract on every implementation, checked over all messages that it sent during its suite."""
 
 from __future__ import annotations
 
@@ -7,71 +7,71 @@ from itertools import pairwise
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import HeardMessage, Rig
+from palpate.check.rig import ReceivedMessage, Rig
 from palpate_bus.contract import MS, Topic
 from palpate_bus.contract.conformance import Checker
 
 RATE_TOLERANCE = 0.2
 """Largest relative error of a live implementation's rate, over the whole check."""
 STAMP_TOLERANCE_MS = 100.0
-"""Beyond the slack."""
+"""Tolerance in addition to the slack."""
 LOST = 0.05
-"""Part of a live implementation's messages that may be lost on the way to this check."""
+"""Share of a live implementation's messages that may be lost in transport."""
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Topics, rates, stamps and values."""
+    """Checks topics, rates, stamps and values."""
     report.section("contract")
     for topic in rig.rules.outputs(rig.role.name):
-        heard = rig.log[topic.name]
-        if not heard:
+        received = rig.log[topic.name]
+        if not received:
             if topic.event:
-                report.skip(f"{topic.name}", "an event topic that had no reason to speak")
+                report.skip(f"{topic.name}", "an event topic without an event")
             else:
                 report.expect(
                     f"{topic.name} is sent", False, "once" if topic.latched else f"every {topic.period_ms} ms", "nothing"
                 )
             continue
-        _values(topic, heard, report)
+        _values(topic, received, report)
         if topic.periodic:
-            _rate(rig, topic, heard, report)
-            _stamps(rig, topic, heard, report)
-        _sequence(rig, topic, heard, report)
+            _rate(rig, topic, received, report)
+            _stamps(rig, topic, received, report)
+        _sequence(rig, topic, received, report)
     if rig.live:
         report.expect(
             "every message can be decoded", not rig.undecodable, "valid CDR", "; ".join(rig.undecodable[:3]) or "all valid"
         )
 
 
-def _values(topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
+def _values(topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     checker = Checker(topic)
-    faults = [fault for item in heard for fault in checker(item.message)]
+    faults = [fault for item in received for fault in checker(item.message)]
     wanted = "frame, ranges and finite numbers as in its row"
-    got = f"{len(heard)} messages, all so"
+    got = f"{len(received)} messages, all so"
     if faults:
         first = faults[0]
         got = f"{len(faults)} faults, first: {first.field} is {first.got}, allowed {first.expected}"
     report.expect(f"{topic.name}: values", not faults, wanted, got)
 
 
-def _rate(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
-    """In-process every tick has its message; live the mean rate is right, by the sender's own clock."""
+def _rate(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    """Checks that every tick has its message; on a live bus, the mean rate by the sender's clock."""
     wanted = f"{1000 / topic.period_ms:g} Hz"
     if not rig.live:
-        times = [item.t for item in heard]
+        times = [item.t for item in received]
         due = list(range(0, rig.t, topic.period))
         report.expect(f"{topic.name}: rate", times == due, f"{len(due)} messages, one on each tick", f"{len(times)}")
         return
-    seconds = (heard[-1].sent - heard[0].sent) / 1e9
-    rate = (len(heard) - 1) / seconds if seconds > 0 else 0.0
+    seconds = (received[-1].sent - received[0].sent) / 1e9
+    rate = (len(received) - 1) / seconds if seconds > 0 else 0.0
     off = abs(rate * topic.period_ms / 1000 - 1)
-    longest = max((b.sent - a.sent for a, b in pairwise(heard)), default=0) / MS
+    longest = max((b.sent - a.sent for a, b in pairwise(received)), default=0) / MS
     report.expect(f"{topic.name}: rate", off < RATE_TOLERANCE, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
 
 
-def _stamps(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
+def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     checker = Checker(topic)
-    stamps = [(item.t, stamp) for item in heard if (stamp := checker.stamp(item.message)) is not None]
+    stamps = [(item.t, stamp) for item in received if (stamp := checker.stamp(item.message)) is not None]
     if not stamps:
         return
     back = [(a, b) for (_, a), (_, b) in pairwise(stamps) if b < a]
@@ -89,9 +89,9 @@ def _stamps(rig: Rig, topic: Topic, heard: list[HeardMessage], report: Conforman
         report.expect(f"{topic.name}: stamps", not wrong, "the tick", f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else "so")
 
 
-def _sequence(rig: Rig, topic: Topic, heard: list[HeardMessage], report: ConformanceReport) -> None:
-    steps = np.diff([item.sequence for item in heard])
+def _sequence(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    steps = np.diff([item.sequence for item in received])
     jumps = int(np.sum(steps != 1))
     ok = bool(np.all(steps > 0)) and jumps <= (LOST * len(steps) if rig.live else 0)
-    got = f"{jumps} jumps among {len(heard)}" if jumps else "without a gap"
+    got = f"{jumps} jumps among {len(received)}" if jumps else "without a gap"
     report.expect(f"{topic.name}: sequence", ok, "numbered 1, 2, 3, ... in the attachment", got)

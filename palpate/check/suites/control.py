@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, HeardMessage, Rig, Source
+from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
@@ -21,13 +21,13 @@ VALID = contract().topics["planning/setpoint"].expiry
 
 
 def joints(q: Any = lbr.HOME, names: tuple[str, ...] = lbr.JOINT_NAMES) -> Source:
-    """An arm at rest at `q` [rad]."""
+    """Return the source of an arm at rest at `q` [rad]."""
     position = np.asarray(q, dtype=float)
     return lambda t: JointState(header(t), list(names), position, np.zeros(7), np.zeros(7))
 
 
 def joint_target(q: Any, stiffness: float) -> Source:
-    """A set-point of mode JOINT."""
+    """Return the source of a set-point of mode JOINT."""
     target = np.asarray(q, dtype=float)
     zero = Vector3(0.0, 0.0, 0.0)
 
@@ -42,7 +42,7 @@ def joint_target(q: Any, stiffness: float) -> Source:
 
 
 def pose_target(X_WI: Array, stiffness: float) -> Source:
-    """A set-point of mode CARTESIAN; the null-space posture is where the arm stands."""
+    """Return the source of a set-point of mode CARTESIAN, with the current null-space posture."""
     pose = pose_message(X_WI[:3, :3], X_WI[:3, 3])
     zero = Vector3(0.0, 0.0, 0.0)
 
@@ -57,7 +57,7 @@ def pose_target(X_WI: Array, stiffness: float) -> Source:
 
 
 def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:
-    """What the controller reads."""
+    """Return the inputs of the controller."""
     sources: dict[str, Source] = {"joint_states": arm or joints()}
     if setpoint is not None:
         sources["planning/setpoint"] = setpoint
@@ -65,12 +65,12 @@ def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Signs, limits, expiry, garbage."""
+    """Checks signs, limits, expiry and reactions to garbage."""
     report.section("law")
     idle = rig.run(0.3, feed())[TORQUE]
     quiet = max((float(np.max(np.abs(item.message.torque))) for item in idle), default=np.inf)
     report.expect(
-        "without a set-point it asks for no torque",
+        "without a set-point it commands no torque",
         quiet < 1e-9 or _ceased(idle),
         "0 N m, or expired commands",
         f"{quiet:.3g} N m",
@@ -86,15 +86,15 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     _silence(rig, report)
 
 
-def _ceased(heard: list[HeardMessage]) -> bool:
-    """Whether the last commands have expired already, or there are none: the driver holds then."""
-    return all(nanoseconds(item.message.valid_for) == 0 for item in heard[-5:])
+def _ceased(received: list[ReceivedMessage]) -> bool:
+    """Return True if the last commands have expired or there are none: then the driver holds."""
+    return all(nanoseconds(item.message.valid_for) == 0 for item in received[-5:])
 
 
 def _torque(rig: Rig, sources: Feed, seconds: float = 0.3) -> Array:
-    """The mean of the last commands [N m], shape (7,)."""
-    heard = rig.run(seconds, sources)[TORQUE][-20:]
-    return np.mean([item.message.torque for item in heard], axis=0) if heard else np.full(7, np.nan)
+    """Return the mean of the last commands [N m], shape (7,)."""
+    received = rig.run(seconds, sources)[TORQUE][-20:]
+    return np.mean([item.message.torque for item in received], axis=0) if received else np.full(7, np.nan)
 
 
 def _joint_sign(rig: Rig, report: ConformanceReport) -> None:
@@ -140,24 +140,24 @@ def _limits(rig: Rig, report: ConformanceReport) -> None:
     rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
     worst = np.max(np.abs([item.message.torque for item in rig.log[TORQUE]]), axis=0)
     ok = bool(np.all(worst <= lbr.TORQUE_LIMIT))
-    report.expect("torques stay within the joints' limits, whatever is asked for", ok, f"{lbr.TORQUE_LIMIT} N m", worst.round(1))
+    report.expect("torques stay within the joints' limits for any set-point", ok, f"{lbr.TORQUE_LIMIT} N m", worst.round(1))
 
 
 def _expiry(rig: Rig, report: ConformanceReport) -> None:
     rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
     ended = rig.t
-    heard = rig.run(0.6 + rig.slack / 1e9, feed())[TORQUE]
-    expired = next((item.t - ended for item in heard if nanoseconds(item.message.valid_for) == 0), None)
+    received = rig.run(0.6 + rig.slack / 1e9, feed())[TORQUE]
+    expired = next((item.t - ended for item in received if nanoseconds(item.message.valid_for) == 0), None)
     limit = VALID + 12 * MS + rig.slack
-    silent = heard[-1].t - ended if heard else 0
-    ok = (expired is not None and expired <= limit and _ceased(heard)) or (expired is None and silent <= limit)
+    silent = received[-1].t - ended if received else 0
+    ok = (expired is not None and expired <= limit and _ceased(received)) or (expired is None and silent <= limit)
     got = f"after {expired / MS:.0f} ms" if expired is not None else f"last command after {silent / MS:.0f} ms"
     report.expect("stops commanding when set-points cease", ok, f"expired commands or none within {limit / MS:.0f} ms", got)
     torque = _torque(rig, feed(joint_target(lbr.HOME, 100.0)))
-    heard = rig.log[TORQUE]
+    received = rig.log[TORQUE]
     report.expect(
         "commands again on a new set-point",
-        not _ceased(heard) and bool(np.all(np.isfinite(torque))),
+        not _ceased(received) and bool(np.all(np.isfinite(torque))),
         "valid commands",
         f"{torque.round(2)} N m",
     )
@@ -168,34 +168,34 @@ def _garbage(rig: Rig, report: ConformanceReport) -> None:
     target[0] += 0.05
     before = _torque(rig, feed(joint_target(target, 100.0)))
     nothing = np.full(7, np.nan)
-    heard = rig.run(0.2, feed(joint_target(nothing, 100.0)))[TORQUE]
-    finite = all(np.all(np.isfinite(item.message.torque)) for item in heard)
+    received = rig.run(0.2, feed(joint_target(nothing, 100.0)))[TORQUE]
+    finite = all(np.all(np.isfinite(item.message.torque)) for item in received)
     report.expect("a set-point that is not a number makes no such torque", finite, "finite torques", "so" if finite else "NaN")
-    still = float(np.max(np.abs(np.asarray(heard[-1].message.torque) - before))) if heard else np.inf
-    calm = still < 1.0 or _ceased(heard)
+    still = float(np.max(np.abs(np.asarray(received[-1].message.torque) - before))) if received else np.inf
+    calm = still < 1.0 or _ceased(received)
     report.expect(
         "and is not followed", calm, "the torques of the last good set-point, or expired commands", f"{still:.2f} N m off"
     )
     broken = np.full(7, np.nan)
-    heard = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(broken)))[TORQUE]
-    finite = all(np.all(np.isfinite(item.message.torque)) for item in heard)
+    received = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(broken)))[TORQUE]
+    finite = all(np.all(np.isfinite(item.message.torque)) for item in received)
     report.expect(
-        "joint states that are no numbers: it ceases", finite and _ceased(heard), "expired commands or none", _last(heard)
+        "joint states that are not numbers: it ceases", finite and _ceased(received), "expired commands or none", _last(received)
     )
     wrong = tuple(reversed(lbr.JOINT_NAMES))
-    heard = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(names=wrong)))[TORQUE]
-    report.expect("joint states in another order: it ceases", _ceased(heard), "expired commands or none", _last(heard))
+    received = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(names=wrong)))[TORQUE]
+    report.expect("joint states in another order: it ceases", _ceased(received), "expired commands or none", _last(received))
     _torque(rig, feed(joint_target(lbr.HOME, 100.0)))
     report.expect("and recovers with good ones", not _ceased(rig.log[TORQUE]), "valid commands", _last(rig.log[TORQUE]))
 
 
 def _silence(rig: Rig, report: ConformanceReport) -> None:
-    heard = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": joint_target(lbr.HOME, 100.0)})[TORQUE]
-    report.expect("no joint states: it ceases", _ceased(heard), "expired commands or none", _last(heard))
+    received = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": joint_target(lbr.HOME, 100.0)})[TORQUE]
+    report.expect("no joint states: it ceases", _ceased(received), "expired commands or none", _last(received))
 
 
-def _last(heard: list[HeardMessage]) -> str:
-    if not heard:
+def _last(received: list[ReceivedMessage]) -> str:
+    if not received:
         return "none"
-    message = heard[-1].message
+    message = received[-1].message
     return f"{np.asarray(message.torque).round(2)} N m, valid for {nanoseconds(message.valid_for) / MS:.0f} ms"

@@ -1,4 +1,4 @@
-"""Role perception: the suite shows it depth frames of a belly of known shape, and then none."""
+"""Role perception: the suite sends depth frames of a belly of known shape, and then none."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ ANSWER_S = 10.0
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Silence unasked, the surface of a known belly, an answer when nothing came."""
+    """Checks silence without a trigger, the surface of a known belly, and the answer without frames."""
     known = exam_input(rig.settings.scenario)
     X_WA = np.array(known.X_WA)
     camera = rig.settings.scenario.camera
@@ -48,8 +48,10 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("bursts")
     rig.send("tf_static", _tf(X_WC))
     feed = _frames(depth, K)
-    unasked = rig.run(0.5, feed)
-    report.expect("says nothing unasked", not unasked[TARGETS], "no targets before a trigger", len(unasked[TARGETS]))
+    untriggered = rig.run(0.5, feed)
+    report.expect(
+        "sends nothing without a trigger", not untriggered[TARGETS], "no targets before a trigger", len(untriggered[TARGETS])
+    )
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
     answered = _answer(rig, feed)
     if not report.expect(
@@ -68,7 +70,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     late = rig.log[TARGETS][before:]
     ok = bool(late) and not len(late[-1].message.positions) and bool(late[-1].message.message)
     got = "no answer" if not late else f"{len(late[-1].message.positions)} targets: {late[-1].message.message}"
-    report.expect("without frames it answers with no targets, and says why", ok, "an empty list with a message", got)
+    report.expect("without frames it answers with no targets and a reason", ok, "an empty list with a message", got)
 
 
 def _answer(rig: Rig, feed: Feed) -> bool:
@@ -80,12 +82,12 @@ def _answer(rig: Rig, feed: Feed) -> bool:
 
 
 def _following(rig: Rig, depth: Array, K: Array, report: ConformanceReport) -> None:
-    """Shown every eighth pixel, it tells how the wall moves."""
+    """Checks that it reports the motion of the wall from images with every eighth pixel."""
     few = np.diag((1 / 8, 1 / 8, 1.0)) @ K
     shown = rig.run(1.0, _frames(np.ascontiguousarray(depth[::8, ::8]), few, SMALL_IMAGE, SMALL_INFO))[MOTION]
-    if report.expect("tells of small images how the wall moves", bool(shown), MOTION, "so" if shown else "nothing"):
+    if report.expect("reports the motion of the wall from small images", bool(shown), MOTION, "so" if shown else "nothing"):
         count = SurfaceMotion.FORECASTS
-        sizes = {len(heard.message.forecast) for heard in shown}
+        sizes = {len(received.message.forecast) for received in shown}
         report.expect("with its forecast", sizes == {count}, f"{count} values", sorted(sizes))
 
 
@@ -117,7 +119,7 @@ def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     p_A = apply(inverse(X_WA), np.asarray(message.vertices, np.float64).reshape(-1, 3))
     n_W = np.asarray(message.normals, np.float64).reshape(-1, 3)
     error = np.abs(p_A[:, 2] - shapes.height(p_A[:, 0], p_A[:, 1]))
-    near = np.hypot(p_A[:, 0], p_A[:, 1]) < 0.8 * shapes.REACH
+    near = np.hypot(p_A[:, 0], p_A[:, 1]) < 0.8 * shapes.REACH_M
     worst = float(np.quantile(error[near], 0.95)) if near.any() else np.inf
     report.expect("where it is", worst < 0.003, "95 % within 3 mm", f"{worst * 1e3:.2f} mm")
     n_A = n_W @ X_WA[:3, :3]
@@ -133,7 +135,7 @@ def _targets(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     p_W = np.array([(p.x, p.y, p.z) for p in message.positions]).reshape(-1, 3)
     sizes = {len(p_W), len(message.normals), len(message.lines)}
     report.expect("targets, each with normal and line", len(sizes) == 1 and len(p_W) > 0, "some, of equal number", sorted(sizes))
-    report.expect("fused what it was sent", message.frames_fused == FRAMES, FRAMES, message.frames_fused)
+    report.expect("fused all frames", message.frames_fused == FRAMES, FRAMES, message.frames_fused)
     if not len(p_W):
         return
     exam = rig.settings.scenario.exam

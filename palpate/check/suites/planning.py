@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, HeardMessage, Rig
+from palpate.check.rig import Feed, ReceivedMessage, Rig
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -20,7 +20,7 @@ AWAIT_S = 20.0
 
 
 class PerfectFollower:
-    """An arm that is where the last joint set-point wants it; it starts at the ready posture."""
+    """An arm that is always at the last joint set-point; it starts at the ready posture."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -28,7 +28,7 @@ class PerfectFollower:
         self.mode = RobotStatus.MODE_ACTIVE
 
     def feed(self) -> Feed:
-        """What planning reads of it."""
+        """Return the inputs of planning."""
         return {"robot/status": self._status}
 
     def _status(self, t: int) -> Any:
@@ -43,14 +43,14 @@ class PerfectFollower:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Set-points, the way to the first picture, stop."""
+    """Checks set-points, the phases up to the first camera burst, and a stop."""
     report.section("set-points")
     arm = PerfectFollower(rig)
     rig.run(0.5, arm.feed())
-    heard = rig.log[SETPOINT]
-    if not report.expect("set-points come", bool(heard), "100 Hz", len(heard)):
+    received = rig.log[SETPOINT]
+    if not report.expect("set-points come", bool(received), "100 Hz", len(received)):
         return
-    _first(heard, report)
+    _first(received, report)
     report.section("examination")
     waited = 0.0
     while not rig.log["planning/camera_trigger"] and waited < AWAIT_S:
@@ -65,7 +65,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     )
     wanted = rig.settings.scenario.camera.frames
     if triggers:
-        report.expect("as many as the scenario says", triggers[0].message.frames == wanted, wanted, triggers[0].message.frames)
+        report.expect("as many as in the scenario", triggers[0].message.frames == wanted, wanted, triggers[0].message.frames)
     _safe(rig.log[SETPOINT], report)
     _phases(rig.log[STATE], report)
     report.section("stop")
@@ -86,12 +86,12 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.expect("and its set-points stand still", moved < 0.05, "below 0.05 rad in a second", f"{moved:.3f} rad")
     report.section("silence")
     quiet = rig.run(0.5, {})
-    report.expect("goes on without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
+    report.expect("continues without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
 
 
-def _first(heard: list[HeardMessage], report: ConformanceReport) -> None:
-    """Nothing may jump when a run starts."""
-    message = heard[0].message
+def _first(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    """Checks that the first set-point is at the arm's position."""
+    message = received[0].message
     if message.mode == ImpedanceSetpoint.MODE_JOINT:
         off = float(np.max(np.abs(np.asarray(message.joint_position) - lbr.HOME)))
         report.expect("the first set-point is where the arm is", off < 0.02, "within 0.02 rad", f"{off:.4f} rad")
@@ -99,8 +99,8 @@ def _first(heard: list[HeardMessage], report: ConformanceReport) -> None:
         report.skip("the first set-point is where the arm is", "it is not of mode JOINT")
 
 
-def _safe(heard: list[HeardMessage], report: ConformanceReport) -> None:
-    joint = [item.message for item in heard if item.message.mode == ImpedanceSetpoint.MODE_JOINT]
+def _safe(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    joint = [item.message for item in received if item.message.mode == ImpedanceSetpoint.MODE_JOINT]
     q = np.array([m.joint_position for m in joint])
     t = np.array([nanoseconds(m.header.stamp) / 1e9 for m in joint])
     inside = bool(np.all(np.abs(q) <= lbr.POSITION_LIMIT))
@@ -113,10 +113,10 @@ def _safe(heard: list[HeardMessage], report: ConformanceReport) -> None:
         lbr.VELOCITY_LIMIT.round(2),
         worst.round(2),
     )
-    valid = [nanoseconds(item.message.valid_for) for item in heard]
+    valid = [nanoseconds(item.message.valid_for) for item in received]
     ok = all(0 < value <= 250 * MS for value in valid)
     report.expect("every set-point expires", ok, "0 to 250 ms", f"{min(valid) / MS:.0f} to {max(valid) / MS:.0f} ms")
-    cartesian = [item.message for item in heard if item.message.mode == ImpedanceSetpoint.MODE_CARTESIAN]
+    cartesian = [item.message for item in received if item.message.mode == ImpedanceSetpoint.MODE_CARTESIAN]
     unit = max((abs(_norm(m.pose.orientation) - 1) for m in cartesian), default=0.0)
     report.expect("orientations are unit quaternions", unit < 1e-3, "length 1", f"{unit:.2g} off")
 
@@ -125,9 +125,9 @@ def _norm(q: Any) -> float:
     return float(np.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2))
 
 
-def _phases(heard: list[HeardMessage], report: ConformanceReport) -> None:
-    phases = list(dict.fromkeys(int(item.message.phase) for item in heard))
+def _phases(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    phases = list(dict.fromkeys(int(item.message.phase) for item in received))
     ok = phases == sorted(phases) and phases[-1] <= ExamState.PHASE_PLAN
     report.expect("phases follow their order", ok, "HOME, LOOK, PLAN", phases)
-    undecided = all(item.message.end_tick < 0 for item in heard)
+    undecided = all(item.message.end_tick < 0 for item in received)
     report.expect("no end is announced yet", undecided, "end_tick -1", "so" if undecided else "decided")

@@ -1,4 +1,4 @@
-"""Role robot: a driver or plant of the arm, with its F/T sensor. The order matters: what latches is released again."""
+"""Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, HeardMessage, Rig, Source
+from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
 from palpate_bus.contract import MS
 from palpate_bus.messages import (
     JointTorqueCommand,
@@ -24,7 +24,7 @@ from palpate_models.robot import lbr
 
 COMMAND = "control/joint_torque"
 PUSH = np.array([6.0, 6.0, 4.0, 4.0, 1.0, 0.6, 0.4])
-"""Torque that moves a joint a little in `PUSH_S` [N m]: above the friction of the simulated arm."""
+"""Torque that moves a joint slightly in `PUSH_S` [N m]: above the friction of the simulated arm."""
 PUSH_S = 0.06
 MOVED_RAD = 2e-4
 DRIFT_RAD = 0.05
@@ -32,7 +32,7 @@ PRESS_N = 10.0
 
 
 def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
-    """No contact, no command; a supervisor who is content, or not."""
+    """Return the inputs without contact and command, with the supervisor at `level`."""
     zero = Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
     cause = SupervisorState.CAUSE_NONE if level == SupervisorState.LEVEL_OK else SupervisorState.CAUSE_FORCE
 
@@ -44,14 +44,14 @@ def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
 
 
 def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
-    """The same with a torque command [N m], shape (7,), on every tick."""
+    """Return the inputs with a torque command [N m], shape (7,), on every tick."""
     values = np.asarray(torque, dtype=float)
     valid_ns = rig.rules.topics[COMMAND].expiry
     return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "")}
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Signs, gravity, holds, latches, limits."""
+    """Checks signs, gravity, holds, latches and limits."""
     report.section("joints")
     rest = rig.run(0.5, quiet(rig))
     _joints(rest["joint_states"], report)
@@ -92,15 +92,15 @@ def _mode_name(rig: Rig) -> str:
     )
 
 
-def _joints(heard: list[HeardMessage], report: ConformanceReport) -> None:
-    if not report.expect("joint_states come", len(heard) > 0, "messages", f"{len(heard)}"):
+def _joints(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+    if not report.expect("joint_states come", len(received) > 0, "messages", f"{len(received)}"):
         return
-    last = heard[-1].message
+    last = received[-1].message
     names = list(last.name)
     report.expect("joint names, in order", names == list(lbr.JOINT_NAMES), ", ".join(lbr.JOINT_NAMES), ", ".join(names))
     shapes = [np.shape(values) for values in (last.position, last.velocity, last.effort)]
     report.expect("seven positions, velocities and efforts", shapes == [(7,)] * 3, "3 x (7,)", shapes)
-    q = np.array([item.message.position for item in heard if np.shape(item.message.position) == (7,)])
+    q = np.array([item.message.position for item in received if np.shape(item.message.position) == (7,)])
     inside = bool(np.all(np.abs(q) <= lbr.POSITION_LIMIT))
     report.expect(
         "joints within their limits", inside, f"+-{np.rad2deg(lbr.POSITION_LIMIT).round()} deg", np.rad2deg(q[-1]).round(1)
@@ -122,7 +122,7 @@ def _description(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _gravity(rig: Rig, report: ConformanceReport) -> None:
-    """Commands exclude gravity: with zero torque a compensated arm stays where it is."""
+    """Checks that commands exclude gravity: with zero torque the arm stays where it is."""
     moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
     report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
@@ -135,20 +135,20 @@ def _gravity(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _signs(rig: Rig, report: ConformanceReport) -> None:
-    """A positive torque accelerates its joint to the positive side, and is reported as applied with that sign."""
-    wrong, unsaid = [], []
+    """Checks that a positive torque accelerates its joint positively and is reported with that sign."""
+    wrong, unreported = [], []
     settle(rig)
     for joint in range(7):
         release(rig)
         torque = np.zeros(7)
         torque[joint] = PUSH[joint]
-        heard = rig.run(PUSH_S, commanding(rig, torque))["joint_states"]
+        received = rig.run(PUSH_S, commanding(rig, torque))["joint_states"]
         settle(rig)
-        q = np.array([item.message.position[joint] for item in heard])
+        q = np.array([item.message.position[joint] for item in received])
         if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
             wrong.append(lbr.JOINT_NAMES[joint])
-        if not any(abs(item.message.effort[joint] - torque[joint]) < 0.2 * torque[joint] for item in heard):
-            unsaid.append(lbr.JOINT_NAMES[joint])
+        if not any(abs(item.message.effort[joint] - torque[joint]) < 0.2 * torque[joint] for item in received):
+            unreported.append(lbr.JOINT_NAMES[joint])
     report.expect(
         "a positive torque moves its joint positively",
         not wrong,
@@ -157,19 +157,19 @@ def _signs(rig: Rig, report: ConformanceReport) -> None:
     )
     report.expect(
         "effort reports the applied torque",
-        not unsaid,
+        not unreported,
         "within 20 % of the command",
-        f"not {', '.join(unsaid)}" if unsaid else "all seven",
+        f"not {', '.join(unreported)}" if unreported else "all seven",
     )
 
 
 def settle(rig: Rig) -> None:
-    """Lets the driver hold until the arm rests."""
+    """Waits in the driver's hold until the arm rests."""
     rig.run(0.4, quiet(rig))
 
 
 def release(rig: Rig) -> None:
-    """A release, as the supervisor grants it."""
+    """Sends a release, as the supervisor grants it."""
     rig.run(0.02, quiet(rig))
     rig.memory["releases"] = rig.memory.get("releases", 0) + 1
     rig.run(0.05 + rig.slack / 1e9, quiet(rig))
@@ -180,11 +180,11 @@ def _activate(rig: Rig) -> None:
     rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))
 
 
-def _holds(rig: Rig, heard: list[HeardMessage]) -> HeardMessage | None:
-    return next((item for item in heard if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
+def _holds(rig: Rig, received: list[ReceivedMessage]) -> ReceivedMessage | None:
+    return next((item for item in received if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
 
 
-def _how(hold: HeardMessage | None) -> str:
+def _how(hold: ReceivedMessage | None) -> str:
     return "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
 
 
@@ -192,8 +192,8 @@ def _expiry(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     ended = rig.t
-    heard = rig.run(0.5 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, heard)
+    received = rig.run(0.5 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, received)
     expiry = rig.rules.topics[COMMAND].expiry_ms or 0
     limit = (expiry + rig.rules.topics["robot/status"].period_ms + 2) * MS + rig.slack
     late = None if hold is None else hold.t - ended
@@ -206,7 +206,7 @@ def _expiry(rig: Rig, report: ConformanceReport) -> None:
     cause = -1 if hold is None else int(hold.message.cause)
     causes = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
     report.expect(
-        "and says why",
+        "and states the reason",
         cause in causes and bool(hold and hold.message.reason),
         "CAUSE_COMMAND_EXPIRED with a reason",
         _mode_name(rig),
@@ -220,9 +220,9 @@ def _expiry(rig: Rig, report: ConformanceReport) -> None:
 
 def _provoke(rig: Rig, report: ConformanceReport, what: str, torque: Any, cause: int) -> None:
     _activate(rig)
-    heard = rig.run(0.1, commanding(rig, torque))["robot/status"]
-    heard += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, heard)
+    received = rig.run(0.1, commanding(rig, torque))["robot/status"]
+    received += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, received)
     got = _how(hold)
     report.expect(
         f"{what} makes it hold", hold is not None and hold.message.cause == cause, f"MODE_SAFE_HOLD, cause {cause}", got
@@ -241,8 +241,8 @@ def _invalid(rig: Rig, report: ConformanceReport) -> None:
 def _stop(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
-    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
-    hold = _holds(rig, heard)
+    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
+    hold = _holds(rig, received)
     got = _how(hold)
     ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
     report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
@@ -250,8 +250,8 @@ def _stop(rig: Rig, report: ConformanceReport) -> None:
 
 def _emergency(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
-    heard = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
-    hold = _holds(rig, heard)
+    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
+    hold = _holds(rig, received)
     got = _how(hold)
     report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
 
@@ -262,7 +262,7 @@ def _pressing(rig: Rig, force_W: Any) -> Feed:
 
 
 def _force(rig: Rig, report: ConformanceReport) -> None:
-    """`ft/wrench` is what tool and environment exert on the sensor, in its axes: a push on the tool shows with its sign."""
+    """Checks the sign of `ft/wrench`, the wrench of tool and environment on the sensor in its axes."""
     if not rig.log["sim/tool_state"]:
         report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
         return
@@ -281,13 +281,13 @@ def _force(rig: Rig, report: ConformanceReport) -> None:
     )
 
 
-def _mean_force(heard: list[HeardMessage]) -> np.ndarray[Any, Any]:
-    forces = [item.message.wrench.force for item in heard]
+def _mean_force(received: list[ReceivedMessage]) -> np.ndarray[Any, Any]:
+    forces = [item.message.wrench.force for item in received]
     return np.mean([(f.x, f.y, f.z) for f in forces], axis=0) if forces else np.full(3, np.nan)
 
 
 def _twist(rig: Rig, report: ConformanceReport) -> None:
-    """The twist is the pose's rate of change, over all of the check."""
+    """Checks that the twist is the pose's rate of change, over the whole suite."""
     states = [item.message for item in rig.log["sim/tool_state"]]
     if not states:
         report.skip("sim/tool_state: twist", "not simulated")
@@ -296,7 +296,7 @@ def _twist(rig: Rig, report: ConformanceReport) -> None:
     p = np.array([(m.pose.position.x, m.pose.position.y, m.pose.position.z) for m in states])
     v = np.array([(m.twist.linear.x, m.twist.linear.y, m.twist.linear.z) for m in states])
     dt = t[2:] - t[:-2]
-    steady = (dt > 0) & (dt < 0.0025)  # neighbours on the grid; pauses of a live check are left out
+    steady = (dt > 0) & (dt < 0.0025)  # neighbouring ticks only; a live check has pauses
     error = np.linalg.norm((p[2:] - p[:-2])[steady] / dt[steady, None] - v[1:-1][steady], axis=1)
     worst, speed = float(np.quantile(error, 0.99)), float(np.max(np.linalg.norm(v, axis=1)))
     report.expect(
@@ -310,15 +310,15 @@ def _twist(rig: Rig, report: ConformanceReport) -> None:
 def _lost(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     rig.lose("control")
-    heard = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, heard)
+    received = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
+    hold = _holds(rig, received)
     got = _how(hold)
     causes = (RobotStatus.CAUSE_COMMANDER_LOST, RobotStatus.CAUSE_COMMAND_EXPIRED)
     report.expect("the loss of control makes it hold", hold is not None and hold.message.cause in causes, "MODE_SAFE_HOLD", got)
 
 
 def _limits(rig: Rig, report: ConformanceReport) -> None:
-    """Over all that was asked for in this check."""
+    """Checks the limits over the whole suite."""
     efforts = [item.message.effort for item in rig.log["joint_states"] if np.shape(item.message.effort) == (7,)]
     worst = np.max(np.abs(efforts), axis=0)
     report.expect(

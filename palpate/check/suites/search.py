@@ -1,4 +1,4 @@
-"""Role search: the suite plays an examination that presses wherever it is asked to, on a belly with one stiff area."""
+"""Role search: the suite plays an examination that carries out each request, on a belly with one stiff area."""
 
 from __future__ import annotations
 
@@ -23,13 +23,13 @@ MOST: Final = 40
 
 
 class Play:
-    """The states of an examination; `over` is the number of the latest request that is carried out."""
+    """States of an examination; `over` is the number of the latest finished request."""
 
     def __init__(self) -> None:
         self.phase, self.over = ExamState.PHASE_PLAN, 0
 
     def state(self, t: int) -> Any:
-        """The state at `t` [ns]."""
+        """Return the state at `t` [ns]."""
         over = self.over
         return exam_state(
             t, self.phase, target_index=over, stroke=over, depth_setpoint=-0.01, depth=-0.01, depth_uncertainty=0.0005
@@ -37,16 +37,16 @@ class Play:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Silence before contact, one request at a time, inside the region, and an end in good time."""
+    """Checks silence before contact, one request at a time, places in the region, and an end within the budget."""
     exam = rig.settings.scenario.exam
     stiff_at = np.array(exam.centre_m) + 0.2 * np.array(exam.region_m)
     play = Play()
     report.section("requests")
     rig.run(0.2, {"exam/state": play.state})
-    report.expect("asks for nothing before contact", not rig.log[REQUEST], "no request", len(rig.log[REQUEST]))
+    report.expect("requests nothing before contact", not rig.log[REQUEST], "no request", len(rig.log[REQUEST]))
     play.phase = ExamState.PHASE_RETRACT
     rig.run(0.5, {"exam/state": play.state})
-    report.expect("asks once, and waits", len(rig.log[REQUEST]) == 1, "1 request", len(rig.log[REQUEST]))
+    report.expect("requests once and waits", len(rig.log[REQUEST]) == 1, "1 request", len(rig.log[REQUEST]))
     early = 0
     while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MOST:
         asked = rig.last(REQUEST)
@@ -56,31 +56,31 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         early += len(rig.run(PRESS_S / 2, {"exam/state": play.state})[REQUEST])
         play.over = int(asked.number)
         rig.run(PRESS_S / 2, {"exam/state": play.state})
-    heard = [item.message for item in rig.log[REQUEST]]
-    report.expect("waits until a press is over", early == 0, "no request meanwhile", early)
-    report.expect("goes on then", len(heard) == play.over + 1, f"{play.over + 1} requests", len(heard))
-    told = all(0 <= message.lump <= 1 for message in heard)
-    report.expect("tells how probable a lump is", told, "0 to 1", heard[-1].lump if heard else "nothing")
-    numbers = [int(message.number) for message in heard]
+    received = [item.message for item in rig.log[REQUEST]]
+    report.expect("waits until a press is over", early == 0, "no request during a press", early)
+    report.expect("then requests the next", len(received) == play.over + 1, f"{play.over + 1} requests", len(received))
+    valid = all(0 <= message.lump <= 1 for message in received)
+    report.expect("reports the probability of a lump", valid, "0 to 1", received[-1].lump if received else "nothing")
+    numbers = [int(message.number) for message in received]
     report.expect("numbers its requests", numbers == list(range(1, len(numbers) + 1)), "1, 2, 3, ...", numbers[:5])
-    presses = [message for message in heard if message.request == SearchRequest.PRESS]
+    presses = [message for message in received if message.request == SearchRequest.PRESS]
     xy = np.array([(message.place.x, message.place.y) for message in presses]).reshape(-1, 2)
     inside = bool(np.all(np.abs(xy - exam.centre_m) <= 0.5 * np.array(exam.region_m) + 1e-9))
     report.expect("presses inside the region", inside, f"{exam.region_m} m about {exam.centre_m} m", f"{len(xy)} places")
     deepest = rig.settings.scenario.limits.depth_m
     ok = all(0 < message.depth <= deepest for message in presses)
-    report.expect("presses no deeper than it may", ok, f"up to {deepest} m", max((m.depth for m in presses), default=0.0))
-    done = bool(heard) and heard[-1].request == SearchRequest.DONE
+    report.expect("presses no deeper than the limit", ok, f"up to {deepest} m", max((m.depth for m in presses), default=0.0))
+    done = bool(received) and received[-1].request == SearchRequest.DONE
     on_budget = len(presses) <= exam.budget.presses
     report.expect("keeps to its budget", on_budget, f"{exam.budget.presses} presses", len(presses))
     if done:
-        report.expect("says why it ends", bool(heard[-1].reason), "a reason", heard[-1].reason)
+        report.expect("ends with a reason", bool(received[-1].reason), "a reason", received[-1].reason)
     else:
-        report.skip("an end", f"it went on beyond {len(presses)} presses")
+        report.skip("an end", f"it continued beyond {len(presses)} presses")
 
 
 def pressed(t: int, asked: Any, stiff_at: Any) -> Message:
-    """What a press of the belly is felt like."""
+    """Return the sample of a press of the belly."""
     xy = np.array((asked.place.x, asked.place.y))
     bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - STIFF_M) / EDGE_M)))
     force = FORCE_N * CONTRAST**bump * (asked.depth / 0.010) ** 1.3

@@ -1,4 +1,4 @@
-"""Role supervisor: the suite plays arm and planning, breaks one limit after another, and wants to be stopped for each."""
+"""Role supervisor: the suite plays arm and planning, violates one limit after another, and expects a stop for each."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, HeardMessage, Rig
+from palpate.check.rig import Feed, ReceivedMessage, Rig
 from palpate.check.shapes import level
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
@@ -20,22 +20,22 @@ from palpate_models.scenario.load import exam_input
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
 FORCE_ERROR_N = 3.0
-"""Force is untared: the sensor's bias is in it."""
+"""Tolerance of the force, which includes the sensor's bias because it is untared."""
 REACT_MS = 150
-"""Within this an emergency has to be seen."""
+"""Time limit for an emergency stop."""
 SOFT_MS = 400
-"""A soft stop may wait until planning has reacted by itself."""
+"""Time limit for a soft stop, which may wait for a reaction of planning."""
 SILENT_S = 0.6
 RISE_NPS = 10.0
 STEP_S = 0.02
 OUTSIDE = ((0.0,) * 7, (2.9, *lbr.HOME[1:]), (0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (1.57, 1.57, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures [rad] of which one is likely to be outside of the workspace."""
+"""Postures [rad]; at least one is probably outside the workspace."""
 STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
 EMERGENCY = (SupervisorState.LEVEL_EMERGENCY,)
 
 
 class PlayedArm:
-    """An arm that stands still in the ready posture, free of everything, until something is changed."""
+    """An arm at rest in the ready posture without contact, until an attribute is changed."""
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
@@ -43,14 +43,14 @@ class PlayedArm:
         self.calm()
 
     def calm(self) -> None:
-        """Back to rest."""
+        """Returns to rest."""
         self.q, self.qd = lbr.HOME.copy(), np.zeros(7)
         self.push_N = 0.0
         """Upward force on the tool [N]."""
         self.mode, self.reason = RobotStatus.MODE_ACTIVE, ""
 
     def feed(self, *without: str) -> Feed:
-        """What the supervisor hears all the time, without some of it."""
+        """Return the periodic inputs of the supervisor without some topics."""
         return {name: source for name, source in ((STATUS, self._status), (EXAM, self._exam)) if name not in without}
 
     def _status(self, t: int) -> Any:
@@ -64,37 +64,39 @@ class PlayedArm:
         return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
 
     def surface(self, t: int, depth: float) -> Any:
-        """A level patch below which the sphere is `depth` [m]."""
+        """Return a level surface that lies `depth` [m] above the sphere's lowest point."""
         x, y, z = tool_pose(self.q, self.robot)[:3, 3]
         return level(t, 0.1, 0.01, (x, y, z + depth - self.robot.indenter_radius_m))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Measures, limits one by one, the latch, an operator, silence, loss."""
+    """Checks measures, each limit, the latch, operator requests, silence and loss."""
     arm = PlayedArm(rig)
     limits = exam_input(rig.settings.scenario).limits
     report.section("rest")
     rest = rig.run(2.0, arm.feed())[STATE]
     if not report.expect("supervisor/state comes", bool(rest), "100 Hz", len(rest)):
         return
-    report.expect("an arm at rest is not stopped", _level(rest) == SupervisorState.LEVEL_OK, "LEVEL_OK", _words(rest))
+    report.expect("an arm at rest is not stopped", _level(rest) == SupervisorState.LEVEL_OK, "LEVEL_OK", _text(rest))
     _measures(rig, arm, report)
 
     report.section("limits")
     _press(rig, arm, limits.force_soft_stop_n - 1.0)
     arm.push_N = limits.force_soft_stop_n + 1.0
     _stops(rig, arm, report, "a force over the soft-stop limit", STOPPED, SupervisorState.CAUSE_FORCE, SOFT_MS)
-    heard = rig.run(1.0, arm.feed())[STATE]
+    received = rig.run(1.0, arm.feed())[STATE]
     report.expect(
-        "a soft stop that does not help becomes an emergency stop", _level(heard) in EMERGENCY, "level 2", _words(heard)
+        "a soft stop that does not help becomes an emergency stop", _level(received) in EMERGENCY, "level 2", _text(received)
     )
     _refuses(rig, arm, report)
     _released(rig, arm, report, "and is released")
     arm.push_N = limits.force_emergency_n + 10.0
     _stops(rig, arm, report, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, REACT_MS)
     _released(rig, arm, report, "and is released after it")
-    heard = _press(rig, arm, limits.force_working_n)
-    report.expect("a steady force below the limits is not stopped", _level(heard) == SupervisorState.LEVEL_OK, "0", _words(heard))
+    received = _press(rig, arm, limits.force_working_n)
+    report.expect(
+        "a steady force below the limits is not stopped", _level(received) == SupervisorState.LEVEL_OK, "0", _text(received)
+    )
     rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.035))
     _stops(rig, arm, report, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH, SOFT_MS)
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
@@ -106,21 +108,21 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
     report.section("others")
     arm.q = np.full(7, np.nan)
-    _stops(rig, arm, report, "positions that are no numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, REACT_MS)
+    _stops(rig, arm, report, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, REACT_MS)
     _released(rig, arm, report, "and is released with numbers")
     arm.mode, arm.reason = RobotStatus.MODE_SAFE_HOLD, "conformance check"
     _stops(rig, arm, report, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER, REACT_MS)
     _released(rig, arm, report, "and is released with the driver")
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough"))
     _stops(rig, arm, report, "an operator's stop", EMERGENCY, SupervisorState.CAUSE_OPERATOR, REACT_MS)
-    heard = rig.run(0.5, arm.feed())[STATE]
-    ok = _level(heard) in EMERGENCY and "enough" in heard[-1].message.reason
-    report.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _words(heard))
+    received = rig.run(0.5, arm.feed())[STATE]
+    ok = _level(received) in EMERGENCY and "enough" in received[-1].message.reason
+    report.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _text(received))
     _released(rig, arm, report, "and is released by the operator")
     for silent in (STATUS, EXAM):
-        heard = rig.run(SILENT_S, arm.feed(silent))[STATE]
+        received = rig.run(SILENT_S, arm.feed(silent))[STATE]
         report.expect(
-            f"stops when {silent} is silent", _level(heard) in EMERGENCY, f"level 2 within {SILENT_S:g} s", _words(heard)
+            f"stops when {silent} is silent", _level(received) in EMERGENCY, f"level 2 within {SILENT_S:g} s", _text(received)
         )
         _released(rig, arm, report, f"and is released when {silent} is back")
     rig.lose("control")
@@ -128,22 +130,22 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
-    """Force, speed and depth are those of the arm."""
+    """Checks the reported force, speed and depth."""
     report.section("measures")
     arm.qd = _turning(arm, 0.05)
     rig.send(SURFACE, arm.surface(rig.t, 0.004))
-    heard = _press(rig, arm, 10.0)
-    state = heard[-1].message
-    report.expect("force is what pushes the tool", abs(state.force - 10.0) < FORCE_ERROR_N, "10 N", f"{state.force:.2f} N")
+    received = _press(rig, arm, 10.0)
+    state = received[-1].message
+    report.expect("force is that on the tool", abs(state.force - 10.0) < FORCE_ERROR_N, "10 N", f"{state.force:.2f} N")
     report.expect("speed is that of the sphere", abs(state.speed - 0.05) < 0.005, "0.05 m/s", f"{state.speed:.4f} m/s")
     report.expect("depth is below the perceived surface", abs(state.depth - 0.004) < 1e-3, "4 mm", f"{state.depth * 1e3:.2f} mm")
-    report.expect("and none of it is a reason to stop", state.level == SupervisorState.LEVEL_OK, "LEVEL_OK", _words(heard))
+    report.expect("and none of them is a reason to stop", state.level == SupervisorState.LEVEL_OK, "LEVEL_OK", _text(received))
     arm.calm()
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
 
 
-def _press(rig: Rig, arm: PlayedArm, force: float) -> list[HeardMessage]:
-    """Presses up to `force` [N] as slowly as an examination does, and keeps it for half a second."""
+def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:
+    """Presses up to `force` [N] as slowly as an examination does, and holds for half a second."""
     for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / RISE_NPS / STEP_S)):
         arm.push_N = float(push)
         rig.run(STEP_S, arm.feed())
@@ -151,7 +153,7 @@ def _press(rig: Rig, arm: PlayedArm, force: float) -> list[HeardMessage]:
 
 
 def _turning(arm: PlayedArm, speed: float) -> Array:
-    """Joint velocities [rad/s], of the first joint alone, that move the tool at `speed` [m/s]."""
+    """Return joint velocities [rad/s] that move the tool at `speed` [m/s] by the first joint alone."""
     lever = float(np.linalg.norm(tool_jacobian(arm.q, arm.robot)[:3, 0]))
     return np.array((speed / lever, *np.zeros(6)))
 
@@ -164,55 +166,57 @@ def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
         p_A = apply(X_AW, tool_pose(np.array(q), arm.robot)[:3, 3])
         if bool(np.any(p_A < low - 0.02) or np.any(p_A > high + 0.02)):
             arm.q = np.array(q)
-            _stops(rig, arm, report, "a tool outside of the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, REACT_MS)
+            _stops(rig, arm, report, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, REACT_MS)
             _released(rig, arm, report, "and is released inside")
             return
-    report.skip("stops for a tool outside of the workspace", "the workspace is larger than what this check tries")
+    report.skip("stops for a tool outside the workspace", "all postures of this check lie in the workspace")
 
 
 def _stops(
     rig: Rig, arm: PlayedArm, report: ConformanceReport, what: str, levels: tuple[int, ...], cause: int, within_ms: float
 ) -> None:
-    """Expects a stop with the right cause and words for what was just made wrong."""
+    """Expects a stop with the right cause and a reason."""
     start = rig.t
-    heard = rig.run(0.5, arm.feed())[STATE]
-    first = next((item for item in heard if item.message.level in levels), None)
+    received = rig.run(0.5, arm.feed())[STATE]
+    first = next((item for item in received if item.message.level in levels), None)
     wanted = f"level {' or '.join(map(str, levels))}, cause {cause}, a reason"
-    if not report.expect(f"stops for {what}", first is not None, wanted, _words(heard)):
+    if not report.expect(f"stops for {what}", first is not None, wanted, _text(received)):
         return
     assert first is not None
     state = first.message
-    report.expect(f"and says so: {what}", state.cause == cause and bool(state.reason), wanted, _words([first]))
+    report.expect(f"and states the cause: {what}", state.cause == cause and bool(state.reason), wanted, _text([first]))
     after = (first.t - start - rig.slack) / MS
-    report.expect(f"soon: {what}", after <= within_ms, f"within {within_ms:.0f} ms", f"{after:.0f} ms")
+    report.expect(f"in time: {what}", after <= within_ms, f"within {within_ms:.0f} ms", f"{after:.0f} ms")
 
 
 def _refuses(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
-    """A release while the force is still there."""
+    """Expects that a release is refused while the force is still present."""
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
-    heard = rig.run(0.3, arm.feed())[STATE]
-    report.expect("a release is refused while its cause stands", _level(heard) in STOPPED, "still stopped", _words(heard))
+    received = rig.run(0.3, arm.feed())[STATE]
+    report.expect(
+        "a release is refused while its cause is present", _level(received) in STOPPED, "still stopped", _text(received)
+    )
 
 
 def _released(rig: Rig, arm: PlayedArm, report: ConformanceReport, name: str) -> None:
-    """All is well again: the stop stays, and ends on release, which is counted."""
+    """Expects that a stop stays when its cause is gone, and ends on release, which is counted."""
     arm.calm()
-    heard = rig.run(0.5, arm.feed())[STATE]
-    stays = _level(heard) in STOPPED
-    before = heard[-1].message.releases if heard else 0
+    received = rig.run(0.5, arm.feed())[STATE]
+    stays = _level(received) in STOPPED
+    before = received[-1].message.releases if received else 0
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
-    heard = rig.run(0.5, arm.feed())[STATE]
-    ok = stays and _level(heard) == SupervisorState.LEVEL_OK and heard[-1].message.releases == before + 1
-    got = _words(heard) if stays else "the stop had gone by itself"
-    report.expect(name, ok, "stopped until released, then level 0 and one release more", got)
+    received = rig.run(0.5, arm.feed())[STATE]
+    ok = stays and _level(received) == SupervisorState.LEVEL_OK and received[-1].message.releases == before + 1
+    got = _text(received) if stays else "the stop ended without a release"
+    report.expect(name, ok, "stopped until released, then level 0 and one more release", got)
 
 
-def _level(heard: list[HeardMessage]) -> int | None:
-    return int(heard[-1].message.level) if heard else None
+def _level(received: list[ReceivedMessage]) -> int | None:
+    return int(received[-1].message.level) if received else None
 
 
-def _words(heard: list[HeardMessage]) -> str:
-    if not heard:
+def _text(received: list[ReceivedMessage]) -> str:
+    if not received:
         return "nothing"
-    state = heard[-1].message
+    state = received[-1].message
     return f"level {state.level}, cause {state.cause}{f': {state.reason}' if state.reason else ''}"

@@ -60,7 +60,7 @@
       gl.disableVertexAttribArray(at.c); gl.vertexAttrib3f(at.c, 0.1, 0.2, 0.3);
       gl.drawArrays(gl.LINES, 0, AXES);
     }
-    for (const { element, place: [x, y, z] } of words) {  // beside the canvas' pixels: text of the page
+    for (const { element, place: [x, y, z] } of words) {  // text of the page, over the canvas
       const [u, v] = [M[0] * x + M[4] * y + M[8] * z, M[1] * x + M[5] * y + M[9] * z];
       element.style.left = `${canvas.offsetLeft + (u + 1) / 2 * canvas.clientWidth}px`;
       element.style.top = `${canvas.offsetTop + (1 - v) / 2 * canvas.clientHeight}px`;

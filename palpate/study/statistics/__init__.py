@@ -1,1 +1,1 @@
-"""What a study's tables say. Definitions and their sources are in docs/scoring.md."""
+"""Statistics of a study's tables. Definitions and their sources are in docs/scoring.md."""

@@ -22,23 +22,23 @@ NORMAL: Final = 1.959964
 
 @dataclass(frozen=True)
 class Sample:
-    """Values of findings, each of a patient; shapes (m,)."""
+    """Values of findings and the patient of each; shapes (m,)."""
 
     values: Array
     patient: NDArray[np.intp]
 
     def mean(self, bootstrap: Bootstrap) -> Estimate:
-        """Their mean."""
+        """Return the mean."""
         if not len(self.values):
             return Estimate(value=None, n=0, of="findings")
         return estimate(float(self.values.mean()), self.mean_replicates(bootstrap), len(self.values), "findings")
 
     def mean_replicates(self, bootstrap: Bootstrap) -> Array:
-        """Replicates of the mean, shape (folds,)."""
+        """Return replicates of the mean, shape (folds,)."""
         return bootstrap.ratio(*(bootstrap.sums(each, self.patient) for each in (self.values, np.ones(len(self.values)))))
 
     def quantile(self, q: float, bootstrap: Bootstrap) -> Estimate:
-        """Their quantile `q`: the least value below or at which that part of them lies."""
+        """Return the quantile `q`: the least value that is not below this share of the values."""
         if not len(self.values):
             return Estimate(value=None, n=0, of="findings")
         value = float(np.quantile(self.values, q, method="inverted_cdf"))
@@ -46,33 +46,33 @@ class Sample:
 
 
 class AgreementRow(Row):
-    """Agreement of estimated and true."""
+    """Agreement of estimated and true values."""
 
     bias: Estimate
     """Mean difference."""
     lower: Estimate
-    """Limits of agreement, bias less and plus 1.96 standard deviations: 95 % of the differences, were they normal."""
+    """Limits of agreement: bias plus and minus 1.96 standard deviations, 95 % of normal differences."""
     upper: Estimate
 
 
 class ErrorsRow(Row):
-    """Of the reported findings that match a lump."""
+    """Errors of the reported findings that match a lump."""
 
     place_mean_m: Estimate
     """Distance of the centres."""
     place_median_m: Estimate
     place_p95_m: Estimate
-    """95 % of the findings have less."""
+    """95 % quantile."""
     size_mean: Estimate
-    """Area over the true area, less one."""
+    """Area divided by the true area, minus one."""
     ratio_mean: Estimate
-    """Stiffness ratio over the true ratio, less one."""
+    """Stiffness ratio divided by the true ratio, minus one."""
     radius_m: AgreementRow
-    """Of the radius of the circle of equal area."""
+    """Agreement of the radius of the circle of equal area."""
     log_ratio: AgreementRow
-    """Of the natural logarithm of the stiffness ratio."""
+    """Agreement of the natural logarithm of the stiffness ratio."""
     ratio_held: Estimate
-    """Findings whose 90 % band of the ratio holds the true one."""
+    """Share of findings whose 90 % band includes the true ratio."""
 
 
 @dataclass(frozen=True)
@@ -80,15 +80,15 @@ class Agreement:
     """Estimated against true (Bland and Altman, Lancet 1986;1:307): differences against means."""
 
     mean: Array
-    """Of estimated and true, shape (m,)."""
+    """Means of estimated and true values, shape (m,)."""
     difference: Array
-    """Estimated less true."""
+    """Estimated minus true values."""
     figures: AgreementRow
 
 
 @dataclass(frozen=True)
 class FindingErrors:
-    """Of the reported findings that match a lump."""
+    """Errors of the reported findings that match a lump."""
 
     place_m: Sample
     """Distance of the centres."""
@@ -137,7 +137,7 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
 
 
 def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstrap: Bootstrap) -> Agreement:
-    """Agreement of m pairs, each of a patient, where both are known."""
+    """Return the agreement of the m pairs of which both values are known."""
     known = np.isfinite(estimated) & np.isfinite(true)
     difference, mean, patient = (estimated - true)[known], (estimated + true)[known] / 2, patient[known]
     bias = Sample(difference, patient)
@@ -155,17 +155,17 @@ COVERED: Final = ("coverage_area", "coverage_lumps", "coverage_ratio")
 
 
 class Spread(Row):
-    """One value of each examination that came to its end."""
+    """Spread of one value per completed examination."""
 
     mean: Estimate
     median: Estimate
     p95: Estimate
-    """95 % of the examinations have less."""
+    """95 % quantile."""
     greatest: float | None
 
 
 def spread(variant: Variant, column: str, bootstrap: Bootstrap) -> Spread:
-    """The spread of a column of the cases."""
+    """Return the spread of a column of the cases."""
     sample = of_cases(variant, column)
     mean, median, p95 = (
         each.model_copy(update={"of": "examinations"})
@@ -175,35 +175,36 @@ def spread(variant: Variant, column: str, bootstrap: Bootstrap) -> Spread:
 
 
 def coverage(variant: Variant, column: str, bootstrap: Bootstrap) -> Estimate:
-    """Mean over examinations of the part on which a 90 % band holds the truth."""
+    """Return the mean over examinations of the share on which a 90 % band includes the truth."""
     return of_cases(variant, column).mean(bootstrap).model_copy(update={"of": "examinations"})
 
 
 def of_cases(variant: Variant, column: str) -> Sample:
-    """A column of the cases that came to their end, where it is known."""
+    """Return a column of the completed cases, where it is known."""
     cases = variant.cases[~variant.cases["failed"]].dropna(subset=[column])
     return Sample(cases[column].to_numpy(dtype=np.float64), cases["patient"].to_numpy(dtype=np.intp))
 
 
 BINS: Final = 10
 LEAST: Final = 1e-6
-"""Confidences are kept this far from 0 and 1 before their log odds are taken."""
+"""Confidences are clipped to this distance from 0 and 1 before their log odds are taken."""
 
 
 class CalibrationRow(Row):
-    """Of findings and candidates together, or of the reported findings where a method publishes no candidates."""
+    """Calibration of findings and candidates, or of the reported findings if a method publishes no candidates."""
 
     slope: Estimate
-    """Of the log odds of a hit against those of the confidence: 1 is ideal, less is too sure (Cox, Biometrika 1958;45:562)."""
+    """Slope of the log odds of a hit over those of the confidence: 1 is ideal, less is overconfident (Cox, Biometrika
+    1958;45:562)."""
     in_the_large: Estimate
-    """Part of hits less mean confidence: 0 is ideal."""
+    """Share of hits minus mean confidence: 0 is ideal."""
     expected_error: Estimate
-    """Mean distance of hits from confidence over ten bins of equal number (Naeini et al., AAAI 2015). Resampling adds to it what
-    chance makes of it; the interval is moved back by the mean of that."""
+    """Mean distance of hits from confidence over ten bins of equal number (Naeini et al., AAAI 2015). Resampling adds a bias,
+    whose mean is subtracted from the interval."""
     expected_error_by_chance: float
-    """95 % of studies have less of it with confidences that are right (Broecker and Smith, Weather Forecast 2007;22:651)."""
+    """95 % quantile over studies with calibrated confidences (Broecker and Smith, Weather Forecast 2007;22:651)."""
     brier: Estimate
-    """Mean square of confidence less hit (Brier 1950)."""
+    """Mean square of confidence minus hit (Brier 1950)."""
 
 
 @dataclass(frozen=True)
@@ -212,19 +213,19 @@ class FindingCalibration:
 
     figures: CalibrationRow
     bins: tuple[tuple[float, Estimate], ...]
-    """Mean confidence and part of hits of each bin: the reliability diagram."""
+    """Mean confidence and share of hits of each bin, for the reliability diagram."""
 
 
 def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
-    """The calibration of one method's confidences; None where it has no areas with a confidence."""
+    """Return the calibration of one method's confidences; None without areas with a confidence."""
     areas = variant.findings.dropna(subset=["confidence"])
     return None if areas.empty else _calibration(areas, "confidence", (areas["lump"] >= 0).to_numpy(), bootstrap)
 
 
 def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
-    """The same of the probabilities of a tensed muscle, over the areas that are stiffer than their surroundings.
+    """Return the calibration of the probabilities of a tensed muscle, over areas that are stiffer than their surroundings.
 
-    None where no area lies on a muscle, or none tells a probability.
+    None if no area lies on a muscle or none has a probability.
     """
     areas = variant.findings.dropna(subset=["guarding", "on_guarding"])
     areas = areas[areas["ratio"] > 1]
@@ -232,9 +233,9 @@ def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | Non
     return _calibration(areas, "guarding", tensed, bootstrap) if tensed.any() else None
 
 
-def _calibration(areas: pd.DataFrame, told: str, hit: NDArray[np.bool_], bootstrap: Bootstrap) -> FindingCalibration:
-    """How the probabilities `told` of areas go with their hits, shape (n,)."""
-    p = areas[told].to_numpy(dtype=np.float64)
+def _calibration(areas: pd.DataFrame, column: str, hit: NDArray[np.bool_], bootstrap: Bootstrap) -> FindingCalibration:
+    """Return the calibration of the probabilities in `column` of n areas against their hits, shape (n,)."""
+    p = areas[column].to_numpy(dtype=np.float64)
     patient = areas["patient"].to_numpy(dtype=np.intp)
     order = np.argsort(p, kind="stable")
     p, hit, patient = p[order], hit[order], patient[order]
@@ -259,7 +260,7 @@ def _calibration(areas: pd.DataFrame, told: str, hit: NDArray[np.bool_], bootstr
 
 
 def _bins(p: Array) -> NDArray[np.intp]:
-    """Bins of equal number of sorted confidences; equal confidences are in one bin."""
+    """Return the bin of each sorted confidence; bins have equal numbers, equal confidences are in one bin."""
     _, first = np.unique(p, return_index=True)
     rank = first[np.searchsorted(p[first], p)]
     return (rank * BINS // len(p)).astype(np.intp)
@@ -271,7 +272,7 @@ def _bin(p: Array, hit: NDArray[np.bool_], patient: NDArray[np.intp], bootstrap:
 
 
 def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], drawn: Array) -> Array:
-    """Sums over the bins of |sum(hit - p)|, over the number of all areas, shape (folds,); areas are in order of their bins."""
+    """Return the sum over bins of |sum(hit - p)| divided by the number of areas, shape (folds,); areas are ordered by bin."""
     _, first = np.unique(label, return_index=True)
     gaps = np.abs(np.add.reduceat(drawn * (hit - p), first, axis=1)).sum(axis=1)
     with np.errstate(invalid="ignore", divide="ignore"):
@@ -285,7 +286,7 @@ def _by_chance(p: Array, label: NDArray[np.intp]) -> float:
 
 
 def _slope(p: Array, hit: NDArray[np.bool_], drawn: Array) -> tuple[float, Array]:
-    """The slope and its replicates, NaN where all or none hit or all confidences are one."""
+    """Return the slope and its replicates; NaN if all or none hit or all confidences are equal."""
     x = logit(np.clip(p, LEAST, 1 - LEAST))
     if hit.all() or not hit.any() or np.ptp(x) < LEAST:
         return float("nan"), np.full(len(drawn), np.nan)

@@ -26,7 +26,7 @@ from palpate.study.statistics.reading import Variant
 
 @dataclass(frozen=True)
 class Analysis:
-    """One method. None stands for what its cases cannot give."""
+    """Statistics of one method; None if its cases do not determine them."""
 
     name: str
     cases: pd.DataFrame
@@ -38,17 +38,17 @@ class Analysis:
     felt: Surface | None
     made: Surface | None
     observed: dict[str, list[tuple[float, Estimate]]]
-    """Part of the lumps found, in bins over each covariate."""
+    """Share of the lumps found, in bins over each covariate."""
     errors: FindingErrors
     calibration: FindingCalibration | None
     guarding: FindingCalibration | None
-    """Of the probabilities of a tensed muscle."""
+    """Calibration of the probabilities of a tensed muscle."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 
 
 def analyse(variant: Variant, bootstrap: Bootstrap) -> Analysis:
-    """The statistics of one method."""
+    """Return the statistics of one method."""
     return Analysis(
         name=variant.name,
         cases=variant.cases,

@@ -16,12 +16,12 @@ from palpate.study.statistics.reading import Variant
 
 
 class Quantity(NamedTuple):
-    """What is compared patient by patient."""
+    """A quantity that is compared patient by patient."""
 
     words: str
     unit: str
     margin: float
-    """Two methods are equivalent when their mean difference is within it."""
+    """Two methods are equivalent if their mean difference is within it."""
 
 
 QUANTITIES: Final = {
@@ -33,61 +33,61 @@ QUANTITIES: Final = {
     "peak_force_n": Quantity("greatest force", "N", 1.0),
     "exam_time_s": Quantity("time of the examination", "s", 10.0),
 }
-"""Margins, chosen before any study whose figures are reported: what would change nothing for a clinician."""
+"""Margins of clinically irrelevant differences, chosen before any reported study."""
 
 COUNTED: Final = ("lumps_found", "false_findings")
-"""Quantities of which equal values in every patient say no more than how rare unequal ones are."""
+"""Quantities for which equal values in all patients only bound the rate of unequal ones."""
 
 
 class McNemar(Row):
     """Patients in whom two methods differ (McNemar, Psychometrika 1947;12:153), by the exact binomial test."""
 
     only_reference: int
-    """Right with the reference alone."""
+    """Patients with a correct result only by the reference."""
     only_other: int
-    """Right with the other alone."""
+    """Patients with a correct result only by the other method."""
     n: int
     difference: Estimate
-    """Rate of the other less that of the reference."""
+    """Rate of the other method minus that of the reference."""
     p: float
 
 
 class Difference(Row):
-    """The other method less the reference, patient by patient."""
+    """The other method minus the reference, patient by patient."""
 
     words: str
     unit: str
     mean: Estimate
     margin: float
     low_90: float | None
-    """90 % interval of the mean: within the margins where the methods are equivalent."""
+    """90 % interval of the mean; within the margins if the methods are equivalent."""
     high_90: float | None
     p_equivalence: float | None
-    """Greater one of the two one-sided t-tests' (Schuirmann, J Pharmacokinet Biopharm 1987;15:657); None where all
-    differences are equal."""
+    """Greater p value of two one-sided t-tests (Schuirmann, J Pharmacokinet Biopharm 1987;15:657); None if all differences are
+    equal."""
     equivalent: bool | None
-    """Whether the 90 % interval is within the margins; None where it is not known."""
+    """True if the 90 % interval is within the margins; None if unknown."""
 
 
 class Comparison(Row):
-    """Another method against the reference, on the patients that both examined."""
+    """Comparison of another method with the reference, on the patients that both examined."""
 
     reference: str
     other: str
     patients: int
     auc: Estimate | None
-    """Differences, other less reference."""
+    """Differences, other minus reference."""
     froc_mean: Estimate | None
     sensitivity_at_zero: Estimate | None
     sensitivity: McNemar
-    """Of patients with a lump that can be felt."""
+    """Sensitivity in patients with a palpable lump."""
     specificity: McNemar
-    """Of persons without a lump."""
+    """Specificity in persons without a lump."""
     quantities: dict[str, Difference]
 
 
 def compare(reference: Variant, other: Variant, bootstrap: Bootstrap) -> Comparison:
-    """The comparison of two methods. A case that failed counts against its method here too."""
+    """Return the comparison of two methods. A failed case counts against its method."""
     shared = np.intersect1d(reference.cases["patient"], other.cases["patient"])
     a, b = reference.only(shared), other.only(shared)
     both = a.cases.merge(b.cases, on="patient", suffixes=("_a", "_b"))
@@ -104,18 +104,20 @@ def compare(reference: Variant, other: Variant, bootstrap: Bootstrap) -> Compari
 
 
 def _curves(a: Variant, b: Variant, bootstrap: Bootstrap) -> dict[str, Estimate | None]:
-    """Differences of what is read off whole curves."""
+    """Return the differences of figures of the curves."""
     found: dict[str, Estimate | None] = {"auc": None, "froc_mean": None, "sensitivity_at_zero": None}
     if (roc_a := roc(a, bootstrap)) and (roc_b := roc(b, bootstrap)):
-        found["auc"] = _less(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
+        found["auc"] = _difference(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
     if (froc_a := froc(a, bootstrap)) and (froc_b := froc(b, bootstrap)):
-        found["froc_mean"] = _less(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
-        found["sensitivity_at_zero"] = _less(froc_b.at_zero, froc_a.at_zero, froc_b.zero_replicates - froc_a.zero_replicates)
+        found["froc_mean"] = _difference(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
+        found["sensitivity_at_zero"] = _difference(
+            froc_b.at_zero, froc_a.at_zero, froc_b.zero_replicates - froc_a.zero_replicates
+        )
     return found
 
 
-def _less(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
-    """The difference b - a; where both are at the end of their range, with what both intervals allow."""
+def _difference(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
+    """Return the difference b - a; if both are at the end of their range, with an interval from both intervals."""
     if None in (a.value, a.low, a.high, b.value, b.low, b.high):
         return Estimate(value=None, n=a.n, of=a.of)
 
@@ -128,7 +130,7 @@ def _less(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
 
 
 def _mcnemar(a: pd.Series, b: pd.Series, patient: pd.Series, bootstrap: Bootstrap) -> McNemar:
-    """Where no patient tells the methods apart, the rates differ by no more than such patients may be (Wilson)."""
+    """Return McNemar's test. Without patients in whom the methods differ, Wilson's limit on their share bounds the difference."""
     n, only_a, only_b = len(a), int((a & ~b).sum()), int((b & ~a).sum())
     if n == 0:
         nothing = Estimate(value=None, n=0, of="patients")
@@ -148,7 +150,7 @@ def _mcnemar(a: pd.Series, b: pd.Series, patient: pd.Series, bootstrap: Bootstra
 
 
 def _values(variant: Variant, name: str) -> pd.Series:
-    """A quantity of each patient, by his index; missing where it is not defined or not known."""
+    """Return a quantity by index of the patient; missing if it is undefined or unknown."""
     cases = variant.cases.set_index("patient")
     if name == "lumps_found":
         return (cases["found"] / cases["lumps"])[cases["ill"]]

@@ -20,17 +20,17 @@ from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate,
 from palpate.study.statistics.reading import Variant
 
 FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
-"""What of a lump reaches the skin: force with it over force without it, radius of the circle as big as its felt area, depth."""
+"""Effect of a lump on the surface: force with it divided by force without it, radius of the circle with its felt area, depth."""
 MADE: Final = ("contrast", "radius_m", "depth_m")
-"""The lump itself: its stiffness over that of its surroundings, radius, depth."""
+"""The lump itself: stiffness relative to its surroundings, radius, depth."""
 LOGARITHMIC: Final = ("felt_contrast", "contrast")
 GREATEST_LAPSE: Final = 0.25
 PRIOR_SD: Final = 10.0
-"""Standard deviation of the weak normal prior on every standardised slope: where found and missed lumps do not overlap at all,
-the likelihood alone would have no greatest value (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+"""Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all, the
+likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
 QUARTILES: Final = (0.25, 0.5, 0.75)
 FEWEST: Final = 10
-"""Lumps found, and lumps missed, below which no surface is fitted."""
+"""Least numbers of found and of missed lumps for a fit."""
 
 
 @dataclass(frozen=True)
@@ -41,26 +41,26 @@ class Surface:
     left_out: tuple[str, ...]
     """Covariates that all lumps share."""
     centre: Array
-    """Of the covariates, contrasts in logarithms; shape (k,)."""
+    """Means of the covariates, contrasts in logarithms; shape (k,)."""
     scale: Array
     range: dict[str, tuple[float, float]]
-    """Of each covariate among the lumps, in its own unit."""
+    """Quartiles of each covariate, in its own unit."""
     quartiles: dict[str, tuple[float, float, float]]
-    """Of each covariate."""
+    """Least and greatest value of each covariate."""
     weights: Array
     """b_0 and b_i, shape (k + 1,)."""
     lapse: float
     replicates: Array
-    """Of the weights and the lapse, shape (folds, k + 2)."""
+    """Replicates of weights and lapse, shape (folds, k + 2)."""
     n: int
     found: int
 
     def typical(self, name: str) -> float:
-        """The median of a covariate."""
+        """Return the median of a covariate."""
         return self.quartiles[name][1]
 
     def probability(self, lumps: dict[str, Array]) -> tuple[Array, Array, Array]:
-        """P(found) and its pointwise interval of lumps with these covariates, each of shape (m,); typical where not given."""
+        """Return P(found) and its pointwise interval for these covariates, each of shape (m,); medians if not given."""
         m = max(map(len, lumps.values()))
         z = self._z({name: lumps.get(name, np.full(m, self.typical(name))) for name in self.names})
         replicates = (1 - self.replicates[:, -1:]) * expit(self.replicates[:, :-1] @ z.T)
@@ -68,7 +68,7 @@ class Surface:
         return (1 - self.lapse) * expit(z @ self.weights), low, high
 
     def threshold(self, name: str, chance: float = 0.9, **others: float) -> Estimate:
-        """The value of the covariate `name` at which lumps are found with probability `chance`; others typical where not given.
+        """Return the value of the covariate `name` at which P(found) is `chance`; other covariates at their medians if not given.
 
         It is the least such value where more of the covariate helps, and the greatest where it hinders. None where that is
         not within the range of the lumps: a surface says nothing of lumps that it has not seen.
@@ -97,7 +97,7 @@ class Surface:
 
 
 def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Surface | None:
-    """The surface of one method over its lumps; None with fewer than FEWEST lumps found or missed, or where all are alike."""
+    """Return the surface of one method; None with fewer than FEWEST lumps found or missed, or if all lumps are equal."""
     lumps = variant.lumps.dropna(subset=list(names))
     lumps = lumps[(lumps[[name for name in names if name in LOGARITHMIC]] > 0).all(axis=1)]
     found = lumps["found"].to_numpy(dtype=bool)
@@ -134,7 +134,7 @@ def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Sur
 
 
 def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, start: Array | None = None) -> tuple[Array, float]:
-    """Weights and lapse of greatest likelihood, shape (k + 2,), and twice its negative logarithm.
+    """Return weights and lapse of greatest likelihood, shape (k + 2,), and twice its negative logarithm.
 
     Each row of `z`, shape (m, k + 1), was seen `count` times.
     """
@@ -168,7 +168,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
 
 
 def observed(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -> list[tuple[float, Estimate]]:
-    """Part of the lumps that were found in bins of equal number over the covariate `name`, with the mean of each bin."""
+    """Return the share of found lumps in bins of equal number over the covariate `name`, with the mean of each bin."""
     lumps = variant.lumps.dropna(subset=[name])
     if lumps.empty:
         return []

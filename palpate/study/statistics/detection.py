@@ -16,30 +16,30 @@ from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
 
 class Rates(Row):
-    """Of what the examination reports as a finding, without any threshold of ours."""
+    """Rates of reported findings, without another threshold."""
 
     completed: Estimate
-    """Cases that came to their end."""
+    """Completed cases."""
     failed: int
-    """Cases that were started three times and have no result."""
+    """Cases without a result after three attempts."""
     not_completed: int
-    """Cases with a result whose examination did not come to its end."""
+    """Cases with a result whose examination was not completed."""
     left_out: int
-    """Patients whose only lumps cannot be felt: neither with a lump nor healthy."""
+    """Patients with only impalpable lumps, who count neither as ill nor as healthy."""
     sensitivity: Estimate
-    """Patients with a lump that can be felt in whom one was found."""
+    """Share of patients with a palpable lump in whom one was found."""
     specificity: Estimate
-    """Persons without a lump of whom nothing was reported."""
+    """Share of persons without a lump who had no finding."""
     lump_sensitivity: Estimate
-    """Lumps that can be felt and were found."""
+    """Share of palpable lumps that were found."""
     false_findings: Estimate
-    """An examination."""
+    """Per examination."""
     false_findings_of_healthy: Estimate
-    """An examination of a person without a lump."""
+    """Per examination of a person without a lump."""
 
 
 def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
-    """The rates of one method. A failed case finds no lump, and alarms falsely where there is none."""
+    """Return the rates of one method. A failed case finds no lump, and is a false alarm in a person without one."""
     cases = variant.cases
     ill, healthy = cases[cases["ill"]], cases[cases["healthy"]]
     done = cases["status"] == "done"
@@ -57,7 +57,7 @@ def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
 
 
 def by_population(variant: Variant, bootstrap: Bootstrap) -> dict[str, Rates]:
-    """The same of each population alone."""
+    """Return the rates by population."""
     populations = variant.cases["population"]
     parts = ((str(name), variant.only(part["patient"].to_numpy())) for name, part in variant.cases.groupby(populations))
     return {name: rates(part, bootstrap) for name, part in parts}
@@ -71,7 +71,7 @@ def _of_lumps(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
 
 
 def _each(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
-    """False findings an examination; where there is none at all, with the exact interval of a Poisson count (Garwood 1936)."""
+    """Return false findings per examination; without any, with the exact interval of a Poisson count (Garwood 1936)."""
     n = len(cases)
     if n == 0:
         return Estimate(value=None, n=0, of="examinations")
@@ -91,11 +91,11 @@ GRID = np.linspace(0, 1, 101)
 
 @dataclass(frozen=True)
 class Roc:
-    """A method's curve."""
+    """ROC curve of a method."""
 
     auc: Estimate
     replicates: Array
-    """Of the AUC, shape (folds,)."""
+    """Replicates of the AUC, shape (folds,)."""
     false_rate: Array
     """False positive rates of the curve, shape (k,)."""
     true_rate: Array
@@ -105,7 +105,7 @@ class Roc:
 
 
 def roc(variant: Variant, bootstrap: Bootstrap) -> Roc | None:
-    """The curve of patients with lumps that can be felt against those without any lump; None where either is missing.
+    """Return the curve of patients with palpable lumps against those without any lump; None if either group is empty.
 
     The AUC is the probability that a patient with a lump has the greater score, ties counted half (Hanley and McNeil,
     Radiology 1982;143:29): its replicates are Mann-Whitney's statistic with each patient counted as often as he was drawn.
@@ -127,7 +127,7 @@ def roc(variant: Variant, bootstrap: Bootstrap) -> Roc | None:
 
 
 def _roc_curves(a: Array, b: Array, w_a: Array, w_b: Array) -> Array:
-    """True rates at `GRID` of every replicate, shape (folds, 101): the part of `a` above the quantile of `b`."""
+    """Return the true rates at `GRID` of every replicate, shape (folds, 101): the share of `a` above the quantile of `b`."""
     thresholds = np.unique(np.concatenate((a, b)))[::-1]
     rates = []
     for scores, weights in ((b, w_b), (a, w_a)):
@@ -139,14 +139,14 @@ def _roc_curves(a: Array, b: Array, w_a: Array, w_b: Array) -> Array:
 
 
 RATES: Final = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
-"""False findings an examination at which LUNA16 takes the mean sensitivity (Setio et al., Med Image Anal 2017;42:1)."""
+"""False findings per examination at which LUNA16 averages the sensitivity (Setio et al., Med Image Anal 2017;42:1)."""
 SHOWN: Final = 200
 """Points of the curve that are kept for its plot."""
 
 
 @dataclass(frozen=True)
 class Froc:
-    """A method's curve over the confidence from which an area counts as a finding."""
+    """FROC curve of a method over the confidence from which an area counts as a finding."""
 
     mean: Estimate
     """Mean sensitivity over `RATES`."""
@@ -157,7 +157,7 @@ class Froc:
     """Sensitivity at the highest threshold without any false finding."""
     zero_replicates: Array
     false_findings: Array
-    """An examination, along the curve, shape (k,)."""
+    """False findings per examination along the curve, shape (k,)."""
     sensitivity: Array
     low: Array
     """Pointwise interval of the sensitivity at `false_findings`, shape (k,)."""
@@ -166,16 +166,16 @@ class Froc:
 
 @dataclass(frozen=True)
 class _Marks:
-    """Areas by falling confidence, shape (m,): hits of lumps, one a lump, and false ones."""
+    """Areas by decreasing confidence, shape (m,): at most one hit per lump, and false ones."""
 
     patient: NDArray[np.intp]
     hit: NDArray[np.bool_]
     last: NDArray[np.bool_]
-    """Whether the next has a lower confidence."""
+    """True if the next has a lower confidence."""
 
 
 def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
-    """The curve of all examinations; None where no lump can be felt.
+    """Return the curve of all examinations; None without a palpable lump.
 
     A lump counts with the greatest confidence of the areas that hit it; an area that hits no lump is false. A failed
     examination of a healthy person is a false finding that no threshold removes. Between the thresholds that occur the
@@ -227,7 +227,7 @@ def _marks(variant: Variant) -> _Marks:
 
 
 def _froc_curves(marks: _Marks, bootstrap: Bootstrap, examined: Array, lumps: Array) -> tuple[Array, Array]:
-    """False findings an examination and sensitivity from no finding at all to every area, shapes (folds, thresholds + 1)."""
+    """Return false findings per examination and sensitivity, from no area to all areas, shapes (folds, thresholds + 1)."""
     drawn = bootstrap.counts[:, marks.patient]
     none = np.zeros((len(drawn), 1))
 
@@ -239,24 +239,25 @@ def _froc_curves(marks: _Marks, bootstrap: Bootstrap, examined: Array, lumps: Ar
 
 
 CLASSES: Final = {"below 1.3": (1.0, 1.3), "1.3 to 1.5": (1.3, 1.5), "1.5 to 2": (1.5, 2.0), "2 and more": (2.0, np.inf)}
-"""Felt contrasts; that of a soft lump is its inverse."""
+"""Felt contrasts; a soft lump counts by its inverse."""
 WIDE_M: Final = 0.015
-"""Felt radius from which a lump is counted apart, too."""
+"""Felt radius from which a lump also counts as large."""
 
 
 class ContrastRow(Row):
     """The lumps of one class of felt contrast."""
 
     found: Estimate
-    """Lumps found."""
+    """Share of lumps found."""
     found_wide: Estimate
-    """Lumps found of those whose felt radius is 15 mm or more."""
+    """Share of lumps found with a felt radius of 15 mm or more."""
     auc: Estimate | None
-    """Of patients whose most clearly felt lump is of this class, against persons without a lump; None where either is missing."""
+    """AUC of patients whose lump of greatest felt contrast is in this class against persons without a lump; None if either is
+    missing."""
 
 
 def by_contrast(variant: Variant, bootstrap: Bootstrap) -> dict[str, ContrastRow]:
-    """The figures of each class. Lumps of which nothing is known of how they feel, as of failed cases, are in none."""
+    """Return the figures of each class. Lumps with unknown felt contrast, as in failed cases, are in none."""
     lumps = variant.lumps[variant.lumps["palpable"]]
     lumps = lumps.assign(contrast=np.exp(np.abs(np.log(lumps["felt_contrast"].astype(float)))))
     clearest = lumps.groupby("patient")["contrast"].max()
@@ -275,7 +276,7 @@ def by_contrast(variant: Variant, bootstrap: Bootstrap) -> dict[str, ContrastRow
 
 
 def _found(lumps: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
-    """Part of the lumps that were found."""
+    """Return the share of lumps that were found."""
     found, made = (bootstrap.sums(values, lumps["patient"]) for values in (lumps["found"], np.ones(len(lumps))))
     n = len(lumps)
     value = float(found.sum() / n) if n else np.nan

@@ -16,7 +16,7 @@ from statsmodels.stats.proportion import proportion_confint
 Array = NDArray[np.float64]
 
 LEVEL: Final = 0.95
-"""Of every interval."""
+"""Level of all intervals."""
 FOLDS: Final = 1000
 """Resamplings of a bootstrap."""
 
@@ -28,21 +28,21 @@ class Row(BaseModel):
 
 
 class Estimate(Row):
-    """A figure with its 95 % interval; None where the data do not give it."""
+    """A figure with its 95 % interval; None if the data do not determine it."""
 
     value: float | None
     low: float | None = None
     high: float | None = None
     n: int
-    """Sample size: how many of `of` it rests on."""
+    """Sample size, a number of `of`."""
     of: str
-    """What was counted: patients, lumps, findings."""
+    """Counted unit: patients, lumps, findings."""
     interval: str = "bootstrap over patients"
-    """How the interval was made."""
+    """Method of the interval."""
 
 
 def wilson(successes: float, n: int, of: str) -> Estimate:
-    """A rate with Wilson's score interval (Wilson, J Am Stat Assoc 1927;22:209)."""
+    """Return a rate with Wilson's score interval (Wilson, J Am Stat Assoc 1927;22:209)."""
     if n == 0:
         return Estimate(value=None, n=0, of=of, interval="Wilson")
     low, high = proportion_confint(successes, n, alpha=1 - LEVEL, method="wilson")
@@ -58,11 +58,11 @@ class Bootstrap:
     """
 
     counts: NDArray[np.int32]
-    """How often each patient was drawn, shape (folds, patients)."""
+    """Number of draws of each patient, shape (folds, patients)."""
 
     @staticmethod
     def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> Bootstrap:
-        """Resamplings of the patients whose population is given, shape (patients,)."""
+        """Draws the resamplings; `populations`: population of each patient, shape (patients,)."""
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"bootstrap over patients")])))
         names = np.asarray(populations)
         counts = np.zeros((folds, len(names)), dtype=np.int32)
@@ -72,18 +72,18 @@ class Bootstrap:
         return Bootstrap(counts)
 
     def sums(self, values: ArrayLike, patient: ArrayLike) -> Array:
-        """Sums of values, each of a patient's index, shapes (m,), by patient, shape (patients,)."""
+        """Return sums by patient, shape (patients,), of values with the index of their patient, shapes (m,)."""
         weights = np.asarray(values, dtype=np.float64)
         indices = np.asarray(patient, dtype=np.intp)
         return np.bincount(indices, weights=weights, minlength=self.counts.shape[1]).astype(np.float64)
 
     def ratio(self, above: Array, below: Array) -> Array:
-        """Replicates of sum(above) / sum(below), each of shape (patients,); NaN where nothing was drawn. Shape (folds,)."""
+        """Return replicates of sum(above) / sum(below), shape (folds,); both by patient; NaN if the sum below is 0."""
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((self.counts @ above) / (self.counts @ below), dtype=np.float64)
 
     def quantile(self, values: Array, patient: NDArray[np.intp], q: float) -> Array:
-        """Replicates of the quantile `q` of values, each of a patient's index, shapes (m,). Shape (folds,)."""
+        """Return replicates of the quantile `q`, shape (folds,), of values with the index of their patient, shapes (m,)."""
         order = np.argsort(values)
         drawn = np.cumsum(self.counts[:, patient[order]], axis=1)
         at = np.argmax(drawn >= q * drawn[:, -1:], axis=1)
@@ -91,7 +91,7 @@ class Bootstrap:
 
 
 def percentiles(replicates: Array, level: float = LEVEL) -> tuple[float, float] | None:
-    """The percentile interval of replicates (Efron 1979); None where fewer than half of them exist."""
+    """Return the percentile interval of replicates (Efron 1979); None if fewer than half of them exist."""
     known = replicates[np.isfinite(replicates)]
     if 2 * len(known) < len(replicates) or not len(known):
         return None
@@ -100,7 +100,7 @@ def percentiles(replicates: Array, level: float = LEVEL) -> tuple[float, float] 
 
 
 def estimate(value: float, replicates: Array, n: int, of: str, degenerate: Callable[[], Estimate] | None = None) -> Estimate:
-    """A figure with its bootstrap interval.
+    """Return a figure with its bootstrap interval.
 
     Where all replicates are one number, as when every lump was found, resampling says nothing of what was not seen;
     `degenerate` then gives the interval.
@@ -115,7 +115,7 @@ def estimate(value: float, replicates: Array, n: int, of: str, degenerate: Calla
 
 
 def bounded(value: float, replicates: Array, n: int, of: str, patients: int) -> Estimate:
-    """A figure between 0 and 1 with its bootstrap interval; at 0 or 1 with Wilson's, as of one trial a patient."""
+    """Return a figure between 0 and 1 with its bootstrap interval; at 0 or 1 with Wilson's, with one trial per patient."""
     if not isfinite(value):
         return Estimate(value=None, n=n, of=of)
 

@@ -1,4 +1,4 @@
-"""A study's three tables as statistics want them: patients that methods share, and failures counted against the method."""
+"""A study's three tables for statistics: patients that methods share, and failures counted against the method."""
 
 from __future__ import annotations
 
@@ -22,33 +22,33 @@ COLUMNS: Final = {
     "findings": "case_id reported area_m2 ratio ratio_lower ratio_upper confidence lump place_error_m area_true_m2 ratio_true",
     "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
 }
-"""What the statistics read of each table."""
+"""Columns that the statistics read from each table."""
 LATER: Final = ("guarding", "on_guarding")
-"""Columns of findings that are empty where an earlier version made the table."""
+"""Columns of findings that are missing in tables of an earlier version."""
 PATIENT: Final = ["study", "population", "split", "number"]
-"""What tells patients apart: methods, tiers and levels of errors examine the same ones."""
+"""Columns that identify a patient: methods, tiers and levels of errors examine the same patients."""
 VARIANT: Final = ["method", "tier", "errors"]
 WORST_ILL, WORST_HEALTHY = -1.0, 2.0
-"""Scores of cases that failed, beyond the confidences 0 to 1: of a patient with lumps, of one without."""
+"""Scores of failed cases of patients with and without lumps, beyond the range 0 to 1 of confidences."""
 
 
 @dataclass(frozen=True)
 class Variant:
-    """The cases of one method, at one tier, with one setting of the errors: one a patient, in the order of the patients.
+    """The cases of one method, at one tier, with one setting of the errors: one per patient, in the order of the patients.
 
-    Rows of `cases` have beside the table's columns: `patient` (index), `failed` (failed or not completed), `lumps` (that can
-    be felt), `ill` (has such a lump), `healthy` (has no lump at all), `worst_score`, `false_alarms`, `found` (lumps).
+    Rows of `cases` have the table's columns, `patient` (index), `failed` (failed or not completed), `lumps` (number of palpable
+    lumps), `ill` (has one), `healthy` (has no lump at all), `worst_score`, `false_alarms`, `found` (lumps).
     """
 
     name: str
     cases: pd.DataFrame
     findings: pd.DataFrame
-    """Findings and candidates of examinations that came to their end, with `patient`."""
+    """Findings and candidates of completed examinations, with `patient`."""
     lumps: pd.DataFrame
-    """With `patient`; those of failed cases are not found, with confidence 0."""
+    """Lumps with `patient`; those of failed cases are not found, with confidence 0."""
 
     def only(self, patients: NDArray[np.intp]) -> Variant:
-        """The same of these patients alone."""
+        """Return the variant of these patients only."""
         tables = (table[table["patient"].isin(patients)] for table in (self.cases, self.findings, self.lumps))
         return Variant(self.name, *tables)
 
@@ -60,30 +60,30 @@ class Tables:
     study: str
     splits: tuple[str, ...]
     patients: pd.DataFrame
-    """One row a patient, its index the patient's number in `Variant`."""
+    """One row per patient; its index is `patient` of a `Variant`."""
     variants: tuple[Variant, ...]
     folds: int
     """Resamplings of a bootstrap."""
 
     @cached_property
     def bootstrap(self) -> Bootstrap:
-        """Resamplings of the patients, which all statistics share."""
+        """Resamplings of the patients, common to all statistics."""
         return Bootstrap.draw(self.patients["population"].to_numpy(dtype=str), self.folds)
 
 
 def read_tables(folder: Path, folds: int = FOLDS) -> Tables:
-    """The tables in `folder`. Raises UserError."""
+    """Return the tables in `folder`. Raises UserError."""
     read = {}
     for name, columns in COLUMNS.items():
         path = folder / f"{name}.parquet"
         try:
             table = parquet.read_table(path).to_pandas()
         except FileNotFoundError as error:
-            raise UserError(f"{path} is not there: give the folder of a study that has run") from error
+            raise UserError(f"{path} is not there: give the folder of a finished study") from error
         except (OSError, ValueError) as error:
             raise UserError(f"{path} cannot be read: {error}") from error
         if missing := [column for column in columns.split() if column not in table.columns]:
-            raise UserError(f"{path} has no column {', '.join(missing)}; it is of another version of Palpate")
+            raise UserError(f"{path} has no column {', '.join(missing)}; it was written by another version of Palpate")
         read[name] = table
     if read["cases"].empty:
         raise UserError(f"{folder / 'cases.parquet'} has no case: run the study first")
@@ -91,7 +91,7 @@ def read_tables(folder: Path, folds: int = FOLDS) -> Tables:
 
 
 def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, folds: int = FOLDS) -> Tables:
-    """Tables from their frames. Raises UserError for two cases of one patient in one variant."""
+    """Return the tables of data frames. Raises UserError for two cases of one patient in one variant."""
     cases = cases.copy()
     patients = cases[PATIENT].drop_duplicates().sort_values(PATIENT).reset_index(drop=True)
     cases["patient"] = cases[PATIENT].merge(patients.reset_index(names="patient"), on=PATIENT)["patient"].to_numpy()
@@ -101,7 +101,7 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
     if not doubled.empty:
         row = doubled.iloc[0]
         where = f"{row['population']}, {row['split']}, number {row['number']}"
-        raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): one a patient is allowed")
+        raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): want one per patient")
     facts = cases[["case_id", "patient", "failed"]]
     findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
     findings = findings[~findings["failed"]].assign(**{name: None for name in LATER if name not in findings})
@@ -147,7 +147,7 @@ def _against_the_method(cases: pd.DataFrame, lumps: pd.DataFrame) -> pd.DataFram
 
 
 def _names(cases: pd.DataFrame) -> pd.Series:
-    """What tells the cases of one patient apart, in words; the method where there is one case a patient."""
+    """Return names that distinguish the cases of one patient; the method if there is one case per patient."""
     by_patient = cases.groupby("patient")
     parts = [column for column in VARIANT if (by_patient[column].nunique(dropna=False) > 1).any()] or ["method"]
     names = cases[parts[0]].astype(str)
@@ -157,5 +157,5 @@ def _names(cases: pd.DataFrame) -> pd.Series:
 
 
 def _order(cases: pd.DataFrame) -> list[str]:
-    """Variants as they first come up in the table, which is in the order of the study's file."""
+    """Return the variants in the order of the table, which is that of the study's file."""
     return [str(name) for name in cases["variant"].unique()]

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.check.rig import HeardMessage, RigSettings, ServiceRig
+from palpate.check.rig import ReceivedMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
 from palpate_bus.contract import MS, contract
@@ -26,7 +26,7 @@ SCENARIO = load_scenario("clean")
 
 
 @pytest.fixture(scope="module")
-def seen() -> dict[str, list[HeardMessage]]:
+def seen() -> dict[str, list[ReceivedMessage]]:
     """A burst of the simulated camera that looks at a level square, as the conformance suite puts it there."""
     rig = ServiceRig(create_camera(SCENARIO), RigSettings(SCENARIO))
     rig.send("planning/camera_trigger", CameraTrigger(header(0), FRAMES))
@@ -37,7 +37,7 @@ def seen() -> dict[str, list[HeardMessage]]:
 ALL = (IMAGE, INFO, POSE, SMALL_IMAGE, SMALL_INFO)
 
 
-def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, ...] = ALL) -> Path:
+def record(folder: Path, log: dict[str, list[ReceivedMessage]], topics: tuple[str, ...] = ALL) -> Path:
     recorder = RecorderService(folder)
     rows = contract().topics
     for topic in topics:
@@ -48,7 +48,7 @@ def record(folder: Path, log: dict[str, list[HeardMessage]], topics: tuple[str, 
 
 
 @pytest.fixture(scope="module")
-def recording(seen: dict[str, list[HeardMessage]], tmp_path_factory: pytest.TempPathFactory) -> Path:
+def recording(seen: dict[str, list[ReceivedMessage]], tmp_path_factory: pytest.TempPathFactory) -> Path:
     return record(tmp_path_factory.mktemp("run") / "recording_mcap", seen)
 
 
@@ -57,7 +57,7 @@ def test_it_conforms_to_the_role_camera(recording: Path) -> None:
     assert report.passed, [result for result in report.results if result.verdict == "failed"]
 
 
-def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[HeardMessage]]) -> None:
+def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[ReceivedMessage]]) -> None:
     rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     rig.run(2.0, {})
     assert not rig.log[IMAGE], "nothing unasked"
@@ -73,7 +73,7 @@ def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: P
     assert rig.last(POSE) == seen[POSE][-1].message
 
 
-def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, seen: dict[str, list[HeardMessage]]) -> None:
+def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, seen: dict[str, list[ReceivedMessage]]) -> None:
     rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     shown = rig.run(0.5, {})
     assert len(shown[SMALL_IMAGE]) == len(shown[SMALL_INFO]) >= 5
@@ -82,7 +82,7 @@ def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, s
         assert nanoseconds(received.message.header.stamp) == received.t
 
 
-def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
+def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[str, list[ReceivedMessage]], tmp_path: Path) -> None:
     """It has the time of reception, which is another one for each message, and a tf_static of each sender."""
     (pose,) = seen[POSE]
     stranger = copy.deepcopy(pose.message)
@@ -144,7 +144,7 @@ def test_intrinsics_that_change_are_refused(seen: dict[str, list[HeardMessage]],
 
 
 def test_a_recording_without_small_images_has_those_of_its_whole_ones(
-    seen: dict[str, list[HeardMessage]], tmp_path: Path
+    seen: dict[str, list[ReceivedMessage]], tmp_path: Path
 ) -> None:
     folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO, POSE))
     shown = ServiceRig(ReplayedCamera(open_recording(folder)), RigSettings(SCENARIO)).run(0.5, {})
@@ -154,13 +154,13 @@ def test_a_recording_without_small_images_has_those_of_its_whole_ones(
     assert shown[SMALL_INFO][0].message.k.tolist() == pytest.approx(seen[SMALL_INFO][0].message.k.tolist())
 
 
-def test_frames_differ_as_their_noise_does(seen: dict[str, list[HeardMessage]]) -> None:
+def test_frames_differ_as_their_noise_does(seen: dict[str, list[ReceivedMessage]]) -> None:
     """Else the order would not be tested."""
     first, second = (np.asarray(received.message.data) for received in seen[IMAGE][:2])
     assert not np.array_equal(first, second)
 
 
-def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
+def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[ReceivedMessage]], tmp_path: Path) -> None:
     folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO))
     with pytest.raises(RecordingError, match="no message of tf_static"):
         ReplayedCamera(open_recording(folder))
