@@ -7,8 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.fuzz.fuzz import all_targets, attempt, campaign, choose, mutate
-from palpate.fuzz.targets import Broken, FuzzTarget
+from palpate.fuzz.fuzz import Broken, FuzzTarget, all_targets, attempt, campaign, choose, mutate
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_models.scenario.load import ScenarioError, load_scenario

@@ -1,7 +1,7 @@
 """The strokes of an examination on a patient without an arm.
 
 Planning's own code moves the indenter: coverage, path, the stroke with its touch, regulation of depth against force. The errors
-of arm, camera and force sensor are drawn from those of whole examinations (`palpate.quick.errors`). `palpate.quick.messages`
+of arm, camera and force sensor are drawn from those of whole examinations (`palpate.quick.errors`). `palpate.quick.case`
 makes exam/state, perception/surface and truth/indentation from the rows.
 """
 

@@ -28,7 +28,7 @@ from palpate.replay.golden import write_recording
 from palpate.replay.rerun import rerun
 from palpate.report.evidence import columns_of, xyz
 from palpate.truth.pressed import Pressed
-from palpate.truth.touched import Touched
+from palpate.truth.surface import Touched
 from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.contract import contract

@@ -19,8 +19,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import Delaunay
 
 from palpate.truth.felt import Felt, Lump
-from palpate.truth.surface import TrueBody, TrueSurface
-from palpate.truth.touched import Touched
+from palpate.truth.surface import Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, apply
 
 Mask = NDArray[np.bool_]

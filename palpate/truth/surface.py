@@ -1,13 +1,14 @@
-"""True rest surface as functions of xy in the abdomen frame A."""
+"""True rest surface as functions of xy in the abdomen frame A, and the places on it that the tool touched."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
-from scipy.spatial import Delaunay
+from scipy.spatial import Delaunay, cKDTree
 
 from palpate_models.numerics.frames import Array
 
@@ -58,3 +59,31 @@ class TrueSurface:
         """Return area of the surface over area in xy at points [1], shape (p,)."""
         normal = np.asarray(self._normal(xy))
         return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))
+
+
+_NEAREST: Final = 4
+"""Number of nearest contacts whose errors are averaged, weighted by inverse distance."""
+
+
+class Touched:
+    """Contacts of a run: k estimated and true places on the skin.
+
+    Kinematics and registration have lateral errors, so an estimate at a place is compared with the truth at the place that the
+    tool actually touched.
+    """
+
+    def __init__(self, believed: Array, true: Array) -> None:
+        """Both [m], shape (k, 3), in the registered and in the true A. Without contacts places are unchanged."""
+        self.believed, self.true = believed, true
+        self._tree = cKDTree(believed[:, :2]) if len(believed) else None
+
+    def places(self, xy: Array) -> Array:
+        """Return true places of the tool for estimated ones xy [m], both of shape (p, 2)."""
+        if self._tree is None:
+            return xy
+        count = min(_NEAREST, len(self.believed))
+        distance, index = (np.asarray(a).reshape(len(xy), count) for a in self._tree.query(xy, k=count))
+        weight = 1.0 / (distance + 1e-4)
+        weight /= weight.sum(axis=1, keepdims=True)
+        shift = (self.true - self.believed)[index, :2]
+        return np.asarray(xy + (weight[..., None] * shift).sum(axis=1))

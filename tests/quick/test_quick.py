@@ -8,10 +8,9 @@ import sys
 import numpy as np
 import pytest
 
-from palpate.quick.case import QuickCase, run_quick
+from palpate.quick.case import QuickCase, collected, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import QuickExamination
-from palpate.quick.messages import collected
 from palpate.quick.patient import NoTissueError, Patient, Touch
 from palpate.quick.study import renewed
 from palpate_models.scenario.load import load_scenario

@@ -26,7 +26,7 @@ from palpate.study.cases import Case, cases_of
 from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, opened
 from palpate.study.runner import StudyStopped, cluster, part_of, run_cases
 from palpate.study.spec import StudyError
-from palpate.study.tables import write_tables
+from palpate.study.summary import write_tables
 from palpate_models.scenario.load import load_scenario
 
 pytestmark = [pytest.mark.slow, pytest.mark.timeout(1800)]

@@ -57,7 +57,9 @@ def test_it_conforms_to_the_role_camera(recording: Path) -> None:
     assert report.passed, [result for result in report.results if result.verdict == "failed"]
 
 
-def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(recording: Path, seen: dict[str, list[ReceivedMessage]]) -> None:
+def test_it_shows_the_recorded_pixels_in_their_order_and_goes_round(
+    recording: Path, seen: dict[str, list[ReceivedMessage]]
+) -> None:
     rig = ServiceRig(ReplayedCamera(open_recording(recording)), RigSettings(SCENARIO))
     rig.run(2.0, {})
     assert not rig.log[IMAGE], "nothing unasked"
@@ -82,7 +84,9 @@ def test_it_shows_the_recorded_small_images_from_the_first_on(recording: Path, s
         assert nanoseconds(received.message.header.stamp) == received.t
 
 
-def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(seen: dict[str, list[ReceivedMessage]], tmp_path: Path) -> None:
+def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(
+    seen: dict[str, list[ReceivedMessage]], tmp_path: Path
+) -> None:
     """It has the time of reception, which is another one for each message, and a tf_static of each sender."""
     (pose,) = seen[POSE]
     stranger = copy.deepcopy(pose.message)
