@@ -1,1 +1,1 @@
-"""Commands that look at a live run or steer it."""
+"""Commands that inspect or control a live run."""

@@ -1,4 +1,4 @@
-"""Options that choose a live bus, and how a tool joins it."""
+"""Options that select a live bus, and the connection to it."""
 
 from __future__ import annotations
 
@@ -57,7 +57,7 @@ class Joined:
 def joined(chosen: ChosenBus) -> Iterator[Joined]:
     """Joins a bus for a `with` block. Ctrl-C ends the command with status 0.
 
-    Raises UserError when there is no such bus.
+    Raises UserError if there is no such bus.
     """
     target = find(*chosen)
     try:

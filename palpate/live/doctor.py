@@ -214,7 +214,7 @@ def doctor(
     run: ChosenRun = None,
     domain: Domain = None,
     as_json: AsJson = False,
-    seconds: Annotated[float, typer.Option(min=1, help="How long to listen.")] = 3.0,
+    seconds: Annotated[float, typer.Option(min=1, help="Duration of the check, in seconds.")] = 3.0,
     watch: Annotated[bool, typer.Option("--watch", help="Print every violation when it occurs, until Ctrl-C.")] = False,
     clean: Annotated[bool, typer.Option("--clean", help="Only remove leftovers of killed runs on this machine.")] = False,
 ) -> None:

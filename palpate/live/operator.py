@@ -21,7 +21,7 @@ DISCOVERY_TIMEOUT_S = 1.0
 
 
 def stop(
-    reason: Annotated[str, typer.Argument(help="Why, for the record.")] = "palpate stop",
+    reason: Annotated[str, typer.Argument(help="Reason, for the record.")] = "palpate stop",
     soft: Annotated[
         bool, typer.Option("--soft", help="Retreat along the normal and wait, instead of holding where it is.")
     ] = False,
@@ -33,7 +33,7 @@ def stop(
 
 def release(
     end: Annotated[bool, typer.Option("--end", help="End the examination: the arm goes home.")] = False,
-    reason: Annotated[str, typer.Option(help="Why, for the record.")] = "palpate release",
+    reason: Annotated[str, typer.Option(help="Reason, for the record.")] = "palpate release",
     run: ChosenRun = None,
 ) -> None:
     """Release a stop: the examination continues where it was, or with --end the arm goes home and the run ends."""

@@ -32,7 +32,7 @@ BANDWIDTH_PERIODS = 5
 SPACING_MESSAGES = 10_000
 """Messages over which rate and spacing are computed at most."""
 SHOWN_ITEMS = 12
-"""Longer arrays are shortened for people."""
+"""Longer arrays are shortened in the output."""
 
 app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
@@ -103,7 +103,7 @@ def echo(  # noqa: PLR0913 - the options of a command
     full: Annotated[bool, typer.Option("--full", help="Print long arrays in full.")] = False,
     seconds: Seconds = None,
 ) -> None:
-    """Print the messages of a topic as they come."""
+    """Print the messages of a topic as they arrive."""
     left = 1 if once else count
     with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
         for received in _until(reader, seconds):
