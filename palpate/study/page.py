@@ -1,17 +1,310 @@
-"""study.html: a study's figures and plots on one self-contained page, in the style of report.html."""
+"""study.html: a study's figures and plots on one self-contained page. Plots are SVG with the page's colour variables."""
 
 from __future__ import annotations
 
+import io
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, Final, Literal
 
+import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 from markupsafe import Markup
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 
-from palpate.study import human_line, plots
+from palpate.report.figures import INK, QUIET
+from palpate.report.page_figures import GRID, plain
+from palpate.study import human_line
+from palpate.study.statistics.accuracy import Agreement, FindingCalibration
 from palpate.study.statistics.analysis import Analysis
-from palpate.study.statistics.comparison import QUANTITIES, Comparison
-from palpate.study.statistics.detectability import FELT, MADE
+from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
+from palpate.study.statistics.detectability import FELT, LOGARITHMIC, MADE, Surface
+from palpate.study.statistics.detection import GRID as ROC_GRID
+from palpate.study.statistics.detection import RATES
+from palpate.study.statistics.estimate import Estimate
+
+COLOURS: Final = ("#0f766e", "#c2410c", "#7c3aed", "#2563eb", "#be185d", "#854d0e")
+HUMAN: Final = "#b91c1c"
+MOST: Final = len(COLOURS)
+"""Methods in one plot."""
+VARIABLES: Final = {INK: "--ink", QUIET: "--quiet", GRID: "--line", HUMAN: "--bad"} | {
+    colour: f"--c{i}" for i, colour in enumerate(COLOURS)
+}
+"""The page's names of the colours."""
+COVARIATES: Final = {
+    "felt_contrast": ("felt contrast, force with the lump over force without", 1.0),
+    "felt_radius_m": ("felt radius [mm]", 1e3),
+    "depth_m": ("depth of the lump [mm]", 1e3),
+    "contrast": ("stiffness of the lump over its surroundings", 1.0),
+    "radius_m": ("radius of the lump [mm]", 1e3),
+}
+MANY: Final = 400
+"""Points from which a cloud is drawn as an image."""
+
+
+def _figure(width: float, height: float) -> Figure:
+    figure = Figure(figsize=(width, height), facecolor="none")
+    figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
+    return figure
+
+
+def _axes(figure: Figure, columns: int = 1) -> list[Axes]:
+    axes = list(np.atleast_1d(figure.subplots(1, columns)))
+    for each in axes:
+        each.set_facecolor("none")
+        for spine in each.spines.values():
+            spine.set_color(QUIET)
+    return axes
+
+
+def _svg(figure: Figure) -> str:
+    """Return the figure as an element of the page: text stays text, colours are the page's variables."""
+    stream = io.StringIO()
+    with rc_context({"svg.fonttype": "none", "svg.hashsalt": "palpate"}):
+        figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Type": None, "Format": None}, dpi=150)
+    text = stream.getvalue()
+    text = text[text.index("<svg") :]
+    for colour, variable in VARIABLES.items():
+        text = text.replace(colour, f"var({variable})")
+    return text
+
+
+def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "best", below: bool = False) -> None:
+    axes.legend(fontsize=8.5, frameon=False, labelcolor=INK, loc=place, bbox_to_anchor=(0, -0.17) if below else None)
+
+
+def _human(axes: Axes) -> None:
+    """Draws the detection rate of human examiners."""
+    label = f"80 physicians, breast models: {human_line.FOUND:.0%} (Fletcher 1985)"
+    axes.axhline(human_line.FOUND, color=HUMAN, ls="--", lw=1.2, label=label)
+
+
+def _title(axes: Axes, words: str) -> None:
+    axes.set_title(words, fontsize=10, color=INK, loc="left")
+
+
+def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: str, label: str) -> None:
+    """Draws estimates with their intervals."""
+    known = [(at, e.value, e.low, e.high) for at, e in zip(x, rows, strict=True) if e.value is not None]
+    if known:
+        at, value, low, high = np.array([[np.nan if v is None else v for v in row] for row in known], dtype=float).T
+        bars = np.clip([value - low, high - value], 0, None)
+        axes.errorbar(at, value, yerr=bars, fmt="o", ms=4, lw=1.1, capsize=2, color=color, label=label)
+
+
+def roc(analyses: Sequence[Analysis]) -> str | None:
+    """Return the ROC per patient of the first MOST methods; None if none has a curve."""
+    shown = [(a.name, a.roc) for a in analyses[:MOST] if a.roc is not None]
+    if not shown:
+        return None
+    figure = _figure(6.2, 5.2)
+    (axes,) = _axes(figure)
+    for color, (name, curve) in zip(COLOURS, shown, strict=False):
+        axes.plot(curve.false_rate, curve.true_rate, color=color, lw=1.8, label=f"{name}: AUC {curve.auc.value:.3f}")
+        axes.fill_between(ROC_GRID, curve.low, curve.high, color=color, alpha=0.13, lw=0)
+    axes.plot([0, 1], [0, 1], color=QUIET, lw=0.8, ls=":")
+    _human(axes)
+    at = 1 - human_line.RESIDENTS_SPECIFICITY
+    axes.plot(at, human_line.RESIDENTS_SENSITIVITY, "D", color=HUMAN, ms=6, label="62 residents, breast models: 58 % of lumps")
+    plain(axes, "patients with a lump above the threshold", "persons without a lump above it")
+    _percent(axes, both=True)
+    axes.set_xlim(-0.01, 1)
+    axes.set_ylim(0, 1.02)
+    _legend(axes, "lower right")
+    return _svg(figure)
+
+
+def froc(analyses: Sequence[Analysis]) -> str | None:
+    """Return the FROC of the first MOST methods; None if none has a curve."""
+    shown = [(a.name, a.froc) for a in analyses[:MOST] if a.froc is not None]
+    if not shown:
+        return None
+    figure = _figure(7.4, 5.2)
+    (axes,) = _axes(figure)
+    least = RATES[0] / 2
+    for color, (name, curve) in zip(COLOURS, shown, strict=False):
+        x = np.maximum(curve.false_findings, least)
+        axes.plot(x, curve.sensitivity, color=color, lw=1.8, label=f"{name}: mean {curve.mean.value:.3f}")
+        axes.fill_between(x, curve.low, curve.high, color=color, alpha=0.13, lw=0)
+        axes.plot(RATES, [e.value or 0.0 for e in curve.at.values()], "o", ms=4, color=color)
+    _human(axes)
+    plain(axes, "lumps found", "false findings an examination")
+    axes.set_xscale("log", base=2)
+    axes.set_xticks(RATES, ["1/8", "1/4", "1/2", "1", "2", "4", "8"])
+    axes.xaxis.set_minor_locator(NullLocator())
+    _percent(axes)
+    axes.set_xlim(least, RATES[-1])
+    axes.set_ylim(0, 1.02)
+    _legend(axes, "lower right")
+    return _svg(figure)
+
+
+def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
+    """Return the probability of detection against each covariate: binned rates, and the surface at quartiles of another one.
+
+    None where no lump is known.
+    """
+    if not any(analysis.observed[name] for name in names):
+        return None
+    surface = analysis.felt if tuple(names) == FELT else analysis.made
+    figure = _figure(14.5, 5.6)
+    for axes, name in zip(_axes(figure, len(names)), names, strict=True):
+        words, scale = COVARIATES[name]
+        if surface is not None and name in surface.names:
+            _sections(axes, surface, name)
+        x, rows = zip(*analysis.observed[name], strict=True) if analysis.observed[name] else ((), ())
+        _errorbar(axes, [scale * at for at in x], rows, INK, "found, in bins of equal number")
+        _human(axes)
+        if name == "radius_m":
+            sizes = [point.size_m / 2 * scale for point in human_line.BY_SIZE]
+            axes.plot(
+                sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump"
+            )
+        plain(axes, "probability of detection" if name == names[0] else "", words)
+        if name in LOGARITHMIC:
+            axes.set_xscale("log")
+            axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.xaxis.set_minor_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
+            axes.tick_params(which="minor", labelsize=7.5, colors=QUIET)
+        _percent(axes)
+        axes.set_ylim(-0.02, 1.02)
+        _legend(axes, "upper left", below=True)
+    return _svg(figure)
+
+
+def _sections(axes: Axes, surface: Surface, name: str) -> None:
+    """Draws the surface along one covariate, at the quartiles of another one, with the rest at their medians."""
+    second = next((other for other in surface.names if other != name), None)
+    _, scale = COVARIATES[name]
+    x = np.geomspace(*surface.range[name], 60) if name in LOGARITHMIC else np.linspace(*surface.range[name], 60)
+    for i, level in enumerate(surface.quartiles[second] if second else (0.0,)):
+        at = {name: x} | ({second: np.full(len(x), level)} if second else {})
+        value, low, high = surface.probability(at)
+        words, unit = COVARIATES[second] if second else ("fitted", 1.0)
+        label = f"{words.split(',')[0].split(' [')[0]} {unit * level:.3g}{' mm' if unit > 1 else ''}" if second else "fitted"
+        axes.plot(scale * x, value, color=COLOURS[i], lw=1.5, label=label)
+        axes.fill_between(scale * x, low, high, color=COLOURS[i], alpha=0.12, lw=0)
+
+
+def errors(analysis: Analysis) -> str | None:
+    """Return place errors and the agreement of size and stiffness; None without a matched finding."""
+    e = analysis.errors
+    if not len(e.place_m.values):
+        return None
+    figure = _figure(14.5, 4.4)
+    place, size, ratio = _axes(figure, 3)
+    x = np.sort(e.place_m.values) * 1e3
+    place.step(np.append(0, x), np.linspace(0, 1, len(x) + 1), where="post", color=COLOURS[0], lw=1.8)
+    plain(place, "part of the matched findings", "error of place [mm]")
+    _percent(place)
+    _title(place, f"Place, n = {len(x)}")
+    _bland_altman(size, e.radius, 1e3)
+    plain(size, "estimated less true radius [mm]", "mean of both [mm]")
+    _title(size, f"Size, n = {e.radius.figures.bias.n}")
+    _bland_altman(ratio, e.log_ratio, 1.0)
+    plain(ratio, "estimated over true ratio", "geometric mean of both")
+    for axis in (ratio.xaxis, ratio.yaxis):
+        axis.set_major_formatter(FuncFormatter(lambda value, _: f"{np.exp(value):.2f}"))
+    _title(ratio, f"Stiffness ratio, n = {e.log_ratio.figures.bias.n}")
+    return _svg(figure)
+
+
+def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
+    many = len(agreement.mean) > MANY
+    axes.plot(scale * agreement.mean, scale * agreement.difference, ".", ms=4, color=COLOURS[0], alpha=0.6, rasterized=many)
+    found = agreement.figures
+    for line, style in ((found.bias, "-"), (found.lower, "--"), (found.upper, "--")):
+        if line.value is not None:
+            axes.axhline(scale * line.value, color=INK, lw=1.1, ls=style)
+        if line.low is not None and line.high is not None:
+            axes.axhspan(scale * line.low, scale * line.high, color=QUIET, alpha=0.18, lw=0)
+    axes.axhline(0, color=QUIET, lw=0.7, ls=":")
+
+
+def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
+    """Return the reliability diagram of the first MOST methods; None without any."""
+    if not rows:
+        return None
+    figure = _figure(6.2, 5.2)
+    (axes,) = _axes(figure)
+    for color, (name, calibrated) in zip(COLOURS, rows, strict=False):
+        x, parts = zip(*calibrated.bins, strict=True)
+        slope = calibrated.figures.slope.value
+        label = name if slope is None else f"{name}: slope {slope:.2f}"
+        _errorbar(axes, x, parts, color, label)
+        axes.plot(x, [part.value for part in parts], color=color, lw=1)
+    axes.plot([0, 1], [0, 1], color=QUIET, lw=0.8, ls=":")
+    plain(axes, "part that hits a lump", "confidence")
+    _percent(axes, both=True)
+    axes.set_xlim(0, 1.02)
+    axes.set_ylim(-0.02, 1.02)
+    _legend(axes, "upper left")
+    return _svg(figure)
+
+
+def effort(analyses: Sequence[Analysis]) -> str:
+    """Return the distributions of greatest force and duration of the first MOST methods."""
+    figure = _figure(11, 4.2)
+    for axes, column, words in zip(
+        _axes(figure, 2), ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
+    ):
+        for color, analysis in zip(COLOURS, analyses, strict=False):
+            x = np.sort(analysis.cases[column][~analysis.cases["failed"]].dropna().to_numpy(dtype=float))
+            axes.step(x, np.arange(1, len(x) + 1) / max(len(x), 1), where="post", color=color, lw=1.6, label=analysis.name)
+        plain(axes, "part of the examinations", words)
+        _percent(axes)
+        _legend(axes, "lower right")
+    return _svg(figure)
+
+
+def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str | None:
+    """Return the paired differences of one quantity from the reference, greatest first; None if none is known.
+
+    Levels of one error, `error=level`, share a row.
+    """
+    known: dict[str, list[tuple[str, Difference]]] = {}
+    for comparison in comparisons:
+        source, _, level = comparison.other.rpartition("=")
+        difference = comparison.quantities[name]
+        if difference.mean.value is not None:
+            known.setdefault(source or level, []).append((level if source else "difference", difference))
+    if not known:
+        return None
+    shown = sorted(known.items(), key=lambda row: -max(abs(d.mean.value or 0) for _, d in row[1]))[:rows][::-1]
+    words, unit, margin = QUANTITIES[name]
+    scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
+    levels = list(dict.fromkeys(level for row in known.values() for level, _ in row))
+    figure = _figure(9.0, 1.6 + 0.34 * len(shown))
+    (axes,) = _axes(figure)
+    height = 0.7 / len(levels)
+    for i, level in enumerate(levels):
+        bars = [
+            (y + (i - (len(levels) - 1) / 2) * height, d.mean)
+            for y, (_, row) in enumerate(shown)
+            for own, d in row
+            if own == level
+        ]
+        at, means = [y for y, _ in bars], [mean for _, mean in bars]
+        color = COLOURS[i % MOST]
+        axes.barh(at, [scale * (mean.value or 0) for mean in means], height=height, color=color, alpha=0.55, label=level)
+        for y, mean in bars:
+            if mean.low is not None and mean.high is not None:
+                axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.3)
+    axes.axvspan(-scale * margin, scale * margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
+    axes.axvline(0, color=QUIET, lw=0.8)
+    plain(axes, "", f"{words}, difference from {comparisons[0].reference}{f' [{unit}]' if unit else ''}")
+    axes.set_yticks(range(len(shown)), [f"{source} (n = {min(d.mean.n for _, d in row)})" for source, row in shown])
+    _legend(axes, "lower right")
+    return _svg(figure)
+
+
+def _percent(axes: Axes, both: bool = False) -> None:
+    axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+    if both:
+        axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
+
 
 TORNADOES = ("lumps_found", "false_findings", "score", "place_error_m")
 FEWEST_FOR_TORNADO = 2
@@ -23,7 +316,7 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
     loader = ChoiceLoader([PackageLoader("palpate.study"), PackageLoader("palpate.report")])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"figure": figure, "percent": percent, "mm": millimetres, "p": p_value, "words": covariate_words}
-    shown = analyses[: plots.MOST]
+    shown = analyses[:MOST]
     calibrated = [(a.name, a.calibration) for a in shown if a.calibration is not None]
     many = len(comparisons) >= FEWEST_FOR_TORNADO
     return environment.get_template("study.html.j2").render(
@@ -32,14 +325,14 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
         methods=[summary["methods"][a.name] for a in shown],
         human=human_line,
         quantities=QUANTITIES,
-        roc=_safe(plots.roc(analyses)),
-        froc=_safe(plots.froc(analyses)),
-        felt={a.name: _safe(plots.detectability(a, FELT)) for a in shown},
-        made={a.name: _safe(plots.detectability(a, MADE)) for a in shown},
-        errors={a.name: _safe(plots.errors(a)) for a in shown},
-        reliability=_safe(plots.reliability(calibrated)),
-        effort=_safe(plots.effort(analyses)),
-        tornadoes=[plot for name in TORNADOES if many and (plot := _safe(plots.tornado(comparisons, name)))],
+        roc=_safe(roc(analyses)),
+        froc=_safe(froc(analyses)),
+        felt={a.name: _safe(detectability(a, FELT)) for a in shown},
+        made={a.name: _safe(detectability(a, MADE)) for a in shown},
+        errors={a.name: _safe(errors(a)) for a in shown},
+        reliability=_safe(reliability(calibrated)),
+        effort=_safe(effort(analyses)),
+        tornadoes=[plot for name in TORNADOES if many and (plot := _safe(tornado(comparisons, name)))],
     )
 
 
@@ -77,4 +370,4 @@ def p_value(value: float | None) -> str:
 
 def covariate_words(name: str) -> str:
     """Return the label of a covariate."""
-    return plots.COVARIATES[name][0]
+    return COVARIATES[name][0]
