@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -17,14 +18,29 @@ from palpate_models.numerics.frames import Array, apply
 from palpate_models.scenario.load import exam_input
 
 SAMPLES, MAP, FINDINGS = "assessment/samples", "assessment/map", "assessment/findings"
-STIFF_AT = np.array((0.02, -0.015))
-STIFF_RADIUS = 0.022
-CONTRAST = 3.0
-SPEED_MPS = 0.03
-LINES_M = 0.0125
-FORCE_N = 3.0
-"""Force at the depth of the scan on unremarkable tissue."""
-ANSWER_S = 30.0
+
+
+@dataclass(frozen=True)
+class Belly:
+    """A belly with one stiff area."""
+
+    stiff_at_m: tuple[float, float] = (0.02, -0.015)
+    stiff_radius_m: float = 0.022
+    contrast: float = 3.0
+    force_n: float = 3.0
+    """Force at the depth of the scan on unremarkable tissue."""
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """The played scan and the wait for findings."""
+
+    speed_mps: float = 0.03
+    spacing_m: float = 0.0125
+    answer_s: float = 30.0
+
+
+BELLY, SCAN = Belly(), ScanSettings()
 
 
 class PlayedScan:
@@ -32,9 +48,9 @@ class PlayedScan:
 
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
         self._X_WA, self._depth, self._start = X_WA, depth, start
-        line = np.arange(-half, half, SPEED_MPS * 0.01)
+        line = np.arange(-half, half, SCAN.speed_mps * 0.01)
         rows = []
-        for i, y in enumerate(np.arange(-half, half + 1e-9, LINES_M)):
+        for i, y in enumerate(np.arange(-half, half + 1e-9, SCAN.spacing_m)):
             rows.append(np.column_stack((line if i % 2 == 0 else line[::-1], np.full(len(line), y))))
         self.path = np.vstack(rows)
         self.duration = len(self.path) * 0.01 + 1.0
@@ -49,7 +65,7 @@ class PlayedScan:
         n_A = shapes.normals(np.array([x]), np.array([y]))
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
         depth = self._depth if scanning else -0.01
-        force = FORCE_N * self.stiffness(x, y) if scanning else 0.0
+        force = BELLY.force_n * self.stiffness(x, y) if scanning else 0.0
         return exam_state(
             t,
             phase,
@@ -68,8 +84,8 @@ class PlayedScan:
     @staticmethod
     def stiffness(x: float, y: float) -> float:
         """Return the stiffness relative to unremarkable tissue."""
-        r = float(np.hypot(x - STIFF_AT[0], y - STIFF_AT[1]))
-        return 1.0 + (CONTRAST - 1.0) / (1.0 + float(np.exp((r - STIFF_RADIUS) / 0.004)))
+        r = float(np.hypot(x - BELLY.stiff_at_m[0], y - BELLY.stiff_at_m[1]))
+        return 1.0 + (BELLY.contrast - 1.0) / (1.0 + float(np.exp((r - BELLY.stiff_radius_m) / 0.004)))
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
@@ -106,11 +122,11 @@ def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
         "where the indenter was", inside, f"within {half * 1e3:.0f} mm of the umbilicus", np.abs(p[:, :2]).max(axis=0).round(3)
     )
     force = np.array([m.normal_force for m in received])
-    ok = bool(np.all((force > 0.5 * FORCE_N) & (force < 1.5 * CONTRAST * FORCE_N)))
+    ok = bool(np.all((force > 0.5 * BELLY.force_n) & (force < 1.5 * BELLY.contrast * BELLY.force_n)))
     report.expect(
         "with the force that was measured",
         ok,
-        f"{FORCE_N} to {CONTRAST * FORCE_N} N",
+        f"{BELLY.force_n} to {BELLY.contrast * BELLY.force_n} N",
         f"{force.min():.2f} to {force.max():.2f} N",
     )
 
@@ -118,7 +134,7 @@ def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
 def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
     report.section("findings")
     waited = 0.0
-    while not rig.log[FINDINGS] and waited < ANSWER_S:
+    while not rig.log[FINDINGS] and waited < SCAN.answer_s:
         rig.run(0.5, {"exam/state": play.state})
         waited += 0.5
     final = [item.message for item in rig.log[FINDINGS] if item.message.final]
@@ -128,10 +144,12 @@ def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
     report.expect("finds the one stiff area", len(found) == 1, "1 finding", len(found))
     if found:
         c = found[0].centroid
-        off = float(np.hypot(c.x - STIFF_AT[0], c.y - STIFF_AT[1]))
+        off = float(np.hypot(c.x - BELLY.stiff_at_m[0], c.y - BELLY.stiff_at_m[1]))
         report.expect("where it is", off < 0.012, "within 12 mm", f"{off * 1e3:.1f} mm")
         ratio = found[0].ratio
-        report.expect("stiffer than its surroundings", 1.3 < ratio < 2 * CONTRAST, f"up to {CONTRAST:g} x", f"{ratio:.2f} x")
+        report.expect(
+            "stiffer than its surroundings", 1.3 < ratio < 2 * BELLY.contrast, f"up to {BELLY.contrast:g} x", f"{ratio:.2f} x"
+        )
         band = found[0].ratio_lower <= ratio <= found[0].ratio_upper
         report.expect(
             "with a band about its ratio",
@@ -156,5 +174,7 @@ def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
         report.expect("bands include their value", ordered, "lower <= apparent <= upper", "so" if ordered else "not so")
         scanned, member = np.asarray(last.scanned, dtype=bool), np.asarray(last.finding) >= 0
         rest = float(np.median(last.apparent[scanned & ~member]))
-        near = 0.5 * FORCE_N < rest < 2 * FORCE_N
-        report.expect("in newtons of the standard press", near, f"about {FORCE_N:g} N outside the findings", f"{rest:.2f} N")
+        near = 0.5 * BELLY.force_n < rest < 2 * BELLY.force_n
+        report.expect(
+            "in newtons of the standard press", near, f"about {BELLY.force_n:g} N outside the findings", f"{rest:.2f} N"
+        )

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -14,12 +15,22 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import header
 
 REQUEST: Final = "exam/request"
-STIFF_M: Final = 0.020
-EDGE_M: Final = 0.007
-FORCE_N: Final = 4.0
-CONTRAST: Final = 3.0
 PRESS_S: Final = 0.3
 MOST: Final = 40
+
+
+@dataclass(frozen=True)
+class Belly:
+    """A belly with one stiff area."""
+
+    stiff_radius_m: float = 0.020
+    edge_m: float = 0.007
+    contrast: float = 3.0
+    force_n: float = 4.0
+    """Force at 10 mm depth on unremarkable tissue."""
+
+
+BELLY: Final = Belly()
 
 
 class Play:
@@ -82,8 +93,8 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 def pressed(t: int, asked: Any, stiff_at: Any) -> Message:
     """Return the sample of a press of the belly."""
     xy = np.array((asked.place.x, asked.place.y))
-    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - STIFF_M) / EDGE_M)))
-    force = FORCE_N * CONTRAST**bump * (asked.depth / 0.010) ** 1.3
+    bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - BELLY.stiff_radius_m) / BELLY.edge_m)))
+    force = BELLY.force_n * BELLY.contrast**bump * (asked.depth / 0.010) ** 1.3
     place = Point(float(xy[0]), float(xy[1]), 0.0)
     up = Vector3(0.0, 0.0, 1.0)
     return PalpationSample(header(t, "abdomen"), place, up, float(asked.depth), float(force), 0.0, 0.5, False, 1, 0.0005)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -19,15 +20,24 @@ from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.load import exam_input
 
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
-FORCE_ERROR_N = 3.0
-"""Tolerance of the force, which includes the sensor's bias because it is untared."""
-REACT_MS = 150
-"""Time limit for an emergency stop."""
-SOFT_MS = 400
-"""Time limit for a soft stop, which may wait for a reaction of planning."""
-SILENT_S = 0.6
-RISE_NPS = 10.0
-STEP_S = 0.02
+
+
+@dataclass(frozen=True)
+class Expected:
+    """Tolerances and time limits of the supervisor, and the rise of the played force."""
+
+    force_error_n: float = 3.0
+    """Includes the sensor's bias, because the force is untared."""
+    react_ms: float = 150.0
+    """For an emergency stop."""
+    soft_ms: float = 400.0
+    """For a soft stop, which may wait for a reaction of planning."""
+    silent_s: float = 0.6
+    rise_nps: float = 10.0
+    step_s: float = 0.02
+
+
+EXPECTED = Expected()
 OUTSIDE = ((0.0,) * 7, (2.9, *lbr.HOME[1:]), (0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (1.57, 1.57, 0.0, 0.0, 0.0, 0.0, 0.0))
 """Postures [rad]; at least one is probably outside the workspace."""
 STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
@@ -83,7 +93,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.section("limits")
     _press(rig, arm, limits.force_soft_stop_n - 1.0)
     arm.push_N = limits.force_soft_stop_n + 1.0
-    _stops(rig, arm, report, "a force over the soft-stop limit", STOPPED, SupervisorState.CAUSE_FORCE, SOFT_MS)
+    _stops(rig, arm, report, "a force over the soft-stop limit", STOPPED, SupervisorState.CAUSE_FORCE, EXPECTED.soft_ms)
     received = rig.run(1.0, arm.feed())[STATE]
     report.expect(
         "a soft stop that does not help becomes an emergency stop", _level(received) in EMERGENCY, "level 2", _text(received)
@@ -91,42 +101,45 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     _refuses(rig, arm, report)
     _released(rig, arm, report, "and is released")
     arm.push_N = limits.force_emergency_n + 10.0
-    _stops(rig, arm, report, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, REACT_MS)
+    _stops(rig, arm, report, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released after it")
     received = _press(rig, arm, limits.force_working_n)
     report.expect(
         "a steady force below the limits is not stopped", _level(received) == SupervisorState.LEVEL_OK, "0", _text(received)
     )
     rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.035))
-    _stops(rig, arm, report, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH, SOFT_MS)
+    _stops(rig, arm, report, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH, EXPECTED.soft_ms)
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
     _released(rig, arm, report, "and is released above the surface")
     arm.qd = _turning(arm, 2.0 * limits.speed_mps)
-    _stops(rig, arm, report, "a tool too fast", EMERGENCY, SupervisorState.CAUSE_SPEED, REACT_MS)
+    _stops(rig, arm, report, "a tool too fast", EMERGENCY, SupervisorState.CAUSE_SPEED, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released at rest")
     _workspace(rig, arm, report)
 
     report.section("others")
     arm.q = np.full(7, np.nan)
-    _stops(rig, arm, report, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, REACT_MS)
+    _stops(rig, arm, report, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released with numbers")
     arm.mode, arm.reason = RobotStatus.MODE_SAFE_HOLD, "conformance check"
-    _stops(rig, arm, report, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER, REACT_MS)
+    _stops(rig, arm, report, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released with the driver")
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough"))
-    _stops(rig, arm, report, "an operator's stop", EMERGENCY, SupervisorState.CAUSE_OPERATOR, REACT_MS)
+    _stops(rig, arm, report, "an operator's stop", EMERGENCY, SupervisorState.CAUSE_OPERATOR, EXPECTED.react_ms)
     received = rig.run(0.5, arm.feed())[STATE]
     ok = _level(received) in EMERGENCY and "enough" in received[-1].message.reason
     report.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _text(received))
     _released(rig, arm, report, "and is released by the operator")
     for silent in (STATUS, EXAM):
-        received = rig.run(SILENT_S, arm.feed(silent))[STATE]
+        received = rig.run(EXPECTED.silent_s, arm.feed(silent))[STATE]
         report.expect(
-            f"stops when {silent} is silent", _level(received) in EMERGENCY, f"level 2 within {SILENT_S:g} s", _text(received)
+            f"stops when {silent} is silent",
+            _level(received) in EMERGENCY,
+            f"level 2 within {EXPECTED.silent_s:g} s",
+            _text(received),
         )
         _released(rig, arm, report, f"and is released when {silent} is back")
     rig.lose("control")
-    _stops(rig, arm, report, "the loss of control", EMERGENCY, SupervisorState.CAUSE_LOST, REACT_MS)
+    _stops(rig, arm, report, "the loss of control", EMERGENCY, SupervisorState.CAUSE_LOST, EXPECTED.react_ms)
 
 
 def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
@@ -136,7 +149,7 @@ def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     rig.send(SURFACE, arm.surface(rig.t, 0.004))
     received = _press(rig, arm, 10.0)
     state = received[-1].message
-    report.expect("force is that on the tool", abs(state.force - 10.0) < FORCE_ERROR_N, "10 N", f"{state.force:.2f} N")
+    report.expect("force is that on the tool", abs(state.force - 10.0) < EXPECTED.force_error_n, "10 N", f"{state.force:.2f} N")
     report.expect("speed is that of the sphere", abs(state.speed - 0.05) < 0.005, "0.05 m/s", f"{state.speed:.4f} m/s")
     report.expect("depth is below the perceived surface", abs(state.depth - 0.004) < 1e-3, "4 mm", f"{state.depth * 1e3:.2f} mm")
     report.expect("and none of them is a reason to stop", state.level == SupervisorState.LEVEL_OK, "LEVEL_OK", _text(received))
@@ -146,9 +159,9 @@ def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 
 def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:
     """Presses up to `force` [N] as slowly as an examination does, and holds for half a second."""
-    for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / RISE_NPS / STEP_S)):
+    for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / EXPECTED.rise_nps / EXPECTED.step_s)):
         arm.push_N = float(push)
-        rig.run(STEP_S, arm.feed())
+        rig.run(EXPECTED.step_s, arm.feed())
     return rig.run(0.5, arm.feed())[STATE]
 
 
@@ -166,7 +179,9 @@ def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
         p_A = apply(X_AW, tool_pose(np.array(q), arm.robot)[:3, 3])
         if bool(np.any(p_A < low - 0.02) or np.any(p_A > high + 0.02)):
             arm.q = np.array(q)
-            _stops(rig, arm, report, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, REACT_MS)
+            _stops(
+                rig, arm, report, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, EXPECTED.react_ms
+            )
             _released(rig, arm, report, "and is released inside")
             return
     report.skip("stops for a tool outside the workspace", "all postures of this check lie in the workspace")
