@@ -144,7 +144,7 @@ def test_without_a_copy_of_the_tissue_nothing_is_scored(scenario: Scenario, felt
     assert report.truth is not None
     assert (report.truth.felt, report.truth.lumps, report.scores) == (False, [], None)
     assert report.depth_rms_error_m is not None
-    assert "no copy can be made" in write_page(tmp_path).read_text(encoding="utf-8")
+    assert "this tissue cannot be copied" in write_page(tmp_path).read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize(
