@@ -107,16 +107,16 @@ def _curves(a: Variant, b: Variant, bootstrap: Bootstrap) -> dict[str, Estimate 
     """Return the differences of figures of the curves."""
     found: dict[str, Estimate | None] = {"auc": None, "froc_mean": None, "sensitivity_at_zero": None}
     if (roc_a := roc(a, bootstrap)) and (roc_b := roc(b, bootstrap)):
-        found["auc"] = _difference(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
+        found["auc"] = _curve_difference(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
     if (froc_a := froc(a, bootstrap)) and (froc_b := froc(b, bootstrap)):
-        found["froc_mean"] = _difference(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
-        found["sensitivity_at_zero"] = _difference(
+        found["froc_mean"] = _curve_difference(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
+        found["sensitivity_at_zero"] = _curve_difference(
             froc_b.at_zero, froc_a.at_zero, froc_b.zero_replicates - froc_a.zero_replicates
         )
     return found
 
 
-def _difference(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
+def _curve_difference(b: Estimate, a: Estimate, replicates: Array) -> Estimate:
     """Return the difference b - a; if both are at the end of their range, with an interval from both intervals."""
     if None in (a.value, a.low, a.high, b.value, b.low, b.high):
         return Estimate(value=None, n=a.n, of=a.of)
