@@ -25,7 +25,7 @@ def fuzz(
     except ValueError as error:
         refuse(error)
     with CaseDisplay(console, False, "targets") as display:
-        done = campaign(chosen, inputs, seed, display.tell)
+        done = campaign(chosen, inputs, seed, display.show)
     for find in done.finds:
         console.print(f"[red]{find.target}[/] {escape(find.error)}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     rate = sum(done.inputs.values()) / done.seconds

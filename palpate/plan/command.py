@@ -34,9 +34,10 @@ def plan(
     from rich.console import Console
 
     from palpate.console import refuse
-    from palpate.plan.prospect import NoPathError, draw, prospect, summary
+    from palpate.plan.prospect import draw, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom
+    from palpate_planning.motion.planner import NoPathError
     from palpate_plugins import PluginError
 
     chosen = usable(scenario, settings, seed)

@@ -105,7 +105,7 @@ def test_a_run_that_cannot_be_is_refused(words: str, said: tuple[str, ...], tmp_
         ("validate --docs file/page.md", "file: cannot be made a folder"),
         ("bench --out .", "is not a writable file"),
         ("faults --out .", "is not a writable file"),
-        ("faults --docs page.md", "wants the lines"),
+        ("faults --docs page.md", "needs the lines"),
         ("faults", "faults.csv: holds no findings"),
     ],
 )
@@ -139,7 +139,7 @@ def plan(tmp_path: Path, *settings: str) -> str:
 
 def test_the_plan_of_a_user_defined_pattern_is_drawn(tmp_path: Path) -> None:
     output = plan(tmp_path, "robot.base_height_m=0.8", f"exam.pattern={SPIRAL}")
-    assert "18 targets in 1 line, felt in" in output
+    assert "18 targets in 1 line, palpated in" in output
     assert "of simulated time" in output
     assert np.asarray(Image.open(tmp_path / "plan.png").convert("L")).std() > 10
 

@@ -109,14 +109,14 @@ def test_a_renewed_reference_agrees_with_the_changed_service(tmp_path: Path, wea
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("--service tisue", "services are robot, tissue"),
+        ("--service tisue", "allowed are robot, tissue"),
         ("--service tissue=none_such", "winkler"),
         ("--service tissue=no_such_file.py", "no_such_file.py"),
-        ("--service camera", "nothing that camera sent"),
+        ("--service camera", "no message of camera to compare with"),
         ("--service control --tolerance x", "--tolerance x"),
         ("--service control --tolerance nothing:torque=1", "no topic 'nothing'"),
         ("--topic nothing", "nothing"),
-        ("--update-refs new.mcap", "--update-refs goes with --service"),
+        ("--update-refs new.mcap", "--update-refs needs --service"),
         ("--service control --for 5", "--for is for a recording that is played"),
         ("--service control --update-refs new.mcap --json", "--json cannot be combined with --update-refs"),
     ],

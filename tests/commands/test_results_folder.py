@@ -100,7 +100,7 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
         assert run in (one / name).read_text(encoding="utf-8"), name
     assert run in Image.open(one / "map.png").info["Comment"]
     shutil.copy(one / "evidence.mcap", two)
-    with pytest.raises(EvidenceError, match="these are two runs"):
+    with pytest.raises(EvidenceError, match="want files of one run"):
         write_page(two)
 
 

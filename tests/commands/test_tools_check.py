@@ -15,7 +15,7 @@ from palpate.check.live_rig import LiveRig
 from palpate.check.perform import started
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites import LASTS_S, SUITES, check
+from palpate.check.suites import DURATION_S, SUITES, check
 from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, names
 from palpate_bus.messages import Point, Pose, SupervisorState
@@ -41,7 +41,7 @@ def test_an_implementation_conforms(name: str) -> None:
     rig = ServiceRig(made(name), RigSettings(SCENARIO))
     report = check(rig)
     assert report.failed == []
-    assert rig.t / NS == pytest.approx(LASTS_S[rig.role.name], rel=0.25)
+    assert rig.t / NS == pytest.approx(DURATION_S[rig.role.name], rel=0.25)
     assert report.passed
     assert len(report.results) > 10
 
@@ -120,7 +120,7 @@ FAULTS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "tissue: elsewhere": (
         "truth/patient",
         lambda m: replace(m, pose=Pose(Point(0.0, 0.0, 1.0), m.pose.orientation)),
-        "truth/patient: lies where truth/phantom says",
+        "truth/patient: at the pose of truth/phantom",
     ),
     "control: never expires": ("control/joint_torque", never_expires, "stops commanding when set-points cease"),
     "control: torque sign": (
@@ -131,7 +131,7 @@ FAULTS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "camera: millimetres": ("camera/depth/image_raw", millimetres, "a level plane is where it is"),
     "perception: inward": ("perception/surface", lambda m: replace(m, normals=-m.normals), "with outward normals"),
     "assessment: two ends": ("assessment/findings", lambda m: [m] * 2, "final findings once"),
-    "supervisor: half force": ("supervisor/state", half_force, "force is what pushes the tool"),
+    "supervisor: half force": ("supervisor/state", half_force, "force is that on the tool"),
     "supervisor: never stops": ("supervisor/state", never_stops, "stops for a tool too fast"),
     "supervisor: forgets": ("supervisor/state", forgets_the_operator, "it stays, with the operator's reason"),
     "supervisor: soft only": ("supervisor/state", soft_only, "stops for a force over the emergency limit"),

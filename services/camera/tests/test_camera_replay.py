@@ -99,7 +99,7 @@ def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(
     assert camera.finish()["frames_recorded"] == FRAMES
 
 
-def restamped(received: list[HeardMessage], stamp: Callable[[int], int]) -> list[HeardMessage]:
+def restamped(received: list[ReceivedMessage], stamp: Callable[[int], int]) -> list[ReceivedMessage]:
     """Return messages with other stamps in their headers, by their time [ns]; they were logged in steps of 100 ms."""
     changed = copy.deepcopy(received)
     for message in changed:
@@ -119,7 +119,7 @@ def restamped(received: list[HeardMessage], stamp: Callable[[int], int]) -> list
     ],
 )
 def test_images_whose_stamps_repeat_or_are_not_those_of_their_intrinsics_are_all_shown(
-    seen: dict[str, list[HeardMessage]], tmp_path: Path, image_stamp: Callable[[int], int], info_stamp: Callable[[int], int]
+    seen: dict[str, list[ReceivedMessage]], tmp_path: Path, image_stamp: Callable[[int], int], info_stamp: Callable[[int], int]
 ) -> None:
     images, infos = restamped(seen[IMAGE], image_stamp), restamped(seen[INFO], info_stamp)
     folder = record(tmp_path / "recording_mcap", {**seen, IMAGE: images, INFO: infos})
@@ -132,14 +132,14 @@ def test_images_whose_stamps_repeat_or_are_not_those_of_their_intrinsics_are_all
 
 
 def test_one_camera_info_is_that_of_all_images_and_a_message_recorded_twice_counts_once(
-    seen: dict[str, list[HeardMessage]], tmp_path: Path
+    seen: dict[str, list[ReceivedMessage]], tmp_path: Path
 ) -> None:
     twice = [one for received in seen[IMAGE] for one in (received, received._replace(t=received.t + 1))]
     folder = record(tmp_path / "recording_mcap", {**seen, IMAGE: twice, INFO: seen[INFO][:1]})
     assert ReplayedCamera(open_recording(folder)).finish()["frames_recorded"] == FRAMES
 
 
-def test_intrinsics_that_change_are_refused(seen: dict[str, list[HeardMessage]], tmp_path: Path) -> None:
+def test_intrinsics_that_change_are_refused(seen: dict[str, list[ReceivedMessage]], tmp_path: Path) -> None:
     infos = copy.deepcopy(seen[INFO])
     infos[-1].message.k[0] *= 1.1
     folder = record(tmp_path / "recording_mcap", {**seen, INFO: infos})
