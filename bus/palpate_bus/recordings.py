@@ -218,7 +218,7 @@ def _listed(metadata: Path) -> tuple[Path, ...]:
 
 @dataclass
 class _Contents:
-    """What one file has, by channel id."""
+    """Contents of one file, by channel id."""
 
     schemas: dict[int, Schema]
     channels: dict[int, Channel]

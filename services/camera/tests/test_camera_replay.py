@@ -10,6 +10,7 @@ import pytest
 from palpate.check.rig import ReceivedMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
+from palpate.run.roles import checked
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.codec import encode
@@ -173,6 +174,16 @@ def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[Rece
 def test_no_recording_is_refused_by_field() -> None:
     with pytest.raises(RecordingError, match=r"camera\.recording"):
         create(SCENARIO)
+
+
+def test_a_run_checks_the_recording_before_anything_starts(tmp_path: Path) -> None:
+    (tmp_path / "bag_0.db3").write_bytes(b"SQLite format 3\0" + bytes(99))
+    changed = {
+        "camera": SCENARIO.camera.model_copy(update={"recording": str(tmp_path)}),
+        "services": SCENARIO.services.model_copy(update={"camera": "replay"}),
+    }
+    with pytest.raises(RecordingError, match="SQLite bag"):
+        checked(SCENARIO.model_copy(update=changed))
 
 
 def test_a_folder_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
