@@ -48,7 +48,7 @@ SECTIONS: dict[str, Callable[[], PageSection]] = {
     "lumps against the continuum": lumps.section,
     "mesh halving and superposition": meshes.section,
     "relaxation": relaxation.section,
-    "some living people": lambda: people.section(people.measure(relaxed_people()[::12])),
+    "some living people": lambda: people.section(people.measure(relaxed_people()[::6])),
     "random cycles": lambda: energy.section(energy.measure(8)),
     "population": population.section,
     "bone": persons.section,
