@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -104,15 +103,14 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     import fmpy
     from fmpy.model_description import ValidationError
 
-    from palpate_fmu.instance import read_variables
+    from palpate_fmu.reading import FmuError, binary_folders, read_description, read_variables
 
     console = Console()
     try:
-        description = fmpy.read_model_description(str(file))
-        with zipfile.ZipFile(file) as archive:
-            platforms = sorted({name.split("/")[1] for name in archive.namelist() if name.startswith("binaries/")})
-    except Exception as error:
-        refuse(f"{file}: not an FMU: {error}")
+        description, findings = read_description(file)
+        platforms = binary_folders(file)
+    except FmuError as error:
+        refuse(error)
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
     console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}", highlight=False)
@@ -124,11 +122,13 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
         table.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
     Console(width=max(150, console.width)).print(table)
     names = len(description.modelVariables) <= NAMES_CHECKED
+    verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
     try:
-        fmpy.read_model_description(str(file), validate_variable_names=names, validate_model_structure=True)
-        verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
+        if not findings:
+            fmpy.read_model_description(str(file), validate_variable_names=names, validate_model_structure=True)
     except ValidationError as error:
-        verdict = "\n".join(error.problems)
+        findings = error.problems
+    verdict = "\n".join(("findings of the validator, which do not prevent its use:", *findings)) if findings else verdict
     console.print(verdict, highlight=False)
 
 
@@ -146,8 +146,9 @@ def simulate(
 ) -> None:
     """Press into an abdomen, hold, withdraw, and plot force against depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native
-    from palpate_fmu.instance import FmuError, FmuInstance
+    from palpate_fmu.instance import FmuInstance
     from palpate_fmu.probing import plot_probing, probe, write_csv
+    from palpate_fmu.reading import FmuError
     from palpate_fmu.running import run_and_plot
 
     console = Console(stderr=True)

@@ -179,14 +179,14 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
         while (sample := subscriptions[0].get(0)) is not None:
             received.append((sample.sequence, sample.payload))
 
-    outcome = run_toys(listen, {"TOY_END_S": "8"}, faults={"robot": ("robot/status", "nan", "1")})
-    assert outcome.failure is None
+    outcome = run_toys(listen, {"TOY_END_S": "8"}, faults={"tissue": ("truth/patient", "nan", "1")})
+    assert outcome.failure is None  # it has observers only
     statuses = {status.name: status for status in codec.decode(received[-1][1], topic.type).status}
-    for name in ("palpate/topic/robot/status", "palpate/robot"):
+    for name in ("palpate/topic/truth/patient", "palpate/tissue"):
         assert statuses[name].level == DiagnosticStatus.ERROR
-        assert "from robot: not finite" in statuses[name].message
-        assert statuses[name].hardware_id == "robot"
-    assert "robot/status" in statuses["palpate/topic/robot/status"].message
+        assert "from tissue: not finite" in statuses[name].message
+        assert statuses[name].hardware_id == "tissue"
+    assert "truth/patient" in statuses["palpate/topic/truth/patient"].message
     assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
 
     dashboard = DashboardService(Scenario(), tmp_path / "drawn.rrd", Live())
@@ -198,10 +198,10 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
             for name, column in chunk.to_record_batch().to_pydict().items():
                 if ":" in name:
                     drawn.setdefault(chunk.entity_path, []).extend(column)
-    assert ["ERROR"] in drawn["/health/topics/robot/status"]
-    assert ["ERROR"] in drawn["/health/services/robot"]
-    assert any("from robot: not finite" in str(text) for text in drawn["/log/health/topics/robot/status"])
-    assert "| robot/status | ERROR |" in str(drawn["/text/services"][-1])
+    assert ["ERROR"] in drawn["/health/topics/truth/patient"]
+    assert ["ERROR"] in drawn["/health/services/tissue"]
+    assert any("from tissue: not finite" in str(text) for text in drawn["/log/health/topics/truth/patient"])
+    assert "| truth/patient | ERROR |" in str(drawn["/text/services"][-1])
 
 
 def test_the_first_diagnostics_include_services_that_joined_late(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -67,21 +67,21 @@ class FaultyPlanning(Service):
 
 
 class Watcher(Collector):
-    """The conductor's collector, with every state of supervisor and driver; it may send an operator's stop."""
+    """The conductor's collector, with every state of supervisor and driver; it may send an operator's request."""
 
     def __init__(self) -> None:
         super().__init__()
         self.states: list[Any] = []
         self.statuses: list[Any] = []
-        self.stop_at: int | None = None
+        self.request: int | None = None
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         self.states.extend(inbox.new("supervisor/state"))
         self.statuses.extend(inbox.new("robot/status"))
         out = dict(super().step(t, inbox))
-        if self.stop_at is not None and t >= self.stop_at:
-            self.stop_at = None
-            out["operator/request"] = OperatorRequest(header(t), OperatorRequest.STOP, "enough")
+        if self.request is not None:
+            out["operator/request"] = OperatorRequest(header(t), self.request, "enough")
+            self.request = None
         return out
 
 
@@ -133,15 +133,10 @@ class Case:
     settings: tuple[str, ...] = ()
     tamper: tuple[str, Callable[[dict[str, Any]], bool]] | None = None
     """A role, and the change of one of its messages."""
+    request: int | None = None
+    """Request of an operator."""
     breach: Callable[[Any], bool] | None = None
     """True if a `truth/indentation` exceeds the limit; None: timed from the event."""
-
-
-def _blind(out: dict[str, Any]) -> bool:
-    if "robot/status" not in out:
-        return False
-    out["robot/status"] = dataclasses.replace(out["robot/status"], position=np.full(7, np.nan))
-    return True
 
 
 def _mistaken(out: dict[str, Any]) -> bool:
@@ -163,9 +158,9 @@ CASES: dict[str, Case] = {
     "strays aside at 200 mm/s": Case(
         SupervisorState.CAUSE_WORKSPACE, lambda n: 0.1 * n + np.array([0.0, 0.2, 0.0]), ("limits.workspace_max_m=[0.7,0.1,1.2]",)
     ),
-    "operator stops": Case(SupervisorState.CAUSE_OPERATOR),
+    "operator stops": Case(SupervisorState.CAUSE_OPERATOR, request=OperatorRequest.STOP),
     "control is gone": Case(SupervisorState.CAUSE_LOST),
-    "robot/status is NaN": Case(SupervisorState.CAUSE_INVALID, tamper=("robot", _blind)),
+    "an unknown request": Case(SupervisorState.CAUSE_INVALID, request=99),
     "a torque command is damaged": Case(SupervisorState.CAUSE_DRIVER, tamper=("control", _mistaken)),
 }
 
@@ -188,9 +183,8 @@ def react(name: str) -> Reaction:
             return 20 * NS if run.t > 20 * NS else None
         if not struck:
             struck.append(run.t)
-            if case.cause == SupervisorState.CAUSE_OPERATOR:
-                watcher.stop_at = run.t
-            elif case.cause == SupervisorState.CAUSE_LOST:
+            watcher.request = case.request
+            if case.cause == SupervisorState.CAUSE_LOST:
                 run.steppers["supervisor"].inbox.lost_roles.add("control")
             for service in others:
                 if isinstance(service, Meddled):

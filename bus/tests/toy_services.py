@@ -75,7 +75,7 @@ class Robot(Service):
         out: dict[str, Any] = {
             "joint_states": JointState(h, NAMES, x, x, x),
             "sim/tool_state": ToolState(h, pose(x[0]), twist(), 0.015),
-            "ft/wrench": WrenchStamped(h, wrench()),
+            "ft/wrench": WrenchStamped(header(t, "ft_sensor"), wrench()),
         }
         if t % (10 * MS) == 0:
             out["robot/status"] = _status(h, x, inbox.lost("control"))
@@ -181,7 +181,9 @@ class Assessment(Service):
     def step(self, t: int, inbox: Inbox) -> Outbox:
         if inbox.latest("exam/state") is None or t % (50 * MS):
             return {}
-        sample = PalpationSample(header(t), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False, 0, 0.0)
+        sample = PalpationSample(
+            header(t, "abdomen"), Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), 0.0, 0.0, 0.0, 0.0, False, 0, 0.0
+        )
         return {"assessment/samples": [sample, sample]}
 
 
@@ -200,7 +202,7 @@ class Camera(Service):
             return {}
         self.frames -= 1
         data = np.full(640 * 480 * 4, self.frames, np.uint8)
-        return {"camera/depth/image_raw": Image(header(t), 480, 640, "32FC1", 0, 2560, data)}
+        return {"camera/depth/image_raw": Image(header(t, "camera_depth_optical_frame"), 480, 640, "32FC1", 0, 2560, data)}
 
 
 class Perception(Service):
@@ -214,7 +216,7 @@ class Perception(Service):
         level = np.full(3, float(images[-1].data[0]), np.float32)
         return {
             "perception/surface": SurfaceMesh(
-                header(t), level, np.zeros(0, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
+                header(t, "world"), level, np.zeros(0, np.float32), np.zeros(0, np.uint32), np.empty(0, np.float32)
             )
         }
 

@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.runtime.lockstep import Packet, Sent, Stepper
@@ -99,7 +100,7 @@ class ServiceRig(Rig):
 
     def __init__(self, service: Service, settings: RigSettings) -> None:
         super().__init__(service.role, settings)
-        self._stepper = Stepper(service, self.rules, strict=False)
+        self._stepper = Stepper(service, self.rules, strict=False, refuse=self._log_refused)
         self._sequences = dict.fromkeys(self._stepper.buffers, 0)
         self._take(self._stepper.start())
 
@@ -117,11 +118,16 @@ class ServiceRig(Rig):
         """Delivers a message as bytes, like the wire."""
         self._sequences[topic] += 1
         buffer = self._stepper.buffers[topic]
-        buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic]))
+        buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic], checked=True))
 
     def lose(self, role: str) -> None:
         """Marks a role lost."""
         self._stepper.inbox.lost_roles.add(role)
+
+    def _log_refused(self, refused: RefusedMessage) -> None:
+        """Log a message that breaks the contract as sent: the suite names what is wrong with it."""
+        log = self.log[refused.topic]
+        log.append(HeardMessage(self.t, refused.message, len(log) + 1, self.t))
 
     def _take(self, sent: list[Sent]) -> None:
         for port, packet in sent:

@@ -169,18 +169,31 @@ def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceP
 
 _LOGGED = re.compile(r"^\d{4}-\d\d-\d\d [\d:,.]+ \S+ [A-Z]+ ")
 """Time, role and level before a message in a service's log."""
+_TRACEBACK = "Traceback (most recent call last)"
+MESSAGE_LINES = 20
+"""Lines of a message that are shown; more are in the log."""
 
 
 def how(code: int, log: Path) -> str:
-    """Return how a process ended as text: its signal, or its exit status `code` and the last line of its log."""
+    """Return how a process ended as text: its signal, or its exit status `code` and the last message of its log."""
     if code < 0:
         return f"killed by signal {-code}"
-    lines: list[str] = []
+    text = ""
     with suppress(OSError):
-        lines = log.read_text(encoding="utf-8", errors="replace").splitlines()
+        text = log.read_text(encoding="utf-8", errors="replace")
     hint = "" if code else ": does it call palpate_bus.run.run_service?"
-    said = next((_LOGGED.sub("", line.strip()) for line in reversed(lines) if line.strip()), f"its log is empty{hint}")
+    said = _last_message(text) or f"its log is empty{hint}"
     return f"left with status {code}: {said}"
+
+
+def _last_message(text: str) -> str:
+    """Return the last message of a log, of all its lines; of a traceback, what was raised."""
+    lines = [line for line in text.splitlines() if line.strip()]
+    begins = [k for k, line in enumerate(lines) if _LOGGED.match(line) or line.startswith(_TRACEBACK)]
+    message = lines[begins[-1] if begins else -1 :]
+    if message and message[0].startswith(_TRACEBACK):
+        message = message[max(k for k, line in enumerate(message) if line.startswith((" ", _TRACEBACK))) + 1 :]
+    return " ".join(_LOGGED.sub("", line.strip()) for line in message[:MESSAGE_LINES])
 
 
 class LocalProcesses:

@@ -124,6 +124,13 @@ def test_the_end_of_a_process_is_described_by_its_log(tmp_path: Path) -> None:
     log.write_text("Traceback (most recent call last):\n  File ...\nMeshError: two holes\n\n")
     assert how(3, log) == "left with status 3: MeshError: two holes"
     assert how(-9, log) == "killed by signal 9"
+    when = "2026-11-28 13:43:09,099 tissue"
+    log.write_text(f"{when} INFO joined\n{when} ERROR services.tissue = fmu: x.fmu: refused:\n- The variable touching\n- and f\n")
+    assert how(3, log).endswith("services.tissue = fmu: x.fmu: refused: - The variable touching - and f")
+    log.write_text(f"{when} ERROR tissue failed\nTraceback (most recent call last):\n  File ...\nMeshError: two\nholes\n")
+    assert how(3, log).endswith("MeshError: two holes")
+    log.write_text("free text\nof a library\n")
+    assert how(1, log).endswith(": of a library")
     log.write_text("")
     assert how(1, log) == "left with status 1: its log is empty"
 

@@ -11,6 +11,7 @@ from traceback import walk_tb
 from typing import Any
 
 from palpate_bus.contract.conformance import Checker
+from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages.codec import CodecError, Message
 from palpate_bus.runtime.lockstep import ForgedSenderError, InputBuffer, LockstepError, Packet
 from palpate_plugins import USER_MODULE
@@ -42,6 +43,7 @@ class FailureCode(StrEnum):
     FORGED = "forged"
     """A second sender uses the identity of a service or of the conductor."""
     CONTRACT_BROKEN = "contract_broken"
+    """A message was refused, or planning announced an end that has passed."""
     DISK_FULL = "disk_full"
     GAVE_UP = "gave_up"
     """Planning aborted the examination."""
@@ -76,6 +78,8 @@ class Failure:
         The text has the error, preceded by the last line of a user-defined file in its traceback, and each input that breaks the
         contract with the role that sends it.
         """
+        if isinstance(error, RefusedMessage):
+            return cls(FailureCode.CONTRACT_BROKEN, f"{_own_line(error)}{error}", (error.role,), (error.topic,))
         found: dict[str, str] = {}
         with suppress(Exception):  # an invalid input must not hide the error
             found = invalid_inputs(buffers)

@@ -10,11 +10,12 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import deque
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from time import perf_counter_ns
 
 from palpate_bus.contract import Contract, Edge, Topic
+from palpate_bus.contract.port_check import PortCheck, RefusedMessage
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.service import Outbox, Service
@@ -80,15 +81,19 @@ class ForgedSenderError(LockstepError):
 
 
 class Packet:
-    """A message as bytes with its stamp [ns] and sequence number; decoded at first access unless the message is known."""
+    """A message as bytes with its stamp [ns] and sequence number; decoded at first access unless the message is known.
 
-    __slots__ = ("message", "payload", "sequence", "stamp")
+    `checked` is True if the message was held against the contract.
+    """
 
-    def __init__(self, payload: bytes, stamp: int, sequence: int, message: Message | None = None) -> None:
+    __slots__ = ("checked", "message", "payload", "sequence", "stamp")
+
+    def __init__(self, payload: bytes, stamp: int, sequence: int, message: Message | None = None, checked: bool = False) -> None:
         self.payload = payload
         self.stamp = stamp
         self.sequence = sequence
         self.message = message
+        self.checked = checked
 
 
 class InputBuffer:
@@ -100,7 +105,7 @@ class InputBuffer:
 
     __slots__ = (
         "_advances", "_blocks", "_last_sequence", "_latched", "_periodic", "_unstamped",
-        "advanced", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
+        "advanced", "check", "decode", "delay", "edge", "grid", "latest", "lost", "new", "pending", "period", "topic",
     )  # fmt: skip
 
     def __init__(self, topic: Topic, edge: Edge, producer_period: int) -> None:
@@ -110,6 +115,7 @@ class InputBuffer:
         self.delay = topic.period if edge is Edge.PREVIOUS else 0
         self.grid = topic.period if topic.periodic else producer_period
         self.decode = codec.decoder(topic.type)
+        self.check = PortCheck(topic)
         self.advanced = NEVER
         self.latest: Packet | None = None
         self.new: list[Packet] = []
@@ -195,7 +201,7 @@ class InputBuffer:
 
 
 class TickInbox:
-    """The inbox of one service in lockstep, over its input buffers."""
+    """The inbox of one service in lockstep, over its input buffers. Raises RefusedMessage for one that breaks the contract."""
 
     __slots__ = ("_blame", "_buffers", "lost_roles")
 
@@ -207,6 +213,8 @@ class TickInbox:
     def _decode(self, buffer: InputBuffer, packet: Packet) -> Message:
         start = perf_counter_ns()
         message = packet.message = buffer.decode(packet.payload)
+        if not packet.checked:
+            buffer.check(message)
         self._blame.decode += perf_counter_ns() - start
         return message
 
@@ -243,7 +251,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence number and the digest over all messages sent."""
 
-    __slots__ = ("_digest", "_exact", "_unchained", "encode", "event", "latched", "period", "sequence", "topic")
+    __slots__ = ("_digest", "_exact", "_unchained", "check", "encode", "event", "latched", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -251,6 +259,7 @@ class OutputPort:
         self.event = topic.event
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
+        self.check = PortCheck(topic)
         self._exact = codec.decodes_to_itself(topic.type)
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
@@ -258,12 +267,13 @@ class OutputPort:
         """Messages that are not in the digest yet; hashing each by itself costs more."""
 
     def pack(self, message: Message, t: int) -> Sent:
-        """Encode and number a message that is sent at `t` [ns]."""
+        """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
+        self.check(message)
         sequence = self.sequence = self.sequence + 1
         payload = self.encode(message)
         if self._digest is not None:
             self._unchained += (_CHAIN.pack(t, sequence, len(payload)), payload)
-        return self, Packet(payload, t, sequence, message if self._exact else None)
+        return self, Packet(payload, t, sequence, message if self._exact else None, True)
 
     def chain(self) -> None:
         """Add the messages packed since the last call to the digest."""
@@ -284,9 +294,20 @@ Sent = tuple[OutputPort, Packet]
 class Stepper:
     """Drives one service: buffers in, step, ports out."""
 
-    def __init__(self, service: Service, contract: Contract, strict: bool = True) -> None:
-        """`strict` requires a message on every tick of the periodic topics, except from observers."""
+    def __init__(
+        self,
+        service: Service,
+        contract: Contract,
+        strict: bool = True,
+        refuse: Callable[[RefusedMessage], None] | None = None,
+    ) -> None:
+        """`strict` requires a message on every tick of the periodic topics, except from observers.
+
+        `refuse` is called with each message of the service that breaks the contract and is therefore not sent; without it the
+        step raises RefusedMessage.
+        """
         self.service = service
+        self._refuse = refuse
         self.role = contract.roles[service.role]
         self.buffers = {
             topic.name: InputBuffer(topic, edge, contract.roles[topic.producer].period)
@@ -311,7 +332,7 @@ class Stepper:
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, which is not a latched topic")
-            sent.append(port.pack(message, 0))
+            sent += self._packed(port, (message,), 0)
         missing = [port.topic.name for port in self.ports.values() if port.latched and not port.sequence]
         if missing:
             raise LockstepError(f"{self.role.name} did not send its latched {', '.join(missing)} at start")
@@ -378,11 +399,23 @@ class Stepper:
         for name, message in outbox.items():
             port = ports.get(name) or self._port(name)
             if port.event:
-                sent += [port.pack(one, t) for one in (message if isinstance(message, list) else (message,))]
+                sent += self._packed(port, message if isinstance(message, list) else (message,), t)
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns: not a multiple of its period ({port.period} ns)")
             else:
+                sent += self._packed(port, (message,), t)
+        return sent
+
+    def _packed(self, port: OutputPort, messages: Iterable[Message], t: int) -> list[Sent]:
+        """Return the messages packed, without those that are refused."""
+        if self._refuse is None:
+            return [port.pack(message, t) for message in messages]
+        sent = []
+        for message in messages:
+            try:
                 sent.append(port.pack(message, t))
+            except RefusedMessage as refused:
+                self._refuse(refused)
         return sent
 
     def _port(self, name: str) -> OutputPort:

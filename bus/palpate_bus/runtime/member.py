@@ -12,6 +12,7 @@ from time import monotonic
 import zenoh
 
 from palpate_bus.contract import Contract, Topic
+from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import codec
 from palpate_bus.wire.liveliness import GraphWatch, NodeTokens, mismatches
 from palpate_bus.wire.rmw import message_key, topic_key
@@ -36,6 +37,8 @@ class Member:
         self.graph = GraphWatch(session, domain)
         self._tokens = NodeTokens(session, role, domain, self.transport.ids)
         self._subscriptions: list[tuple[str, Subscription]] = []
+        self._noted: list[str] = []
+        self._refused: set[str] = set()
         self._reported: set[str] = set()
         self._routed = bool(list(session.info.routers_zid()))
         self._checked_at = 0.0
@@ -70,10 +73,17 @@ class Member:
         self._subscriptions.append((name, subscription))
         return subscription
 
+    def note_refused(self, refused: RefusedMessage) -> None:
+        """Note a message that was refused, the first of its topic."""
+        if refused.topic not in self._refused:
+            self._refused.add(refused.topic)
+            self._noted.append(f"{refused}; such messages are dropped")
+
     def suspicions(self) -> list[str]:
-        """Return new suspicions about the senders of this role's inputs, each once."""
-        found = (f"{name}: {why}" for name, subscription in self._subscriptions if (why := subscription.suspicion))
-        new = [text for text in found if text not in self._reported]
+        """Return new suspicions about the senders of this role's inputs, and its new notes, each once."""
+        found = [f"{name}: {why}" for name, subscription in self._subscriptions if (why := subscription.suspicion)]
+        new = [text for text in (*found, *self._noted) if text not in self._reported]
+        self._noted.clear()
         self._reported.update(new)
         return new
 

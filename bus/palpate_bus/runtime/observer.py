@@ -14,6 +14,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.contract import Topic
+from palpate_bus.contract.port_check import PortCheck, RefusedMessage
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.runtime.conductor_link import ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Packet, Stepper
@@ -50,10 +51,13 @@ class _Feed:
             self._subscriber = member.session.declare_subscriber(key, channel)
         self._try = self._subscriber.handler.try_recv
         self._decode = codec.decoder(topic.type)
+        self._check = PortCheck(topic)
+        self._refuse = member.note_refused
         self.sequence = 0
         self.missed = 0
         self.garbage = 0
         self.forged = 0
+        self.refused = 0
         self._tagger = member.transport.tagger(key)
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
@@ -74,6 +78,12 @@ class _Feed:
             if message is None:  # an observer accepts every sender, and invalid bytes must not end it
                 self.garbage += 1
                 continue
+            try:
+                self._check(message)
+            except RefusedMessage as refused:
+                self.refused += 1
+                self._refuse(refused)
+                continue
             if sequence > self.sequence + 1 and not self.topic.open:
                 self.missed += sequence - self.sequence - 1
             self.sequence = max(self.sequence, sequence)
@@ -86,7 +96,7 @@ class ObservedService:
 
     def __init__(self, service: Service, member: Member, lossless: bool = False) -> None:
         """`lossless` keeps every message of every topic, not only the newest of the periodic ones."""
-        self.stepper = Stepper(service, member.rules)
+        self.stepper = Stepper(service, member.rules, refuse=member.note_refused)
         self.feeds = [
             _Feed(member, buffer.topic, lossless or not buffer.topic.periodic) for buffer in self.stepper.buffers.values()
         ]
@@ -130,6 +140,7 @@ class ObservedService:
         return {
             "garbage": sum(feed.garbage for feed in self.feeds),
             "forged": sum(feed.forged for feed in self.feeds),
+            "refused": sum(feed.refused for feed in self.feeds),
             "missed": {feed.topic.name: feed.missed for feed in self.feeds if feed.missed},
         }
 

@@ -3,7 +3,8 @@
 `t` counts periods since the common start, with absolute deadlines, so that no drift builds up. A late step is counted as an
 overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick by tick, unless it is later
 than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps must stay
-on the common clock. No service waits for another; expiry protects the readers of a late sample.
+on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks the
+contract is dropped where it is sent or received, so that its readers act as on silence.
 
 On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
 """
@@ -16,6 +17,7 @@ from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
 from palpate_bus.contract import MS, Edge, Topic, Visibility
+from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
@@ -102,7 +104,8 @@ class WallClockNode(Node):
     """One service on its own timer."""
 
     def __init__(self, service: Service, member: Member) -> None:
-        self._stepper = Stepper(service, member.rules, strict=False)
+        self._member = member
+        self._stepper = Stepper(service, member.rules, strict=False, refuse=self._refuse)
         self._seat = Seat(self._stepper, member)
         stays = PHYSICS_STAYS_S if self._stepper.role.critical else 0.0
         super().__init__((self._seat,), member, WITHOUT_CONDUCTOR_S + stays)
@@ -114,6 +117,7 @@ class WallClockNode(Node):
         self._sequences = dict.fromkeys(self._data, 0)
         self.gaps = 0
         self.undecodable = 0
+        self.refused = 0
         self.overruns = 0
         self.skips = 0
         self._ages = {name: LatencyHistogram() for name in self._data}
@@ -241,12 +245,20 @@ class WallClockNode(Node):
                 try:
                     # decoded here, not in the service: invalid bytes must not end a driver whose arm is in contact
                     message = buffer.decode(sample.payload)
+                    buffer.check(message)
+                except RefusedMessage as refused:
+                    self._refuse(refused)
+                    continue
                 except CodecError as error:
                     self.undecodable += 1
                     if self.undecodable == 1:
                         log.error("%s: %s; such messages are dropped and counted", name, error)
                     continue
                 buffer.deliver(Packet(sample.payload, t - buffer.delay, sample.sequence, message))
+
+    def _refuse(self, refused: RefusedMessage) -> None:
+        self.refused += 1
+        self._member.note_refused(refused)
 
     def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
         seat.output.send(sent)
@@ -259,6 +271,7 @@ class WallClockNode(Node):
             "forged": sum(s.forged for s in self._data.values()),
             "gaps": self.gaps,
             "undecodable": self.undecodable,
+            "refused": self.refused,
             "overruns": self.overruns,
             "skips": self.skips,
             "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},

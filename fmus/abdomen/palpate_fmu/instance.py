@@ -8,19 +8,19 @@ FMPy reads the description and loads the library. Variables are grouped into por
         motion.push()
         fmu.step(0.0, 1e-3)
 
-Scalars of FMI 2.0 that are named like array elements (`name[1]`, `name[1,2]`) are one array here too.
+Scalars that are named like array elements (`name[1]`, `name[1,2]`) are one array here too.
 """
 
 from __future__ import annotations
 
 import ctypes
-import re
+import logging
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import chdir
 from functools import cache
-from math import prod
+from math import isfinite, nan
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
@@ -28,9 +28,8 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palpate_errors import UserError
+from palpate_fmu.reading import FmuError, FmuVariable, binary_folders, listed, read_description, read_scalars, read_variables
 
-_ELEMENT = re.compile(r"^(.*)\[(\d+(?:,\d+)*)\]$")
 _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
     "Float64": ("Float64", None, np.float64),
     "Real": ("Float64", "Real", np.float64),
@@ -45,64 +44,24 @@ _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
     "UInt64": ("UInt64", None, np.uint64),
     "Integer": ("Int32", "Integer", np.int32),
     "Enumeration": ("Int64", "Integer", np.int64),
+    "Boolean": ("Boolean", "Boolean", np.bool_),
 }
 """By the type of a variable: its functions in FMI 3.0 and 2.0, and its NumPy type (FMI 2.0's integers are of 32 bits)."""
-
-
-class FmuError(UserError):
-    """An FMU that cannot be loaded, or one of its functions that failed: holds what the FMU said."""
-
-
-@dataclass(frozen=True)
-class FmuVariable:
-    """A variable: a scalar, or an array whatever the FMI version."""
-
-    name: str
-    references: tuple[int, ...]
-    """One for FMI 3.0, one an element for FMI 2.0."""
-    shape: tuple[int, ...]
-    causality: str
-    variability: str
-    type: str
-    unit: str | None
-    low: str | None
-    high: str | None
-    doc: str | None
-
-    @property
-    def size(self) -> int:
-        """Number of values."""
-        return prod(self.shape)
-
-
-def read_variables(description: Any) -> dict[str, FmuVariable]:
-    """The variables of an FMPy model description, by name."""
-    by_reference = {v.valueReference: v for v in description.modelVariables}
-    single: dict[str, FmuVariable] = {}
-    elements: dict[str, dict[tuple[int, ...], Any]] = {}
-    for v in description.modelVariables:
-        element = _ELEMENT.match(v.name) if description.fmiVersion == "2.0" else None
-        if element:
-            index = tuple(int(part) for part in element[2].split(","))
-            elements.setdefault(element[1], {})[index] = v
-            continue
-        extents = [int(by_reference[d.valueReference].start if d.start is None else d.start) for d in v.dimensions or ()]
-        single[v.name] = _variable(v.name, (v.valueReference,), tuple(extents), v)
-    for name, members in elements.items():
-        shape = tuple(max(index[axis] for index in members) for axis in range(len(next(iter(members)))))
-        first = next(iter(members.values()))
-        if prod(shape) != len(members) or name in single or any(m.type != first.type for m in members.values()):
-            single |= {m.name: _variable(m.name, (m.valueReference,), (), m) for m in members.values()}
-        else:
-            single[name] = _variable(name, tuple(members[index].valueReference for index in sorted(members)), shape, first)
-    return single
-
-
-def _variable(name: str, references: tuple[int, ...], shape: tuple[int, ...], v: Any) -> FmuVariable:
-    unit = v.unit or (v.declaredType.unit if v.declaredType else None)
-    return FmuVariable(name, references, shape, v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
-
-
+_FINDINGS = 5
+"""Findings of the validator that are logged."""
+_WARNING, _DISCARD, _FATAL = 1, 2, 4
+_STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
+_LAST_SUCCESSFUL_TIME_2, _TERMINATED_2 = 2, 3
+"""FMI 2.0's fmi2StatusKind for the time that a discarded step reached, and for the wish to end the simulation."""
+_FLAGS = (
+    ("eventHandlingNeeded", "the FMU asks for an event, which a host without event mode does not handle"),
+    ("terminateSimulation", "the FMU asks to end the simulation"),
+    ("earlyReturn", "the FMU returned early, which it was not allowed"),
+)
+"""FMI 3.0's flags of a step, in the order of fmi3DoStep, and their meaning."""
+TIME_TOLERANCE = 1e-6
+"""Share of a step by which the time that the FMU has reached may differ from the end of the step."""
+log = logging.getLogger("palpate.fmu")
 _messages = threading.local()
 
 
@@ -184,30 +143,48 @@ class Port:
         self._call("Get", self._arguments)
         return self.values
 
+    def not_finite(self) -> str:
+        """Return the first variable that has a value that is not finite, with the value; empty if all are finite."""
+        if self.values.dtype.kind != "f" or np.isfinite(self.values).all():
+            return ""
+        found = ((name, value) for name, view in self._views.items() for value in view.flat if not isfinite(value))
+        return next(f"{name} is {value}" for name, value in found)
+
 
 class FmuInstance:
     """A co-simulation FMU, initialised at `start_s` [s] with `values` for parameters and inputs.
 
-    Raises FmuError if the file is none, has no binary for this platform, or refuses a value.
+    Without `start_s` it starts when its default experiment does, else at 0. Raises FmuError if the file is not an FMU for
+    co-simulation, has no binary for this platform, or refuses a value.
     """
 
-    def __init__(self, path: Path, start_s: float = 0.0, values: Mapping[str, ArrayLike] | None = None) -> None:
+    def __init__(self, path: Path, start_s: float | None = None, values: Mapping[str, ArrayLike] | None = None) -> None:
         import fmpy  # noqa: PLC0415  (slow to import)
 
         self.path = Path(path)
         self._folder: str | None = None
         self._fmu: Any = None
-        try:
-            self.description: Any = fmpy.read_model_description(str(path))
-        except Exception as error:
-            raise FmuError(f"{path}: not an FMU: {error}") from error
+        self._fatal = False
+        self.warnings = 0
+        """Calls that the FMU answered with a warning."""
+        self.description, findings = read_description(self.path)
+        for finding in findings[:_FINDINGS]:
+            log.warning("%s: %s (finding of a validator; the FMU is used)", self.path.name, finding)
+        if len(findings) > _FINDINGS:
+            log.warning("%s: %d findings more, see palpate fmu info", self.path.name, len(findings) - _FINDINGS)
         if self.description.coSimulation is None:
-            raise FmuError(f"{path}: not an FMU for co-simulation")
+            raise FmuError(f"{path}: an FMU without co-simulation")
         self.version = 2 if self.description.fmiVersion == "2.0" else 3
+        self.start_s = _default_start(self.description) if start_s is None else start_s
         self.variables = read_variables(self.description)
-        self._folder = str(fmpy.extract(str(path)))
+        self._scalars = read_scalars(self.description)
+        places = binary_folders(self.path)
+        if not {fmpy.platform, fmpy.platform_tuple} & set(places):
+            raise FmuError(f"{path}: no binary for {fmpy.platform_tuple}; it has {', '.join(places) or 'none'}")
         try:
-            self._fmu = _instantiate(self._folder, self.description)
+            self._folder = str(fmpy.extract(str(path)))
+            with chdir("."):  # FMPy changes the folder, and stays there if a library cannot be loaded
+                self._fmu = _instantiate(self._folder, self.description)
         except Exception as error:
             self.close()
             raise FmuError(
@@ -218,7 +195,7 @@ class FmuInstance:
         try:
             for name, value in (values or {}).items():
                 self.set(name, value)
-            self._initialise(start_s)
+            self._initialise(self.start_s)
         except BaseException:
             self.close()
             raise
@@ -229,10 +206,17 @@ class FmuInstance:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
-    def _check(self, status: int, what: str) -> None:
-        if status > 1:
-            name = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")[min(status, 5)]
-            raise FmuError(f"{self.path.name}: {what}: fmi{self.version}{name}: {_take_messages() or 'no message'}")
+    def _answered(self, status: int, what: str, more: str = "") -> None:
+        """Process a status that is not OK: count a warning, raise FmuError for all others. `more` is added to its text."""
+        said = _take_messages() or "no message"
+        if status == _WARNING:
+            self.warnings += 1
+            if self.warnings == 1:
+                log.warning("%s: %s: %s (further warnings are counted)", self.path.name, what, said)
+            return
+        self._fatal = status == _FATAL
+        name = f"fmi{self.version}{_STATUS[status]}" if 0 <= status < len(_STATUS) else f"unknown status {status}"
+        raise FmuError(f"{self.path.name}: {what}: {name}{more}: {said}")
 
     def _function(self, name: str) -> Callable[..., int]:
         """A function of the library itself: FMPy's wrappers cost several microseconds a call."""
@@ -243,10 +227,11 @@ class FmuInstance:
         step, component = self._function("DoStep"), self._component
         if self.version == 2:
             self._do_step: Callable[[float, float], int] = lambda t, dt: step(component, t, dt, 1)
+            self._flags: tuple[ctypes.c_bool, ...] = ()
             return
-        flags = [ctypes.c_bool() for _ in range(3)]
-        last = ctypes.c_double()
-        pointers = (*map(ctypes.byref, flags), ctypes.byref(last))
+        self._flags = tuple(ctypes.c_bool() for _ in _FLAGS)
+        self._reached = ctypes.c_double()
+        pointers = (*map(ctypes.byref, self._flags), ctypes.byref(self._reached))
         self._do_step = lambda t, dt: step(component, t, dt, True, *pointers)
 
     def _initialise(self, start_s: float) -> None:
@@ -259,27 +244,37 @@ class FmuInstance:
                 fmu.enterInitializationMode(startTime=start_s)
             fmu.exitInitializationMode()
         except Exception as error:
-            raise FmuError(f"{self.path.name}: initialization: {error}: {_take_messages()}") from error
+            self._fatal = getattr(error, "status", None) == _FATAL
+            raise FmuError(
+                f"{self.path.name}: initialization at {start_s:g} s: {error} {_take_messages() or 'no message'}"
+            ) from error
+
+    def variable(self, name: str) -> FmuVariable:
+        """Return a variable, or an element of an array that the FMU has as scalars. Raises FmuError if there is none."""
+        found = self.variables.get(name) or self._scalars.get(name)
+        if found is None:
+            raise FmuError(f"{self.path.name} has no variable {name!r}; it has {listed(self.variables)}")
+        return found
 
     def port(self, names: Sequence[str]) -> Port:
-        """The variables of some names, which must be of one type. Raises FmuError naming one that is not there."""
-        for name in names:
-            if name not in self.variables:
-                raise FmuError(f"{self.path.name} has no variable {name!r}; it has {', '.join(self.variables)}")
-        members = [self.variables[name] for name in names]
+        """Return the variables of some names, which must be of one type. Raises FmuError naming one that is not there."""
+        members = [self.variable(name) for name in names]
         kinds = {v.type for v in members}
-        if len(kinds) != 1 or (kind := kinds.pop()) not in _TYPES:
-            raise FmuError(f"{self.path.name}: {', '.join(names)} are of the types {sorted(kinds)}, of which no port can be made")
-        newer, older, dtype = _TYPES[kind]
+        if len(kinds) != 1:
+            raise FmuError(f"{self.path.name}: {', '.join(names)}: want variables of one type, got {sorted(kinds)}")
+        kind = kinds.pop()
+        newer, older, dtype = _TYPES.get(kind, (None, None, np.float64))
         suffix = newer if self.version == 3 else older
-        dtype = np.int32 if suffix == "Integer" else dtype
+        if suffix is None:
+            raise FmuError(f"{self.path.name}: {', '.join(names)}: of type {kind}; want {', '.join(_TYPES)}")
+        dtype = np.int32 if self.version == 2 and suffix in ("Integer", "Boolean") else dtype
         functions = {verb: self._function(f"{verb}{suffix}") for verb in ("Get", "Set")}
-        component, check = self._component, self._check
+        component, answered = self._component, self._answered
 
         def call(verb: str, arguments: tuple[Any, ...]) -> None:
             status = functions[verb](component, *arguments)
-            if status > 1:
-                check(status, f"{verb.lower()} {', '.join(names)}")
+            if status:
+                answered(status, f"{verb.lower()} {', '.join(names)}")
 
         return Port(members, dtype, call, self.version)
 
@@ -296,16 +291,50 @@ class FmuInstance:
         port.push()
 
     def step(self, t_s: float, dt_s: float) -> None:
-        """Advances from `t_s` by `dt_s` [s]. Raises FmuError; what state the FMU then has, is up to it."""
+        """Advances from `t_s` by `dt_s` [s].
+
+        Raises FmuError if the FMU did not reach the end of the step, or must not be stepped again; its state is then undefined.
+        """
+        if self._flags:
+            self._reached.value = nan
         status = self._do_step(t_s, dt_s)
-        if status > 1:
-            self._check(status, f"step from {t_s:g} s by {dt_s:g} s")
+        if status:
+            reached = self._reached_text() if status == _DISCARD else ""
+            self._answered(status, f"step from {t_s:g} s by {dt_s:g} s", reached)
+        for flag, (name, meaning) in zip(self._flags, _FLAGS, strict=False):
+            if not flag.value or (name == "earlyReturn" and self._reached.value >= t_s + dt_s * (1 - TIME_TOLERANCE)):
+                continue
+            reached = self._reached_text() if name == "earlyReturn" else ""
+            said = _take_messages() or "no message"
+            raise FmuError(f"{self.path.name}: step from {t_s:g} s by {dt_s:g} s: {meaning} ({name}){reached}: {said}")
+
+    def _reached_text(self) -> str:
+        """Return how far a step came that did not succeed, as text; empty if the FMU does not give it."""
+        reached, ended = ctypes.c_double(nan), ctypes.c_int(0)
+        if self.version == 3:
+            reached = self._reached
+        else:
+            self._function("GetRealStatus")(self._component, _LAST_SUCCESSFUL_TIME_2, ctypes.byref(reached))
+            self._function("GetBooleanStatus")(self._component, _TERMINATED_2, ctypes.byref(ended))
+        time = f", it reached {reached.value:g} s" if isfinite(reached.value) else ""
+        return time + (", it asks to end the simulation" if ended.value else "")
 
     def close(self) -> None:
         """Frees the instance, its library and its unpacked files."""
         if self._fmu is not None:
-            self._fmu.freeInstance()
+            if not self._fatal:  # after a fatal error no function may be called
+                self._fmu.freeInstance()
             self._fmu = None
         if self._folder is not None:
             shutil.rmtree(self._folder, ignore_errors=True)
             self._folder = None
+
+
+def _default_start(description: Any) -> float:
+    """Return the start of an FMU's default experiment [s], 0 if it has none."""
+    experiment = description.defaultExperiment
+    try:
+        start = float(experiment.startTime)
+    except (AttributeError, TypeError, ValueError):
+        return 0.0
+    return start if isfinite(start) else 0.0

@@ -13,7 +13,7 @@ import numpy as np
 from fmpy import fmi2, fmi3
 from numpy.typing import ArrayLike
 
-from palpate_fmu.instance import read_variables
+from palpate_fmu.reading import read_variables
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.schema import Lesion, Phantom
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -80,3 +81,26 @@ def test_any_fmu_is_run_and_plotted(fmu2: Path, tmp_path: Path) -> None:
     names = run_and_plot(fmu2, tmp_path / "x.png")
     assert "normal_force" in names
     assert (tmp_path / "x.png").stat().st_size > 5000
+
+
+FOREIGN = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription fmiVersion="{}" modelName="one" modelIdentifier="one" guid="g"><CoSimulation modelIdentifier="one"/>
+<ModelVariables><ScalarVariable name="touching" valueReference="7" causality="output"><Boolean/></ScalarVariable></ModelVariables>
+<ModelStructure/></fmiModelDescription>"""
+
+
+@pytest.mark.parametrize(
+    ("version", "status", "words"),
+    [("2.0", 0, ("platforms: linux64", "do not prevent its use", "touching")), ("1.0", 2, ("FMI 1.0; want 2.0 or 3.0",))],
+)
+def test_info_shows_what_a_strangers_fmu_is(version: str, status: int, words: tuple[str, ...], tmp_path: Path) -> None:
+    path = tmp_path / "one.fmu"
+    with zipfile.ZipFile(path, "w") as archive:
+        for folder in ("binaries/", "binaries/linux64/", "binaries/win64/"):
+            archive.writestr(folder, "")  # as zip tools write them
+        archive.writestr("binaries/linux64/one.so", "")
+        archive.writestr("modelDescription.xml", FOREIGN.format(version))
+    shown = runner.invoke(app, ["info", str(path)])
+    assert shown.exit_code == status, shown.output
+    for word in words:
+        assert word in shown.output

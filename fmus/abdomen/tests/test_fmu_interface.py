@@ -12,7 +12,8 @@ from fmpy.validation import validate_fmu
 
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
-from palpate_fmu.instance import FmuError, FmuInstance
+from palpate_fmu.instance import FmuInstance
+from palpate_fmu.reading import FmuError
 from palpate_fmu.variables import TABLE, Sizes, VariableKind
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Phantom

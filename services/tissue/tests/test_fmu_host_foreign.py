@@ -15,7 +15,7 @@ from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_fmu.instance import FmuError
+from palpate_fmu.reading import FmuError
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.service import host
 

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import yaml
-from pydantic import BaseModel, BeforeValidator, ConfigDict, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError, model_validator
 
 from palpate_plugins import PluginError
 
@@ -54,7 +54,7 @@ class OutputEntry(_Entry):
 
     variable: str | None = None
     scenario: str | None = None
-    value: float | str | None = None
+    value: FiniteFloat | str | None = None
 
     @model_validator(mode="after")
     def _one(self) -> OutputEntry:
@@ -77,8 +77,10 @@ class FmuMap(BaseModel):
     """Frame of the FMU's points and vectors."""
     inputs: dict[str, dict[str, Annotated[InputEntry, _short("field")]]] = {}
     outputs: dict[str, dict[str, Annotated[OutputEntry, _short("variable")]]]
-    parameters: dict[str, float | list[float]] = {}
+    parameters: dict[str, FiniteFloat | list[FiniteFloat]] = {}
     """Start values of parameters and inputs."""
+    start_s: FiniteFloat | None = None
+    """Time of the FMU [s] one period before tick 0; by default the start of its default experiment, else 0."""
 
 
 def load_map(path: Path) -> FmuMap:

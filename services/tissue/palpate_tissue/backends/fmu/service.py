@@ -20,6 +20,7 @@ from palpate_errors import RunError, UserError
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.instance import FmuInstance
+from palpate_fmu.reading import read_description
 from palpate_models.numerics.frames import Array, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import true_pose
@@ -35,7 +36,10 @@ MOST_STEPS = 1000
 
 
 class FmuService(Service):
-    """Hosts an FMU in a role. At tick T the FMU is advanced to T with the newest inputs; it starts one period before tick 0."""
+    """Hosts an FMU in a role. Each tick advances the FMU by a period, or by several that were missed, with the newest inputs.
+
+    The first step, at tick 0, begins at the FMU's start time.
+    """
 
     def __init__(
         self,
@@ -50,7 +54,9 @@ class FmuService(Service):
             raise MapError(f"unknown role {table.role!r}; roles are {', '.join(rules.roles)}")
         self._period = rules.roles[table.role].period
         self._time = -self._period
-        self._fmu = FmuInstance(fmu_file, self._time / NS, table.parameters)
+        self._fmu = FmuInstance(fmu_file, table.start_s, table.parameters)
+        self._ahead = round(self._fmu.start_s * NS) + self._period
+        """Time of the FMU minus that of the run [ns]."""
         try:
             self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
         except MapError:
@@ -83,17 +89,19 @@ class FmuService(Service):
     def _advance(self, t: int) -> None:
         behind, rest = divmod(t - self._time, self._period)
         if behind == 1 or (self._variable_step and t > self._time):
-            self._fmu.step(self._time / NS, (t - self._time) / NS)
-            self._steps += 1
+            self._step(self._time, t - self._time)
         else:
             if behind > MOST_STEPS:
                 raise RunError(f"the FMU is {behind} periods behind, at most {MOST_STEPS} can be caught up")
             if rest:
                 raise RunError(f"the FMU takes steps of {self._period / NS} s only and cannot step to {t / NS} s")
             for k in range(behind):
-                self._fmu.step((self._time + k * self._period) / NS, self._period / NS)
-                self._steps += 1
+                self._step(self._time + k * self._period, self._period)
         self._time = t
+
+    def _step(self, begin: int, duration: int) -> None:
+        self._fmu.step((begin + self._ahead) / NS, duration / NS)
+        self._steps += 1
 
     def finish(self) -> Mapping[str, Any]:
         """Return facts about the FMU, and free it."""
@@ -103,7 +111,9 @@ class FmuService(Service):
             "model": description.modelName,
             "fmi_version": description.fmiVersion,
             "token": description.guid or getattr(description, "instantiationToken", None),
+            "start_s": self._fmu.start_s,
             "steps": self._steps,
+            "warnings": self._fmu.warnings,
         }
         self._fmu.close()
         return facts
@@ -153,9 +163,7 @@ def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuServi
 
     For the tissue the frame `abdomen` is the patient's true frame; for other roles, whose scenario has it, the registered one.
     """
-    if not fmu_file.is_file():
-        raise MapError(f"FMU {fmu_file}: no such file")
-    table = table or packaged_map("tissue_fmi2" if _fmi_version(fmu_file) == "2.0" else "tissue")
+    table = table or packaged_map("tissue_fmi2" if read_description(fmu_file)[0].fmiVersion == "2.0" else "tissue")
     X_WA = matrix(true_pose(scenario))
     frames = {"world": np.eye(4), "abdomen": X_WA}
     known: dict[str, Any] = {"X_WA.position": X_WA[:3, 3], "X_WA.orientation": Rotation.from_matrix(X_WA[:3, :3]).as_quat()}
@@ -170,9 +178,3 @@ def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuServi
             "phantom.lesion": model.lesion,
         }
     return host(table.role, fmu_file, table, frames, known)
-
-
-def _fmi_version(fmu_file: Path) -> str:
-    import fmpy  # noqa: PLC0415  (slow to import)
-
-    return str(fmpy.read_model_description(str(fmu_file), validate=False).fmiVersion)

@@ -7,7 +7,7 @@ fields.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
 from typing import Any
@@ -17,8 +17,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.codec import Message, message_type, store
-from palpate_bus.messages.stamps import header
-from palpate_fmu.instance import FmuInstance, FmuVariable, Port
+from palpate_bus.messages.stamps import NS, header
+from palpate_fmu.instance import FmuInstance, Port
+from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
 from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
 
@@ -196,20 +197,23 @@ class InputTopic:
     """A topic read by the FMU."""
 
     topic: Topic
-    port: Port
+    ports: tuple[Port, ...]
     moves: tuple[tuple[NDArray[Any], Callable[[Message], Any], Change], ...]
 
     def write(self, message: Message) -> None:
         """Sets the FMU's variables from a message."""
         for target, read, change in self.moves:
             target[...] = np.reshape(change(read(message)), target.shape)
-        self.port.push()
+        for port in self.ports:
+            port.push()
 
 
 @dataclass(frozen=True)
 class OutputTopic:
     """A topic filled by the FMU."""
 
+    fmu: str
+    """Name of the FMU's file."""
     topic: Topic
     make: Make
     ports: tuple[Port, ...]
@@ -217,9 +221,11 @@ class OutputTopic:
     constants: dict[str, Any] = field(default_factory=dict)
 
     def message(self, t: int) -> Message:
-        """Return the message of time `t` [ns]."""
+        """Return the message of time `t` [ns]. Raises FmuError if a variable is not finite."""
         for port in self.ports:
             port.pull()
+            if wrong := port.not_finite():
+                raise FmuError(f"{self.fmu}: {wrong} at {t / NS:g} s, for {self.topic.name}: want finite numbers")
         values = dict(self.constants)
         for path, source, change in self.moves:
             values[path] = change(source)
@@ -235,7 +241,7 @@ class Wiring:
         self._table, self._fmu, self._rules = table, fmu, rules
         self._frames = frames
         self._scenario = scenario
-        self.inputs = tuple(self._input(name, entries) for name, entries in table.inputs.items())
+        self.inputs = tuple(self._input(name, entries) for name, entries in table.inputs.items() if entries)
         mine = {topic.name for topic in rules.outputs(table.role)}
         if missing := mine - table.outputs.keys():
             raise MapError(f"the map lacks topics that the role {table.role} must send: {', '.join(sorted(missing))}")
@@ -247,15 +253,22 @@ class Wiring:
         return self._rules.topics[name]
 
     def _variable(self, name: str, where: str) -> FmuVariable:
-        if name not in self._fmu.variables:
-            known = ", ".join(self._fmu.variables)
-            raise MapError(f"{where}: {self._fmu.path.name} has no variable {name!r}; it has {known}")
-        return self._fmu.variables[name]
+        try:
+            return self._fmu.variable(name)
+        except FmuError as error:
+            raise MapError(f"{where}: {error}") from error
+
+    def _ports(self, variables: Iterable[FmuVariable]) -> dict[str, Port]:
+        """Return the port of each variable by its name: one port per type."""
+        names: dict[str, list[str]] = {}
+        for variable in variables:
+            names.setdefault(variable.type, []).append(variable.name)
+        return {name: port for members in names.values() for port in [self._fmu.port(members)] for name in members}
 
     def _input(self, name: str, entries: Mapping[str, InputEntry]) -> InputTopic:
         topic = self._topic(name, {row.name for row, _ in self._rules.inputs(self._table.role)}, "read")
         chosen = {key: self._variable(key, f"{name}.{entry.field}") for key, entry in entries.items()}
-        port = self._fmu.port(list(chosen))
+        ports = self._ports(chosen.values())
         moves = []
         for variable_name, entry in entries.items():
             where = f"{name}.{entry.field} -> {variable_name}"
@@ -266,8 +279,8 @@ class Wiring:
             change = _chain(
                 self._turn(entry, topic, where, into_fmu=True), self._scale(entry, topic, entry.field, variable, where, True)
             )
-            moves.append((port[variable_name], reader(topic.type, entry.field), change))
-        return InputTopic(topic, port, tuple(moves))
+            moves.append((ports[variable_name][variable_name], reader(topic.type, entry.field), change))
+        return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
 
     def _output(self, name: str, entries: Mapping[str, OutputEntry]) -> OutputTopic:
         topic = self._topic(name, {row.name for row in self._rules.outputs(self._table.role)}, "send")
@@ -287,19 +300,16 @@ class Wiring:
                 constants[path] = value
             else:
                 constants[path] = entry.value
-        ports, moves = [], []
-        for kind in dict.fromkeys(variable.type for variable, _ in wanted.values()):
-            members = {path: pair for path, pair in wanted.items() if pair[0].type == kind}
-            port = self._fmu.port(list(dict.fromkeys(variable.name for variable, _ in members.values())))
-            ports.append(port)
-            for path, (variable, entry) in members.items():
-                where = f"{variable.name} -> {name}.{path}"
-                change = _chain(
-                    self._scale(entry, topic, path, variable, where, False), self._turn(entry, topic, where, into_fmu=False)
-                )
-                moves.append((path, port[variable.name], change))
+        ports = self._ports({variable.name: variable for variable, _ in wanted.values()}.values())
+        moves = []
+        for path, (variable, entry) in wanted.items():
+            where = f"{variable.name} -> {name}.{path}"
+            change = _chain(
+                self._scale(entry, topic, path, variable, where, False), self._turn(entry, topic, where, into_fmu=False)
+            )
+            moves.append((path, ports[variable.name][variable.name], change))
         make = maker(topic.type, topic.frame or "", frozenset(entries))
-        return OutputTopic(topic, make, tuple(ports), tuple(moves), constants)
+        return OutputTopic(self._fmu.path.name, topic, make, tuple(dict.fromkeys(ports.values())), tuple(moves), constants)
 
     def _fit(self, topic: Topic, path: str, variable: FmuVariable, where: str) -> None:
         room = size(topic.type, path)

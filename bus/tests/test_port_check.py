@@ -1,0 +1,144 @@
+"""The check at the ports: what breaks the contract is refused and named, where it is sent and where it is received."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from toy_services import TOYS, Robot
+
+from palpate_bus.contract import MS, contract
+from palpate_bus.contract.conformance import Checker
+from palpate_bus.contract.port_check import PortCheck, RefusedMessage
+from palpate_bus.messages import Vector3, Wrench, codec
+from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.composed import Composed, ServiceFailed
+from palpate_bus.runtime.failure import FailureCode
+from palpate_bus.runtime.lockstep import Packet, Stepper
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.testing.strategies import messages
+
+RULES = contract()
+NAN, INF = float("nan"), float("inf")
+
+
+@pytest.mark.parametrize("name", RULES.topics)
+@settings(max_examples=15, deadline=None)
+@given(data=st.data())
+def test_it_accepts_what_the_checker_finds_nothing_in(name: str, data: st.DataObject) -> None:
+    topic = RULES.topics[name]
+    message = data.draw(messages(topic.type))
+    if topic.frame is not None and hasattr(message, "header"):
+        message.header.frame_id = topic.frame
+    found = Checker(topic)(message)
+    try:
+        PortCheck(topic)(message)
+    except RefusedMessage as refused:
+        assert refused.violation == found[0]
+    else:
+        assert found == []
+
+
+def joints(message: Any, field: str, value: float) -> Any:
+    return dataclasses.replace(message, **{field: np.array([0.0, 0.0, 0.0, value, 0.0, 0.0, 0.0])})
+
+
+def force(value: float) -> Callable[[Any], Any]:
+    return lambda message: dataclasses.replace(message, wrench=Wrench(Vector3(0.0, value, 0.0), Vector3(0.0, 0.0, 0.0)))
+
+
+LIES: dict[str, tuple[str, Callable[[Any], Any], tuple[str, ...]]] = {
+    "force is NaN": ("ft/wrench", force(NAN), ("wrench.force = nan", "-200..200 [N]")),
+    "force is infinite": ("ft/wrench", force(-INF), ("wrench.force = -inf", "-200..200 [N]")),
+    "force is too large": ("ft/wrench", force(201.0), ("wrench.force = 201", "-200..200 [N]")),
+    "one joint is NaN": ("joint_states", lambda m: joints(m, "velocity", NAN), ("velocity = nan", "-4..4 [rad/s]")),
+    "one joint is infinite": ("joint_states", lambda m: joints(m, "effort", INF), ("effort = inf", "-200..200 [N m]")),
+    "one joint is in degrees": ("joint_states", lambda m: joints(m, "position", 90.0), ("position = 90", "deg")),
+    "another frame": (
+        "ft/wrench",
+        lambda m: dataclasses.replace(m, header=header(0, "moon")),
+        ("'moon'", "ft_sensor"),
+    ),
+    "another type": ("ft/wrench", lambda _: Vector3(0.0, 0.0, 0.0), ("geometry_msgs/msg/WrenchStamped",)),
+    "a field without a range": ("sim/tool_state", lambda m: _turned(m, NAN), ("pose.orientation.y = nan", "finite")),
+    "text for a number": ("ft/wrench", force("much"), ("ft/wrench",)),  # type: ignore[arg-type]
+}
+
+
+def _turned(message: Any, value: float) -> Any:
+    message.pose.orientation.y = value
+    return message
+
+
+class Liar(Robot):
+    def __init__(self, lie: str, at: int = 20 * MS) -> None:
+        self._topic, self._change, _ = LIES[lie]
+        self._at = at
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        sent = dict(super().step(t, inbox))
+        if t >= self._at:
+            sent[self._topic] = self._change(sent[self._topic])
+        return sent
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_in_lockstep_the_run_ends_with_the_first_message_that_breaks_the_contract(lie: str) -> None:
+    others: list[Service] = [toy() for role, toy in TOYS.items() if role != "robot"]
+    run = Composed([Liar(lie), *others])
+    with pytest.raises(ServiceFailed) as caught:
+        run.run(lambda: None, 100 * MS)
+    topic, _, words = LIES[lie]
+    assert caught.value.t == 20 * MS
+    assert (caught.value.failure.code, caught.value.failure.topics) == (FailureCode.CONTRACT_BROKEN, (topic,))
+    assert caught.value.failure.roles == ("robot",)
+    for word in (*words, f"{topic} from robot refused"):
+        assert word in str(caught.value)
+
+
+@pytest.mark.parametrize("lie", [name for name in LIES if name not in ("another type", "text for a number")])
+def test_a_reader_refuses_what_a_foreign_sender_puts_on_the_bus(lie: str) -> None:
+    """The bytes of a sender that has no such check."""
+    topic, change, words = LIES[lie]
+    row = RULES.topics[topic]
+    reader = next(iter(row.readers))
+
+    class Reader(Service):
+        role = reader
+
+        def step(self, t: int, inbox: Inbox) -> Outbox:
+            inbox.latest(topic)
+            return {}
+
+    good = Liar(lie, 10**18).step(0, Stepper(Robot(), RULES).inbox)[topic]
+    for message, refused in ((good, False), (change(good), True)):
+        stepper = Stepper(Reader(), RULES, strict=False)
+        stepper.buffers[topic].accept(1, codec.encode(message, row.type))
+        if not refused:
+            stepper.step(0)
+            continue
+        with pytest.raises(RefusedMessage) as caught:
+            stepper.step(0)
+        for word in words:
+            assert word in str(caught.value)
+
+
+def test_by_the_wall_clock_it_is_not_sent_and_reported() -> None:
+    refused: list[RefusedMessage] = []
+    stepper = Stepper(Liar("force is NaN", MS), RULES, strict=False, refuse=refused.append)
+    sent = [{port.topic.name for port, _ in stepper.step(t)} for t in (0, MS, 2 * MS)]
+    assert ["ft/wrench" in names for names in sent] == [True, False, False]
+    assert all("joint_states" in names for names in sent)
+    assert [(one.role, one.topic) for one in refused] == [("robot", "ft/wrench")] * 2
+
+
+def test_a_message_is_held_against_the_contract_once() -> None:
+    """Readers in the sender's process do not check again: a packet of a port is checked."""
+    stepper = Stepper(Liar("force is NaN", 10**18), RULES, strict=False)
+    assert all(packet.checked for _, packet in stepper.step(0))
+    assert not Packet(b"", 0, 1).checked

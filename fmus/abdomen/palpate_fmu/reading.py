@@ -1,0 +1,162 @@
+"""Reads the model description of any FMU: its variables, with arrays also where FMI 2.0 has scalars, and what a validator finds.
+
+A finding is no reason to refuse an FMU: many tools write descriptions that break a rule and describe every variable well.
+"""
+
+from __future__ import annotations
+
+import re
+import tempfile
+import zipfile
+from collections.abc import Collection, Mapping
+from dataclasses import dataclass
+from math import prod
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree as ET
+
+from palpate_errors import UserError
+
+DESCRIPTION = "modelDescription.xml"
+_VERSION = re.compile(r"2\.0|3\.\d+")
+_ELEMENT = re.compile(r"^(.*?)((?:\[ *-?\d+(?: *, *-?\d+)* *\])+)$")
+_INDEX = re.compile(r"-?\d+")
+_NAMED = 30
+"""Variables that a message lists."""
+
+
+class FmuError(UserError):
+    """An FMU that cannot be loaded, or one of its functions that failed: holds the FMU's messages."""
+
+
+@dataclass(frozen=True)
+class FmuVariable:
+    """A variable: a scalar, or an array in any FMI version."""
+
+    name: str
+    references: tuple[int, ...]
+    """One value reference, or one per element if the FMU has the elements as scalars."""
+    shape: tuple[int, ...]
+    causality: str
+    variability: str
+    type: str
+    unit: str | None
+    low: str | None
+    high: str | None
+    doc: str | None
+
+    @property
+    def size(self) -> int:
+        """Number of values."""
+        return prod(self.shape)
+
+
+def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
+    """Return FMPy's model description and the validator's findings. Raises FmuError if it is not an FMU, or of FMI 1.0."""
+    import fmpy  # noqa: PLC0415  (slow to import)
+
+    if not path.is_file():
+        raise FmuError(f"{path}: no such file")
+    try:
+        with zipfile.ZipFile(path) as archive:
+            root = ET.fromstring(archive.read(DESCRIPTION))
+    except Exception as error:  # a damaged archive raises many kinds
+        raise FmuError(f"{path}: not an FMU: {error}") from error
+    if root.tag != "fmiModelDescription":
+        raise FmuError(f"{path}: not an FMU: the root of its {DESCRIPTION} is {root.tag}")
+    version = root.get("fmiVersion", "")
+    if not _VERSION.fullmatch(version):
+        raise FmuError(f"{path}: FMI {version or 'of no version'}; want 2.0 or 3.0")
+    try:
+        return fmpy.read_model_description(str(path)), ()
+    except Exception as error:
+        findings = tuple(getattr(error, "problems", (str(error),)))
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            file = Path(folder) / DESCRIPTION
+            _simplify(root)
+            ET.ElementTree(root).write(file)
+            return fmpy.read_model_description(str(file), validate=False), findings
+    except Exception as error:
+        raise FmuError(f"{path}: its {DESCRIPTION} cannot be read: {error}; {'; '.join(findings)}") from error
+
+
+def _simplify(root: ET.Element) -> None:
+    """Remove references that lead nowhere and that no simulation needs; FMPy reads none of them leniently."""
+    variables = root.find("ModelVariables")
+    variables = ET.SubElement(root, "ModelVariables") if variables is None else variables
+    older = root.get("fmiVersion") == "2.0"
+    known = set(map(str, range(1, len(variables) + 1))) if older else {one.get("valueReference") for one in variables}
+    for parent in [root.find("ModelStructure"), *root.iterfind("ModelStructure/*")]:
+        for unknown in list(parent if parent is not None else ()):
+            unknown.attrib.pop("dependencies", None)
+            unknown.attrib.pop("dependenciesKind", None)
+            reference = unknown.get("index" if older else "valueReference")
+            if parent is not None and reference not in known and not len(unknown):
+                parent.remove(unknown)
+    types = {one.get("name") for one in root.iterfind("TypeDefinitions/*")}
+    for variable in variables:
+        variable.attrib.setdefault("initial", "")  # else FMPy derives it, for legal combinations of the other attributes only
+        for one in (variable, *variable):
+            one.attrib.pop("derivative", None)
+            one.attrib.pop("clocks", None)
+            if one.get("declaredType") not in types:
+                one.attrib.pop("declaredType", None)
+
+
+def binary_folders(path: Path) -> tuple[str, ...]:
+    """Return the platforms for which an FMU has binaries, as its folders name them."""
+    with zipfile.ZipFile(path) as archive:
+        parts = [name.split("/") for name in archive.namelist()]
+    return tuple(sorted({part[1] for part in parts if part[0] == "binaries" and len(part) > 2 and part[-1]}))
+
+
+def read_variables(description: Any) -> dict[str, FmuVariable]:
+    """Return the variables of an FMPy model description, by name.
+
+    Scalars that are named like the elements of an array (`x[0]`, `x[1]`; `x[1,1]`; `x[0][0]`) are one array, from whatever index
+    they begin at, if none is missing.
+    """
+    single = read_scalars(description)
+    elements: dict[str, dict[tuple[int, ...], FmuVariable]] = {}
+    for variable in single.values():
+        if not variable.shape and (element := _ELEMENT.match(variable.name)):
+            elements.setdefault(element[1], {})[tuple(map(int, _INDEX.findall(element[2])))] = variable
+    for name, members in elements.items():
+        shape = _shape(members)
+        first = members[min(members)]
+        if shape is None or name in single or any(m.type != first.type for m in members.values()):
+            continue
+        references = tuple(members[index].references[0] for index in sorted(members))
+        rest = (first.causality, first.variability, first.type, first.unit, first.low, first.high, first.doc)
+        single[name] = FmuVariable(name, references, shape, *rest)
+        for member in members.values():
+            del single[member.name]
+    return single
+
+
+def _shape(indices: Collection[tuple[int, ...]]) -> tuple[int, ...] | None:
+    """Return the shape of the array with these indices; None if it has gaps."""
+    axes = [set(axis) for axis in zip(*indices, strict=False)]
+    shape = tuple(max(axis) - min(axis) + 1 for axis in axes)
+    same = len({len(index) for index in indices}) == 1
+    return shape if same and prod(shape) == len(indices) else None
+
+
+def read_scalars(description: Any) -> dict[str, FmuVariable]:
+    """Return the variables as the FMU has them: an array of FMI 2.0 is one scalar per element."""
+    by_reference = {v.valueReference: v for v in description.modelVariables}
+    found = {}
+    for v in description.modelVariables:
+        extents = [int(by_reference[d.valueReference].start if d.start is None else d.start) for d in v.dimensions or ()]
+        unit = v.unit or (v.declaredType.unit if v.declaredType else None)
+        rest = (v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
+        found[v.name] = FmuVariable(v.name, (v.valueReference,), tuple(extents), *rest)
+    return found
+
+
+def listed(variables: Mapping[str, Any]) -> str:
+    """Return the names of variables as text, of at most `_NAMED`."""
+    names = list(variables)
+    rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""
+    return ", ".join(names[:_NAMED]) + rest

@@ -1,0 +1,179 @@
+"""A small FMU that behaves oddly on request, FMI 2.0 or 3.0: a wall of springs with input z and output f."""
+
+from __future__ import annotations
+
+import zipfile
+from collections.abc import Mapping
+from enum import IntEnum
+from pathlib import Path
+
+from palpate_fmu.compiling import compile_library, native, platforms
+
+
+class Odd(IntEnum):
+    """What goes wrong in a step, from the time of the parameter `at` on."""
+
+    NOTHING = 0
+    TERMINATE = 1
+    EARLY = 2
+    EVENT = 3
+    EARLY_AT_END = 4
+    DISCARD = 5
+    ERROR = 6
+    FATAL = 7
+    PENDING = 8
+    UNKNOWN = 9
+    WARNING = 10
+    NAN = 11
+    INFINITE = 12
+    ONLY_FROM_START = 13
+    """It can only be started at `at`."""
+
+
+SOURCE = """
+#include <math.h>
+#include <stdbool.h>
+#include <stdlib.h>
+
+#define EXPORT __attribute__((visibility("default")))
+typedef struct { double z, f, odd, at, reached, a[4]; } Wall;
+
+static int start(Wall *w, double t) { return (int)w->odd == 13 && t != w->at ? 3 : 0; }
+
+static int step(Wall *w, double t, double dt, bool *event, bool *end, bool *early, double *last) {
+    const int odd = t + dt > w->at + 1e-9 ? (int)w->odd : 0;
+    static const int status[] = {0, 0, 0, 0, 0, 2, 3, 4, 5, 42, 1};
+    w->f = odd == 11 ? NAN : odd == 12 ? INFINITY : fmax(0.0, 800.0 * (0.945 - w->z));
+    for (int k = 0; k < 4; k++) w->a[k] = k + 1;
+    *event = odd == 3;
+    *end = odd == 1;
+    *early = odd == 2 || odd == 4;
+    w->reached = *last = odd == 2 || odd == 5 ? t + dt / 4 : t + dt;
+    return odd <= 10 ? status[odd] : 0;
+}
+
+#if FMI_VERSION == 2
+EXPORT void *fmi2Instantiate(const char *n, int t, const char *g, const char *r, const void *f, int v, int l) {
+    (void)n, (void)t, (void)g, (void)r, (void)f, (void)v, (void)l;
+    return calloc(1, sizeof(Wall));
+}
+EXPORT void fmi2FreeInstance(void *c) { free(c); }
+EXPORT int fmi2GetReal(void *c, const unsigned *vr, size_t n, double *v) {
+    for (size_t k = 0; k < n; k++) v[k] = ((double *)c)[vr[k]];
+    return 0;
+}
+EXPORT int fmi2SetReal(void *c, const unsigned *vr, size_t n, const double *v) {
+    for (size_t k = 0; k < n; k++) ((double *)c)[vr[k]] = v[k];
+    return 0;
+}
+EXPORT int fmi2GetBoolean(void *c, const unsigned *vr, size_t n, int *v) {
+    (void)vr;
+    for (size_t k = 0; k < n; k++) v[k] = ((Wall *)c)->f > 0;
+    return 0;
+}
+EXPORT int fmi2GetRealStatus(void *c, int kind, double *v) { return kind == 2 ? (*v = ((Wall *)c)->reached, 0) : 3; }
+EXPORT int fmi2DoStep(void *c, double t, double dt, int k) {
+    bool flags[3];
+    double last;
+    (void)k;
+    return step(c, t, dt, &flags[0], &flags[1], &flags[2], &last);
+}
+EXPORT int fmi2SetupExperiment(void *c, int a, double b, double t, int e, double f) {
+    (void)a, (void)b, (void)e, (void)f;
+    return start(c, t);
+}
+EXPORT int fmi2EnterInitializationMode(void *c) { return !c; }
+EXPORT int fmi2ExitInitializationMode(void *c) { return !c; }
+#else
+EXPORT void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l, bool e, bool w,
+                                         const unsigned *i, size_t m, void *x, void *f, void *u) {
+    (void)n, (void)g, (void)r, (void)v, (void)l, (void)e, (void)w, (void)i, (void)m, (void)x, (void)f, (void)u;
+    return calloc(1, sizeof(Wall));
+}
+EXPORT void fmi3FreeInstance(void *c) { free(c); }
+EXPORT int fmi3GetFloat64(void *c, const unsigned *vr, size_t n, double *v, size_t room) {
+    (void)room;
+    for (size_t k = 0; k < n; k++) {
+        for (unsigned j = 0; j < (vr[k] == 10 ? 4 : 1); j++) *v++ = vr[k] == 10 ? ((Wall *)c)->a[j] : ((double *)c)[vr[k]];
+    }
+    return 0;
+}
+EXPORT int fmi3SetFloat64(void *c, const unsigned *vr, size_t n, const double *v, size_t room) {
+    (void)room;
+    for (size_t k = 0; k < n; k++) ((double *)c)[vr[k]] = v[k];
+    return 0;
+}
+EXPORT int fmi3GetBoolean(void *c, const unsigned *vr, size_t n, bool *v, size_t room) {
+    (void)vr, (void)room;
+    for (size_t k = 0; k < n; k++) v[k] = ((Wall *)c)->f > 0;
+    return 0;
+}
+EXPORT int fmi3DoStep(void *c, double t, double dt, bool k, bool *e, bool *s, bool *r, double *last) {
+    (void)k;
+    return step(c, t, dt, e, s, r, last);
+}
+EXPORT int fmi3EnterInitializationMode(void *c, bool a, double b, double t, bool e, double f) {
+    (void)a, (void)b, (void)e, (void)f;
+    return start(c, t);
+}
+EXPORT int fmi3ExitInitializationMode(void *c) { return !c; }
+#endif
+"""
+NAMES: tuple[tuple[str, str], ...] = (("z", "input"), ("f", "output"), ("odd", "parameter"), ("at", "parameter"))
+
+
+def description(version: int, more: str = "", start: str = "", base: int | None = None, brackets: str = "[{}]") -> str:
+    """Return a model description; `more` variables are added, `base` is the first index of the flattened array `a`."""
+    elements = [] if base is None else [(f"a{brackets.format(base + k)}", "output", 5 + k) for k in range(4)]
+    rows = [(name, causality, vr) for vr, (name, causality) in enumerate(NAMES)] + elements
+    head = '<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription modelName="wall" '
+    tool = 'modelIdentifier="wall" canHandleVariableCommunicationStepSize="true"'
+    experiment = f'<DefaultExperiment startTime="{start}"/>' if start else ""
+
+    def words(causality: str) -> str:
+        variability = "fixed" if causality == "parameter" else "continuous"
+        return f'causality="{causality}" variability="{variability}"'
+
+    def value(causality: str) -> str:
+        return "" if causality == "output" else ' start="0"'
+
+    outputs = [k for k, (_, causality, _) in enumerate(rows) if causality == "output"]
+    if version == 2:
+        variables = "".join(
+            f'<ScalarVariable name="{name}" valueReference="{vr}" {words(causality)}><Real{value(causality)}/></ScalarVariable>'
+            for name, causality, vr in rows
+        )
+        unknowns = "".join(f'<Unknown index="{k + 1}"/>' for k in outputs)
+        structure = f"<Outputs>{unknowns}</Outputs><InitialUnknowns>{unknowns}</InitialUnknowns>"
+        head += f'fmiVersion="2.0" guid="wall"><CoSimulation {tool}/>'
+    else:
+        variables = '<Float64 name="time" valueReference="99" causality="independent" variability="continuous"/>'
+        variables += "".join(
+            f'<Float64 name="{name}" valueReference="{vr}" {words(causality)}{value(causality)}/>' for name, causality, vr in rows
+        )
+        structure = "".join(f'<{kind} valueReference="{rows[k][2]}"/>' for kind in ("Output", "InitialUnknown") for k in outputs)
+        head += f'fmiVersion="3.0" instantiationToken="wall"><CoSimulation {tool}/>'
+    return (
+        f"{head}{experiment}<ModelVariables>{variables}{more}</ModelVariables>"
+        f"<ModelStructure>{structure}</ModelStructure></fmiModelDescription>"
+    )
+
+
+def build_wall(path: Path, version: int, text: str = "", others: Mapping[str, str] | None = None) -> Path:
+    """Writes the FMU for this platform, with `text` as its model description and `others` as further entries."""
+    from fmpy import fmi2, fmi3
+
+    slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
+    missing = [name for name in dir(slave) if name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE]
+    source = path.parent / f"wall{version}"
+    source.mkdir(exist_ok=True)
+    rest = "".join(f"EXPORT int {name}(void) {{ return 3; }}\n" for name in missing)
+    (source / "wall.c").write_text(f"#define FMI_VERSION {version}\n{SOURCE}{rest}")
+    (target,) = platforms(3, [native()])
+    place = target.tuple_3 if version == 3 else target.folder_2
+    with zipfile.ZipFile(path, "w") as archive:
+        archive.writestr("modelDescription.xml", text or description(version))
+        archive.writestr(f"binaries/{place}/wall{target.suffix}", compile_library(source, ["wall.c"], target))
+        for name, content in (others or {}).items():
+            archive.writestr(name, content)
+    return path
