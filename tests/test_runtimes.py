@@ -168,6 +168,21 @@ def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
     assert sum(report["foreign"] for report in outcome.reports.values()) >= 1
 
 
+def test_in_lockstep_a_reader_that_receives_nan_ends_the_run_and_names_the_sender() -> None:
+    outcome = run_toys(environment={"TOY_END_S": "8"}, faults={"robot": ("joint_states", "nan", "1")})
+    assert_failed(outcome, FailureCode.CONTRACT_BROKEN, "robot")
+    assert outcome.failure is not None
+    assert outcome.failure.topics == ("joint_states",)
+    assert "joint_states from robot refused: position = nan; allowed: -3.2..3.2 [rad]" in outcome.failure.text
+
+
+def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
+    outcome = run_toys(wallclock=True, faults={"robot": ("joint_states", "nan", "0.5")})
+    assert outcome.failure is None
+    assert outcome.reports["control"]["refused"] > 0
+    assert sum("joint_states from robot refused" in text for text in outcome.trouble) == 1
+
+
 def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -> None:
     topic = contract().topics["diagnostics"]
     subscriptions: list[Subscription] = []

@@ -22,6 +22,8 @@ from palpate_errors import RunError
 
 FEW = 32
 """Up to this number of values a loop in Python is faster than numpy."""
+LARGE = 1e9
+"""Larger limits are not compared with a sum of squares, which could overflow."""
 
 
 class RefusedMessage(RunError):
@@ -101,7 +103,7 @@ class _Source:
         found = [limits for row, limits in self._topic.ranges.items() if f"{path}.".startswith(f"{row}.")]
         if base == "string" or not (found or base.startswith("float")):
             return None
-        largest = sys.float_info.max
+        largest = float(np.finfo(np.float32).max) if base == "float32" else sys.float_info.max
         lows, highs = zip(*(found or [(-largest, largest)]), strict=True)
         return max(lows), min(highs)
 
@@ -136,8 +138,8 @@ class _Source:
         yield f"if {inner}.size > {FEW}:"
         yield f" if not ({low!r} <= {inner}.min() and {inner}.max() <= {high!r}): return False"
         radius = min(-low, high)
-        if detail[0].startswith("float") and radius > 0:  # no number is larger than the root of the sum of squares
-            yield f"elif not {inner}.dot({inner}) <= {min(radius * radius, sys.float_info.max)!r}:"
+        if detail[0].startswith("float") and 0 < radius < LARGE:  # no number is larger than the root of the sum of squares
+            yield f"elif not {inner}.dot({inner}) <= {radius * radius!r}:"
         else:
             yield "else:"
         yield f" for one in {inner}.tolist():"

@@ -134,7 +134,7 @@ def test_a_map_of_ones_own_is_read_from_the_scenario(scenario: Scenario, tmp_pat
 
 
 def test_a_missing_file_is_said(scenario: Scenario) -> None:
-    with pytest.raises(MapError, match=r"FMU nowhere\.fmu: no such file"):
+    with pytest.raises(MapError, match=r"nowhere\.fmu: no such file"):
         create(chosen(scenario, fmu="nowhere.fmu"))
 
 

@@ -59,7 +59,7 @@ class FmuService(Service):
         """Time of the FMU minus that of the run [ns]."""
         try:
             self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
-        except MapError:
+        except UserError:
             self._fmu.close()  # removes the unpacked files
             raise
         self._latched = tuple(output for output in self._wiring.outputs if output.topic.latched)
