@@ -7,6 +7,7 @@ fields.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from operator import attrgetter
@@ -23,6 +24,7 @@ from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
 from palpate_tissue.backends.fmu.mapping import FmuMap, FrameChange, InputEntry, MapError, OutputEntry, _Entry
 
+_log = logging.getLogger("palpate.tissue")
 BASES = ("kg", "m", "s", "A", "K", "mol", "cd", "rad")
 _NAMED: dict[str, tuple[float, dict[str, int]]] = {
     "1": (1.0, {}),
@@ -241,6 +243,9 @@ class Wiring:
         self._table, self._fmu, self._rules = table, fmu, rules
         self._frames = frames
         self._scenario = scenario
+        for name, entries in table.inputs.items():
+            if not entries:
+                _log.warning("inputs.%s: names no variable; the topic is left out", name)
         self.inputs = tuple(self._input(name, entries) for name, entries in table.inputs.items() if entries)
         mine = {topic.name for topic in rules.outputs(table.role)}
         if missing := mine - table.outputs.keys():
