@@ -1,6 +1,6 @@
 """Reads the model description of any FMU: its variables, with arrays also where FMI 2.0 has scalars, and what a validator finds.
 
-A finding is no reason to refuse an FMU: many tools write descriptions that break a rule and describe every variable well.
+A finding does not make an FMU unusable: many tools write descriptions that break a rule and still describe every variable well.
 """
 
 from __future__ import annotations

@@ -11,7 +11,7 @@ from palpate_fmu.compiling import compile_library, native, platforms
 
 
 class Odd(IntEnum):
-    """What goes wrong in a step, from the time of the parameter `at` on."""
+    """Fault of a step, from the time of the parameter `at` on."""
 
     NOTHING = 0
     TERMINATE = 1
