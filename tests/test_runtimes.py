@@ -170,7 +170,7 @@ def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
 
 def test_in_lockstep_a_reader_that_receives_nan_ends_the_run_and_names_the_sender() -> None:
     outcome = run_toys(environment={"TOY_END_S": "8"}, faults={"robot": ("joint_states", "nan", "1")})
-    assert_failed(outcome, FailureCode.CONTRACT_BROKEN, "robot")
+    assert_failed(outcome, FailureCode.CONTRACT_BROKEN, "control", "robot")  # who read it and who sent it
     assert outcome.failure is not None
     assert outcome.failure.topics == ("joint_states",)
     assert "joint_states from robot refused: position = nan; allowed: -3.2..3.2 [rad]" in outcome.failure.text
