@@ -127,7 +127,7 @@ class ServiceRig(Rig):
     def _log_refused(self, refused: RefusedMessage) -> None:
         """Log a message that breaks the contract as sent: the suite names what is wrong with it."""
         log = self.log[refused.topic]
-        log.append(HeardMessage(self.t, refused.message, len(log) + 1, self.t))
+        log.append(ReceivedMessage(self.t, refused.message, len(log) + 1, self.t))
 
     def _take(self, sent: list[Sent]) -> None:
         for port, packet in sent:
