@@ -19,7 +19,7 @@ from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance, compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE
-from palpate_tissue.backends.elastic.tissue import ElasticTissue
+from palpate_tissue.backends.elastic.tissue import ElasticTissue, ElasticTuning
 
 STILL = np.zeros(3)
 ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
@@ -62,8 +62,8 @@ def layer(half_m: float = 0.045) -> Compliance:
 
 def reach(beside_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
     """Lets springs act away from the sphere."""
-    for name in ("_BESIDE_M", "_BESIDE_MUSCLE_M"):
-        monkeypatch.setattr(f"palpate_tissue.backends.elastic.tissue.{name}", beside_m)
+    tuning = ElasticTuning(springs_beyond_m=beside_m, muscle_beyond_m=beside_m)
+    monkeypatch.setattr("palpate_tissue.backends.elastic.tissue.TUNING", tuning)
 
 
 def press(tissue: ElasticTissue, depth: float, speed: float = 0.005) -> float:
