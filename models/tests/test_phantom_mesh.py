@@ -90,7 +90,106 @@ def test_millimetres_are_named(tmp_path):
 def test_too_small_is_named(tmp_path):
     vertices, faces = dome(2)
     write(tmp_path / "tiny.stl", vertices / 1000, faces)
-    refused(tmp_path / "tiny.stl", "want metres")
+    refused(tmp_path / "tiny.stl", "in kilometres it is 0.46 m")
+
+
+def test_every_unit_that_fits_is_named_with_the_size_it_gives(tmp_path):
+    vertices, faces = dome(2)
+    write(tmp_path / "inches.stl", vertices / 0.0254, faces)
+    refused(
+        tmp_path / "inches.stl",
+        r"size is 18\.\d+.*in centimetres it is 0\.18 m .*in inches it is 0\.46 m \(scale it by 0\.0254\)",
+    )
+
+
+def ply(vertices, faces, *, promised=0, comment=""):
+    """An ASCII PLY whose header promises so many faces more than there are."""
+    header = (
+        f"ply\nformat ascii 1.0\n{comment}element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
+    )
+    header += f"element face {len(faces) + promised}\nproperty list uchar int vertex_indices\nend_header\n"
+    rows = [*(" ".join(map(repr, map(float, v))) for v in vertices), *(" ".join(map(str, (len(f), *f))) for f in faces)]
+    return (header + "\n".join(rows) + "\n").encode()
+
+
+BOX = trimesh.creation.box((0.4, 0.5, 0.2)).apply_translation((0, 0, -0.1))
+QUADS = [(0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3)]
+CORNERS = [(x, y, z) for x in (-0.2, 0.2) for y in (-0.25, 0.25) for z in (-0.2, 0)]
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.9, 0.99])
+@pytest.mark.parametrize("kind", ["ply", "ply_ascii", "ply_quads", "stl", "stl_ascii"])
+def test_a_file_that_was_cut_off_is_refused(tmp_path, kind, share):
+    if kind == "ply_quads":
+        content = ply(CORNERS, QUADS)
+    elif kind == "ply_ascii":
+        content = ply(*dome(3))
+    else:
+        content = trimesh.Trimesh(*dome(3), process=False).export(file_type=kind)
+        content = content.encode() if isinstance(content, str) else content
+    path = tmp_path / f"cut.{kind[:3]}"
+    path.write_bytes(content)
+    build_phantom(Phantom(kind="mesh", mesh=str(path)), 0)
+    path.write_bytes(content[: int(share * len(content))])
+    refused(path, "not whole")
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "words"),
+    [
+        ("beyond.ply", ply(BOX.vertices, [*BOX.faces, (0, 1, 12)]), "face 12 names vertex 12, the vertices are 0 to 7"),
+        ("negative.ply", ply(BOX.vertices, [*BOX.faces, (0, 1, -3)]), "face 12 names vertex -3"),
+        ("promised.ply", ply(BOX.vertices, BOX.faces, promised=5), "promises 17 of face, 12 are there"),
+        ("beyond.obj", BOX.export(file_type="obj") + "\nf 1 2 99\n", "face 12 names vertex 99, the vertices are 1 to 8"),
+        ("zero.obj", BOX.export(file_type="obj") + "\nf 0 1 2\n", "face 12 names vertex 0, the vertices are 1 to 8"),
+        ("backwards.obj", BOX.export(file_type="obj") + "\nf -1 -2 -9\n", "face 12 names vertex -9"),
+        ("short.obj", BOX.export(file_type="obj") + "\nf 1 2", "names 2 vertices"),
+    ],
+)
+def test_a_face_that_names_a_missing_vertex_is_refused(tmp_path, name, content, words):
+    (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    refused(tmp_path / name, words)
+
+
+@pytest.mark.parametrize("name", ["texture.ply", "material.obj"])
+def test_textures_and_materials_are_not_loaded(tmp_path, capfd, name):
+    path = tmp_path / name
+    if name.endswith("ply"):
+        path.write_bytes(ply(BOX.vertices, BOX.faces, comment="comment TextureFile nothing.png\n"))
+    else:
+        path.write_text("mtllib nothing.mtl\nusemtl skin\n" + BOX.export(file_type="obj"))
+    build_phantom(Phantom(kind="mesh", mesh=str(path)), 0)
+    assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.parametrize(
+    ("name", "turn", "words"),
+    [
+        ("prone", (1, -1, -1), r"faces \(-?0, -?0, -1\), want \+z"),
+        ("open", (1, -1, -1), "it seems to lie face down"),
+        ("y_up", None, r"faces \(.*1, .*\), want \+z"),
+    ],
+)
+def test_a_body_that_does_not_face_up_is_refused(tmp_path, name, turn, words):
+    vertices, faces = dome(3)
+    if name == "open":
+        faces = faces[vertices[faces][:, :, 2].min(axis=1) > -0.08]
+    vertices = vertices[:, (0, 2, 1)] if turn is None else vertices * turn
+    write(tmp_path / f"{name}.ply", vertices, faces)
+    refused(tmp_path / f"{name}.ply", words)
+
+
+@pytest.mark.parametrize("mesh", [BOX, trimesh.creation.cylinder(0.2, 0.2).apply_translation((0, 0, -0.1))])
+def test_refining_large_triangles_leaves_no_slivers(mesh):
+    corners = mesh.vertices[mesh.faces]
+    surface = refine(mesh.vertices, mesh.faces.astype(np.int32), 0.005)
+    assert shape(surface.vertices[surface.triangles]).min() > 0.49 * shape(corners).min()
+
+
+def shape(corners):
+    """Twice the area over the longest edge squared."""
+    edges = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+    return np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1) / edges**2
 
 
 def test_missing_and_wrong_files_are_named(tmp_path):
@@ -162,6 +261,8 @@ def test_umbilicus_off_the_origin_is_refused(tmp_path):
     vertices, faces = dome(3)
     write(tmp_path / "off.ply", vertices + np.array((0, 0, 0.3)), faces)
     refused(tmp_path / "off.ply", "umbilicus must be at the origin")
+    write(tmp_path / "inside.ply", BOX.vertices + np.array((0, 0, 0.1)), BOX.faces)
+    refused(tmp_path / "inside.ply", "umbilicus must be at the origin")
 
 
 def test_a_mesh_too_fine_is_refused(tmp_path):

@@ -34,16 +34,19 @@ def plan(
     from rich.console import Console
 
     from palpate.console import refuse
-    from palpate.plan.prospect import draw, prospect, summary
+    from palpate.plan.prospect import check_tissue, draw, prospect, summary
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom
     from palpate_planning.motion.planner import NoPathError
     from palpate_plugins import PluginError
 
+    if out.suffix.lower() != ".png":
+        refuse(f"--out {out}: want the name of a .png file")
     chosen = usable(scenario, settings, seed)
     try:
         with Console(stderr=True).status("planning: about ten seconds"):
             phantom = build_phantom(chosen.phantom, chosen.seed)
+            check_tissue(chosen, phantom)
             planned = prospect(chosen, phantom)
             draw(out, chosen, phantom, planned)
     except (NoPathError, PluginError, OSError) as error:

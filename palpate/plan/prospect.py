@@ -12,6 +12,8 @@ from scipy.spatial import Delaunay
 from palpate.quick.patient import seen_lattice
 from palpate.run.inputs import scan_over, surface_of
 from palpate.run.outlook import Outlook
+from palpate_bus.contract import contract
+from palpate_bus.messages.stamps import NS
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.robot.lbr import HOME
@@ -21,6 +23,7 @@ from palpate_models.scenario.schema import Exam, Mode, Scenario
 from palpate_planning.reasons import Cause
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
 from palpate_planning.wall.surface import PerceivedSurface
+from palpate_tissue.backends.winkler.mechanics import assemble
 
 PERIOD_S = 0.010
 """Time step of the planner's trajectories."""
@@ -44,6 +47,12 @@ class Prospect:
     def length_m(self) -> float:
         """Path length in contact."""
         return float(sum(np.linalg.norm(np.diff(stroke, axis=0), axis=1).sum() for stroke in self.strokes))
+
+
+def check_tissue(scenario: Scenario, phantom: PhantomModel) -> None:
+    """Raise UserError if the default tissue could not be stepped on this phantom's mesh."""
+    if scenario.services.tissue == "winkler":
+        assemble(phantom, scenario.phantom.stiffness).substeps(contract().roles["tissue"].period / NS)
 
 
 def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:

@@ -10,22 +10,18 @@ from numpy.typing import NDArray
 from scipy import sparse
 from scipy.sparse.csgraph import connected_components
 
-from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
+from palpate_models.patient.mesh_file import IntArray, MeshError, read_mesh
 
-IntArray = NDArray[np.int32]
-
-SUFFIXES = (".obj", ".stl", ".ply")
 LARGEST_M = 3.0
 SMALLEST_M = 0.05
 MOST_VERTICES = 20_000
 _REGION_HALF_M = 0.112
 """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
 _NEAR_UMBILICUS_M = 0.03
-
-
-class MeshError(UserError):
-    """A mesh that cannot be a phantom. The message names the file, what is wrong, where, and what to do."""
+UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048, "kilometres": 1e3}
+SMALLEST_BODY_M = 0.15
+LEAST_NORMAL_Z = 0.7
 
 
 @dataclass(frozen=True)
@@ -37,35 +33,24 @@ class TriangleMesh:
 
 
 def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
-    """The surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where examined.
+    """Return the surface in an OBJ, STL or PLY file (metres, abdomen frame), with edges up to `edge_m` [m] where examined.
 
-    Raises MeshError if the file is missing, unreadable, empty, not in metres, not at the origin, degenerate,
-    non-manifold, in several pieces, not orientable or too fine.
+    Raises MeshError if the file cannot be read whole, or its surface is empty, not in metres, not at the origin, not facing
+    the camera, degenerate, non-manifold, in several pieces, not orientable or too fine.
     """
-    import trimesh  # noqa: PLC0415 - only user meshes need it, and it takes 0.3 s to import
-
-    if path.suffix.lower() not in SUFFIXES:
-        raise MeshError(f"phantom.mesh = {path}: want a file in {', '.join(SUFFIXES)}")
-    if not path.is_file():
-        raise MeshError(f"phantom.mesh = {path}: no such file")
     try:
-        loaded = trimesh.load(path, force="mesh", process=False)
-        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
-        triangles = np.array(loaded.faces, dtype=np.int32).reshape(-1, 3)
-    except Exception as error:
-        raise MeshError(f"phantom.mesh = {path}: cannot be read as {path.suffix.lower()}: {error}") from error
-    try:
-        vertices, triangles = weld(vertices, triangles)
+        vertices, triangles = weld(*read_mesh(path))
         check(vertices, triangles)
         triangles = orient(vertices, triangles)
+        check_place(vertices, triangles)
+        surface = refine(vertices, triangles, edge_m)
+        if len(surface.vertices) > MOST_VERTICES:
+            raise MeshError(
+                f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {MOST_VERTICES} are simulated: "
+                "decimate the mesh or raise phantom.edge_m"
+            )
     except MeshError as error:
-        raise MeshError(f"phantom.mesh = {path}: {error}") from None
-    surface = refine(vertices, triangles, edge_m)
-    if len(surface.vertices) > MOST_VERTICES:
-        raise MeshError(
-            f"phantom.mesh = {path}: {len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most "
-            f"{MOST_VERTICES} are simulated: decimate the mesh or raise phantom.edge_m"
-        )
+        raise MeshError(f"phantom.mesh = {path}: {error}") from error.__cause__
     return surface
 
 
@@ -84,16 +69,17 @@ def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
 
 
 def check(vertices: Array, triangles: IntArray) -> None:
-    """Raises MeshError unless the mesh is a manifold of sound triangles, in metres, through the origin of A."""
+    """Raise MeshError unless the mesh is a manifold of sound triangles, in metres."""
     size = float(np.ptp(vertices, axis=0).max())
-    if size > LARGEST_M:
-        units = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254}
-        likely = [
-            f": is it in {name}? Scale it by {factor:g}" for name, factor in units.items() if 0.15 < size * factor < LARGEST_M
+    if not SMALLEST_M <= size <= LARGEST_M:
+        fitting = [
+            f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
+            for unit, factor in UNITS_M.items()
+            if SMALLEST_BODY_M <= size * factor <= LARGEST_M
         ]
-        raise MeshError(f"it is {size:.4g} m large, more than {LARGEST_M} m{''.join(likely[:1])} (want metres)")
-    if size < SMALLEST_M:
-        raise MeshError(f"it is {size:.4g} m large, less than {SMALLEST_M} m: want metres")
+        raise MeshError(
+            f"its size is {size:.4g}, want {SMALLEST_M} to {LARGEST_M} metres; {', '.join(fitting) or 'no unit fits'}"
+        )
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -119,14 +105,26 @@ def check(vertices: Array, triangles: IntArray) -> None:
     if pieces > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
     _check_fans(vertices, triangles)
-    at = np.argmin(np.linalg.norm(vertices, axis=1))
-    nearest = vertices[at]
-    reach = max(_NEAR_UMBILICUS_M, float(longest[(triangles == at).any(axis=1)].max()))
-    if np.linalg.norm(nearest) > reach:
-        raise MeshError(
-            f"the umbilicus must be at the origin (abdomen frame: x to the patient's left, y to the head, z outward), "
-            f"but the nearest vertex is {_place(nearest[None])}"
-        )
+
+
+def check_place(vertices: Array, triangles: IntArray) -> None:
+    """Raise MeshError unless the surface passes through the origin of A, the umbilicus, and faces +z there."""
+    import trimesh  # noqa: PLC0415 - as in read_mesh
+
+    frame = "abdomen frame: x to the patient's left, y to the head, z outward"
+    nearest = trimesh.triangles.closest_point(vertices[triangles], np.zeros((len(triangles), 3)))
+    away = np.linalg.norm(nearest, axis=1)
+    if away.min() > _NEAR_UMBILICUS_M:
+        place = _place(nearest[[away.argmin()]])
+        raise MeshError(f"the umbilicus must be at the origin ({frame}), but the surface is nearest to it at {place}")
+    cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
+    normal = cross / max(np.linalg.norm(cross), 1e-300)
+    border = boundary_vertices(len(vertices), triangles)
+    if normal[2] < LEAST_NORMAL_Z:
+        raise MeshError(f"at the umbilicus the surface faces ({', '.join(f'{x:.2g}' for x in normal)}), want +z ({frame})")
+    if border.any() and vertices[border, 2].mean() > _NEAR_UMBILICUS_M:
+        rise = vertices[border, 2].mean()
+        raise MeshError(f"its border lies {rise:.2g} m above the umbilicus, want it below: it seems to lie face down ({frame})")
 
 
 def orient(vertices: Array, triangles: IntArray) -> IntArray:
@@ -160,7 +158,7 @@ def orient(vertices: Array, triangles: IntArray) -> IntArray:
 
 
 def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
-    """The mesh with edges of at most `edge_m` [m] on the front of the examined region, without hanging vertices."""
+    """Return the mesh with edges of at most `edge_m` [m] on the front of the examined region, without hanging vertices."""
     for _ in range(16):
         pairs, inverse = np.unique(np.sort(_half_edges(triangles), axis=1), axis=0, return_inverse=True)
         of_face = inverse.reshape(3, -1).T  # edges (0 1), (1 2), (2 0) of each triangle
@@ -176,29 +174,39 @@ def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
             break
         # Split only the longest edges of a neighbourhood at a time: bisection of longest edges keeps angles sound.
         longest_of_face = length[of_face].max(axis=1)
+        longest = of_face[np.arange(len(of_face)), length[of_face].argmax(axis=1)]
         keep = np.zeros(len(pairs), dtype=np.bool_)
         for k in range(3):
             is_longest = length[of_face[:, k]] >= 0.7 * longest_of_face
             keep[of_face[is_longest, k]] = True
         split &= keep
+        while True:  # a split edge implies the longest one of its triangles, so that no sliver arises (Rivara 1984)
+            more = split.copy()
+            more[longest[split[of_face].any(axis=1)]] = True
+            if (more == split).all():
+                break
+            split = more
         middle = np.full(len(pairs), -1, dtype=np.int32)
         middle[split] = len(vertices) + np.arange(int(split.sum()))
         vertices = np.concatenate((vertices, vertices[pairs[split]].mean(axis=1)))
-        triangles = _split_triangles(triangles, middle[of_face])
+        triangles = _split_triangles(triangles, middle[of_face], length[of_face])
     return TriangleMesh(vertices, triangles)
 
 
-def _split_triangles(triangles: IntArray, middle: IntArray) -> IntArray:
-    """Triangles cut at the given edge midpoints, shape (m, 3), -1 where an edge is whole."""
+def _split_triangles(triangles: IntArray, middle: IntArray, length: Array) -> IntArray:
+    """Return triangles cut at the given edge midpoints, shape (m, 3), -1 where an edge is whole; the longer edge first."""
     out = [triangles[(middle < 0).all(axis=1)]]
     for k in range(3):
-        turned, m = np.roll(triangles, -k, axis=1), np.roll(middle, -k, axis=1)
+        turned, m, size = (np.roll(array, -k, axis=1) for array in (triangles, middle, length))
         a, b, c = turned.T
         ab, bc, ca = m.T
         one = (ab >= 0) & (bc < 0) & (ca < 0)
         out += [np.column_stack((a, ab, c))[one], np.column_stack((ab, b, c))[one]]
         two = (ab >= 0) & (bc >= 0) & (ca < 0)
-        out += [np.column_stack(t)[two] for t in ((ab, b, bc), (a, ab, bc), (a, bc, c))]
+        first = two & (size[:, 0] > size[:, 1])
+        out += [np.column_stack(t)[first] for t in ((ab, b, bc), (ab, bc, c), (a, ab, c))]
+        second = two & ~first
+        out += [np.column_stack(t)[second] for t in ((ab, b, bc), (a, ab, bc), (a, bc, c))]
     a, b, c = triangles.T
     ab, bc, ca = middle.T
     three = (middle >= 0).all(axis=1)

@@ -1,0 +1,102 @@
+"""Triangles from OBJ, STL and PLY files: whole, with indices that exist."""
+
+from __future__ import annotations
+
+import re
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
+
+if TYPE_CHECKING:
+    import trimesh
+
+IntArray = NDArray[np.int32]
+
+SUFFIXES = (".obj", ".stl", ".ply")
+STL_HEADER_BYTES, STL_TRIANGLE_BYTES = 84, 50
+
+
+class MeshError(UserError):
+    """A mesh that cannot be a phantom. The message names the file, what is wrong, where, and what to do."""
+
+
+def read_mesh(path: Path) -> tuple[Array, IntArray]:
+    """Return the vertices, shape (n, 3), and triangles, shape (m, 3), of a file as they are written.
+
+    Colours, textures and materials are not read.
+
+    Raises MeshError if the file is missing, of another format, has fewer elements than it promises, or a face names a vertex
+    that is not there.
+    """
+    import trimesh  # noqa: PLC0415 - only user meshes need it, and it takes 0.3 s to import
+
+    if path.suffix.lower() not in SUFFIXES:
+        raise MeshError(f"want a file in {', '.join(SUFFIXES)}")
+    if not path.is_file():
+        raise MeshError("no such file")
+    try:
+        if path.suffix.lower() == ".stl":
+            _check_stl(path.read_bytes())
+        elif path.suffix.lower() == ".obj":
+            _check_obj(path.read_text(errors="replace"))
+        loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
+        _check_ply(loaded)
+        vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
+        triangles = np.array(loaded.faces, dtype=np.int32).reshape(-1, 3)
+    except MeshError:
+        raise
+    except Exception as error:
+        raise MeshError(f"cannot be read as {path.suffix.lower()}, it is damaged or not whole: {error}") from error
+    _check_indices(triangles, 0, len(vertices) - 1)
+    return vertices, triangles
+
+
+def _check_indices(faces: IntArray, first: int, last: int) -> None:
+    wrong = np.argwhere((faces < first) | (faces > last))
+    if len(wrong):
+        face, corner = wrong[0]
+        raise MeshError(f"face {face} names vertex {faces[face, corner]}, the vertices are {first} to {last}")
+
+
+def _check_ply(loaded: trimesh.Trimesh) -> None:
+    """Raise MeshError if an element of a PLY file has fewer rows than its header says."""
+    for name, element in loaded.metadata.get("_ply_raw", {}).items():
+        data, promised = element.get("data", ()), element["length"]
+        columns = list(data.values()) if isinstance(data, dict) else [data]
+        rows = min((len(column) for column in columns), default=0)
+        if name in ("vertex", "face") and rows < promised:
+            raise MeshError(f"its header promises {promised} of {name}, {rows} are there: the file is not whole")
+        short = [row for row in columns[0] if name == "face" and isinstance(row, list | np.ndarray) and len(row) < 3]
+        if short:
+            raise MeshError(f"a face names {len(short[0])} vertices, want at least 3: the file is not whole")
+
+
+def _check_stl(content: bytes) -> None:
+    """Raise MeshError if an STL file ends early."""
+    if content[:5] == b"solid" and b"facet" in content[:1000]:
+        begun, ended = len(re.findall(rb"^\s*facet\s", content, re.MULTILINE)), content.count(b"endfacet")
+        if begun != ended or b"endsolid" not in content[-1000:]:
+            raise MeshError(f"{begun} triangles begin and {ended} end, and it has no endsolid: the file is not whole")
+        return
+    promised = int.from_bytes(content[80:STL_HEADER_BYTES], "little")
+    room = max(len(content) - STL_HEADER_BYTES, 0)
+    if room != promised * STL_TRIANGLE_BYTES:
+        there = room / STL_TRIANGLE_BYTES
+        raise MeshError(f"its header promises {promised} triangles, {there:g} are there: the file is not whole, or no STL")
+
+
+def _check_obj(content: str) -> None:
+    """Raise MeshError if a face of an OBJ file names vertices that are not there: they count from 1, or from -1 backwards."""
+    vertices = len(re.findall(r"^\s*v\s", content, re.MULTILINE))
+    for number, face in enumerate(re.findall(r"^\s*f\s(.*)$", content, re.MULTILINE)):
+        corners = [int(corner.split("/")[0]) for corner in face.split("#")[0].split()]
+        if len(corners) < 3:
+            raise MeshError(f"face {number} names {len(corners)} vertices, want at least 3: the file is not whole")
+        for corner in corners:
+            if corner == 0 or abs(corner) > vertices:
+                raise MeshError(f"face {number} names vertex {corner}, the vertices are 1 to {vertices}")
