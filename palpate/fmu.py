@@ -59,7 +59,7 @@ def build(
     from palpate_fmu.compiling import CompileError, platforms
     from palpate_fmu.export import build_scenario_fmu
     from palpate_fmu.phantom_file import ExportError
-    from palpate_models.patient.mesh import MeshError
+    from palpate_models.patient.mesh_file import MeshError
     from palpate_models.scenario.load import ScenarioError
 
     console = Console(stderr=True)

@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from palpate_models.patient.guarding import Activation, Guarding
-from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Background, Phantom, Stiffness
 from palpate_models.patient.tension import pressed_force, tension_of_ratio

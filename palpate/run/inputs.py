@@ -10,7 +10,7 @@ import numpy as np
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_errors import UserError
-from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.patterns import Scan, scan_of

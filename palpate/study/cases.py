@@ -16,7 +16,7 @@ from typing import Any, Final, NamedTuple
 
 from palpate.run.roles import checked
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
-from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.errors import Errors
 from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario

@@ -16,7 +16,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.abdomen import lattice, parametric_surface
 from palpate_models.patient.field import background_factor, lesion_field
 from palpate_models.patient.healthy import healthy_wall
-from palpate_models.patient.mesh import MeshError, boundary_vertices, load_mesh, vertex_normals
+from palpate_models.patient.mesh import boundary_vertices, load_mesh, vertex_normals
+from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.patient.tension import tension_field

@@ -18,7 +18,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient import wall
 from palpate_models.patient.field import edge_distance, smoothstep
 from palpate_models.patient.guarding import Guarding
-from palpate_models.patient.mesh import MeshError
+from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.schema import Stiffness
 
 RADIUS_M, DEPTH_M, SPEED_MPS = 0.010, 0.010, 0.005
