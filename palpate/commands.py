@@ -18,7 +18,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, say
+from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, reserve_output, say
 from palpate_errors import UserError
 
 HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
@@ -84,6 +84,8 @@ COMMANDS = {name: where for group in GROUPS.values() for name, where in group.it
 def main() -> None:
     """Runs the command of `sys.argv`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
+    if "--json" in sys.argv:
+        reserve_output()
     try:
         app_for(name)(prog_name="palpate")
     except BrokenPipeError:

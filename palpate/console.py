@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+import sys
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TextIO
 
 import typer
 from rich.console import Console, RenderableType
@@ -125,14 +126,27 @@ def wide_console() -> Console:
     return plain if plain.is_terminal else Console(highlight=False, width=max(WIDE_COLUMNS, plain.width))
 
 
+_DOCUMENT: TextIO | None = None
+"""Standard output, if it is reserved."""
+
+
+def reserve_output() -> None:
+    """Reserves standard output for `print_json` and `print_line`; what libraries print there goes to standard error."""
+    global _DOCUMENT  # noqa: PLW0603 - standard output is one for the process
+    if _DOCUMENT is None:
+        sys.stdout.flush()
+        _DOCUMENT = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        os.dup2(2, 1)
+
+
 def print_json(value: Any) -> None:
     """Prints one JSON document to standard output."""
-    print(json.dumps(value, indent=2), flush=True)
+    print(json.dumps(value, indent=2), file=_DOCUMENT, flush=True)
 
 
 def print_line(value: Any) -> None:
     """Prints one line of JSON, for streams."""
-    print(json.dumps(value), flush=True)
+    print(json.dumps(value), file=_DOCUMENT, flush=True)
 
 
 def table(*columns: str) -> Table:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -10,6 +12,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
+from palpate.apart import guarded
 from palpate.console import refuse
 
 if TYPE_CHECKING:
@@ -147,16 +150,20 @@ def simulate(
     """Press into an abdomen, hold, withdraw, and plot force against depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native
     from palpate_fmu.instance import FmuInstance
-    from palpate_fmu.probing import plot_probing, probe, write_csv
+    from palpate_fmu.probing import Probing, plot_probing, probe, write_csv
     from palpate_fmu.reading import FmuError
     from palpate_fmu.running import run_and_plot
 
     console = Console(stderr=True)
-    try:
+
+    def perform() -> tuple[Probing | None, Sequence[str]]:
         with FmuInstance(file) as fmu:
             abdomen = {"indenter_position", "indentation_depth", "normal_force"} <= fmu.variables.keys()
             probing = probe(fmu, at, depth, speed, hold) if abdomen else None
-        names = () if probing else run_and_plot(file, out)
+        return probing, () if probing else run_and_plot(file, out)
+
+    try:
+        probing, names = guarded(str(file), perform, math.inf)
     except FmuError as error:
         refuse(f"{error} (this machine is {native()})")
     if probing is None:

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-import json
 from typing import Annotated
 
 import typer
 from rich.console import Console
 from rich.table import Table
+
+from palpate.console import print_line
 
 WIDE = 160
 """Columns of the table of topics, where the terminal has fewer or there is none."""
@@ -18,7 +19,7 @@ def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them a
     from palpate_models.scenario.load import load_scenario, scenario_names
 
     if as_json:
-        print(json.dumps([load_scenario(name).model_dump(mode="json") for name in scenario_names()]))
+        print_line([load_scenario(name).model_dump(mode="json") for name in scenario_names()])
         return
     table = Table("scenario", "lesions", "description", box=None)
     for name in scenario_names():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import count
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
-from palpate.console import CaseDisplay, fail, output_file, output_folder, refuse
+from palpate.console import CaseDisplay, fail, output_file, output_folder, print_line, refuse
 from palpate.run.options import Settings
 
 
@@ -58,7 +57,7 @@ def reproduce(
     except OSError as error:
         refuse(error)
     if as_json:
-        print(json.dumps(facts))
+        print_line(facts)
         return
     if not quiet:
         console.print(

@@ -45,8 +45,8 @@ def create(role: str, choice: str, scenario: Any) -> Service:
     make = create_for(role, choice)
     try:
         service = make(scenario)
-    except Exception as error:
-        if not is_file(choice) and not isinstance(error, ModuleNotFoundError):
+    except (Exception, SystemExit) as error:
+        if not is_file(choice) and not isinstance(error, ModuleNotFoundError | SystemExit):
             raise
         raise kind(role).failure(choice, error) from error
     if service.role != role:

@@ -125,7 +125,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
     except UserError as error:
         log.error("%s", error)
         status = EXIT_FAILED
-    except Exception:
+    except (Exception, SystemExit):
         log.exception("%s failed", name)
         status = EXIT_FAILED
     leave(sessions.values(), status)

@@ -127,6 +127,14 @@ class Settings(BaseSettings):
     absent: Annotated[tuple[str, ...], NoDecode] = Field(
         default=(), description="Optional roles of the contract that do not take part in the run, separated by commas."
     )
+    step_limit_s: float = Field(
+        default=10.0,
+        gt=0,
+        description="Lockstep: time [s] that a step of a foreign service may take: a file, an FMU, a plug-in of another package.",
+    )
+    start_limit_s: float = Field(
+        default=120.0, gt=0, description="Lockstep: time [s] that a foreign service may take to load and to initialise."
+    )
     runs: Path | None = Field(
         default=None,
         description="Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
@@ -241,8 +249,6 @@ def allowed(name: str) -> str:
         kinds = [kind for kind in typing.get_args(field.annotation) if kind is not type(None)]
     if typing.get_origin(kinds[0]) is Literal:
         return ", ".join(typing.get_args(kinds[0]))
-    if kinds[0] is bool:
-        return "0, 1"
     if kinds[0] is int:
         bounds = {bound: getattr(rule, bound) for rule in field.metadata for bound in ("ge", "le") if hasattr(rule, bound)}
         return f"{bounds['ge']} to {bounds['le']}" if "le" in bounds else f"a whole number from {bounds['ge']}"
@@ -250,7 +256,8 @@ def allowed(name: str) -> str:
         return "ROLE=MILLISECONDS, ..."
     if typing.get_origin(kinds[0]) is tuple:
         return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
-    words: dict[Any, str] = {Path: "a path", float: "a number above 0, up to 1"}
+    most = "".join(f", up to {rule.le:g}" for rule in field.metadata if hasattr(rule, "le"))
+    words: dict[Any, str] = {bool: "0, 1", Path: "a path", float: f"a number above 0{most}"}
     return words.get(kinds[0], "text")
 
 

@@ -21,6 +21,7 @@ from typing import Any
 
 from palpate_errors import UserError
 
+DISTRIBUTION = "palpate"
 USER_MODULE = "palpate_user_"
 """Prefix of the module names of user files, before the kind."""
 
@@ -73,6 +74,13 @@ class PluginKind:
         if not all(map(_installed, _requirements(point, self._extra(point)))):
             self._load_installed(point)  # another distribution may provide the library, so the import decides
 
+    def foreign(self, choice: str) -> bool:
+        """True for a user's file and for a plug-in of another distribution."""
+        if is_file(choice):
+            return True
+        point = next(iter(entry_points(group=f"palpate.{self.kind}", name=choice)), None)
+        return choice not in self.builtin and point is not None and point.dist is not None and point.dist.name != DISTRIBUTION
+
     def load(self, choice: str) -> Callable[..., Any]:
         """Return the function."""
         self.check(choice)
@@ -90,7 +98,7 @@ class PluginKind:
             raise self._error(choice, self.expected(choice))
         return next(iter(found))
 
-    def failure(self, choice: str, error: Exception) -> PluginError:
+    def failure(self, choice: str, error: BaseException) -> PluginError:
         """Return the PluginError for an exception of the function, with the last line of its file that took part."""
         if isinstance(error, ModuleNotFoundError):
             extra = None if is_file(choice) or choice in self.builtin else self._extra(self.entry_point(choice))
@@ -141,7 +149,7 @@ class PluginKind:
         module = sys.modules[name] = module_from_spec(spec)
         try:
             spec.loader.exec_module(module)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self.failure(choice, error) from error
         function: Callable[..., Any] = getattr(module, self.function)
         return function

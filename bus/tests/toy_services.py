@@ -5,7 +5,9 @@ Run as a program it is the process of one role, or of several: `python toy_servi
 
 from __future__ import annotations
 
+import ctypes
 import os
+import signal
 import sys
 import time
 from typing import Any
@@ -62,6 +64,24 @@ def wrench(x: float = 0.0) -> Any:
     return Wrench(Vector3(x, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
 
 
+def misbehave(how: str) -> None:
+    """Does what foreign code may do."""
+    print(f"{how} by print")
+    os.write(1, f"{how} by file descriptor 1\n".encode())
+    if how.startswith("exit"):
+        os._exit(int(how[4:]))
+    if how == "leave":
+        sys.exit(0)
+    if how == "crash":
+        ctypes.string_at(0)
+    if how == "kill":
+        os.kill(os.getpid(), signal.SIGKILL)
+    while how == "spin":
+        pass
+    if how == "hang":
+        time.sleep(600)
+
+
 class Robot(Service):
     role = "robot"
 
@@ -115,6 +135,8 @@ class Tissue(Service):
         return {"truth/phantom": PhantomTruth(mesh, np.zeros(1), np.zeros(1), np.zeros(1, np.int32), pose())}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
+        if t == 500 * MS and "TOY_TISSUE_DOES" in os.environ:
+            misbehave(os.environ["TOY_TISSUE_DOES"])
         h = header(t, "world")
         tool = inbox.latest("sim/tool_state")  # by the wall clock a service may step before it comes
         x = 1.0 if tool is None else float(np.cos(tool.pose.position.x))

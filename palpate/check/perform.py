@@ -15,6 +15,7 @@ import typer
 from rich.console import Console, RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
+from palpate.apart import guarded, shared_numbers
 from palpate.check.live_rig import LiveRig
 from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import Rig, RigSettings, ServiceRig
@@ -23,6 +24,7 @@ from palpate.console import table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.joining import NoBus
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import dump_scenario, view_of
 
@@ -84,10 +86,19 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED
 
 
 def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
-    """Checks an implementation in this process, in simulated time. Raises PluginError for an unknown one."""
-    rig, report = ServiceRig(implementations.create(role, choice, settings.scenario), settings), ConformanceReport(role)
-    with CheckDisplay(rig, report):
-        return check(rig, report)
+    """Checks an implementation in a child process, in simulated time. Raises PluginError for one that there is not, RunError for
+    one that exits, crashes or hangs.
+    """
+    steps = shared_numbers()
+
+    def perform() -> ConformanceReport:
+        service = implementations.create(role, choice, settings.scenario)
+        rig, report = ServiceRig(service, settings, steps), ConformanceReport(role)
+        with CheckDisplay(rig, report):
+            return check(rig, report)
+
+    limits = Settings.read()
+    return guarded(f"services.{role} = {choice!r}", perform, limits.start_limit_s, place=lambda: (steps[0],))
 
 
 def check_live(

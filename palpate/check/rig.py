@@ -7,7 +7,7 @@ a bus, in wall-clock mode. The same suites run on both.
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, MutableSequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -98,8 +98,10 @@ class Rig(ABC):
 class ServiceRig(Rig):
     """A service in this process, in simulated time."""
 
-    def __init__(self, service: Service, settings: RigSettings) -> None:
+    def __init__(self, service: Service, settings: RigSettings, steps: MutableSequence[int] | None = None) -> None:
+        """The first number of `steps` is that of its steps."""
         super().__init__(service.role, settings)
+        self._steps: MutableSequence[int] = [0] if steps is None else steps
         self._stepper = Stepper(service, self.rules, strict=False, refuse=self._log_refused)
         self._sequences = dict.fromkeys(self._stepper.buffers, 0)
         self._take(self._stepper.start())
@@ -111,6 +113,7 @@ class ServiceRig(Rig):
                 if not self.t % period and (message := source(self.t)) is not None:
                     self.send(name, message)
             if not self.t % self.role.period:
+                self._steps[0] += 1
                 self._take(self._stepper.step(self.t))
             self.t += MS
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from io import BytesIO
@@ -17,6 +18,7 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
+from palpate.apart import guarded
 from palpate.exam_state import exam_state
 from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
@@ -25,6 +27,7 @@ from palpate.report.results import finding_row, sample_columns
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
+from palpate.run.roles import foreign_roles
 from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
@@ -160,9 +163,14 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
     if any(touch.seen is not seen for touch in felt):
         raise ValueError("touches: they are of several patients; want touches of one patient")
     gathered = _gathered(seen, felt)
-    (service,) = load_services(seen.scenario, ("assessment",))
-    with threadpool_limits(1):  # the result must not depend on the number of threads
-        facts = have_assessed(service, gathered)
+
+    def work() -> tuple[Collected, dict[str, Any]]:
+        (service,) = load_services(seen.scenario, ("assessment",))
+        with threadpool_limits(1):  # the result must not depend on the number of threads
+            return gathered, have_assessed(service, gathered)
+
+    foreign = "assessment" in foreign_roles(seen.scenario)
+    gathered, facts = guarded("services.assessment", work, math.inf) if foreign else work()
     return Assessment(
         samples=samples_frame(gathered.samples),
         map=None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map),

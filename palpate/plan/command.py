@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from pathlib import Path
 from typing import Annotated
@@ -33,6 +34,7 @@ def plan(
     """
     from rich.console import Console
 
+    from palpate.apart import guarded
     from palpate.console import refuse
     from palpate.plan.prospect import check_tissue, draw, prospect, summary
     from palpate.run.inputs import usable
@@ -47,7 +49,7 @@ def plan(
         with Console(stderr=True).status("planning: about ten seconds"):
             phantom = build_phantom(chosen.phantom, chosen.seed)
             check_tissue(chosen, phantom)
-            planned = prospect(chosen, phantom)
+            planned = guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
             draw(out, chosen, phantom, planned)
     except (NoPathError, PluginError, OSError) as error:
         refuse(error)

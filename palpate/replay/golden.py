@@ -7,8 +7,8 @@ outputs are those for the rounded inputs, so on one platform a reference differs
 
 from __future__ import annotations
 
-import json
 import logging
+import math
 import tempfile
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace
@@ -20,7 +20,8 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 from rich.console import Console
 
-from palpate.console import TimeLeft, fail
+from palpate.apart import guarded, shared_numbers
+from palpate.console import TimeLeft, fail, print_json
 from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
 from palpate.replay.rerun import rerun
 from palpate_bus import implementations
@@ -29,6 +30,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds, time_message
 from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
+from palpate_bus.settings import Settings
 from palpate_models.scenario.load import load_scenario, view_of
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
@@ -220,20 +222,34 @@ def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[R
 
 def write_reference(file: Path, service: str, scenario: Path | None, start: int, end: int | None, target: Path) -> None:
     """Writes the reference of a service from a recording between `start` and `end` [ns]."""
-    case = prepare(file, service, scenario)
-    make_reference(case, target, start, case.end if end is None else end)
+
+    def write() -> None:
+        case = prepare(file, service, scenario)
+        make_reference(case, target, start, case.end if end is None else end)
+
+    guarded(f"--service {service}", write, math.inf)
     Console(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
 
 
 def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:
     """Runs a service again on its recorded inputs and prints the comparison. Raises typer.Exit(3) if the outputs differ."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    case = prepare(file, service, scenario)
-    with TimeLeft(f"running {case.role} again", 0, case.end) as bar:
-        results = replay_service(case, parse_tolerance(tolerance), bar.reach)
+    role, allowed, reached = service.partition("=")[0], parse_tolerance(tolerance), shared_numbers()
+
+    def perform() -> dict[str, TopicResult]:
+        case = prepare(file, service, scenario)
+        with TimeLeft(f"running {role} again", 0, case.end) as bar:
+
+            def progress(t: int) -> None:
+                reached[0] = t
+                bar.reach(t)
+
+            return replay_service(case, allowed, progress)
+
+    results = guarded(f"--service {service}", perform, Settings.read().start_limit_s, place=lambda: (reached[0],))
     if as_json:
-        print(json.dumps({name: as_dict(result) for name, result in results.items()}, indent=2))
+        print_json({name: as_dict(result) for name, result in results.items()})
     else:
         Console(width=max(140, Console().width)).print(result_table(results))
     if not all(result.agrees for result in results.values()):
-        fail(f"the messages of {case.role} differ from {file}; if this is intended, renew it with --update-refs")
+        fail(f"the messages of {role} differ from {file}; if this is intended, renew it with --update-refs")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import shutil
 import subprocess
 import tempfile
@@ -13,6 +12,7 @@ from typing import Annotated
 import typer
 from rich.console import Console
 
+from palpate.console import print_line
 from palpate_errors import UserError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
@@ -62,7 +62,7 @@ def report(
         page = write_page(folder)
         paths = {"html": page, **({"pdf": write_pdf(page)} if pdf else {})}
     if as_json:
-        print(json.dumps({kind: str(path) for kind, path in paths.items()}))
+        print_line({kind: str(path) for kind, path in paths.items()})
     elif not quiet:
         for path in paths.values():
             print(path)

@@ -14,6 +14,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from palpate.apart import guarded
 from palpate.report import archive, rows, scoring
 from palpate.report.evidence import (
     ContactRecord,
@@ -31,9 +32,11 @@ from palpate.report.evidence import (
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, TruthRow
-from palpate.truth.pressed import press_patient
+from palpate.truth.pressed import Pressed, press_patient
 from palpate.truth.surface import TrueBody
+from palpate_bus import implementations
 from palpate_bus.runs.run_name import run_of
+from palpate_bus.settings import Settings
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
 from palpate_models.numerics.frames import Array, apply, inverse
@@ -64,11 +67,18 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     runs = [steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
     contact = reduce(ContactRecord.then, runs)
     try:
-        pressed = press_patient(scenario)
+        pressed = _pressed(scenario)
     except Exception:  # a user-defined tissue that was changed during the run, or that can be created only once
         log.exception("palpable truth unknown: the patient cannot be pressed")
         pressed = None
     return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
+
+
+def _pressed(scenario: Scenario) -> Pressed | None:
+    tissue = scenario.services.tissue
+    if not implementations.kind("tissue").foreign(tissue):
+        return press_patient(scenario)
+    return guarded(f"services.tissue = {tissue!r}", lambda: press_patient(scenario), Settings.read().start_limit_s)
 
 
 def clean_world(scenario: Scenario) -> bool:

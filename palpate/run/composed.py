@@ -1,62 +1,218 @@
-"""A run with all services in this process."""
+"""A run with all services in one child process: a service that exits, crashes or hangs does not take the command with it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping, MutableSequence
 from contextlib import nullcontext, suppress
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from enum import IntEnum
 from pathlib import Path
 from time import perf_counter
+from typing import Any, Final
 
+from palpate.apart import ChildLost, Send, TimeLimit, run_apart, shared_numbers
 from palpate.environment import given
 from palpate.run.interrupts import all_is_measured
-from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, write_scenario_files
+from palpate_bus.contract import contract
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runtime.composed import Composed, ServiceFailed
-from palpate_bus.runtime.failure import Failure
+from palpate_bus.runtime.composed import BETWEEN, Composed, ServiceFailed
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.process import rare_collections
 from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
-from palpate_conductor.collector import Collector, FrameTree
-from palpate_conductor.outcome import SIM_LIMIT, RunProgress, RunResult, Tell, failure_of, gave_up
+from palpate_bus.settings import Settings, variable
+from palpate_conductor.collector import Collected, CollectedNews, Collector, FrameTree, collect
+from palpate_conductor.outcome import SIM_LIMIT, Patience, RunProgress, RunResult, Tell, failure_of, gave_up
+from palpate_errors import RunError, UserError
 from palpate_models.scenario.load import exam_input, seen, view_of
 from palpate_models.scenario.schema import Scenario
 
+REPORT_S: Final = 0.1
+"""Time between two reports of the child."""
 
-def load_services(scenario: Scenario, roles: tuple[str, ...]) -> list[Service]:
-    """Return the services of `roles` as the scenario chooses them. Raises PluginError for a missing one or missing libraries."""
-    return [create(role, choice(scenario, role), seen(scenario, view_of(role))) for role in roles]
+
+class Stage(IntEnum):
+    """What the child does with a service."""
+
+    LOAD = 0
+    STEP = 1
+    FINISH = 2
+
+
+@dataclass(frozen=True)
+class Place:
+    """Where the child is, in memory that it shares with its parent: number of a role, simulated time [ns], stage."""
+
+    cells: MutableSequence[int]
+
+    @classmethod
+    def shared(cls) -> Place:
+        """Return a place that a forked process shares."""
+        place = cls(shared_numbers())
+        place.cells[0] = BETWEEN
+        return place
+
+    def enter(self, stage: Stage, role: str | None = None) -> None:
+        """Set stage and role."""
+        self.cells[0] = BETWEEN if role is None else tuple(contract().roles).index(role)
+        self.cells[2] = stage
+
+    def now(self) -> tuple[int, int, int]:
+        """Return the numbers."""
+        return self.cells[0], self.cells[1], self.cells[2]
+
+    @property
+    def role(self) -> str | None:
+        """The role whose code runs; None between two steps."""
+        return None if self.cells[0] == BETWEEN else tuple(contract().roles)[self.cells[0]]
+
+    @property
+    def t(self) -> int:
+        """Simulated time [ns]."""
+        return self.cells[1]
+
+    @property
+    def stage(self) -> Stage:
+        """What it does."""
+        return Stage(self.cells[2])
+
+
+@dataclass(frozen=True)
+class News:
+    """A report of the child."""
+
+    t: int
+    start: float
+    """When the first tick began, by `perf_counter` [s]."""
+    collected: Mapping[str, Any]
+    trouble: tuple[str, ...]
+    measured: bool
+
+
+def load_services(scenario: Scenario, roles: tuple[str, ...], loading: Callable[[str], None] = lambda _: None) -> list[Service]:
+    """Return the services of `roles` as the scenario chooses them. Raises PluginError for a missing one or missing libraries.
+
+    `loading` is called with each role before.
+    """
+
+    def load(role: str) -> Service:
+        loading(role)
+        return create(role, choice(scenario, role), seen(scenario, view_of(role)))
+
+    return [load(role) for role in roles]
 
 
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
-    """Runs all services in this process. Raises PluginError for a service that cannot be made."""
+    """Runs all services in one child process. Raises PluginError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
+    place = Place.shared()
+    limits = _Limits(place, foreign_roles(scenario))
+    collected = Collector().collected
+    start = 0.0
+
+    def receive(news: News) -> None:
+        nonlocal start
+        start = news.start
+        collect(collected, news.collected)
+        if news.measured:
+            all_is_measured()
+        tell(RunProgress(news.t, news.t / NS / max(perf_counter() - start, 1e-9), collected, news.trouble))
+
+    try:
+        result = run_apart(
+            lambda send: run_here(scenario, out, observers, place, send), receive, TimeLimit(place.now, limits.limit_s).check
+        )
+    except UserError:
+        raise
+    except Exception as error:  # the report needs what was measured
+        now = perf_counter()
+        result = RunResult(
+            runtime="composed",
+            collected=collected,
+            run_hash=None,
+            digests={},
+            sim_time_s=place.t / NS,
+            wall_time_s=now - (start or now),
+            start_time_s=start or now,
+            blame={},
+            counters={},
+            failure=limits.failure(error) if isinstance(error, RunError) else failure_of(error, place.t),
+            lost={} if place.role is None else {place.role: place.t},
+        )
+    all_is_measured()
+    return replace(result, collected=collected, start_time_s=result.start_time_s - begin)
+
+
+class _Limits:
+    """How long each part may take, and what it means that the child ended in one."""
+
+    def __init__(self, place: Place, foreign: frozenset[str]) -> None:
+        self._place, self._foreign = place, foreign
+        self._settings, self._patience = Settings.read(), Patience()
+
+    def limit_s(self) -> float:
+        """Return the limit at the present place [s]."""
+        starts = self._place.stage is Stage.LOAD
+        if self._place.role in self._foreign:
+            return self._settings.start_limit_s if starts else self._settings.step_limit_s
+        return self._patience.start if starts else self._patience.hard
+
+    def failure(self, error: RunError) -> Failure:
+        """Return the failure of a run whose child ended with `error`."""
+        role, stage = self._place.role, self._place.stage
+        hangs = isinstance(error, ChildLost) and error.late
+        when = {Stage.LOAD: "at start", Stage.STEP: f"at {self._place.t / NS:.3f} s", Stage.FINISH: "at its end"}[stage]
+        where = " in its step" if role and stage is Stage.STEP else ""
+        text = f"{role or 'the process of all services'} lost {when}: {error}{where}"
+        if hangs and role in self._foreign:
+            text += f" ({variable('start_limit_s' if stage is Stage.LOAD else 'step_limit_s')})"
+        codes = {Stage.LOAD: FailureCode.NO_ANSWER if hangs else FailureCode.START_FAILED}
+        code = codes.get(stage, FailureCode.BLOCKED if hangs else FailureCode.ROLE_LOST)
+        return Failure(code, text, () if role is None else (role,))
+
+
+def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: Place, send: Send) -> RunResult:
+    """Runs all services in this process. What is collected goes to `send`, as `News`, and not into the result.
+
+    The result's `start_time_s` is the time of the first tick by `perf_counter`.
+    """
     collector = Collector(tree=FrameTree(exam_input(scenario)))
+    news = CollectedNews(collector.collected)
     observer_settings = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
+
+    def loading(role: str) -> None:
+        place.enter(Stage.LOAD, role)
+
     with given(observer_settings):  # only observers: the name of the results folder may reveal the patient
-        observing = load_services(scenario, observers)
+        observing = load_services(scenario, observers, loading)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    run = Composed(
-        [*load_services(scenario, workers(scenario)), *viewers, collector], taps=[recorder.record for recorder in recorders]
-    )
+    services = [*load_services(scenario, workers(scenario), loading), *viewers, collector]
+    run = Composed(services, taps=[recorder.record for recorder in recorders], at=place.cells)
     start = perf_counter()
     failure: Failure | None = None
     last = 0
     shown = start
 
+    def report(measured: bool = False) -> None:
+        send(News(run.t, start, news.take(), tuple(run.trouble), measured))
+
     def end() -> int | None:
         nonlocal shown
         now = perf_counter()
-        if now - shown > 0.1:
+        if now - shown > REPORT_S:
             shown = now
-            tell(RunProgress(run.t, run.t / NS / (now - start), collector.collected, tuple(run.trouble)))
+            report()
         return collector.collected.end_tick
 
     lost: dict[str, int] = {}
     interrupted = False
     try:
+        run.start()
+        place.enter(Stage.STEP)
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
     except ServiceFailed as error:
@@ -66,21 +222,24 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report still needs what was measured
         interrupted = isinstance(error, KeyboardInterrupt)
         failure, last = failure_of(error, run.t), run.t
-    all_is_measured()
     wall = perf_counter() - start
+    report(measured=True)
+    place.enter(Stage.FINISH)
     facts = run.finish()
     for recorder in recorders:
         if isinstance(recorder, Service):
+            place.enter(Stage.FINISH, recorder.role)
             with suppress(Exception) if recorder.role in run.lost else nullcontext():
                 facts[recorder.role] = recorder.finish()
+    place.enter(Stage.FINISH)
     return RunResult(
         runtime="composed",
-        collected=collector.collected,
+        collected=Collected(),
         run_hash=None if failure else run.run_hash(),
         digests=run.digests(),
         sim_time_s=last / NS,
         wall_time_s=wall,
-        start_time_s=start - begin,
+        start_time_s=start,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
         failure=failure or gave_up(collector.collected),

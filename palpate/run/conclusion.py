@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 import tempfile
 from contextlib import nullcontext
@@ -11,7 +10,7 @@ from pathlib import Path
 import typer
 from rich.console import Console
 
-from palpate.console import EXIT_FAILED, SteadyConsole, say
+from palpate.console import EXIT_FAILED, SteadyConsole, print_line, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
@@ -40,7 +39,7 @@ def conclude(
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
         report, page, trouble = _write(folder, scenario, result)
     if as_json:
-        print(json.dumps({"folder": str(folder), **report.model_dump(mode="json")}))
+        print_line({"folder": str(folder), **report.model_dump(mode="json")})
     else:
         print_findings(SteadyConsole(), report)
     for sentence in _contract_violations(result):

@@ -10,8 +10,9 @@ from palpate.run.group import Groups, apart
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, override_files, read_processes
-from palpate.run.roles import OBSERVERS, choice, kept, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, write_scenario_files
 from palpate_bus import implementations
+from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
@@ -73,9 +74,12 @@ def run_distributed(
         }
         if places:
             write_places(out, places)
-        patience = Patience()
+        settings = Settings.read()
+        patience = Patience(
+            foreign=foreign_roles(scenario), foreign_start=settings.start_limit_s, foreign_step=settings.step_limit_s
+        )
         if absent.roles:
-            patience = Patience(absent=absent.roles, join=absent.wait_s)
+            patience = replace(patience, absent=absent.roles, join=absent.wait_s)
             absent.call(out, places)
         try:
             tree = FrameTree(exam_input(scenario))

@@ -7,13 +7,14 @@ from pathlib import Path
 
 import numpy as np
 
+from palpate.run.outlook import scan_safely
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_errors import UserError
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.patterns import Scan, scan_of
+from palpate_models.scenario.patterns import Scan
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError, is_file
 
@@ -26,7 +27,7 @@ def surface_of(phantom: PhantomModel) -> TrueSurface:
 def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
     """Return the scan of the scenario's pattern. Raises PluginError for an unusable pattern or a region off the body."""
     surface = surface_of(phantom)
-    scan = scan_of(scenario.exam, surface.points)
+    scan = scan_safely(scenario.exam, surface.points)
     off = ~np.isfinite(surface.height(scan.targets))
     if off.any():
         exam = scenario.exam

@@ -40,7 +40,7 @@ class RunOptions:
     )
     overwrite: Annotated[bool, typer.Option("--overwrite", help="Remove the results of an earlier run from the folder.")] = False
     seed: Seed = None
-    composed: Annotated[bool, typer.Option("--composed", help="Run all services in this process.")] = False
+    composed: Annotated[bool, typer.Option("--composed", help="Run all services in one process.")] = False
     group: Annotated[
         list[str] | None,
         typer.Option(metavar="ROLE,ROLE", help="Put these services in one process, each other one in its own; may be repeated."),

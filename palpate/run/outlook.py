@@ -7,9 +7,20 @@ from itertools import pairwise
 
 import numpy as np
 
+from palpate.apart import guarded
+from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.patterns import Scan, scan_of, touch_centres
-from palpate_models.scenario.schema import Exam, Mode
+from palpate_models.scenario.patterns import Scan, Surface, scan_of, touch_centres
+from palpate_models.scenario.schema import PATTERN, Exam, Mode
+from palpate_plugins import PluginError
+
+
+def scan_safely(exam: Exam, surface: Surface) -> Scan:
+    """Return the scan of the examination's pattern; a user's pattern runs in a child process. Raises PluginError."""
+    if not PATTERN.foreign(exam.pattern):
+        return scan_of(exam, surface)
+    part = f"exam.pattern = {exam.pattern!r}"
+    return guarded(part, lambda: scan_of(exam, surface), Settings.read().start_limit_s, PluginError)
 
 
 @dataclass(frozen=True)
@@ -47,7 +58,7 @@ class Outlook:
     @staticmethod
     def of(exam: Exam) -> Outlook:
         """Return the estimates for an examination; the duration is a fit to examinations of several sizes."""
-        scan = scan_of(exam, _flat)
+        scan = scan_safely(exam, _flat)
         touches = len(touch_centres(scan.targets))
         presses = exam.budget.presses if exam.searched else len(scan.targets)
         duration = TIMING.approach_and_return_s + TIMING.touch_s * touches + _pressing_s(exam, scan)

@@ -19,6 +19,7 @@ from typing import IO, Any, Self
 
 import yaml
 
+from palpate.apart import ended
 from palpate.environment import FIXED, given
 from palpate.run.forks import Child, Forks
 from palpate.run.group import GroupMember, Groups, group_command
@@ -177,13 +178,13 @@ MESSAGE_LINES = 20
 def how(code: int, log: Path) -> str:
     """Return how a process ended as text: its signal, or its exit status `code` and the last message of its log."""
     if code < 0:
-        return f"killed by signal {-code}"
+        return ended(code)
     text = ""
     with suppress(OSError):
         text = log.read_text(encoding="utf-8", errors="replace")
     hint = "" if code else ": does it call palpate_bus.run.run_service?"
     said = _last_message(text) or f"its log is empty{hint}"
-    return f"left with status {code}: {said}"
+    return f"{ended(code)}: {said}"
 
 
 def _last_message(text: str) -> str:

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from zipfile import ZipFile, is_zipfile
 
+from palpate.apart import guarded
 from palpate.run.options import Record
 from palpate_bus import implementations
 from palpate_bus.contract import contract
@@ -15,7 +16,7 @@ from palpate_bus.settings import Settings
 from palpate_models.scenario.load import HIDDEN, did_you_mean, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services
 from palpate_plugins import PluginError, is_file
-from palpate_search.choice import policy
+from palpate_search.choice import POLICY, policy
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
 WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))
@@ -81,12 +82,34 @@ def checked(scenario: Scenario) -> Scenario:
     search = scenario.search
     if scenario.exam.searched:
         try:
-            policy(search.policy)
+            _check_policy(search.policy)
         except PluginError as error:
             raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(search.policy):
             search = search.model_copy(update={"policy": str(Path(search.policy).resolve())})
     return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
+
+
+def _check_policy(name: str) -> None:
+    """Raises PluginError for a policy that cannot be loaded."""
+
+    def load() -> None:
+        policy(name)
+
+    if POLICY.foreign(name):
+        guarded(f"search.policy = {name!r}", load, Settings.read().start_limit_s, PluginError)
+    else:
+        load()
+
+
+def foreign_roles(scenario: Scenario) -> frozenset[str]:
+    """Return the roles whose service, or a part of it, is not of this package."""
+    found = {role for role in _ROLES if implementations.kind(role).foreign(choice(scenario, role))}
+    if choice(scenario, "tissue") == "fmu" and scenario.tissue.fmu:
+        found.add("tissue")
+    if scenario.exam.searched and POLICY.foreign(scenario.search.policy):
+        found.add("search")
+    return frozenset(found)
 
 
 def _check_fmu(scenario: Scenario) -> None:

@@ -116,13 +116,14 @@ def examine(case: Case, runs: Path | None = None) -> Attempt:
         examinations = loop_errors(scenario).examinations
     else:
         report, assess_s = _whole(scenario, case, runs)
+    # a composed run is forked and shares memory
+    peaks = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return Attempt(
         case_id=case.case_id,
         report=report,
         why=report.failure if case.runtime == "wallclock" else None,  # in simulated time it would fail again in the same way
         code=code_digest(),
-        peak_memory_bytes=KIB
-        * sum(resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)),
+        peak_memory_bytes=KIB * (max(peaks) if case.runtime == "lockstep" else sum(peaks)),
         wall_time_s=perf_counter() - begin,
         assess_time_s=assess_s,
         core_s=_core_s() - used,

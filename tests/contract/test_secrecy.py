@@ -91,7 +91,8 @@ def in_one_process(scenario: Scenario, out: Path) -> Any:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(composed, "create", create)
         with pytest.raises(StopError):
-            composed.run_composed(scenario, out, lambda _: None)
+            write_scenario_files(scenario, out)
+            composed.run_here(scenario, out, OBSERVERS, composed.Place.shared(), lambda _: None)
     return handouts
 
 

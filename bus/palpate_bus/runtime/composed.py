@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping, MutableSequence, Sequence
 from contextlib import nullcontext, suppress
 from typing import Any
 
@@ -17,12 +17,14 @@ Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
 CONDUCTOR = "conductor"
 """The only observer that a run needs: without it there is no result."""
+BETWEEN = -1
+"""The number of no role, between two steps."""
 
 
 class ServiceFailed(RunError):
     """A service raised. Names the role and the tick; the cause is chained."""
 
-    def __init__(self, stepper: Stepper, t: int, cause: Exception) -> None:
+    def __init__(self, stepper: Stepper, t: int, cause: BaseException) -> None:
         self.role = stepper.role.name
         self.t = t
         self.failure = Failure.of(cause, self.role, stepper.buffers.values())
@@ -38,9 +40,20 @@ class Composed:
     A service that raises ends the run. An observer or a tap that raises is left out from then on, see `lost` and `trouble`.
     """
 
-    def __init__(self, services: Sequence[Service], rules: Contract | None = None, taps: Sequence[Tap] = ()) -> None:
-        self._group = Group(services, rules or contract())
+    def __init__(
+        self,
+        services: Sequence[Service],
+        rules: Contract | None = None,
+        taps: Sequence[Tap] = (),
+        at: MutableSequence[int] | None = None,
+    ) -> None:
+        """`at` is kept up to date: the number of the role that steps, in the order of the contract, and simulated time [ns]."""
+        rules = rules or contract()
+        self._group = Group(services, rules)
         self.steppers = self._group.steppers
+        self._at: MutableSequence[int] = [BETWEEN, 0] if at is None else at
+        numbers = {role: number for number, role in enumerate(rules.roles)}
+        self._numbers = {stepper: numbers[role] for role, stepper in self.steppers.items()}
         self._taps = tuple(taps)
         self._started = False
         self.t = 0
@@ -62,24 +75,28 @@ class Composed:
     def start(self) -> None:
         """Send the latched messages."""
         for stepper in self.steppers.values():
+            self._at[0] = self._numbers[stepper]
             try:
                 self._send(stepper.start(), 0)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise ServiceFailed(stepper, 0, error) from error
         self._started = True
 
     def tick(self) -> None:
         """Step the services that are due, then advance simulated time to the next tick."""
-        t = self.t
+        t, at, numbers = self.t, self._at, self._numbers
+        at[1] = t
         for stepper in self._group.due(t):
+            at[0] = numbers[stepper]
             try:
                 sent = stepper.step(t)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 if not stepper.role.observer or stepper.role.name == CONDUCTOR:
                     raise ServiceFailed(stepper, t, error) from error
                 self._leave_out(stepper.role.name, t, Failure.of(error, stepper.role.name, stepper.buffers.values()).text)
                 self._group.leave_out(frozenset(self.lost))
                 continue
+            at[0] = BETWEEN
             if sent:
                 self._send(sent, t)
         self.t = t + self._group.period
@@ -104,6 +121,7 @@ class Composed:
         """Finish every service; return the facts of each. Errors of those that failed before are suppressed."""
         facts = {}
         for role, stepper in self.steppers.items():
+            self._at[0] = self._numbers[stepper]
             with suppress(Exception) if role in self.lost else nullcontext():
                 facts[role] = stepper.service.finish()
         return facts

@@ -94,7 +94,7 @@ class Node(ABC):
                 with suppress(Exception):
                     seat.close()
             raise
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             culprit = self._acting
             failure = Failure.of(error, culprit.role, culprit.stepper.buffers.values())
             if len(self._seats) > 1:

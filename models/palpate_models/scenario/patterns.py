@@ -47,7 +47,7 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
     function = PATTERN.load(exam.pattern)
     try:
         made = function(exam, surface)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise PATTERN.failure(exam.pattern, error) from error
     if not isinstance(made, Scan):
         raise PluginError(f"exam.pattern = {exam.pattern!r}: returned {type(made).__name__}, want a Scan of {__name__}")

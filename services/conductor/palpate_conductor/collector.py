@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
@@ -64,6 +64,16 @@ class KeptMessages(Sequence[Any]):
             self._kept.append(self._encode(message))
             self._newest = message
 
+    def kept_from(self, first: int) -> list[bytes]:
+        """Return the messages from the one with index `first` on, as bytes."""
+        return self._kept[first:]
+
+    def keep(self, messages: Sequence[bytes]) -> None:
+        """Append messages that are bytes already."""
+        self._kept += messages
+        if messages:
+            self._newest = self._decode(messages[-1])
+
     def __len__(self) -> int:
         return len(self._kept)
 
@@ -108,6 +118,40 @@ class Collected:
         """Simulated time [ns] at which the run ends; None until planning announces it."""
         exam = self.exam
         return None if exam is None or exam.end_tick < 0 else int(exam.end_tick)
+
+
+class CollectedNews:
+    """What a process has collected since it last reported it to another one, which adds it to its copy."""
+
+    def __init__(self, collected: Collected) -> None:
+        self._collected = collected
+        self._counts: dict[str, int] = {}
+        self._newest: dict[str, Any] = {}
+
+    def take(self) -> dict[str, Any]:
+        """Return by field of `Collected` the further messages, or the newest one."""
+        news: dict[str, Any] = {}
+        for field_ in fields(Collected):
+            name, value = field_.name, getattr(self._collected, field_.name)
+            if isinstance(value, KeptMessages | list):
+                first, self._counts[name] = self._counts.get(name, 0), len(value)
+                further = value.kept_from(first) if isinstance(value, KeptMessages) else value[first:]
+                news |= {name: further} if further else {}
+            elif value is not self._newest.get(name):
+                news[name] = self._newest[name] = value
+        return news
+
+
+def collect(collected: Collected, news: Mapping[str, Any]) -> None:
+    """Add what `CollectedNews.take` of another process returned."""
+    for name, value in news.items():
+        mine = getattr(collected, name)
+        if isinstance(mine, KeptMessages):
+            mine.keep(value)
+        elif isinstance(mine, list):
+            mine += value
+        else:
+            setattr(collected, name, value)
 
 
 class Collector(Service):

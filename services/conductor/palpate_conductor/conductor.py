@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import logging
-from collections.abc import Callable, Container, Iterable, Mapping
+from collections.abc import Callable, Container, Iterable, Mapping, Set
 from dataclasses import dataclass
 from time import monotonic, perf_counter, sleep
 from typing import Any
@@ -20,7 +20,7 @@ from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_bus.runtime.process import rare_collections
-from palpate_bus.settings import Settings
+from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import Grants
@@ -225,6 +225,8 @@ class Conductor:
                     warned = True
             joining = bool(self._patience.absent) and own_roles <= missing_inputs.keys()
             since, limit_s = (own_answered, self._patience.join) if joining else (begin, self._patience.start)
+            if not joining and own_roles - missing_inputs.keys() <= self._patience.foreign:
+                limit_s = min(limit_s, self._patience.foreign_start)
             if monotonic() - since > limit_s:
                 raise self._start_timeout(missing_inputs, limit_s)
         self._contract.poll(force=True)  # so that the first diagnostics include the service that joined last
@@ -262,7 +264,7 @@ class Conductor:
             self._extend_grant()
             if self._wallclock and not finished:  # a service that finished reports nothing more
                 self.watchdog.note_silence()
-            self._check_progress()
+            self._check_progress(finished)
             tell(self)
             sleep(TUNING.poll_s)
 
@@ -295,10 +297,16 @@ class Conductor:
         recorded = self.watchdog.progress["recorder"].tick if records else None
         self.grants.extend(collected.exam_time, collected.end_tick, recorded)
 
-    def _check_progress(self) -> None:
-        """Warn about a stall, and end the run if it lasts too long."""
+    def _check_progress(self, finished: Set[str]) -> None:
+        """Warn about a stall, and end the run if it lasts too long, or a step of a foreign service does."""
+        limit_s = self._patience.foreign_step
         roles = [role for role in self._workers if role not in self.outcome.lost and role not in self._slots.empty]
         stalled = self.watchdog.longest_stall(roles) if self._wallclock else self.watchdog.stalled_for()
+        stuck = [] if self._wallclock else self.watchdog.silent(self._patience.foreign & {*roles} - finished, limit_s)
+        if stuck and self.watchdog.silent_for() < TUNING.silent_s:
+            when = max(self.watchdog.progress[stuck[0]].tick, 0) / NS
+            text = f"{', '.join(stuck)} blocks the run at {when:.3f} s: its step did not return within {limit_s:g} s"
+            raise RunFailed(FailureCode.BLOCKED, f"{text} ({variable('step_limit_s')})", *stuck)
         if stalled > self._patience.hard:
             if (silent := self.watchdog.silent_for()) > TUNING.silent_s:
                 text = f"transport lost: no report of any service for {silent:.0f} s; no service is at fault"

@@ -58,6 +58,12 @@ class Patience:
     """Without a finished tick: a warning names the blocking service."""
     hard: float = 120.0
     """Without a finished tick: the run ends."""
+    foreign: frozenset[str] = frozenset()
+    """Roles whose services are not of this package; the two limits below are theirs."""
+    foreign_start: float = 120.0
+    """Until they answer, where all others have."""
+    foreign_step: float = 10.0
+    """Without a report, in a step."""
     frozen: float = 2.5
     """Until the service of a stopped process counts as lost."""
     asleep: float = 15.0

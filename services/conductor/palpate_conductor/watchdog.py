@@ -104,6 +104,10 @@ class RunWatchdog:
         """Return the time [s] since the last report of any service; services that wait report, too."""
         return monotonic() - max(progress.reported for progress in self.progress.values())
 
+    def silent(self, roles: Collection[str], limit_s: float) -> list[str]:
+        """Return those of `roles` without a report for `limit_s` [s]. A service reports while it waits, not in its step."""
+        return [role for role in roles if monotonic() - self.progress[role].reported > limit_s]
+
     def note_silence(self) -> None:
         """Update the longest silence of all services."""
         self._longest_silence = max(self._longest_silence, self.silent_for())

@@ -1,0 +1,182 @@
+"""Services and files that exit, crash, hang or print: none takes the command or its output with it."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+from threading import Timer
+
+import pytest
+from toy_runs import ROLES, composed_hash, run_toys, toy_services
+
+from palpate.check.perform import check_here
+from palpate.check.rig import RigSettings
+from palpate.run import composed
+from palpate.run.outlook import scan_safely
+from palpate.run.roles import checked
+from palpate_bus.runtime.failure import FailureCode
+from palpate_conductor.outcome import Patience, RunProgress, RunResult
+from palpate_errors import RunError
+from palpate_models.scenario.load import load_scenario
+from palpate_plugins import PluginError
+
+SCENARIO = load_scenario("clean", ["services.tissue=mine.py"])
+LOST, FAILED, BLOCKED = FailureCode.ROLE_LOST, FailureCode.ROLE_FAILED, FailureCode.BLOCKED
+ENDS = [
+    ("exit0", LOST, "left with status 0"),
+    ("exit3", LOST, "left with status 3"),
+    ("leave", FAILED, "SystemExit: 0"),
+    ("crash", LOST, "killed by signal 11 (SIGSEGV)"),
+    ("kill", LOST, "killed by signal 9 (SIGKILL)"),
+    ("hang", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
+    ("spin", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
+]
+
+
+class Toys:
+    """Makes the toy services; `at_load` and `at_end` misbehave in the tissue."""
+
+    at_load = at_end = ""
+
+    def create(self, role: str, _: str, __: object) -> object:
+        if role == "tissue" and self.at_load:
+            toy_services.misbehave(self.at_load)
+        service = toy_services.TOYS[role]()
+        if role == "tissue" and self.at_end:
+            service.finish = lambda: toy_services.misbehave(self.at_end) or {}  # type: ignore[method-assign, func-returns-value]
+        return service
+
+
+@pytest.fixture
+def toys(monkeypatch: pytest.MonkeyPatch) -> Toys:
+    made = Toys()
+    monkeypatch.setattr(composed, "create", made.create)
+    monkeypatch.setattr(composed, "workers", lambda _: ROLES)
+    monkeypatch.setenv("PALPATE_STEP_LIMIT_S", "0.5")
+    monkeypatch.setenv("PALPATE_START_LIMIT_S", "0.5")
+    return made
+
+
+def run(out: Path, shown: list[RunProgress] | None = None) -> RunResult:
+    return composed.run_composed(SCENARIO, out, (shown if shown is not None else []).append, observers=())
+
+
+@pytest.mark.usefixtures("toys")
+def test_a_composed_run_gives_what_its_child_has_collected(tmp_path: Path) -> None:
+    shown: list[RunProgress] = []
+    result = run(tmp_path, shown)
+    assert result.failure is None
+    assert result.run_hash == composed_hash()
+    assert result.sim_time_s == toy_services.END / 1e9
+    assert len(result.collected.exam_states) == result.counters["conductor"]["facts"]["exam_states"]
+    assert len(result.collected.samples) == result.counters["conductor"]["facts"]["samples"] > 0
+    assert result.collected.end_tick == toy_services.END
+    assert result.collected.phantom is not None
+    assert shown[-1].collected is result.collected
+
+
+@pytest.mark.usefixtures("toys")
+@pytest.mark.parametrize(("how", "code", "text"), ENDS)
+def test_a_composed_run_names_the_service_and_how_it_ended(
+    how: str, code: FailureCode, text: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("TOY_TISSUE_DOES", how)
+    result = run(tmp_path)
+    assert result.failure is not None
+    assert result.failure.text.startswith(f"tissue lost at 0.500 s: {text}")
+    assert (result.failure.code, result.failure.roles) == (code, ("tissue",))
+    assert result.lost == {"tissue": 500_000_000}
+    assert result.run_hash is None
+    printed = capfd.readouterr()
+    assert printed.out == ""
+    assert f"{how} by file descriptor 1" in printed.err
+
+
+@pytest.mark.parametrize(
+    ("how", "code", "text"),
+    [
+        ("exit0", FailureCode.START_FAILED, "tissue lost at start: left with status 0"),
+        ("crash", FailureCode.START_FAILED, "tissue lost at start: killed by signal 11 (SIGSEGV)"),
+        ("hang", FailureCode.NO_ANSWER, "tissue lost at start: did not return within 0.5 s (PALPATE_START_LIMIT_S)"),
+    ],
+)
+def test_a_service_that_cannot_be_loaded_is_named(
+    how: str, code: FailureCode, text: str, toys: Toys, tmp_path: Path, capfd: pytest.CaptureFixture[str]
+) -> None:
+    toys.at_load = how
+    failure = run(tmp_path).failure
+    assert failure is not None
+    assert (failure.code, failure.text, failure.roles) == (code, text, ("tissue",))
+    assert capfd.readouterr().out == ""
+
+
+def test_a_service_that_exits_at_its_end_leaves_what_was_measured(toys: Toys, tmp_path: Path) -> None:
+    toys.at_end = "exit0"
+    result = run(tmp_path)
+    assert result.failure is not None
+    assert result.failure.text == "tissue lost at its end: left with status 0"
+    assert result.collected.end_tick == toy_services.END
+
+
+@pytest.mark.usefixtures("toys")
+def test_an_interruption_is_that_of_the_child(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TOY_TISSUE_DOES", "hang")
+    monkeypatch.setenv("PALPATE_STEP_LIMIT_S", "20")
+    Timer(2.0, os.kill, (os.getpid(), signal.SIGINT)).start()
+    result = run(tmp_path)
+    assert result.interrupted
+    assert result.failure is not None
+    assert result.failure.code is FailureCode.INTERRUPTED
+
+
+@pytest.mark.parametrize("how", [how for how, *_ in ENDS])
+def test_separate_processes_name_it_too(how: str) -> None:
+    rest = ("planning", *(role for role in ROLES if role not in ("tissue", "planning")))
+    patience = Patience(foreign=frozenset({"tissue"}), foreign_step=2.0)
+    outcome = run_toys(environment={"TOY_TISSUE_DOES": how}, patience=patience, groups=(("tissue",), rest))
+    assert outcome.failure is not None
+    assert "tissue" in outcome.failure.roles
+    assert outcome.failure.code in ((BLOCKED,) if how in ("hang", "spin") else (LOST, FAILED))
+
+
+EXITING = {
+    "exits": "os._exit(0)",
+    "raises SystemExit": "sys.exit(0)",
+    "crashes": "ctypes.string_at(0)",
+    "hangs": "time.sleep(600)",
+}
+
+
+@pytest.mark.parametrize("does", EXITING.values(), ids=EXITING)
+@pytest.mark.parametrize(("field", "function"), [("exam.pattern", "scan"), ("search.policy", "next_press")])
+def test_a_file_that_is_loaded_before_the_run_is_named(
+    field: str, function: str, does: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("PALPATE_START_LIMIT_S", "1")
+    file = tmp_path / "mine.py"
+    file.write_text(f"import ctypes, os, sys, time\n{does}\ndef {function}(*_): pass\n")
+    settings = [f"{field}={file}", *(["exam.pattern=search"] if field == "search.policy" else [])]
+    scenario = load_scenario("clean", settings)
+    with pytest.raises(PluginError, match=f"{field} = '{file}'"):
+        if function == "scan":
+            scan_safely(scenario.exam, lambda xy: (xy, xy))
+        else:
+            checked(scenario)
+
+
+def test_a_check_of_a_service_that_exits_does_not_pass(tmp_path: Path) -> None:
+    file = tmp_path / "mine.py"
+    file.write_text("import os\ndef create(scenario): os._exit(0)\n")
+    with pytest.raises(RunError, match=r"services.control = .*left with status 0"):
+        check_here("control", str(file), RigSettings(load_scenario("clean"), 0.0, motion=False))
+
+
+def test_a_document_on_standard_output_is_alone() -> None:
+    program = "from palpate.console import *; reserve_output(); print('a'); os.write(1, b'b'); print_json({'c': 1})"
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert json.loads(done.stdout) == {"c": 1}
+    assert set("ab") <= set(done.stderr)
