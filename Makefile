@@ -33,8 +33,7 @@ bench: install  ## figures with ratios, as a table and as bench.json
 	$(BIN)/palpate bench
 
 # The folders whose English is checked: docstrings, comments, messages and pages.
-PLAIN := *.md .ci .github asv compose dashboards docs fmus models palpate research services/assessment services/camera services/conductor \
-	services/control services/recorder services/robot services/search services/supervisor services/tissue tests
+PLAIN := *.md .ci .github asv benchmarks bus compose dashboards docs fmus models palpate research services tests
 lint: install  ## code, types, imports, pages and plain English
 	$(BIN)/python -m pytest -q -m "pages" tests
 	$(BIN)/codespell -D - -D .codespell-house-words.txt $$(git ls-files $(PLAIN) | grep -vE '\.(png|gif|csv|json|html|parquet|mcap)$$')

@@ -59,7 +59,7 @@ GROUPS = {
     },
     "Maintain": {
         "bench": "palpate_benchmarks.bench:bench",
-        "faults": "palpate_benchmarks.campaign_command:faults",
+        "faults": "palpate_benchmarks.faults:faults",
         "fuzz": "palpate.fuzz.command:fuzz",
     },
 }

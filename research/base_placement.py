@@ -16,7 +16,7 @@ from palpate_models.robot.lbr import HOME, POSITION_LIMIT
 from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Exam, Robot, Scenario
-from palpate_planning.placement.redundancy import PRESSING_FORCE_N, Mask, PostureSequence, plan_redundancy
+from palpate_planning.placement.redundancy import POSTURES, Mask, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
 BORDER_M = 0.005
@@ -95,9 +95,9 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
 
     base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", 7, count), ca.MX.sym("worst")
     bases = ca.repmat(base, 1, count)
-    costs = functions.cost.map(count)(Q, bases, PRESSING_FORCE_N)[0]
+    costs = functions.cost.map(count)(Q, bases, POSTURES.pressing_force_n)[0]
     objective = worst + MEAN_WEIGHT * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
-    first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), PRESSING_FORCE_N)[0]
+    first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), POSTURES.pressing_force_n)[0]
     residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
     corner = base[0] + BASE_SIDE_M / 2 * (ca.cos(base[3]) + ca.sqrt(ca.sin(base[3]) ** 2 + 1e-6))
     problem = {

@@ -14,9 +14,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, PageSection
+from palpate_validation.check import COLOURS, Check, PageSection
 from palpate_validation.drop import DartScene, Ellipsoid, Flesh, SoftBox
-from palpate_validation.plots import COLOURS
 from palpate_validation.probing import STILL
 from palpate_validation.report import show
 

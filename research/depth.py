@@ -20,7 +20,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import open_recording
 from palpate_models.numerics.frames import Array
-from palpate_validation.plots import COLOURS, write_figure
+from palpate_validation.check import COLOURS, write_figure
 
 STATES, TRUTH = "exam/state", "truth/indentation"
 FEWEST = 20

@@ -16,9 +16,8 @@ from matplotlib.figure import Figure
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, PageSection
-from palpate_validation.hertz import POISSON, YOUNG_PA, hertz_force
-from palpate_validation.plots import COLOURS, QUIET
+from palpate_validation.check import COLOURS, QUIET, Check, PageSection
+from palpate_validation.hertz import HERTZ, hertz_force
 from palpate_validation.probing import ELASTIC, STILL, hold, static_curve
 from palpate_validation.report import show
 
@@ -56,9 +55,10 @@ class FlexBlock:
     def __init__(self, counts: tuple[int, int, int] = COUNTS, spacing: float = SPACING_M, radius: float = RADIUS_M) -> None:
         """`counts` vertices along each axis, `spacing` [m] apart; the sphere's `radius` [m]."""
         size = spacing * (np.array(counts) - 1)
+        young = HERTZ.young_pa * (1 - FLEX_POISSON**2) / (1 - HERTZ.poisson**2)
         xml = _SCENE.format(
             dt=DT, start=radius + SKIN_M, radius=radius, time=2 * DT, counts=" ".join(map(str, counts)), h=spacing,
-            middle=-size[2] / 2, skin=SKIN_M, mass=1000 * size.prod(), young=YOUNG_PA * (1 - FLEX_POISSON**2) / (1 - POISSON**2),
+            middle=-size[2] / 2, skin=SKIN_M, mass=1000 * size.prod(), young=young,
             poisson=FLEX_POISSON, last_x=counts[0] - 1, last_y=counts[1] - 1,
         )  # fmt: skip
         mujoco.set_mju_user_warning(_ignore)  # else they go to a file in the working folder

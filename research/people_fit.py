@@ -19,7 +19,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient import remus2024
 from palpate_models.patient.remus2024 import Fit
 from palpate_models.patient.wall import MEDIAN, WallParameters
-from palpate_validation.indentation import COMPARED_M, RATIO_AT_M, SPACING_M, at_depths, press
+from palpate_validation.people import COMPARED_M, PRESS, at_depths, press
 
 LENGTHS_M = np.geomspace(0.005, 0.026, 9)
 STIFFENINGS_PER_M = np.array((0.0, 20.0, 35.0, 50.0, 65.0, 80.0, 100.0, 120.0, 145.0, 175.0))
@@ -40,7 +40,7 @@ COLUMNS = (
 """Columns of `fitted.csv`."""
 
 Simulated = Callable[[float, float], Array]
-"""Force over k_w [m^3] at each `SPACING_M`, by wall length [m] and stiffening [1/m]."""
+"""Force over k_w [m^3] at each `PRESS.spacing_m`, by wall length [m] and stiffening [1/m]."""
 
 
 def simulate() -> Simulated:
@@ -73,8 +73,8 @@ def fit(measured: Array, simulated: Simulated) -> tuple[WallParameters, float, f
 
 def tension_of() -> Callable[[float], float]:
     """The tension that multiplies the force of the median person's wall at 10 mm by a ratio."""
-    at = round(RATIO_AT_M / SPACING_M)
-    force = np.array([press(MEDIAN, tension, RATIO_AT_M)[at] for tension in track(TENSIONS.tolist(), "tensions")])
+    at = round(PRESS.ratio_at_m / PRESS.spacing_m)
+    force = np.array([press(MEDIAN, tension, PRESS.ratio_at_m)[at] for tension in track(TENSIONS.tolist(), "tensions")])
     return lambda ratio: float(np.interp(ratio, force / force[0], TENSIONS))
 
 
@@ -86,7 +86,7 @@ def fits() -> dict[tuple[str, str], Fit]:
     for region, person in track(remus2024.relaxed_people(), "places"):
         wall, offset, rms = fit(curves[region, person].force(COMPARED_M), simulated)
         tensed = curves[remus2024.activated(region), person]
-        ratio = float(tensed.force(RATIO_AT_M) / curves[region, person].force(RATIO_AT_M))
+        ratio = float(tensed.force(PRESS.ratio_at_m) / curves[region, person].force(PRESS.ratio_at_m))
         found[region, person] = Fit(wall, offset, rms, ratio, tension(ratio))
     print("median person:", fit(remus2024.median_force(COMPARED_M), simulated))
     return found

@@ -33,7 +33,7 @@ from palpate.truth.surface import Touched
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
-from palpate_validation.plots import COLOURS, QUIET, write_figure
+from palpate_validation.check import COLOURS, QUIET, write_figure
 
 LEVEL: Final = 0.90
 MARGINS: Final[dict[str, tuple[float, str]]] = {

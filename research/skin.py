@@ -21,7 +21,7 @@ from palpate_models.numerics.frames import Array, apply, inverse, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import exam_input, load_scenario, true_pose
 from palpate_models.scenario.schema import Scenario
-from palpate_validation.plots import write_figure
+from palpate_validation.check import write_figure
 
 SURFACE, IMAGES, ALL = "perception/surface", "perception/correction", "exam/correction"
 

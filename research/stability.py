@@ -6,8 +6,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, QUIET
+from palpate_validation.check import COLOURS, QUIET, Check, PageSection
 from palpate_validation.report import show
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, Ringing, press
 from research.loop_theory import linearise

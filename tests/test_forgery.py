@@ -18,8 +18,7 @@ from palpate_bus.messages import JointTorqueCommand, RunControl, codec
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode
-from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key, unpack
-from palpate_bus.wire.tags import make_key
+from palpate_bus.wire.rmw import AttachmentWriter, make_key, message_key, topic_key, unpack
 
 CONTROL_KEY = message_key("palpate/control", CONTROL_TYPE, 0)
 TORQUE = contract().topics["control/joint_torque"]

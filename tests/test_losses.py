@@ -14,7 +14,7 @@ import pytest
 from examination import assert_held_and_no_harder, kill_in_contact
 
 from palpate.report.evidence import peak_force
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, Blow, Struck, calm_rate, strike
+from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, calm_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.runtime.failure import FailureCode
 
@@ -63,7 +63,7 @@ def kill(processes: Mapping[str, psutil.Process]) -> None:
 
 def freeze(processes: Mapping[str, psutil.Process]) -> None:
     processes[CONDUCTOR].suspend()
-    time.sleep(FREEZE_S)
+    time.sleep(TIMES.freeze_s)
     processes[CONDUCTOR].resume()
 
 

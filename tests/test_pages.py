@@ -300,7 +300,7 @@ def test_scenario_and_errors(pages: dict[str, str]) -> None:
 
 def test_settings_commands_and_messages(pages: dict[str, str]) -> None:
     from palpate.commands import COMMANDS
-    from palpate_bus.messages.names import PACKAGES
+    from palpate_bus.messages.typestore import PACKAGES
     from palpate_bus.settings import Settings, variable
 
     assert all(f"| `{variable(name)}` |" in pages["settings"] for name in Settings.model_fields)

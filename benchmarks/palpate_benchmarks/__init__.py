@@ -1,1 +1,1 @@
-"""What the parts and whole runs cost, and what examinations do when something fails."""
+"""Speed of the parts and of whole runs (`palpate bench`), and the fault campaign (`palpate faults`)."""

@@ -1,19 +1,19 @@
-"""A service with a fault: a transport that loses, delays, doubles or changes what the service sends.
+"""Service with a fault: its transport drops, delays, duplicates or changes messages.
 
     python -m palpate_benchmarks.faulty ROLE planning/setpoint nan 0
 
-runs the service of a role as usual, but from SIGUSR1 on its transport does to this topic what the kind says; the last word is how
-many messages it hits, 0 for all from then on. `palpate faults` starts its processes like this.
+runs the service of a role. From SIGUSR1 on the fault affects messages of the topic; the last argument is the number of affected
+messages, 0 for all. `palpate faults` starts its processes in this way.
 
-| kind | what happens |
+| kind | effect |
 |---|---|
 | `drop` | the message is not sent |
-| `delay` | it is sent half a second late, and those after it with it |
-| `duplicate` | it is sent twice |
-| `corrupt` | sixteen bytes in its middle are inverted |
-| `truncate` | it lacks its second half |
-| `nan` | every float field in it is NaN |
-| `stamp` | its header is stamped an hour ago |
+| `delay` | the message and those after it are sent half a second late |
+| `duplicate` | the message is sent twice |
+| `corrupt` | sixteen bytes in the middle are inverted |
+| `truncate` | the second half is missing |
+| `nan` | every float field is NaN |
+| `stamp` | the header is stamped an hour ago |
 | `jump` | the wall clock of this process is an hour ahead; the topic is `clock` |
 """
 
@@ -29,7 +29,7 @@ from typing import Any, Final
 import numpy as np
 import zenoh
 
-from palpate_benchmarks.fault_kinds import MESSAGE_KINDS
+from palpate_benchmarks.fault_cases import MESSAGE_KINDS
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
@@ -45,14 +45,14 @@ CORRUPTED_BYTES: Final = 16
 
 @dataclass(frozen=True)
 class InjectedFault:
-    """What happens to which topic, and when. Raises ValueError for a kind or topic that there is not."""
+    """Fault in the messages of one topic. Raises ValueError for an unknown kind or topic."""
 
     topic: str
     kind: str
     count: int = 1
-    """How many messages it hits; 0: all from then on."""
+    """Number of affected messages; 0: all."""
     at: int | None = None
-    """From this simulated time [ns] on (periodic topics only); None: from SIGUSR1 on."""
+    """Simulated time [ns] of the first affected message (periodic topics only); None: from SIGUSR1 on."""
 
     def __post_init__(self) -> None:
         if self.kind not in KINDS:
@@ -66,49 +66,49 @@ class InjectedFault:
 
 
 class FaultyTransport(Transport):
-    """A transport that does something wrong once its time has come."""
+    """Transport with a fault."""
 
     def __init__(self, session: zenoh.Session, fault: InjectedFault) -> None:
         super().__init__(session)
         self._fault = fault
-        self.struck = False
-        """Whether SIGUSR1 has come."""
+        self.triggered = False
+        """True after SIGUSR1."""
         if fault.at is None:
-            signal.signal(signal.SIGUSR1, self._strike)
+            signal.signal(signal.SIGUSR1, self._trigger)
 
-    def _strike(self, *_: object) -> None:
-        self.struck = True
+    def _trigger(self, *_: object) -> None:
+        self.triggered = True
 
     def now(self) -> int:
-        """The wall time [ns], an hour ahead after a jump."""
-        return super().now() + (JUMP_NS if self.struck and self._fault.kind == "jump" else 0)
+        """Return the wall time [ns], an hour ahead after a jump."""
+        return super().now() + (JUMP_NS if self.triggered and self._fault.kind == "jump" else 0)
 
     def publisher(self, topic: str, key: str, qos: Qos, gid: bytes) -> Sender:
-        """The sending end of a topic, faulty if the fault is in that topic."""
+        """Return the sender of a topic, a faulty one if the fault is in that topic."""
         sender = super().publisher(topic, key, qos, gid)
         if topic != self._fault.topic:
             return sender
-        return FaultySender(sender, contract().topics[topic], self._fault, lambda: self.struck)
+        return FaultySender(sender, contract().topics[topic], self._fault, lambda: self.triggered)
 
 
 class FaultySender:
-    """The sending end of a topic that does something wrong once its time has come."""
+    """Sender of a topic with a fault."""
 
-    def __init__(self, sender: Sender, topic: Topic, fault: InjectedFault, struck: Callable[[], bool]) -> None:
-        self._sender, self._topic, self._fault, self._struck = sender, topic, fault, struck
+    def __init__(self, sender: Sender, topic: Topic, fault: InjectedFault, triggered: Callable[[], bool]) -> None:
+        self._sender, self._topic, self._fault, self._triggered = sender, topic, fault, triggered
         self._left = fault.count
 
     def _due(self, sequence: int) -> bool:
         if self._left == 0 and self._fault.count:
             return False
         at = self._fault.at
-        due = self._struck() if at is None else (sequence - 1) * self._topic.period >= at
+        due = self._triggered() if at is None else (sequence - 1) * self._topic.period >= at
         if due and self._fault.count:
             self._left -= 1
         return due
 
     def put(self, payload: bytes, sequence: int) -> None:
-        """Sends a message, or what the fault makes of it."""
+        """Send a message, with the fault if it is due."""
         if not self._due(sequence):
             self._sender.put(payload, sequence)
             return
@@ -124,11 +124,11 @@ class FaultySender:
             self._sender.put(payload, sequence)
 
     def hello(self) -> None:
-        """Sends the empty message that tests the edge; it is never at fault."""
+        """Send the empty message that tests the edge; the fault does not affect it."""
         self._sender.hello()
 
     def close(self) -> None:
-        """Undeclares it."""
+        """Undeclare the sender."""
         self._sender.close()
 
 
@@ -147,7 +147,7 @@ def _nan(payload: bytes, topic: Topic) -> bytes:
 
 
 def _with_nan(value: Any) -> Any:
-    """A copy of the value in which every float is NaN."""
+    """Return a copy of the value in which every float is NaN."""
     if isinstance(value, float):
         return float("nan")
     if isinstance(value, np.ndarray):
@@ -178,12 +178,12 @@ KINDS: Final = (*MESSAGE_KINDS, "jump")
 
 
 def command(role: str, fault: InjectedFault) -> tuple[str, ...]:
-    """The command that starts the service of `role` with a fault that SIGUSR1 starts."""
+    """Return the command that starts the service of `role` with a fault that SIGUSR1 triggers."""
     return ("python", "-m", "palpate_benchmarks.faulty", role, fault.topic, fault.kind, str(fault.count))
 
 
 def serve(arguments: Sequence[str]) -> None:
-    """Runs a service with a fault; see the module's description."""
+    """Run a service with a fault; see the module's description."""
     role, topic, kind, count = arguments
     fault = InjectedFault(topic, kind, int(count))
     run_service(role, lambda: chosen(role, load_scenario), lambda session: FaultyTransport(session, fault))

@@ -1,10 +1,10 @@
-"""A whole run that is struck from outside, in contact: its conductor, its recorder, or several processes at once.
+"""Runs with a fault from outside, in contact: in the conductor, the recorder, or several processes at once.
 
     python -m palpate_benchmarks.struck FOLDER RUNTIME RATE SECONDS ROLES [secure]
 
-is the conductor of such a run: it forks the services and observers of these ROLES (comma-separated), says where they are, and
-when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, does the damage, and gathers the outcome.
-What the arm did is read from what the recorder wrote, or where that was struck too, from what the conductor had heard.
+is the conductor of such a run. It forks the services and observers of ROLES (comma-separated), prints their process ids, and
+prints a line when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, injects the fault and returns
+the outcome. Forces and reactions are read from the recording, or, if the fault hit the recorder, from the conductor's messages.
 """
 
 from __future__ import annotations
@@ -30,7 +30,8 @@ from palpate.run.group import apart
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, measure
-from palpate_benchmarks.campaign import CONTACT_S, PATIENCE, SETTINGS, forks
+from palpate_benchmarks.campaign import PATIENCE, SETTINGS, forks
+from palpate_benchmarks.fault_cases import LIMITS
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.codec import decode
@@ -42,60 +43,69 @@ from palpate_conductor.outcome import RunProgress, Timing
 from palpate_models.scenario.load import load_scenario
 
 Blow = Callable[[Mapping[str, psutil.Process]], None]
-"""Does the damage to some of the processes of a run, which it is given by role, the conductor among them."""
+"""Injects the fault; its argument has the processes of the run by role, with the conductor."""
 CONDUCTOR: Final = "conductor"
 ROLES: Final = (*WORKERS, "recorder")
 AT_DEPTH: Final = "the indenter slides at depth"
 PROCESSES: Final = "processes: "
 RESULT: Final = "result: "
-FREEZE_S: Final = 10.0
-"""How long a frozen conductor stands still."""
-LEAVES_WITHIN_S: Final = 30.0
-"""Services that are still there after this time hang."""
-ENDS_WITHIN_S: Final = 120.0
-"""A conductor that has not ended after this time hangs."""
+
+
+@dataclass(frozen=True)
+class FaultTimes:
+    """Wall times around a fault [s]."""
+
+    freeze_s: float = 10.0
+    """Duration of a freeze that includes the conductor."""
+    services_leave_s: float = 30.0
+    """Time after which remaining services count as hung."""
+    conductor_ends_s: float = 120.0
+    """Time after which the conductor counts as hung."""
+
+
+TIMES: Final = FaultTimes()
 
 
 @dataclass
 class Struck:
-    """What became of a run that was struck."""
+    """Outcome of a run with a fault from outside."""
 
     folder: Path
     own: Path
-    """The folder of its sockets."""
+    """Folder of the run's sockets."""
     status: int | None
-    """The conductor's; None when it hung."""
+    """Exit status of the conductor; None if it hung."""
     said: dict[str, Any]
-    """What the conductor made of it: failure, trouble, and the forces that it heard; empty when it was killed."""
+    """Result printed by the conductor: failure, lost roles and received forces; empty if it was killed."""
     struck_s: float
-    """Simulated time of the blow."""
+    """Simulated time of the fault."""
     left_after_s: float
-    """From the blow until the last service had left."""
+    """Wall time from the fault until the last service left."""
     staying: list[str] = field(default_factory=list)
-    """Services that did not leave."""
+    """Services that hung."""
 
     def log(self, role: str) -> str:
-        """What a service wrote."""
+        """Return the log of a service."""
         return (self.folder / "logs" / f"{role}.log").read_text(encoding="utf-8")
 
     @cached_property
     def forces(self) -> list[tuple[int, float]]:
-        """The greatest true force [N] until each simulated time [ns] since the one before."""
+        """Simulated times [ns] and the peak true force [N] since the previous one."""
         return [(stamp, peak_force(message)) for stamp, message in self.recorded("truth/indentation")]
 
     def recorded(self, topic: str) -> list[tuple[int, Any]]:
-        """Messages of a topic out of the recording: (stamp [ns], message)."""
+        """Return the recorded messages of a topic: (stamp [ns], message)."""
         row = contract().topics[topic]
         return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
 
 
 def kept_rate() -> float:
-    """The rate that the machine keeps for a second."""
+    """Return the rate that this machine sustains for a second."""
     return measure().rate or RATES[-1]
 
 
 def calm_rate() -> float:
-    """A rate below that: whoever is busy beside it shall not stop the arm before it is struck."""
+    """Return the next lower rate, so that other load does not stop the arm before the fault."""
     kept = kept_rate()
     return next((rate for rate in RATES if rate < kept), kept)
 
@@ -104,25 +114,33 @@ def strike(
     folder: Path,
     runtime: str,
     blow: Blow,
-    seconds: float = CONTACT_S,
+    seconds: float = LIMITS.at_depth_s,
     roles: Sequence[str] = ROLES,
     namespace: str = "",
     rate: float = 1.0,
 ) -> Struck | None:
-    """Runs a short examination and does the damage when the indenter has slid at depth for `seconds` [s] of simulated time.
+    """Run a short examination and inject the fault when the indenter has slid at depth for `seconds` [s] of simulated time.
 
-    By the wall clock time passes at `rate`. In a network `namespace` all processes are clients of a secure router there, so that
-    what is done to its loopback hits them.
-
-    None when it never came to that: on a busy machine a run by the wall clock may be stopped on its way there.
+    `rate` is simulated per wall time in wall-clock mode. In a network `namespace` all processes are clients of a secure router,
+    so that a fault in its loopback affects all. Returns None if the indenter did not reach the depth: on a busy machine a run in
+    wall-clock mode may be stopped before.
     """
-    words = [sys.executable, "-m", "palpate_benchmarks.struck", str(folder), runtime, str(rate), str(seconds), ",".join(roles)]
+    arguments = [
+        sys.executable,
+        "-m",
+        "palpate_benchmarks.struck",
+        str(folder),
+        runtime,
+        str(rate),
+        str(seconds),
+        ",".join(roles),
+    ]
     if namespace:
-        words = ["ip", "netns", "exec", namespace, *words, "secure"]
+        arguments = ["ip", "netns", "exec", namespace, *arguments, "secure"]
     log = folder / "logs" / f"{CONDUCTOR}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as stderr:
-        run = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
+        run = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
     assert run.stdout is not None
     own, at, struck_s, said = Path(), 0.0, 0.0, {}
     processes: dict[str, psutil.Process] = {}
@@ -143,7 +161,7 @@ def strike(
             elif line.startswith(AT_DEPTH):
                 struck_s, at = float(line.rsplit(" ", 1)[1]), time.monotonic()
                 blow(processes)
-                alarm = threading.Timer(ENDS_WITHIN_S, end_hanging)
+                alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
                 alarm.start()
             elif line.startswith(RESULT):
                 said = json.loads(line.removeprefix(RESULT))
@@ -151,20 +169,20 @@ def strike(
     finally:
         if alarm is not None:
             alarm.cancel()
-        if run.poll() is None:  # whatever interrupted this, the run does not stay
+        if run.poll() is None:  # an exception must not leave the run behind
             for process in processes.values():
                 with suppress(psutil.Error):
                     process.kill()
             run.kill()
     status = None if hanging.is_set() else code
     services = {role: process for role, process in processes.items() if role != CONDUCTOR}
-    _, staying = psutil.wait_procs(services.values(), timeout=LEAVES_WITHIN_S)
+    _, staying = psutil.wait_procs(services.values(), timeout=TIMES.services_leave_s)
     left = time.monotonic() - at
     hung = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
     for process in staying:
         process.kill()
     if not at:
-        print(f"never at depth: {said.get('failure')}", file=sys.stderr)
+        print(f"the indenter did not reach the depth: {said.get('failure')}", file=sys.stderr)
         return None
     return Struck(folder, own, status, said, struck_s, left, hung)
 
@@ -172,7 +190,7 @@ def strike(
 def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...], secure: SecureBus | None) -> None:
     began: list[int] = []
 
-    def tell(progress: RunProgress) -> None:
+    def report_depth(progress: RunProgress) -> None:
         exam = progress.collected.exam
         if exam is not None and exam.phase == ExamState.PHASE_SCAN:
             if not began:
@@ -190,7 +208,7 @@ def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...
     pids = {role: child.pid for role, child in local.running.items()}
     print(f"{PROCESSES}{json.dumps({**pids, 'folder': str(local.folder)})}", flush=True)
     with local.as_conductor():
-        result = conduct(session, roles, tell, local.ended, timing, PATIENCE)
+        result = conduct(session, roles, report_depth, local.ended, timing, PATIENCE)
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
     failure = None if result.failure is None else asdict(result.failure)
     print(f"{RESULT}{json.dumps({'failure': failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)

@@ -1,6 +1,6 @@
-"""Cases of the fault campaign that strike a whole run from outside (`struck`): its conductor, its recorder, several at once.
+"""Cases of the fault campaign that hit a whole run from outside (`struck`): conductor, recorder, several roles, the machine.
 
-Beside a fixed list there are drawn ones: a seed says which roles are struck, how, and how long after contact.
+There is a fixed list of cases, and random ones: a seed determines roles, kind and time in contact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from random import Random
 from typing import Any, Final
@@ -21,9 +21,9 @@ import psutil
 from palpate.report.archive import EvidenceError
 from palpate.report.recovery import recovered
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.campaign import CaseOutcome, FaultCase, FaultFinding, mentioned
-from palpate_benchmarks.fault_kinds import SCARCE_KINDS
-from palpate_benchmarks.struck import CONDUCTOR, FREEZE_S, ROLES, Blow, Struck, calm_rate, kept_rate, strike
+from palpate_benchmarks.campaign import mentioned, set_peaks
+from palpate_benchmarks.fault_cases import SCARCE_KINDS, CaseOutcome, FaultCase, FaultFinding
+from palpate_benchmarks.struck import CONDUCTOR, ROLES, TIMES, Blow, Struck, calm_rate, kept_rate, strike
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
@@ -32,7 +32,7 @@ from palpate_bus.runtime.failure import FailureCode
 
 TOGETHER: Final = "+"
 DASHBOARD: Final = "dashboard"
-"""It runs in the cases that strike it alone."""
+"""Observer that takes part only in the cases that hit it."""
 FIXED: Final = (
     CONDUCTOR,
     "recorder",
@@ -46,23 +46,32 @@ FIXED: Final = (
 )
 KINDS: Final = ("kill", "freeze")
 PARTITION: Final = "partition"
-PARTITIONS_S: Final = (1, 5, 30)
 NETWORK: Final = "network"
 MACHINE: Final = "machine"
-STARVED_S: Final = (1, 5)
-SPINNING: Final = 8
-"""Processes a core that want all of its time while a machine is starved."""
-LONGEST_S: Final = 0.6
-"""Drawn cases strike within so much simulated time of contact: a line is no longer."""
+
+
+@dataclass(frozen=True)
+class CaseTuning:
+    """Durations of the faults."""
+
+    partitions_s: tuple[int, ...] = (1, 5, 30)
+    starved_s: tuple[int, ...] = (1, 5)
+    spinning_per_core: int = 8
+    """Busy processes per core while the machine is starved."""
+    at_depth_s: tuple[float, float] = (0.05, 0.6)
+    """Range of the simulated time at depth before a random fault; a line takes no longer."""
+
+
+CASES: Final = CaseTuning()
 
 
 def is_whole(case: FaultCase) -> bool:
-    """Whether a case strikes a run from outside."""
+    """True if a case hits a run from outside."""
     return case.kind in (PARTITION, *SCARCE_KINDS) or (case.kind in KINDS and case.where not in WORKERS)
 
 
 def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
-    """The fixed list; `only` keeps those that strike one of these roles."""
+    """Yield the fixed list; `only` restricts it to cases that hit one of these roles."""
     for mode in modes:
         for kind in (kind for kind in KINDS if kind in kinds):
             for where in FIXED:
@@ -74,85 +83,85 @@ def fixed(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> It
 
 
 def _others() -> Iterator[tuple[str, str]]:
-    """Kind and place of the faults that are neither killed nor frozen processes."""
+    """Yield kind and place of the faults other than killed and frozen processes."""
     yield from (("memory", role) for role in ROLES)
     yield "disk", "recorder"
-    yield from (("starve", f"{MACHINE}, {seconds} s") for seconds in STARVED_S)
-    yield from ((PARTITION, f"{NETWORK}, {seconds} s") for seconds in PARTITIONS_S)
+    yield from (("starve", f"{MACHINE}, {seconds} s") for seconds in CASES.starved_s)
+    yield from ((PARTITION, f"{NETWORK}, {seconds} s") for seconds in CASES.partitions_s)
 
 
 def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
-    """`count` cases out of a seed: one to three roles, killed or frozen, at a moment in contact."""
+    """Yield `count` random cases: one to three roles are killed or frozen at a random time in contact."""
     draw = Random(seed)
     for _ in range(count):
         roles = draw.sample([*ROLES, CONDUCTOR], draw.choice((1, 2, 2, 3)))
-        at_s = round(draw.uniform(0.05, LONGEST_S), 3)
+        at_s = round(draw.uniform(*CASES.at_depth_s), 3)
         yield FaultCase(draw.choice(KINDS), TOGETHER.join(sorted(roles)), draw.choice(modes) == "wallclock", at_s)
 
 
 def run_whole(case: FaultCase, folder: Path) -> FaultFinding:
-    """Runs one case; its logs stay in a folder of its own under `folder`."""
-    finding = FaultFinding(case.kind, case.where, "wall clock" if case.wallclock else "lockstep", at_s=case.at_s)
+    """Run one case; its logs stay in a subfolder of `folder`."""
+    finding = FaultFinding(case.kind, case.where, case.mode, at_s=case.at_s)
     begin = time.monotonic()
-    struck = _done(case, folder, kept_rate() if case.wallclock else 1.0)
+    struck = _run(case, folder, kept_rate() if case.wallclock else 1.0)
     if struck is None and case.wallclock:
-        struck = _done(case, folder, calm_rate())
+        struck = _run(case, folder, calm_rate())
     finding.wall_s = round(time.monotonic() - begin, 1)
     if struck is None:
-        finding.ended = "the fault was never done: the run did not come to depth"
+        finding.ended = "the fault was not injected: the indenter did not reach the depth"
         return finding
     _judge(finding, struck, _culprits(case))
     return finding
 
 
-def _done(case: FaultCase, folder: Path, rate: float) -> Struck | None:
-    """The run of a case, with its fault; None when it did not come to that."""
+def _run(case: FaultCase, folder: Path, rate: float) -> Struck | None:
+    """Run a case with its fault; return None if the indenter did not reach the depth."""
     if case.kind == PARTITION:
-        return _parted(case, folder, rate)
+        return _run_partitioned(case, folder, rate)
     roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
     return strike((folder / case.name).resolve(), _runtime(case), _blow(case), case.at_s, roles, rate=rate)
 
 
 def _culprits(case: FaultCase) -> list[str]:
-    """Return the roles, failure codes or words of which one has to be named as the cause."""
+    """Return roles, failure codes and keywords; the reported cause has to name one of them."""
     if case.kind == PARTITION:
         return ["transport", FailureCode.TRANSPORT_LOST]
     return ["machine", "processor", "late", "expired"] if case.kind == "starve" else case.where.split(TOGETHER)
 
 
 def _blow(case: FaultCase) -> Blow:
-    """What does the damage of a case."""
+    """Return the function that injects the fault of a case."""
     if case.kind == "starve":
         return lambda _: starve(_seconds(case))
     if case.kind in SCARCE_KINDS:
-        what = {"memory": psutil.RLIMIT_AS, "disk": psutil.RLIMIT_FSIZE}[case.kind]
-        return lambda processes: _no_more(processes[case.where], what)
+        resource = {"memory": psutil.RLIMIT_AS, "disk": psutil.RLIMIT_FSIZE}[case.kind]
+        return lambda processes: _freeze_usage(processes[case.where], resource)
     return lambda processes: _signal(case, processes)
 
 
 def _signal(case: FaultCase, processes: Mapping[str, psutil.Process]) -> None:
-    """Kills or freezes the roles of a case; what is frozen with the conductor wakes again."""
+    """Kill or freeze the roles of a case; roles frozen together with the conductor resume after `TIMES.freeze_s`."""
     roles = case.where.split(TOGETHER)
     number = signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP
     for role in roles:
         processes[role].send_signal(number)
-    if case.kind == "freeze" and CONDUCTOR in roles:  # others are ended by their conductor
-        time.sleep(FREEZE_S)
+    if case.kind == "freeze" and CONDUCTOR in roles:  # otherwise the conductor ends the frozen processes
+        time.sleep(TIMES.freeze_s)
         for role in roles:
             if processes[role].is_running():
                 processes[role].send_signal(signal.SIGCONT)
 
 
-def _no_more(process: psutil.Process, what: int) -> None:
-    """Lets a process have no more address space than it has, or lets none of its files grow."""
-    now = process.memory_info().vms if what == psutil.RLIMIT_AS else 0
-    process.rlimit(what, (now, psutil.RLIM_INFINITY))
+def _freeze_usage(process: psutil.Process, resource: int) -> None:
+    """Limit a process to its present address space, or prevent its files from growing."""
+    limit = process.memory_info().vms if resource == psutil.RLIMIT_AS else 0
+    process.rlimit(resource, (limit, psutil.RLIM_INFINITY))
 
 
 def starve(seconds: float) -> None:
-    """Keeps every core busy for some time [s] with processes that want all of it."""
-    words = [sys.executable, "-c", "while True: pass"]
-    spinning = [subprocess.Popen(words) for _ in range(SPINNING * len(os.sched_getaffinity(0)))]
+    """Keep every core busy for `seconds` [s] with several processes."""
+    command = [sys.executable, "-c", "while True: pass"]
+    spinning = [subprocess.Popen(command) for _ in range(CASES.spinning_per_core * len(os.sched_getaffinity(0)))]
     try:
         time.sleep(seconds)
     finally:
@@ -162,7 +171,7 @@ def starve(seconds: float) -> None:
 
 
 def _seconds(case: FaultCase) -> float:
-    """How long the fault of a case lasts [s]."""
+    """Return the duration of the fault of a case [s]."""
     return float(case.where.split()[1])
 
 
@@ -170,8 +179,8 @@ def _runtime(case: FaultCase) -> str:
     return "wallclock" if case.wallclock else "lockstep"
 
 
-def _parted(case: FaultCase, folder: Path, rate: float) -> Struck | None:
-    """A run in a network namespace of its own, whose network is gone for some time. Needs root, as `ip netns` does."""
+def _run_partitioned(case: FaultCase, folder: Path, rate: float) -> Struck | None:
+    """Run in a new network namespace whose network is down for some time. Needs root, as `ip netns` does."""
     name = f"palpate-{os.getpid()}"
 
     def loopback(state: str) -> None:
@@ -201,7 +210,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
     if failure:
         finding.outcome, finding.ended = CaseOutcome.ENDED, text
     elif finding.kind in KINDS:
-        finding.outcome, finding.ended = CaseOutcome.CONTINUED_WITHOUT, "completed without what was struck"
+        finding.outcome, finding.ended = CaseOutcome.CONTINUED_WITHOUT, "completed without the disabled role"
     else:
         finding.outcome, finding.ended = CaseOutcome.COMPLETED, "complete"
     found = {failure.get("code"), *failure.get("roles", ()), *struck.said.get("lost", ())}
@@ -212,7 +221,7 @@ def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
 
 
 def _recovered(folder: Path) -> tuple[dict[str, Any], bool]:
-    """Return the failure of a run without a conductor, and True if anything that it had measured can be recovered."""
+    """Return the failure of a run whose conductor was killed, and True if its measurements can be recovered."""
     try:
         _, result = recovered(folder)
     except EvidenceError as error:
@@ -231,7 +240,7 @@ def _first_sign(struck: Struck) -> str:
 
 
 def _measure(finding: FaultFinding, struck: Struck) -> None:
-    """Forces and the arm's reaction, as far as anybody wrote or heard them."""
+    """Enter forces and the arm's reaction, as far as they were recorded or received."""
     forces = [(stamp, force) for stamp, force in struck.said.get("forces", ())]
     statuses: list[tuple[int, Any]] = []
     states: list[tuple[int, Any]] = []
@@ -239,11 +248,8 @@ def _measure(finding: FaultFinding, struck: Struck) -> None:
         forces = forces or struck.forces
         statuses, states = struck.recorded("robot/status"), struck.recorded("exam/state")
     except (RecordingError, OSError):
-        pass  # the recorder was struck: its file has no end
-    split = struck.struck_s * 1e9
-    finding.peak_force_before_n = round(max((force for stamp, force in forces if stamp < split), default=0.0), 2)
-    after = [force for stamp, force in forces if stamp >= split]
-    finding.peak_force_n = round(max(after), 2) if after else None
+        pass  # the fault hit the recorder: its file is incomplete
+    set_peaks(finding, forces, struck.struck_s * 1e9)
     if finding.outcome is not CaseOutcome.ENDED:
         finding.reaction = "none needed"
     elif any(status.mode == RobotStatus.MODE_SAFE_HOLD for _, status in statuses):

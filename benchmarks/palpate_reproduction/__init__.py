@@ -1,1 +1,1 @@
-"""The seed paper's figures and claims, from runs of Palpate."""
+"""Figures and claims of the seed paper, reproduced by runs of Palpate."""

@@ -1,4 +1,4 @@
-"""`palpate reproduce`: the seed paper's figures and claims from runs of our own, next to what the paper reports."""
+"""`palpate reproduce`: figures and claims of the seed paper from new runs, compared with the paper."""
 
 from __future__ import annotations
 
@@ -17,17 +17,17 @@ def reproduce(
     out: Annotated[Path, output_folder("Folder of the runs; finished ones are kept.", "--out", "-o")] = Path("out/reproduction"),
     docs: Annotated[Path | None, output_file("The page; by default reproduction.md in the folder of the runs.")] = None,
     every: Annotated[
-        bool, typer.Option("--all", help="Also run raster continuous and snake point, to see the gain of each.")
+        bool, typer.Option("--all", help="Also run raster continuous and snake point, which separates the two gains.")
     ] = False,
-    again: Annotated[bool, typer.Option("--again", help="Run finished ones again.")] = False,
+    again: Annotated[bool, typer.Option("--again", help="Repeat finished runs.")] = False,
     settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the page's path only.")] = False,
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
-    """Reproduce the seed paper: figures 3, 5, 6, 7, 8 and what it claims, from our own runs. This takes about ten minutes."""
+    """Reproduce figures 3, 5, 6, 7 and 8 and the claims of the seed paper from new runs. This takes about ten minutes."""
     from palpate.report.archive import EvidenceError, completed
     from palpate.run.inputs import usable
-    from palpate_reproduction import reproduction
+    from palpate_reproduction.page import write_page
     from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, ReproductionError, perform, record_graph
 
     console = Console(stderr=True)
@@ -41,17 +41,17 @@ def reproduce(
     try:
         with CaseDisplay(console, quiet, "steps") as display:
 
-            def tell(words: str) -> None:
-                display.show(next(begun), steps, words)
+            def show(step: str) -> None:
+                display.show(next(begun), steps, step)
 
             for case in cases:
                 if again or completed(out / case.name) is None:
-                    tell(f"examining: {case.pattern}, {case.mode}")
+                    show(f"examining: {case.pattern}, {case.mode}")
                     perform(case, out / case.name, chosen)
             if again or not (out / "bus" / GRAPH).is_file():
-                tell("starting a run on the bus, for its graph")
+                show("starting a run on the bus, for its graph")
                 record_graph(out / "bus")
-            facts = reproduction.write(out, cases, page, images, chosen, tell)
+            facts = write_page(out, cases, page, images, chosen, show)
     except (ReproductionError, EvidenceError) as error:
         fail(error)
     except OSError as error:
@@ -62,7 +62,7 @@ def reproduce(
     if not quiet:
         console.print(
             f"snake with continuous indentation covers {facts['factor']:.1f} times faster than raster with points; "
-            f"map and model correlate with {facts['correlation']:.3f}",
+            f"map and model have a correlation of {facts['correlation']:.3f}",
             highlight=False,
         )
     print(page)

@@ -1,4 +1,4 @@
-"""The figures of docs/reproduction.md: 3, 5, 6, 7 and 8 of the paper, from our runs. Each function writes one PNG."""
+"""Figures of docs/reproduction.md: 3, 5, 6, 7 and 8 of the paper, from our runs. Each function writes one PNG."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from palpate_validation.check import PageSection
 
 DPI: Final = 100
 COLOURS: Final = 192
-"""Colours of the palette that large pictures are reduced to, to keep them small."""
+"""Size of the colour palette, which keeps the files small."""
 ROOM: Final = Viewpoint((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
 CLOSE: Final = Viewpoint((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
 
@@ -36,7 +36,7 @@ def _figure(width: float, height: float) -> Figure:
 
 
 def _save(figure: Figure, path: Path) -> None:
-    """As a small PNG: the drawing's colours reduced to a palette."""
+    """Write a PNG with a colour palette."""
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.canvas.draw()
     canvas: Any = figure.canvas
@@ -45,7 +45,7 @@ def _save(figure: Figure, path: Path) -> None:
 
 
 def transients(path: Path) -> PageSection:
-    """Figure 3: a tool dropped on soft and rigid surfaces. Returns what was measured."""
+    """Draw figure 3, a tool dropped on soft and rigid surfaces; return the measurements."""
     section = drop.section()
     figure = _figure(9.0, 4.6)
     if section.draw is not None:
@@ -59,12 +59,12 @@ _PLACES: Final = {
     "camera": (0.0, 4.4), "perception": (4.6, 4.4), "planning": (9.2, 4.4), "assessment": (13.4, 4.4),
     "supervisor": (12.4, 2.2), "tissue": (0.0, 0.0), "robot": (6.6, 0.0), "control": (13.4, 0.0),
 }  # fmt: skip
-"""Where each node stands; one that is not named here stands in a row below."""
+"""Position of each node; other nodes are drawn in a row below."""
 _BEND: Final = 0.13
 
 
 def graph(path: Path, rows: Sequence[dict[str, str]], watching: Sequence[str]) -> tuple[int, int]:
-    """Figure 5: nodes and topics of a live graph, `watching` nodes without arrows. Returns how many of both there are."""
+    """Draw figure 5, nodes and topics of a live graph, without arrows of the `watching` nodes; return the number of both."""
     nodes = sorted({row["node"] for row in rows})
     topics = sorted({row["topic"] for row in rows if not row["topic"].startswith("palpate/")})
     writers = {row["topic"]: row["node"] for row in rows if row["kind"] == "MP"}
@@ -94,28 +94,28 @@ def graph(path: Path, rows: Sequence[dict[str, str]], watching: Sequence[str]) -
         axes.annotate("", (b[0], b[1]), (a[0], a[1]), arrowprops={**style, **ends}, zorder=1)
         middle = (a + b) / 2 + np.array((b[1] - a[1], a[0] - b[0])) * _BEND / 2
         box = {"boxstyle": "round,pad=0.12", "fc": "white", "ec": "none", "alpha": 0.85}
-        words = "\n".join(sorted(names))
-        axes.text(middle[0], middle[1], words, fontsize=7.2, color=INK, ha="center", va="center", bbox=box, zorder=2.5)
+        topic_list = "\n".join(sorted(names))
+        axes.text(middle[0], middle[1], topic_list, fontsize=7.2, color=INK, ha="center", va="center", bbox=box, zorder=2.5)
     readers = ", ".join("/" + name for name in nodes if name in watching)
-    axes.text(7.8, 6.2, f"{readers} read nearly\neverything: their arrows are left out", va="center", fontsize=9, color=QUIET)
+    axes.text(7.8, 6.2, f"{readers} read nearly\nall topics: their arrows are omitted", va="center", fontsize=9, color=QUIET)
     _save(figure, path)
     return len(nodes), len(topics)
 
 
 def phases(path: Path, stage: Stage, shown: Sequence[tuple[str, Moment, bool]]) -> None:
-    """Figure 6: the scene in the phases of an examination: (words, moment, whether from close by)."""
+    """Draw figure 6, the scene in the phases of an examination: (title, moment, True for a close view)."""
     figure = _figure(12.0, 2.9 * -(-len(shown) // 3))
     grid = figure.subplots(-(-len(shown) // 3), 3, squeeze=False).ravel()
     for axes in grid:
         axes.set_axis_off()
-    for axes, (words, moment, close) in zip(grid, shown, strict=False):
+    for axes, (title, moment, close) in zip(grid, shown, strict=False):
         axes.imshow(picture(stage.bodies(moment), CLOSE if close else ROOM, 480, 340))
-        axes.set_title(f"{words}, {moment.time_s:.1f} s", fontsize=9.5, color=INK)
+        axes.set_title(f"{title}, {moment.time_s:.1f} s", fontsize=9.5, color=INK)
     _save(figure, path)
 
 
 def force_map(path: Path, evidence: Evidence, samples_xy: NDArray[np.float64]) -> None:
-    """Figure 7: normal force over the surface, in the plane and in space."""
+    """Draw figure 7, normal force over the surface, in the plane and in 3-D."""
     drawing = Drawing(evidence.stiffness_map, evidence.findings, None)
     layer = drawing.force_layer
     figure = _figure(10.5, 4.6)
@@ -132,16 +132,16 @@ def force_map(path: Path, evidence: Evidence, samples_xy: NDArray[np.float64]) -
 
 
 def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
-    """Figure 8: the model with its stiff area on the left, the palpation's result on the right; returns their correlation [1].
+    """Draw figure 8, the model with its stiff area and the map measured by palpation; return their correlation [1].
 
-    It is that of the logarithms of true and estimated apparent stiffness over the scanned surface.
+    The correlation is that of the logarithms of true and estimated apparent stiffness over the scanned surface.
     """
     drawing = Drawing(evidence.stiffness_map, evidence.findings, truth)
     if drawing.true is None:
-        raise ValueError("the run knows no truth to compare with")
+        raise ValueError("the run has no truth to compare with")
     figure = _figure(10.5, 4.6)
     left, right = figure.subplots(1, 2)
-    small = "true apparent stiffness; dashed: where the lump is felt, solid: finding"
+    small = "true apparent stiffness; dashed: palpable part of the lump, solid: finding"
     drawing.panel(left, drawing.stiffness_layer(drawing.true), "a", "The model", small, truth=True)
     small = "estimated apparent stiffness; solid: finding"
     drawing.panel(right, drawing.stiffness_layer(drawing.map.apparent), "b", "The palpation", small, labels=True)
@@ -151,7 +151,7 @@ def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
 
 
 def coverage(path: Path, names: Sequence[str], evidence: Sequence[Evidence]) -> None:
-    """How much of the region each way of covering had reached, over simulated time since the first descent."""
+    """Draw the covered part of the region over simulated time since first contact, for each way to cover."""
     figure = _figure(7.5, 3.4)
     axes = figure.subplots()
     for name, one in zip(names, evidence, strict=True):

@@ -1,14 +1,19 @@
-"""Pictures of a scene without a display: ray casting, smooth normals, one lamp with its shadow. Arrays in, an image out."""
+"""Rendering of a scene without a display: ray casting, smooth normals, one lamp with its shadow."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from ctypes import CDLL, RTLD_GLOBAL
 from typing import Any, NamedTuple
 
+import libusb_package
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_reproduction.open3d_loader import open3d as o3d
+_LIBUSB = CDLL(str(libusb_package.get_library_path()), mode=RTLD_GLOBAL)
+"""libusb-1.0 from a wheel, which Open3D links against, so that no system package is needed."""
+
+import open3d as o3d  # noqa: E402  (after libusb)
 
 Array = NDArray[np.floating[Any]]
 LAMP = np.array((0.45, -0.55, 1.0)) / np.linalg.norm((0.45, -0.55, 1.0))
@@ -18,7 +23,7 @@ BACKGROUND = (247, 249, 250)
 
 
 class Body(NamedTuple):
-    """A mesh in world: vertices [m], unit normals and colours in 0..255, shapes (n, 3); triangles, shape (m, 3)."""
+    """Mesh in world: vertices [m], unit normals and colours in 0..255, shapes (n, 3); triangles, shape (m, 3)."""
 
     vertices: NDArray[np.float32]
     triangles: NDArray[np.uint32]
@@ -27,7 +32,7 @@ class Body(NamedTuple):
 
 
 class Viewpoint(NamedTuple):
-    """Where the eye is [m], what it looks at, its vertical angle of view [deg]; world's z is up."""
+    """Position of the eye and of its target [m], and vertical angle of view [deg]; world's z is up."""
 
     eye: tuple[float, float, float]
     target: tuple[float, float, float]
@@ -35,7 +40,7 @@ class Viewpoint(NamedTuple):
 
 
 def picture(bodies: Sequence[Body], view: Viewpoint, width: int, height: int, smooth: int = 2) -> NDArray[np.uint8]:
-    """The scene as seen, shape (height, width, 3), averaged over smooth x smooth rays a pixel."""
+    """Return an image of the scene, shape (height, width, 3), averaged over smooth x smooth rays per pixel."""
     scene = o3d.t.geometry.RaycastingScene()
     for body in bodies:
         scene.add_triangles(_tensor(body.vertices.astype(np.float32)), _tensor(body.triangles.astype(np.uint32)))
@@ -64,7 +69,7 @@ def _tensor(array: NDArray[Any]) -> Any:
 
 
 def _rays(view: Viewpoint, width: int, height: int) -> NDArray[np.float32]:
-    """Origins and unit directions, shape (height, width, 6)."""
+    """Return origins and unit directions of the rays, shape (height, width, 6)."""
     eye, target = np.array(view.eye), np.array(view.target)
     forward = (target - eye) / np.linalg.norm(target - eye)
     right = np.cross(forward, (0.0, 0.0, 1.0))
@@ -81,7 +86,7 @@ def _rays(view: Viewpoint, width: int, height: int) -> NDArray[np.float32]:
 def _attributes(
     bodies: Sequence[Body], which: NDArray[Any], face: NDArray[Any], uv: NDArray[Any]
 ) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """Colour and unit normal at each hit, interpolated over its triangle."""
+    """Return colour and unit normal at each hit, interpolated over its triangle."""
     color, normal = np.zeros((2, len(which), 3), dtype=np.float32)
     weights = np.column_stack((1 - uv.sum(axis=1), uv)).astype(np.float32)
     for i, body in enumerate(bodies):

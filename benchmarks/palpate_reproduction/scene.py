@@ -1,4 +1,4 @@
-"""What stood where at a moment of a recorded run: robot, table, patient, the abdomen as it was pressed, as bodies to draw."""
+"""Scene of a recorded run at a given time: robot, table and deformed abdomen as bodies to draw."""
 
 from __future__ import annotations
 
@@ -21,13 +21,14 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_reproduction.render import Body
 
-SEEN = ("sim/link_poses", "sim/surface", "assessment/map")
+TOPICS = ("sim/link_poses", "sim/surface", "assessment/map")
 CARRY_M = 0.012
+"""Distance over which the map colours the vertices of the abdomen."""
 
 
 @dataclass(frozen=True)
 class Moment:
-    """Messages as they were at a simulated time."""
+    """Latest messages at a simulated time."""
 
     time_s: float
     link_poses: Any
@@ -36,35 +37,35 @@ class Moment:
 
 
 def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]:
-    """The scene at each of `times_s`, in their order, from a recording's files. Raises OSError, ValueError if it ends before."""
+    """Return the scene at each of `times_s` from the files of a recording. Raises OSError, ValueError if it ends before."""
     inbox = RecordedInbox()
     wanted = sorted(set(times_s))
     found: dict[float, Moment] = {}
 
     def take(time: float) -> None:
-        poses, surface, known = (inbox.latest(topic) for topic in SEEN)
+        poses, surface, known = (inbox.latest(topic) for topic in TOPICS)
         found[time] = Moment(time, poses, surface, known)
 
     for stamp, topic, payload in messages(recording):
         while wanted and stamp / 1e9 > wanted[0]:
             take(wanted.pop(0))
-        if topic in SEEN:
+        if topic in TOPICS:
             inbox.put(topic, payload, stamp)
     for time in wanted:
         take(time)
     if any(moment.link_poses is None or moment.surface is None for moment in found.values()):
-        raise ValueError(f"{recording}: it holds no robot or no abdomen at {min(times_s):.1f} s")
+        raise ValueError(f"{recording}: no robot or no abdomen at {min(times_s):.1f} s")
     return [found[time] for time in times_s]
 
 
 def deformation_mm(rest: Moment, pressed: Moment) -> float:
-    """How far the farthest vertex of the abdomen is from where it rests [mm]."""
+    """Return the largest displacement of a vertex of the abdomen [mm]."""
     before, after = (arrays.triples(moment.surface.vertices) for moment in (rest, pressed))
     return float(1e3 * np.linalg.norm(after - before, axis=1).max())
 
 
 class Stage:
-    """Turns moments into bodies in world; what stands still is made once."""
+    """Converts moments to bodies in world; static bodies are built once."""
 
     def __init__(self, scenario: Scenario, rest: Moment) -> None:
         given = exam_input(scenario)
@@ -79,11 +80,11 @@ class Stage:
         self._still = [_box(box) for box in table.boxes(given.robot)]
 
     def bodies(self, moment: Moment) -> list[Body]:
-        """All that is seen at a moment."""
+        """Return all bodies at a moment."""
         return [*self._still, self.abdomen(moment), *self._robot(moment)]
 
     def abdomen(self, moment: Moment) -> Body:
-        """The deformed abdomen, coloured by what is known of its stiffness."""
+        """Return the deformed abdomen, coloured by the estimated stiffness."""
         vertices = arrays.triples(moment.surface.vertices).astype(np.float32)
         colors = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
         known = moment.stiffness_map

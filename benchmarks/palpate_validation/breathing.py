@@ -1,4 +1,4 @@
-"""Breathing: rate, shape and irregularity read from the curve alone, and how it fades to the body's border."""
+"""Validation of breathing: rate, shape and irregularity measured on the curve, and the mode over the body."""
 
 from __future__ import annotations
 
@@ -11,14 +11,22 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import TABLE_S, Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Phantom
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK
+from palpate_validation.check import COLOURS, INK, Check, PageSection
 
-STEP_S = 0.01
-PATIENTS = 20
-SHOWN_S = 60.0
-AT_REST = 1e-4
-"""A wall within this part of the mean depth is at rest."""
+
+@dataclass(frozen=True)
+class BreathingSetup:
+    """Sampling of the curves."""
+
+    step_s: float = 0.01
+    patients: int = 20
+    shown_s: float = 60.0
+    at_rest: float = 1e-4
+    """Excursion, relative to the mean depth, below which the wall is at rest."""
+
+
+SETUP = BreathingSetup()
+
 KINDS = {
     "quiet": Breathing(kind="quiet"),
     "deep": Breathing(kind="deep"),
@@ -29,20 +37,20 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Breaths:
-    """n breaths, as an observer of the navel measures them."""
+    """n breaths, measured at the navel."""
 
     inspiration: Array
-    """Rise of the wall [s], shape (n,)."""
+    """Duration of the rise [s], shape (n,)."""
     expiration: Array
-    """Its fall [s], shape (n,)."""
+    """Duration of the fall [s], shape (n,)."""
     pause: Array
-    """Rest before the next rise [s], shape (n,)."""
+    """Duration of the rest before the next rise [s], shape (n,)."""
     depth: Array
     """[m], shape (n,)."""
 
     @property
     def duration(self) -> Array:
-        """From one rise to the next [s], shape (n,)."""
+        """Time from one rise to the next [s], shape (n,)."""
         return self.inspiration + self.expiration + self.pause
 
     @property
@@ -53,7 +61,7 @@ class Breaths:
 
 @dataclass(frozen=True)
 class Measured:
-    """Breaths of some patients, and one curve of each kind."""
+    """Breaths of several patients, and one curve of each kind."""
 
     quiet: tuple[Breaths, ...]
     deep: tuple[Breaths, ...]
@@ -62,39 +70,39 @@ class Measured:
     curves: dict[str, Array]
     """Excursion [m] by kind, shape (m,) each."""
     jump: float
-    """Largest change of the speed from one step to the next, over the largest speed, quiet [1]."""
+    """Largest change of speed in one step, relative to the largest speed, quiet breathing [1]."""
     border: float
-    """Largest share of the excursion that any vertex of the border or the back has."""
+    """Largest mode of a vertex of the border or the back."""
     largest_at_m: float
-    """Distance from the navel of the vertex that has the largest share [m]."""
+    """Distance of the vertex with the largest mode from the navel [m]."""
     across: tuple[Array, Array]
-    """x [m] and share of the excursion of the vertices near y = 0."""
+    """x [m] and mode of the vertices near y = 0."""
     along: tuple[Array, Array]
-    """y [m] and share of the excursion of the vertices near x = 0."""
+    """y [m] and mode of the vertices near x = 0."""
 
 
 def sampled(breathing: Breathing, seed: int, until_s: float = TABLE_S) -> Array:
-    """The excursion [m] of a patient at every `STEP_S` [s]."""
+    """Return the excursion [m] of a patient at every `SETUP.step_s` [s]."""
     curve = BreathingCurve(breathing, seed)
-    return np.array([curve.excursion(t) for t in np.arange(0, until_s, STEP_S)])
+    return np.array([curve.excursion(t) for t in np.arange(0, until_s, SETUP.step_s)])
 
 
 def read(excursion: Array) -> Breaths:
-    """The whole breaths in a curve: each from where it begins to rise to where it does so again."""
-    above = excursion > AT_REST * excursion.mean()
+    """Return the complete breaths in a curve, each from the start of a rise to the start of the next."""
+    above = excursion > SETUP.at_rest * excursion.mean()
     edges = np.diff(above.astype(int))
     rise, rest = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     rest = rest[rest > rise[0]][: len(rise) - 1]
     pairs = list(zip(rise[:-1], rest, strict=True))
     top = np.array([a + int(np.argmax(excursion[a : b + 1])) for a, b in pairs])
     steps = (top - rise[:-1], rest - top, rise[1:] - rest)
-    up, down, still = (STEP_S * count.astype(np.float64) for count in steps)
+    up, down, still = (SETUP.step_s * count.astype(np.float64) for count in steps)
     return Breaths(up, down, still, excursion[top])
 
 
-def measure(patients: int = PATIENTS) -> Measured:
-    """Measure the breaths of this number of patients, and the default body's share of them."""
-    curves = {name: sampled(breathing, 0, SHOWN_S) for name, breathing in KINDS.items()}
+def measure(patients: int = SETUP.patients) -> Measured:
+    """Measure the breaths of `patients` patients, and the mode over the default body."""
+    curves = {name: sampled(breathing, 0, SETUP.shown_s) for name, breathing in KINDS.items()}
     speed = np.diff(curves["quiet"])
     body = build_phantom(Phantom(), 0)
     x, y = body.vertices[:, 0], body.vertices[:, 1]
@@ -107,7 +115,7 @@ def measure(patients: int = PATIENTS) -> Measured:
     return Measured(
         quiet=tuple(read(sampled(KINDS["quiet"], seed)) for seed in range(patients)),
         deep=tuple(read(sampled(KINDS["deep"], seed)) for seed in range(patients)),
-        time=np.arange(0, SHOWN_S, STEP_S),
+        time=np.arange(0, SETUP.shown_s, SETUP.step_s),
         curves=curves,
         jump=float(np.abs(np.diff(speed)).max() / np.abs(speed).max()),
         border=float(body.breathing[body.fixed].max()),
@@ -122,12 +130,12 @@ def _pooled(breaths: tuple[Breaths, ...], field: str) -> Array:
 
 
 def _cv(breaths: tuple[Breaths, ...], field: str) -> float:
-    """Mean over patients of each one's coefficient of variation [%]."""
+    """Return the mean over patients of the coefficient of variation [%]."""
     return 100 * float(np.mean([getattr(one, field).std() / getattr(one, field).mean() for one in breaths]))
 
 
 def _memory(breaths: tuple[Breaths, ...], field: str) -> float:
-    """Mean over patients of the correlation of a breath with the one before."""
+    """Return the mean over patients of the correlation between successive breaths."""
     return float(np.mean([np.corrcoef(getattr(one, field)[:-1], getattr(one, field)[1:])[0, 1] for one in breaths]))
 
 
@@ -142,8 +150,8 @@ def section(found: Measured | None = None) -> PageSection:
     pause = 100 * float((_pooled(quiet, "pause") / _pooled(quiet, "duration")).mean())
     checks = (
         Check("breaths a minute, quiet", rate, "", 13.5, 14.5, "14, n = 100 (Ragnarsdottir 2006)"),
-        Check("breaths a minute, deep", slow, "", 7.1, 7.7, "7.4 (the same)"),
-        Check("expiration over inspiration", ratio, "", 1.14, 1.26, "1.21 men, 1.14 women (the same)"),
+        Check("breaths a minute, deep", slow, "", 7.1, 7.7, "7.4 (Ragnarsdottir 2006)"),
+        Check("expiration over inspiration", ratio, "", 1.14, 1.26, "1.21 men, 1.14 women (Ragnarsdottir 2006)"),
         Check("pause, of a breath", pause, "%", against="assumed"),
         Check("depth at the navel, quiet", depth_mm, "mm", 5, 12, "5 to 12 mm, assumed"),
         Check("quiet over deep", share, "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
@@ -153,12 +161,12 @@ def section(found: Measured | None = None) -> PageSection:
         Check("correlation of depth with the breath before", _memory(quiet, "depth"), "", 0.15, 0.45, "0.30 (Tobin 1995)"),
         Check("change of speed in 10 ms, of the greatest", 100 * found.jump, "%", None, 5, "a curve without corners"),
         Check("share of the excursion at the body's border", found.border, "", None, 0, "none"),
-        Check("distance of the largest share from the navel", 1e3 * found.largest_at_m, "mm", None, 30, "the navel"),
+        Check("distance of the largest excursion from the navel", 1e3 * found.largest_at_m, "mm", None, 30, "the navel"),
     )
     text = (
         f"{len(quiet)} patients breathe for {TABLE_S:g} s each; their breaths are read from the curve, sampled at "
-        f"{1 / STEP_S:g} Hz, without knowledge of the table behind it. Duration and depth are log-normal from breath to breath, "
-        "and a breath remembers the one before; pause, depth in millimetres and coughs are assumed. Sighs are left out."
+        f"{1 / SETUP.step_s:g} Hz, without access to the table of breaths. Duration and depth are log-normal and correlated "
+        "from breath to breath; pause, depth in millimetres and coughs are assumed. Sighs are not modelled."
     )
     data = {"time_s": found.time, **{f"{name}_m": curve for name, curve in found.curves.items()}}
     data |= {"quiet_duration_s": _pooled(quiet, "duration"), "quiet_depth_m": _pooled(quiet, "depth")}
@@ -166,7 +174,7 @@ def section(found: Measured | None = None) -> PageSection:
 
 
 def draw(figure: Figure, found: Measured) -> None:
-    """A minute of each kind; duration against depth of quiet breaths; the share of the excursion over the body."""
+    """Draw a minute of each kind, duration against depth of quiet breaths, and the mode over the body."""
     grid = figure.add_gridspec(2, 2, height_ratios=(1.5, 1))
     axes = figure.add_subplot(grid[0, :])
     for k, (name, curve) in enumerate(found.curves.items()):

@@ -1,11 +1,13 @@
-"""Result of a comparison: checks with bounds, a figure, and the data of both."""
+"""Result of a comparison: checks with bounds, a figure in the common style, and the data of both."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
 from matplotlib.figure import Figure
 
 Draw = Callable[[Figure], None]
@@ -13,7 +15,7 @@ Draw = Callable[[Figure], None]
 
 @dataclass(frozen=True)
 class Check:
-    """One measured figure with the range that it must be in. Bounds of None are open; with neither it is only reported."""
+    """One measured figure with its bounds. A bound of None is open; without bounds the figure is only reported."""
 
     name: str
     measured: float
@@ -36,7 +38,7 @@ class Check:
 
     @property
     def bound(self) -> str:
-        """The bound in words."""
+        """Text of the bounds."""
         if self.low is not None and self.high is not None:
             return f"{self.low:g} to {self.high:g}"
         if self.high is not None:
@@ -46,7 +48,7 @@ class Check:
 
 @dataclass(frozen=True)
 class PageSection:
-    """One comparison: what it says, its checks, and how to draw it."""
+    """One comparison: its text, its checks and its figure."""
 
     name: str
     title: str
@@ -57,4 +59,31 @@ class PageSection:
     size_in: tuple[float, float] = (7.0, 3.2)
     """Width and height of the figure [inch]."""
     data: Mapping[str, Any] = field(default_factory=dict)
-    """The numbers behind the figure, for validate.json: anything that JSON takes, and arrays."""
+    """Numbers of the figure for validate.json: JSON values and arrays."""
+
+
+INK = "#1b2a33"
+QUIET = "#6b7a83"
+COLOURS = ("#0b7285", "#c2571a", "#5b4b8a", "#3a7d34", "#a61e4d")
+STYLE: Any = {
+    "font.size": 8,
+    "axes.edgecolor": QUIET,
+    "axes.labelcolor": INK,
+    "axes.spines.top": False,
+    "axes.spines.right": False,
+    "axes.grid": True,
+    "grid.color": "#e3e7ea",
+    "grid.linewidth": 0.5,
+    "legend.frameon": False,
+    "legend.fontsize": 7,
+    "xtick.color": QUIET,
+    "ytick.color": QUIET,
+}
+
+
+def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.2), dpi: int = 110) -> None:
+    """Draw and write a PNG; `size_in` [inch]. The folder must exist."""
+    with mpl.rc_context(STYLE):
+        figure = Figure(figsize=size_in, layout="constrained")
+        draw(figure)
+        figure.savefig(path, dpi=dpi, metadata={"Software": None})

@@ -1,4 +1,4 @@
-"""`palpate validate`: the physics measured against independent references."""
+"""`palpate validate`: validation of the physics against independent references."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ app = typer.Typer(name="validate", help="Measure the physics against independent
 
 
 def run_section(name: str) -> PageSection:
-    """Measures the section of that name. Raises KeyError if there is none."""
+    """Measure a section by name. Raises KeyError if it does not exist."""
     section: PageSection = importlib.import_module(f"palpate_validation.{SECTIONS[name]}").section()
     return section
 

@@ -1,8 +1,8 @@
 """The contact test of the paper's figure 3: an indenter dropped on a soft and on a rigid surface, force and position over time.
 
-The paper plunges by about 3 mm, oscillates and comes to rest at about 1 mm; on the rigid surface it stops where it touches.
-Our default wall is softer than the paper's surface: this tool would sink 11 mm into it and dip twice more. The figure's surface
-is stiffer and less damped, as DART's was, with the stiffness chosen for the 1 mm, drop and damping for the 3 mm.
+In the paper the tool plunges by about 3 mm, oscillates and comes to rest at about 1 mm; on the rigid surface it stops at contact.
+The default wall is softer than the paper's surface: this tool would sink 11 mm into it and oscillate twice. The surface of the
+figure is stiffer and less damped, as in DART; stiffness is chosen for the 1 mm, drop height and damping for the 3 mm.
 
     from palpate_validation.drop import measure, draw
     draw(figure, measure())
@@ -22,11 +22,10 @@ from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK, QUIET
+from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 
 HEAVY_KG = 1e6
-"""Mass of what the flesh hangs on: it moves by less than a nanometre."""
+"""Mass of the body that holds the flesh, so that it moves by less than a nanometre."""
 
 
 @dataclass(frozen=True)
@@ -38,7 +37,7 @@ class SoftBox:
 
     @property
     def xml(self) -> str:
-        """The geometry in SKEL."""
+        """Geometry in the SKEL format."""
         size, counts = " ".join(map(str, self.size_m)), " ".join(map(str, self.counts))
         return f"<box><size>{size}</size><frags>{counts}</frags></box>"
 
@@ -50,7 +49,7 @@ class SoftBox:
 
     @property
     def height_m(self) -> float:
-        """Along z."""
+        """Height along z."""
         return self.size_m[2]
 
 
@@ -64,7 +63,7 @@ class Ellipsoid:
 
     @property
     def xml(self) -> str:
-        """The geometry in SKEL."""
+        """Geometry in the SKEL format."""
         size = " ".join(map(str, self.size_m))
         counts = f"<num_slices>{self.slices}</num_slices><num_stacks>{self.stacks}</num_stacks>"
         return f"<ellipsoid><size>{size}</size>{counts}</ellipsoid>"
@@ -76,13 +75,13 @@ class Ellipsoid:
 
     @property
     def height_m(self) -> float:
-        """Along z."""
+        """Height along z."""
         return self.size_m[2]
 
 
 @dataclass(frozen=True)
 class Flesh:
-    """A DART soft body's parameters; each vertex has the same."""
+    """Parameters of a DART soft body, equal for all vertices."""
 
     shape: SoftBox | Ellipsoid
     k_v: float
@@ -95,7 +94,7 @@ class Flesh:
     """Mass of a vertex [kg]."""
 
     def at_rest(self, dt: float) -> float:
-        """Part of a static contact force that DART reports at the step `dt` [s]."""
+        """Return the fraction of a static contact force that DART reports at time step `dt` [s]."""
         return self.mass / (self.mass + dt * self.damping + dt**2 * self.k_v)
 
 
@@ -123,7 +122,7 @@ _GROUND = """<skeleton name="flesh"><mobile>false</mobile>
 
 
 class DartScene:
-    """A sphere on a vertical rail over flesh, or over a rigid block when there is no flesh."""
+    """A sphere on a vertical rail over flesh, or over a rigid block without flesh."""
 
     def __init__(
         self, flesh: Flesh | None, radius: float, dt: float, *, friction: float = 1.0, mass: float = 1.0, height: float = 0.0
@@ -157,33 +156,41 @@ class DartScene:
         return -(self._height + float(self._probe.getPositions()[0]))
 
     def force(self) -> float:
-        """Upward force on the sphere in the last step [N]."""
+        """Return the upward force on the sphere in the last step [N]."""
         contacts = self.world.getLastCollisionResult().getContacts()
         return abs(float(sum(contact.force[2] for contact in contacts)))
 
     def move(self, velocity: float) -> None:
-        """One step in which the sphere moves with `velocity` [m/s] along z, whatever it takes."""
+        """Step with a prescribed velocity of the sphere along z [m/s]."""
         self._probe.getJoint(0).setActuatorType(dart.dynamics.ActuatorType.VELOCITY)
         self._probe.setCommand(0, velocity)
         self.world.step()
 
     def fall(self, weight: float) -> None:
-        """One step in which only `weight` [N] and contact act on the sphere."""
+        """Step with only `weight` [N] and contact acting on the sphere."""
         self._probe.setForces([-weight])
         self.world.step()
 
 
-MASS_KG = 0.35
-"""Stand-off and indenter of the default tool."""
-RADIUS_M = 0.015
-HEIGHT_M = 0.006
-SECONDS = 0.8
-DT = 4e-4
+@dataclass(frozen=True)
+class DropSetup:
+    """The dropped indenter."""
+
+    mass_kg: float = 0.35
+    """Stand-off and indenter of the default tool."""
+    radius_m: float = 0.015
+    height_m: float = 0.006
+    duration_s: float = 0.8
+    step_s: float = 4e-4
+    surface_edge_m: float = 0.0025
+
+
+SETUP = DropSetup()
+
 SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
-"""Our surface for the figure."""
-SURFACE_EDGE_M = 0.0025
+"""Surface of Palpate in the figure."""
 FLESH = Flesh(SoftBox((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damping=0.7, mass=1e-3)
-"""DART's soft body for the figure, vertices 2.5 mm apart."""
+"""Soft body of DART in the figure, vertices 2.5 mm apart."""
 
 
 @dataclass(frozen=True)
@@ -192,11 +199,11 @@ class Drop:
 
     name: str
     time: Array
-    """Since the first contact [s]."""
+    """Time since the first contact [s]."""
     depth: Array
-    """Depth of its lowest point below the rest surface [m]; negative in the air."""
+    """Depth of the lowest point below the rest surface [m]; negative in the air."""
     force: Array
-    """Normal force on it [N]."""
+    """Normal force on the indenter [N]."""
 
     @property
     def deepest(self) -> float:
@@ -210,7 +217,7 @@ class Drop:
 
     @property
     def oscillations(self) -> int:
-        """Times that it dips again after the first dip, by at least 0.05 mm."""
+        """Number of further plunges after the first, of at least 0.05 mm."""
         peaks, _ = find_peaks(self.depth, prominence=5e-5)
         return max(0, len(peaks) - 1)
 
@@ -221,33 +228,35 @@ class Drop:
 
 
 def drop_on_tissue(
-    surface: Stiffness = SURFACE, mass: float = MASS_KG, height: float = HEIGHT_M, seconds: float = SECONDS
+    surface: Stiffness = SURFACE, mass: float = SETUP.mass_kg, height: float = SETUP.height_m, seconds: float = SETUP.duration_s
 ) -> Drop:
-    """Drops a sphere of `mass` [kg] from `height` [m] on our tissue; semi-implicit Euler at 0.4 ms."""
-    tissue = WinklerTissue(flat_phantom(0.035, SURFACE_EDGE_M, surface.k_w_n_per_m3), surface, dt=DT)
+    """Drop a sphere of `mass` [kg] from `height` [m] on Palpate's tissue; semi-implicit Euler at 0.4 ms."""
+    tissue = WinklerTissue(flat_phantom(0.035, SETUP.surface_edge_m, surface.k_w_n_per_m3), surface, dt=SETUP.step_s)
     z, v, contact = height, 0.0, 0.0
-    p = np.array((0.0, 0.0, RADIUS_M + height))
+    p = np.array((0.0, 0.0, SETUP.radius_m + height))
     velocity = np.zeros(3)
     depth, force = [], []
-    for k in range(round(seconds / DT)):
-        v += DT * (contact / mass - GRAVITY)
-        z += DT * v
-        p[2], velocity[2] = RADIUS_M + z, v
-        contact = float(tissue.step(k * DT, p, velocity, RADIUS_M)[0][2])
+    for k in range(round(seconds / SETUP.step_s)):
+        v += SETUP.step_s * (contact / mass - GRAVITY)
+        z += SETUP.step_s * v
+        p[2], velocity[2] = SETUP.radius_m + z, v
+        contact = float(tissue.step(k * SETUP.step_s, p, velocity, SETUP.radius_m)[0][2])
         depth.append(-z)
         force.append(contact)
-    return _since_contact("soft, Palpate", np.array(depth), np.array(force), DT)
+    return _since_contact("soft, Palpate", np.array(depth), np.array(force), SETUP.step_s)
 
 
-def drop_in_dart(flesh: Flesh | None, mass: float = MASS_KG, height: float = HEIGHT_M, seconds: float = SECONDS) -> Drop:
-    """The same in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
-    scene = DartScene(flesh, RADIUS_M, DT, friction=1.0, mass=mass, height=height)
+def drop_in_dart(
+    flesh: Flesh | None, mass: float = SETUP.mass_kg, height: float = SETUP.height_m, seconds: float = SETUP.duration_s
+) -> Drop:
+    """Drop the sphere in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
+    scene = DartScene(flesh, SETUP.radius_m, SETUP.step_s, friction=1.0, mass=mass, height=height)
     depth, force = [], []
-    for _ in range(round(seconds / DT)):
+    for _ in range(round(seconds / SETUP.step_s)):
         scene.fall(mass * GRAVITY)
         depth.append(scene.depth)
         force.append(scene.force())
-    return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force), DT)
+    return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force), SETUP.step_s)
 
 
 def _since_contact(name: str, depth: Array, force: Array, dt: float) -> Drop:
@@ -256,16 +265,16 @@ def _since_contact(name: str, depth: Array, force: Array, dt: float) -> Drop:
     return Drop(name, time - time[first], depth, force)
 
 
-def measure(seconds: float = SECONDS) -> tuple[Drop, Drop, Drop]:
-    """Soft in our tissue, soft in DART, rigid in DART."""
+def measure(seconds: float = SETUP.duration_s) -> tuple[Drop, Drop, Drop]:
+    """Return the drops on Palpate's tissue, on the soft body of DART and on a rigid block in DART."""
     return drop_on_tissue(seconds=seconds), drop_in_dart(FLESH, seconds=seconds), drop_in_dart(None, seconds=seconds)
 
 
 def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
-    """The figure with what the paper says of it as bounds."""
+    """Return the comparison with the paper's figures as bounds."""
     drops = drops or measure()
     soft, flesh, rigid = drops
-    weight = MASS_KG * GRAVITY
+    weight = SETUP.mass_kg * GRAVITY
     checks = (
         Check("Palpate: deepest plunge", 1e3 * soft.deepest, "mm", 2.5, 3.5, "paper: about 3 mm"),
         Check("Palpate: depth at rest", 1e3 * soft.settled, "mm", 0.9, 1.1, "paper: about 1 mm"),
@@ -278,11 +287,12 @@ def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
         Check("rigid: dips after the first", rigid.oscillations, "", high=0, against="paper: no oscillation"),
     )
     text = (
-        f"A tool of {MASS_KG:g} kg with a sphere of {RADIUS_M * 1e3:g} mm, dropped from {HEIGHT_M * 1e3:g} mm, "
+        f"A tool of {SETUP.mass_kg:g} kg with a sphere of {SETUP.radius_m * 1e3:g} mm, dropped from {SETUP.height_m * 1e3:g} mm, "
         "as in the paper's figure 3. "
-        "Soft surfaces oscillate and settle about 1 mm in; the rigid one stops it at once. The paper gives no masses and "
-        "no stiffness: stiffness is chosen for its 1 mm, drop and damping for its 3 mm. Into the default wall this tool would "
-        "sink 11 mm."
+        "On soft surfaces it oscillates and settles at about 1 mm; on the rigid one it stops at once. The paper reports "
+        "neither mass nor stiffness: stiffness is chosen for its 1 mm, drop height and damping for its 3 mm. This "
+        "tool would sink 11 mm into the "
+        "default wall."
     )
     data = {drop.name: {"time_s": drop.time, "depth_m": drop.depth, "force_n": drop.force} for drop in drops}
     return PageSection(
@@ -291,7 +301,7 @@ def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
 
 
 def draw(figure: Figure, drops: tuple[Drop, ...]) -> None:
-    """Force above, position below; soft on the left, rigid on the right."""
+    """Draw force (top) and position (bottom) on soft (left) and rigid surfaces (right)."""
     axes = figure.subplots(2, 2, sharex="col")
     for drop, colour in zip(drops, COLOURS, strict=False):
         column = 1 if drop.name.startswith("rigid") else 0
@@ -299,7 +309,7 @@ def draw(figure: Figure, drops: tuple[Drop, ...]) -> None:
         axes[0, column].plot(drop.time, drop.force, **style)
         axes[1, column].plot(drop.time, -1e3 * drop.depth, **style)
     for column in (0, 1):
-        axes[0, column].axhline(MASS_KG * GRAVITY, color=QUIET, lw=0.6, ls="--")
+        axes[0, column].axhline(SETUP.mass_kg * GRAVITY, color=QUIET, lw=0.6, ls="--")
         axes[1, column].axhline(0, color=INK, lw=0.6)
         axes[1, column].set(xlabel="time since contact [s]", xlim=(-0.05, 0.6))
         axes[1, column].set_ylim(-3.6, 4.4)

@@ -1,4 +1,4 @@
-"""The elastic tier against Hertz and Sneddon: a flat half-space, pressed by paraboloids and spheres of several radii."""
+"""Validation of the elastic tier against Hertz and Sneddon: paraboloids and spheres pressed into a flat half-space."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
 from palpate_tissue.backends.elastic.slab import FlatSlab
-from palpate_validation.check import Check, PageSection
-from palpate_validation.hertz import YOUNG_PA, hertz_force, sneddon_force
-from palpate_validation.plots import COLOURS, INK, QUIET
+from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
+from palpate_validation.hertz import HERTZ, hertz_force, sneddon_force
 
 RADII_M = (0.010, 0.015, 0.020, 0.030)
 DEPTHS_M = np.array((2, 3, 5, 7, 10)) * 1e-3
@@ -29,8 +28,8 @@ class ElasticCurves:
 
 
 def measure() -> ElasticCurves:
-    """Presses the half-space at rest, at a place between its vertices."""
-    slab = FlatSlab(young_pa=YOUNG_PA)
+    """Press the half-space at rest, between its vertices."""
+    slab = FlatSlab(young_pa=HERTZ.young_pa)
     between = (0.0004, 0.00025)
 
     def press(profile: str) -> Array:
@@ -41,13 +40,13 @@ def measure() -> ElasticCurves:
     return ElasticCurves(
         press("paraboloid"),
         press("sphere"),
-        np.array([hertz_force(DEPTHS_M, r, YOUNG_PA, slab.poisson) for r in RADII_M]),
-        np.array([[sneddon_force(float(d), r, YOUNG_PA, slab.poisson) for d in DEPTHS_M] for r in RADII_M]),
+        np.array([hertz_force(DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in RADII_M]),
+        np.array([[sneddon_force(float(d), r, HERTZ.young_pa, slab.poisson) for d in DEPTHS_M] for r in RADII_M]),
     )
 
 
 def section(curves: ElasticCurves | None = None) -> PageSection:
-    """The comparison with its bounds."""
+    """Return the comparison with its bounds."""
     c = curves or measure()
     by_hertz, by_sneddon = 100 * (c.paraboloid / c.hertz - 1), 100 * (c.sphere / c.sneddon - 1)
     at = int(np.argmin(np.abs(DEPTHS_M - 0.005)))
@@ -63,9 +62,8 @@ def section(curves: ElasticCurves | None = None) -> PageSection:
               100 * float(c.sphere[2, -1] / c.hertz[2, -1] - 1), "%", against="Hertz"),
     )  # fmt: skip
     text = (
-        "The elastic tier as a half-space of 10 kPa. Hertz speaks of a paraboloid, and that is what is pressed first; a true "
-        "sphere "
-        "falls short of it by some percent at depths of half a radius, as Sneddon's solution says."
+        "The elastic tier as a half-space of 10 kPa. Hertz's solution is for a paraboloid. The force of a "
+        "sphere is some percent smaller at depths of half a radius, in agreement with Sneddon's solution."
     )
     data = {"radii_m": RADII_M, "depths_m": DEPTHS_M, "paraboloid_n": c.paraboloid, "sphere_n": c.sphere, "hertz_n": c.hertz,
             "sneddon_n": c.sneddon}  # fmt: skip
@@ -75,7 +73,7 @@ def section(curves: ElasticCurves | None = None) -> PageSection:
 
 
 def draw(figure: Figure, c: ElasticCurves) -> None:
-    """Force over theory against depth, for each radius."""
+    """Draw force relative to theory against depth, for each radius."""
     axes = figure.subplots()
     mm = DEPTHS_M * 1e3
     for k, radius in enumerate(RADII_M):

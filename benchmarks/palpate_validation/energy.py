@@ -1,4 +1,4 @@
-"""Energy: no closed cycle of the indenter, pressing, sliding and lifting, gets work out of the tissue."""
+"""Validation of passivity: no closed cycle of pressing, sliding and lifting extracts work from the tissue."""
 
 from __future__ import annotations
 
@@ -13,24 +13,31 @@ from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.wall import MEDIAN
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK
+from palpate_validation.check import COLOURS, INK, Check, PageSection
 
-RADIUS_M = 0.015
-REACH_M = 0.03
-"""Sideways reach of a cycle."""
-DEEPEST_M = 0.015
-CYCLES = 40
+
+@dataclass(frozen=True)
+class CycleSetup:
+    """The random cycles."""
+
+    radius_m: float = 0.015
+    reach_m: float = 0.03
+    """Sideways reach of a cycle."""
+    deepest_m: float = 0.015
+    cycles: int = 40
+
+
+SETUP = CycleSetup()
 
 
 @dataclass(frozen=True)
 class Cycle:
-    """The books of one closed cycle, in joule; arrays of shape (steps,)."""
+    """Energies of one closed cycle [J]; arrays of shape (steps,)."""
 
     work: Array
-    """Done by the indenter on the tissue so far."""
+    """Work done by the indenter on the tissue up to each step."""
     stored: Array
-    """In springs, branches and friction."""
+    """Energy stored in springs, branches and friction."""
     depth: Array
     """Depth of the sphere's lowest point below z = 0 [m]."""
     touched: int
@@ -38,23 +45,23 @@ class Cycle:
 
     @property
     def surplus(self) -> float:
-        """Largest excess of the stored energy over the work done, over the largest energy stored; passive: not above 0."""
+        """Largest excess of stored energy over work done, relative to the largest stored energy; passive: not above 0."""
         return float((self.stored - self.work).max() / max(float(self.stored.max()), 1e-12))
 
     @property
     def gained(self) -> float:
-        """Work got out over the closed cycle, over the largest work put in; passive: not above 0."""
+        """Work extracted in the closed cycle, relative to the largest work done; passive: not above 0."""
         return float(-self.work[-1] / max(float(self.work.max()), 1e-12))
 
 
 def lumpy_phantom() -> PhantomModel:
-    """A flat wall that stiffens as the median person's, and in it the smallest and sharpest lesion that the mesh allows, x10."""
+    """Return a flat wall that stiffens like the median person's, with the smallest and sharpest lesion of the mesh, x10."""
     model = flat_phantom(0.09, lesions=(Lesion(centre_m=(0.01, 0.0), radii_m=(0.015, 0.015), contrast=10, edge_m=0.002),))
     return replace(model, stiffening=np.full(len(model.vertices), MEDIAN.stiffening_per_m))
 
 
 def closed_path(amplitude: Array, phase: Array, steps: int) -> Array:
-    """A closed path of the sphere's centre [m], shape (steps + 1, 3), that starts and ends out of contact.
+    """Return a closed path of the sphere's centre [m], shape (steps + 1, 3), that starts and ends out of contact.
 
     `amplitude` and `phase` have shape (3, 3): harmonics 1 to 3 of x, y and depth, amplitudes from -1 to 1.
     """
@@ -62,28 +69,28 @@ def closed_path(amplitude: Array, phase: Array, steps: int) -> Array:
     waves = np.array([sum(a * np.sin((n + 1) * t + p) / (n + 1) for n, (a, p) in enumerate(zip(*row, strict=True)))
                       for row in zip(amplitude, phase, strict=True)])  # fmt: skip
     window = np.sin(t / 2) ** 2  # zero at both ends, where the sphere is 1 mm above the surface
-    x, y = REACH_M / 2 * (waves[:2] - waves[:2, :1])
-    dip = np.clip(0.6 + 0.4 * waves[2], -0.2, 1.0) * (DEEPEST_M + 0.001)
-    return np.column_stack((x, y, RADIUS_M + 0.001 - window * dip))
+    x, y = SETUP.reach_m / 2 * (waves[:2] - waves[:2, :1])
+    dip = np.clip(0.6 + 0.4 * waves[2], -0.2, 1.0) * (SETUP.deepest_m + 0.001)
+    return np.column_stack((x, y, SETUP.radius_m + 0.001 - window * dip))
 
 
 def run_cycle(model: PhantomModel, path: Array, friction: float = 0.3) -> Cycle:
-    """Moves the sphere along a closed path, a step a millisecond; work by the trapezoidal rule."""
+    """Move the sphere along a closed path, one step per millisecond; work by the trapezoidal rule."""
     tissue = WinklerTissue(model, Stiffness(friction=friction))
     work, stored, touched, done = [], [], 0, 0.0
     last = np.zeros(3)
     for k, (a, b) in enumerate(pairwise(path)):
-        force, _ = tissue.step(k * tissue.dt, b, (b - a) / tissue.dt, RADIUS_M)
+        force, _ = tissue.step(k * tissue.dt, b, (b - a) / tissue.dt, SETUP.radius_m)
         done -= float(0.5 * (force + last) @ (b - a))
         work.append(done)
         stored.append(tissue.energy())
         touched += tissue.touching
         last = force
-    return Cycle(np.array(work), np.array(stored), RADIUS_M - path[1:, 2], touched)
+    return Cycle(np.array(work), np.array(stored), SETUP.radius_m - path[1:, 2], touched)
 
 
-def measure(cycles: int = CYCLES, seed: int = 0) -> list[Cycle]:
-    """Random closed cycles of 0.4 to 3 s, with and without friction."""
+def measure(cycles: int = SETUP.cycles, seed: int = 0) -> list[Cycle]:
+    """Run random closed cycles of 0.4 to 3 s, with and without friction."""
     rng = np.random.default_rng(seed)
     model = lumpy_phantom()
     return [
@@ -97,7 +104,7 @@ def measure(cycles: int = CYCLES, seed: int = 0) -> list[Cycle]:
 
 
 def section(cycles: list[Cycle] | None = None) -> PageSection:
-    """The cycles with their bounds."""
+    """Return the cycles with their bounds."""
     cycles = cycles or measure()
     in_contact = [cycle for cycle in cycles if cycle.touched > 50]
     lost = [-cycle.gained for cycle in in_contact]
@@ -109,16 +116,16 @@ def section(cycles: list[Cycle] | None = None) -> PageSection:
               against="passivity"),
     )  # fmt: skip
     text = (
-        f"{len(cycles)} random closed cycles that press a stiffening wall up to {DEEPEST_M * 1e3:g} mm, slide over a sharp "
-        "lesion ten times as stiff, lift and come back, with friction of 0, 0.3 or 1. At no millisecond is more stored than was "
-        f"put in, and every cycle costs work: {100 * min(lost):.0f} to {100 * max(lost):.0f} % of what was put in."
+        f"{len(cycles)} random closed cycles that press a stiffening wall up to {SETUP.deepest_m * 1e3:g} mm, slide over a sharp "
+        "lesion ten times as stiff, lift and return, with friction of 0, 0.3 or 1. At every millisecond the stored energy is at "
+        f"most the work done, and every cycle dissipates {100 * min(lost):.0f} to {100 * max(lost):.0f} % of the work done."
     )
     data = {"gained": [c.gained for c in in_contact], "surplus": [c.surplus for c in in_contact]}
     return PageSection("energy", "Energy", text, checks, lambda f: draw(f, in_contact), data=data)
 
 
 def draw(figure: Figure, cycles: list[Cycle]) -> None:
-    """Work and stored energy of one cycle, and what all cycles cost."""
+    """Draw work and stored energy of one cycle, and the dissipation of all cycles."""
     left, right = figure.subplots(1, 2)
     shown = max(cycles, key=lambda cycle: cycle.touched)
     t = np.arange(len(shown.work)) * 1e-3

@@ -1,8 +1,8 @@
-"""The surface tier's equations in the continuum: an axisymmetric finite-element solution that shares no code with the tissue.
+"""Reference solution of the surface tier's equations: axisymmetric finite elements that share no code with the tissue.
 
     k_w u - (1/r) (r G u')' = p,    p >= 0,  u >= w(r),  p (u - w) = 0,    w(r) = d - R + sqrt(R^2 - r^2)
 
-It is what a mesh of the tissue must converge to, for any k_w(r) and G(r): a reference for lumps as for the flat surface.
+A mesh of the tissue must converge to it for any k_w(r) and G(r), so it is a reference for lumps and for the flat surface.
 """
 
 from __future__ import annotations
@@ -23,12 +23,12 @@ MOST_ITERATIONS = 200
 
 
 def uniform(value: float) -> Profile:
-    """A profile of one value everywhere."""
+    """Return a constant profile."""
     return lambda r: np.full_like(r, value)
 
 
 def lump(value: float, radius: float, contrast: float, edge: float) -> Profile:
-    """`value` times `contrast` inside `radius` [m], with a cubic edge of width `edge` [m] centred there (as phantoms have)."""
+    """Return a profile of `value`, times `contrast` inside `radius` [m], with a cubic edge of width `edge` [m] centred there."""
 
     def profile(r: Array) -> Array:
         t = np.clip(0.5 - (r - radius) / edge, 0.0, 1.0)
@@ -38,7 +38,7 @@ def lump(value: float, radius: float, contrast: float, edge: float) -> Profile:
 
 
 def static_force(depth: float, radius: float, k_w: Profile, shear: Profile, h: float = 2e-4) -> float:
-    """Force [N] on a frictionless sphere of `radius` [m] at `depth` [m]; `k_w` [N/m^3] and G = `shear` [N/m] over r [m].
+    """Return the force [N] on a frictionless sphere of `radius` at `depth` [m]; `k_w` [N/m^3] and G = `shear` [N/m] over r [m].
 
     Linear elements of length `h` [m], lumped foundation, contact by the primal-dual active set method (Hintermueller, Ito
     and Kunisch 2002). Raises RuntimeError if the contact set does not settle.
@@ -67,7 +67,7 @@ def static_force(depth: float, radius: float, k_w: Profile, shear: Profile, h: f
 
 
 def _solve(diagonal: Array, spring: Array, active: NDArray[np.bool_], hold: Array) -> Array:
-    """Equilibrium with `u = hold` where `active` and u = 0 at the outer end."""
+    """Return the equilibrium with `u = hold` where `active` and u = 0 at the outer end."""
     prescribed = active.copy()
     prescribed[-1] = True
     value = np.where(active, hold, 0.0)

@@ -1,4 +1,4 @@
-"""The surface tier against Hertz: where a Winkler-Pasternak wall is a half-space, and where it stops being one."""
+"""Validation of the surface tier against Hertz: the range in which a Winkler-Pasternak wall behaves as a half-space."""
 
 from __future__ import annotations
 
@@ -9,31 +9,39 @@ from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK, QUIET
+from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 from palpate_validation.probing import static_curve
 
-YOUNG_PA = 1.0e4
-POISSON = 0.49
-"""The half-space that the default wall stands for (10 kPa)."""
-CALIBRATED_RADIUS_M = 0.020
-"""The indenter for which k_w and l were chosen."""
-TOLERANCE = 0.10
-RANGE_M = (0.005, 0.015)
-RADII_M = (0.010, 0.015, 0.020, 0.030)
+
+@dataclass(frozen=True)
+class HertzSetup:
+    """The half-space and the range of the comparison."""
+
+    young_pa: float = 1.0e4
+    poisson: float = 0.49
+    """Parameters of the half-space that the default wall approximates (10 kPa)."""
+    calibrated_radius_m: float = 0.020
+    """Radius of the indenter for which k_w and l were chosen."""
+    tolerance: float = 0.10
+    range_m: tuple[float, float] = (0.005, 0.015)
+    radii_m: tuple[float, ...] = (0.010, 0.015, 0.020, 0.030)
+
+
+HERTZ = HertzSetup()
+
 DEPTHS_M = np.array((1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 17, 20, 25)) * 1e-3
 
 
-def hertz_force(depth: Array | float, radius: float, young: float = YOUNG_PA, poisson: float = POISSON) -> Array:
-    """Force [N] of a rigid sphere of `radius` [m] on an elastic half-space at `depth` [m]: 4/3 E* sqrt(R) d^1.5.
+def hertz_force(depth: Array | float, radius: float, young: float = HERTZ.young_pa, poisson: float = HERTZ.poisson) -> Array:
+    """Return the force [N] of a rigid sphere of `radius` [m] on an elastic half-space at `depth` [m]: 4/3 E* sqrt(R) d^1.5.
 
-    Hertz 1882; Johnson, Contact Mechanics, section 4.2. Small strain: it holds for depths well below the radius.
+    Hertz 1882; Johnson, Contact Mechanics, section 4.2. Valid for small strain, that is for depths well below the radius.
     """
     return np.asarray(4 / 3 * young / (1 - poisson**2) * np.sqrt(radius) * np.asarray(depth, dtype=float) ** 1.5)
 
 
-def sneddon_force(depth: float, radius: float, young: float = YOUNG_PA, poisson: float = POISSON) -> float:
-    """Force [N] of a rigid sphere, not a paraboloid, on an elastic half-space at `depth` [m] (Sneddon 1965).
+def sneddon_force(depth: float, radius: float, young: float = HERTZ.young_pa, poisson: float = HERTZ.poisson) -> float:
+    """Return the force [N] of a rigid sphere, not a paraboloid, on an elastic half-space at `depth` [m] (Sneddon 1965).
 
     d = a/2 ln((R + a) / (R - a)),  F = E* [(a^2 + R^2)/2 ln((R + a) / (R - a)) - a R].
     """
@@ -57,11 +65,11 @@ class HertzCurves:
 
     @property
     def error(self) -> Array:
-        """Force over Hertz's, minus one."""
+        """Relative error of the force."""
         return np.asarray(self.force / self.hertz - 1)
 
-    def within(self, radius: float, tolerance: float = TOLERANCE) -> tuple[float, float]:
-        """The interval of depths [m] about 10 mm in which the force is within `tolerance` of Hertz, interpolated."""
+    def within(self, radius: float, tolerance: float = HERTZ.tolerance) -> tuple[float, float]:
+        """Return the interval of depths [m] around 10 mm in which the force is within `tolerance` of Hertz, interpolated."""
         error = self.error[self.radii.index(radius)]
         fine = np.linspace(self.depths[0], self.depths[-1], 2000)
         bad = np.flatnonzero(np.abs(np.interp(fine, self.depths, error)) > tolerance)
@@ -75,24 +83,25 @@ class HertzCurves:
         )
 
 
-def measure(radii: tuple[float, ...] = RADII_M, depths: Array = DEPTHS_M) -> HertzCurves:
-    """Presses spheres of `radii` [m] into the flat phantom, to `depths` [m]."""
+def measure(radii: tuple[float, ...] = HERTZ.radii_m, depths: Array = DEPTHS_M) -> HertzCurves:
+    """Press spheres of `radii` [m] into the flat phantom to `depths` [m]."""
     model = flat_phantom()
     force = np.array([static_curve(model, depths, radius) for radius in radii])
     return HertzCurves(radii, depths, force, np.array([hertz_force(depths, radius) for radius in radii]))
 
 
 def section(curves: HertzCurves | None = None) -> PageSection:
-    """The comparison with its bounds."""
+    """Return the comparison with its bounds."""
     curves = curves or measure()
-    calibrated = curves.error[curves.radii.index(CALIBRATED_RADIUS_M)]
-    inside = (curves.depths >= RANGE_M[0] - 1e-9) & (curves.depths <= RANGE_M[1] + 1e-9)
+    calibrated = curves.error[curves.radii.index(HERTZ.calibrated_radius_m)]
+    inside = (curves.depths >= HERTZ.range_m[0] - 1e-9) & (curves.depths <= HERTZ.range_m[1] + 1e-9)
+    low_mm, high_mm, radius_mm = (1e3 * x for x in (*HERTZ.range_m, HERTZ.calibrated_radius_m))
     checks = [
         Check(
-            f"largest error over {RANGE_M[0] * 1e3:g} to {RANGE_M[1] * 1e3:g} mm at R = {CALIBRATED_RADIUS_M * 1e3:g} mm",
+            f"largest error over {low_mm:g} to {high_mm:g} mm at R = {radius_mm:g} mm",
             100 * float(np.abs(calibrated[inside]).max()),
             "%",
-            high=100 * TOLERANCE,
+            high=100 * HERTZ.tolerance,
             against="Hertz, 10 kPa, nu 0.49",
         )
     ]
@@ -102,16 +111,17 @@ def section(curves: HertzCurves | None = None) -> PageSection:
         ranges[f"{radius * 1e3:g} mm"] = [low, high]
         at_ten = float(np.interp(0.010, curves.depths, curves.error[curves.radii.index(radius)]))
         checks.append(Check(f"error at 10 mm depth, R = {radius * 1e3:g} mm", 100 * at_ten, "%", against="Hertz"))
-    said = ", ".join(
+    ranges_text = ", ".join(
         f"{low * 1e3:.1f} to {high * 1e3:.1f} mm at R = {name}" if np.isfinite(low) else f"nowhere near 10 mm at R = {name}"
         for name, (low, high) in ranges.items()
     )
     text = (
         "A rigid sphere held in the flat surface of the default wall, force as a mean over five places on the vertex lattice, "
-        f"against an elastic half-space of 10 kPa. Within {100 * TOLERANCE:g} %: {said} (25 mm is the deepest that was tried). "
-        "A surface of springs has a length of its own, l = 15 mm, where a half-space has none. Shallow contacts, smaller than l, "
-        "are too stiff; deep ones of a small sphere are too soft, and deeper than about half a radius Hertz's small strains are "
-        "in doubt themselves. Beyond these ranges take the elastic tier."
+        f"against an elastic half-space of 10 kPa. Within {100 * HERTZ.tolerance:g} %: {ranges_text} (largest tested "
+        "depth: 25 mm). "
+        "A surface of springs has a characteristic length, l = 15 mm; a half-space has none. Shallow contacts, smaller than l, "
+        "are too stiff; deep contacts of a small sphere are too soft, and beyond about half a radius Hertz's small strains "
+        "do not hold. Outside these ranges use the elastic tier."
     )
     data = {
         "radii_m": curves.radii,
@@ -126,7 +136,7 @@ def section(curves: HertzCurves | None = None) -> PageSection:
 
 
 def draw(figure: Figure, curves: HertzCurves) -> None:
-    """Force against depth, and its ratio to Hertz with the band in which it counts as right."""
+    """Draw force against depth, and its ratio to Hertz with the tolerance band."""
     left, right = figure.subplots(1, 2)
     mm = curves.depths * 1e3
     for k, radius in enumerate(curves.radii):
@@ -137,7 +147,7 @@ def draw(figure: Figure, curves: HertzCurves) -> None:
     left.plot([], [], color=QUIET, lw=1, ls="--", label="Hertz")
     left.set(xlabel="depth [mm]", ylabel="force [N]", xscale="log", yscale="log")
     left.legend()
-    right.axhspan(1 - TOLERANCE, 1 + TOLERANCE, color=QUIET, alpha=0.15, lw=0)
+    right.axhspan(1 - HERTZ.tolerance, 1 + HERTZ.tolerance, color=QUIET, alpha=0.15, lw=0)
     right.axhline(1, color=INK, lw=0.6)
-    right.axvspan(RANGE_M[0] * 1e3, RANGE_M[1] * 1e3, color=QUIET, alpha=0.08, lw=0)
+    right.axvspan(HERTZ.range_m[0] * 1e3, HERTZ.range_m[1] * 1e3, color=QUIET, alpha=0.08, lw=0)
     right.set(xlabel="depth [mm]", ylabel="force over Hertz", ylim=(0.7, 1.4))

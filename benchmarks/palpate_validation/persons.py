@@ -1,4 +1,4 @@
-"""Three persons as they were drawn: the force that a press meets over the belly, and the shape of the body."""
+"""Three sampled persons: maps of the force of a press, and the shape of the body."""
 
 from __future__ import annotations
 
@@ -16,19 +16,27 @@ from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.person import drawn
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Build, Phantom
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK, QUIET
+from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 
 SEEDS = ((Build.SLIM, 4), (Build.MEDIAN, 2), (Build.OBESE, 3))
-SHOWN_N = (0.7, 15.0)
-TICKS_N = (1, 2, 5, 10)
-REGION_M = 0.1
-STRIP_M = 0.012
+
+
+@dataclass(frozen=True)
+class MapSetup:
+    """Ranges of the drawn maps."""
+
+    shown_n: tuple[float, float] = (0.7, 15.0)
+    ticks_n: tuple[int, ...] = (1, 2, 5, 10)
+    region_m: float = 0.1
+    strip_m: float = 0.012
+
+
+SETUP = MapSetup()
 
 
 @dataclass(frozen=True)
 class Person:
-    """A person, and the force on a sphere of 10 mm pressed 10 mm deep at every vertex of the mesh [N], shape (n,)."""
+    """A person and the force [N] on a sphere of 10 mm pressed 10 mm deep at each vertex, shape (n,)."""
 
     build: Build
     phantom: Phantom
@@ -48,7 +56,7 @@ class Person:
 
 
 def measure() -> tuple[Person, ...]:
-    """The persons of `SEEDS`."""
+    """Return the persons of `SEEDS`."""
     return tuple(_person(build, seed) for build, seed in SEEDS)
 
 
@@ -59,40 +67,41 @@ def _person(build: Build, seed: int) -> Person:
 
 
 def section(found: tuple[Person, ...] | None = None) -> PageSection:
-    """The persons, and what must be so in each."""
+    """Return the persons with their bounds."""
     found = found or measure()
     checks = []
     for person in found:
-        belly = person.front & (person.bone < 0.01) & (np.abs(person.model.vertices[:, :2]) < REGION_M).all(axis=1)
+        belly = person.front & (person.bone < 0.01) & (np.abs(person.model.vertices[:, :2]) < SETUP.region_m).all(axis=1)
         over_bone = float(np.median(person.force[person.front & (person.bone > 0.9)]) / np.median(person.force[belly]))
-        checks.append(Check(f"{person.build}: force over bone, of that over the belly", over_bone, "times", low=3.0))
+        checks.append(Check(f"{person.build}: ratio of the force over bone to that over the belly", over_bone, "times", low=3.0))
         checks.append(Check(f"{person.build}: median force over the belly", float(np.median(person.force[belly])), "N"))
     text = (
         "Three persons of `phantom.kind: person`, one of each build. Above, the force on a sphere of 10 mm pressed 10 mm "
-        "deep, as the stiffness and stiffening of each place give it; white lines are where the wall begins to lie on "
-        "ribs and iliac crests, the dashed square is the default examined region. Below, the crown line from pelvis to "
-        "ribs, and the middle section."
+        "deep, from the local stiffness and stiffening; white lines mark the edge of "
+        "ribs and iliac crests under the wall, the dashed square is the default examined region. Below, the crown "
+        "line from pelvis "
+        "to ribs, and the middle section."
     )
     return PageSection("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
 
 
 def draw(figure: Figure, found: tuple[Person, ...]) -> None:
-    """A map of the force for each person, and outlines of the bodies."""
+    """Draw a map of the force for each person, and outlines of the bodies."""
     axes = figure.subplots(2, 3, height_ratios=(2.4, 1))
     image = None
     for k, (person, (above, below)) in enumerate(zip(found, axes.T, strict=True)):
         x, y, z = person.model.vertices.T
         shown = person.front[person.model.triangles].all(axis=1)
         mesh = Triangulation(1e3 * x, 1e3 * y, person.model.triangles[shown])
-        image = above.tripcolor(mesh, person.force, shading="gouraud", cmap="viridis", norm=LogNorm(*SHOWN_N))
+        image = above.tripcolor(mesh, person.force, shading="gouraud", cmap="viridis", norm=LogNorm(*SETUP.shown_n))
         above.tricontour(mesh, person.bone, levels=[0.5], colors="white", linewidths=0.8)
-        side = 1e3 * REGION_M
+        side = 1e3 * SETUP.region_m
         above.plot([-side, side, side, -side, -side], [-side, -side, side, side, -side], "--", color="white", lw=0.7)
         fat = 0.0 if person.phantom.anatomy is None else person.phantom.anatomy.fat_m
         above.set(title=f"{person.build}: {1e3 * fat:.0f} mm of fat", aspect="equal", xlim=(-250, 250), ylim=(-250, 250))
         above.grid(visible=False)
         for at, along, label, line in ((np.abs(x), y, "crown line", "-"), (np.abs(y), x, "middle section", "--")):
-            near = np.flatnonzero(person.front & (at < STRIP_M))
+            near = np.flatnonzero(person.front & (at < SETUP.strip_m))
             order = near[np.argsort(along[near])]
             below.plot(1e3 * along[order], 1e3 * z[order], line, color=COLOURS[0] if line == "-" else INK, lw=1, label=label)
         below.set(xlabel="along, across [mm]", xlim=(-250, 250), ylim=(-150, 25))
@@ -103,5 +112,5 @@ def draw(figure: Figure, found: tuple[Person, ...]) -> None:
             below.legend(loc="lower center")
     assert image is not None
     figure.colorbar(
-        image, ax=axes[0], label="force at 10 mm [N]", extend="max", shrink=0.9, ticks=TICKS_N, format="%g"
+        image, ax=axes[0], label="force at 10 mm [N]", extend="max", shrink=0.9, ticks=SETUP.ticks_n, format="%g"
     ).minorticks_off()

@@ -1,4 +1,4 @@
-"""Sampled persons pressed as Remus et al. pressed living people: their statistics against the measured ones."""
+"""Validation of sampled persons: the statistics of their forces against those of the living people of Remus et al."""
 
 from __future__ import annotations
 
@@ -15,32 +15,40 @@ from palpate_models.patient.healthy import belly, healthy_wall
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Build, Phantom
 from palpate_models.patient.tension import pressed_force
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK
+from palpate_validation.check import COLOURS, INK, Check, PageSection
 
-PERSONS = 200
-PLACES = 5
+
+@dataclass(frozen=True)
+class PopulationSetup:
+    """The sampled population."""
+
+    persons: int = 200
+    places: int = 5
+    apart_m: float = 0.04
+    """Least distance between positions on a person."""
+
+
+SETUP = PopulationSetup()
+
 DEPTHS_M = np.array((0.005, 0.010, 0.020))
-APART_M = 0.04
-"""Least distance of a person's places."""
 AT_10_MM = 1
 
 
 @dataclass(frozen=True)
 class PopulationSample:
-    """Places of a number of people."""
+    """Forces at positions on several people."""
 
     person: NDArray[np.int_]
-    """Whose place it is, shape (n,)."""
+    """Number of the person, shape (n,)."""
     force: Array
-    """At `DEPTHS_M` [N], shape (n, 3)."""
+    """Force at `DEPTHS_M` [N], shape (n, 3)."""
 
     def of_people(self, depth: int) -> list[Array]:
-        """The logarithms of each one's forces at a depth."""
+        """Return the logarithms of the forces of each person at a depth."""
         return [np.log(self.force[self.person == one, depth]) for one in np.unique(self.person)]
 
     def figures(self) -> dict[str, float]:
-        """The statistics that are compared."""
+        """Return the compared statistics."""
         ten = self.of_people(AT_10_MM)
         scatter = sum(float(((logs - logs.mean()) ** 2).sum()) for logs in ten)
         exponents = np.log2(self.force[:, 1:] / self.force[:, :-1])
@@ -64,14 +72,14 @@ WITHIN = (0.08, 0.08, 0.10, 0.15, 0.15, 0.40, 0.20, 0.12, 0.07, 0.07, 0.40)
 
 
 def measured() -> PopulationSample:
-    """The 48 relaxed places of the file."""
+    """Return the 48 relaxed positions of the file."""
     places = remus2024.relaxed_people()
     force = np.array([remus2024.curve(*place).force(DEPTHS_M) for place in places])
     return PopulationSample(np.array([remus2024.PEOPLE.index(person) for _, person in places]), force)
 
 
-def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> PopulationSample:
-    """Persons of the seeds 0, 1, 2 .., each pressed at `PLACES` random places of the belly away from bone.
+def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> PopulationSample:
+    """Return persons of the seeds 0, 1, 2 .., each pressed at `SETUP.places` random positions of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
     (`palpate_models.patient.tension.pressed_force`, which is within 3 % of the file at nearly all of its fitted places); the zero
@@ -88,40 +96,40 @@ def sampled(persons: int = PERSONS, build: Build = Build.MEDIAN) -> PopulationSa
         for factor, stiffening in zip(wall.stiffness.tolist(), wall.stiffening.tolist(), strict=True):
             here = usual.model_copy(update={"k_w_n_per_m3": usual.k_w_n_per_m3 * factor, "stiffening_per_m": stiffening})
             force.append([pressed_force(here, 0.0, depth + offset) for depth in DEPTHS_M.tolist()])
-    return PopulationSample(np.repeat(np.arange(persons), PLACES), np.array(force))
+    return PopulationSample(np.repeat(np.arange(persons), SETUP.places), np.array(force))
 
 
 def _places(points: Array, rng: np.random.Generator) -> Array:
-    """Places chosen of points (m, 3), at least `APART_M` from each other, shape (PLACES, 3)."""
+    """Return randomly chosen points of (m, 3), at least `SETUP.apart_m` from each other, shape (SETUP.places, 3)."""
     chosen: list[Array] = []
     for point in rng.permutation(points):
-        if all(np.linalg.norm(point - other) >= APART_M for other in chosen):
+        if all(np.linalg.norm(point - other) >= SETUP.apart_m for other in chosen):
             chosen.append(point)
-        if len(chosen) == PLACES:
+        if len(chosen) == SETUP.places:
             return np.array(chosen)
-    raise RuntimeError(f"population: fewer than {PLACES} places {APART_M} m apart among {len(points)}")
+    raise RuntimeError(f"population: fewer than {SETUP.places} places {SETUP.apart_m} m apart among {len(points)}")
 
 
 def section(found: PopulationSample | None = None) -> PageSection:
-    """The comparison with its bounds."""
+    """Return the comparison with its bounds."""
     found, people = found or sampled(), measured()
     checks = tuple(
         Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
         for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
     )
     text = (
-        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {PLACES} random places "
+        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {SETUP.places} random places "
         "of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus et "
         "al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
-        "Ten people determine a deviation between people to a quarter; the bounds are as wide. The people were young, male "
-        "and slim: other builds are models."
+        "Ten people determine an SD between people to a quarter, which is the width of the bounds. The people were young, male "
+        "and slim; other builds are not validated."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
     return PageSection("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
 
 
 def draw(figure: Figure, found: PopulationSample, people: PopulationSample) -> None:
-    """Distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
+    """Draw distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
     axes = figure.subplots(1, 3)
     shown = (
         ("force at 10 mm [N]", found.force[:, AT_10_MM], people.force[:, AT_10_MM]),

@@ -1,4 +1,4 @@
-"""Probing a tissue: a sphere held at depths below a flat surface until nothing moves any more."""
+"""Probing of a tissue: a sphere is held below a flat surface until equilibrium."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 ELASTIC = Stiffness(k_w_n_per_m3=1.7e5, length_m=0.015, stiffening_per_m=0.0, prony_g=(), prony_tau_s=(), friction=0.0)
-"""The linear wall that is near a half-space of 10 kPa, without relaxation and friction: what static references know."""
+"""Linear wall near a half-space of 10 kPa, without relaxation and friction, for comparison with static references."""
 SETTLE_S = 0.3
 """Duration of a hold [s]: six times the dashpot's 0.05 s."""
 OFFSETS = ((0.0, 0.0), (0.0025, 0.0), (0.0, 0.0029), (0.0013, 0.0008), (0.0031, 0.0017))
-"""Places on the vertex lattice over which a force is averaged [m]: on a vertex, an edge, a triangle."""
+"""Positions on the vertex lattice over which a force is averaged [m]: on a vertex, an edge, a triangle."""
 STILL = np.zeros(3)
 
 
 def hold(
     tissue: WinklerTissue, depth: float, radius: float, xy: Sequence[float] = (0.0, 0.0), seconds: float = SETTLE_S
 ) -> float:
-    """Normal force [N] on a sphere of `radius` [m] held at `depth` [m] below z = 0, after `seconds` [s]."""
+    """Return the normal force [N] on a sphere of `radius` [m] held at `depth` [m] below z = 0, after `seconds` [s]."""
     p = np.array((*xy, radius - depth))
     force = STILL
     for k in range(round(seconds / tissue.dt)):
@@ -38,7 +38,7 @@ def static_curve(
     stiffness: Stiffness = ELASTIC,
     offsets: Sequence[tuple[float, float]] = OFFSETS,
 ) -> Array:
-    """Static force [N] at rising `depths` [m], shape as theirs, as a mean over places on the lattice.
+    """Return the static force [N] at increasing `depths` [m], of their shape, as a mean over positions on the lattice.
 
     Without relaxation the equilibrium does not depend on the path, so one tissue is pressed deeper and deeper.
     """

@@ -1,4 +1,4 @@
-"""Relaxation of a held contact: the Prony series read back from the force alone."""
+"""Validation of relaxation: the Prony series estimated from the force of a held contact."""
 
 from __future__ import annotations
 
@@ -12,29 +12,37 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import COLOURS, INK
+from palpate_validation.check import COLOURS, INK, Check, PageSection
 from palpate_validation.probing import ELASTIC, STILL, hold
 
-HALF_M = 0.04
-RADIUS_M = 0.015
-DEPTH_M = 0.008
-HOLD_S = 160.0
-"""Three of the longest time constants."""
-FROM_S = 0.5
-"""Before it the dashpot's 0.05 s is still in the force."""
+
+@dataclass(frozen=True)
+class RelaxationSetup:
+    """The held contact."""
+
+    half_m: float = 0.04
+    radius_m: float = 0.015
+    depth_m: float = 0.008
+    hold_s: float = 160.0
+    """Duration of the hold, three times the longest time constant."""
+    from_s: float = 0.5
+    """Start of the fit; before it the dashpot (0.05 s) affects the force."""
+
+
+SETUP = RelaxationSetup()
+
 WALL = Stiffness(length_m=ELASTIC.length_m, stiffening_per_m=0.0, friction=0.0)
 """The linear wall of `ELASTIC` with the default's relaxation."""
 
 
 @dataclass(frozen=True)
 class Relaxation:
-    """A held contact's force over time, and the series fitted to it."""
+    """Force of a held contact over time, and the fitted series."""
 
     time: Array
     """[s], shape (n,)"""
     ratio: Array
-    """Force over the instantaneous one, shape (n,)."""
+    """Force relative to the instantaneous force, shape (n,)."""
     g: Array
     """Fitted relaxing fractions, shape (2,)."""
     tau: Array
@@ -42,19 +50,19 @@ class Relaxation:
 
 
 def series(t: Array, g1: float, tau1: float, g2: float, tau2: float) -> Array:
-    """F(t) / F0 = 1 - sum g (1 - exp(-t / tau)) of two branches."""
+    """Return F(t) / F0 = 1 - sum g (1 - exp(-t / tau)) of two branches."""
     return np.asarray(1 - g1 * (1 - np.exp(-t / tau1)) - g2 * (1 - np.exp(-t / tau2)))
 
 
-def measure(hold_s: float = HOLD_S) -> Relaxation:
-    """Holds the sphere for `hold_s` [s] and fits the series to the force by least squares, from a guess of 1 s and 20 s."""
-    model = flat_phantom(HALF_M)
-    instantaneous = hold(WinklerTissue(model, ELASTIC), DEPTH_M, RADIUS_M)
+def measure(hold_s: float = SETUP.hold_s) -> Relaxation:
+    """Hold the sphere for `hold_s` [s] and fit the series to the force by least squares, starting from 1 s and 20 s."""
+    model = flat_phantom(SETUP.half_m)
+    instantaneous = hold(WinklerTissue(model, ELASTIC), SETUP.depth_m, SETUP.radius_m)
     tissue = WinklerTissue(model, WALL)
-    p = np.array((0.0, 0.0, RADIUS_M - DEPTH_M))
-    force = np.array([tissue.step(0.0, p, STILL, RADIUS_M)[0][2] for _ in range(round(hold_s / tissue.dt))])
+    p = np.array((0.0, 0.0, SETUP.radius_m - SETUP.depth_m))
+    force = np.array([tissue.step(0.0, p, STILL, SETUP.radius_m)[0][2] for _ in range(round(hold_s / tissue.dt))])
     time = tissue.dt * np.arange(1, len(force) + 1)
-    keep = np.unique(np.geomspace(FROM_S, hold_s, 400) / tissue.dt).astype(int) - 1
+    keep = np.unique(np.geomspace(SETUP.from_s, hold_s, 400) / tissue.dt).astype(int) - 1
     time, ratio = time[keep], force[keep] / instantaneous
     (g1, tau1, g2, tau2), _ = curve_fit(series, time, ratio, p0=(0.2, 1.0, 0.2, 20.0))
     order = np.argsort((tau1, tau2))
@@ -62,7 +70,7 @@ def measure(hold_s: float = HOLD_S) -> Relaxation:
 
 
 def section(found: Relaxation | None = None) -> PageSection:
-    """The series read back, with its bounds."""
+    """Return the estimated series with its bounds."""
     found = found or measure()
     checks = []
     for k, (g, tau) in enumerate(zip(WALL.prony_g, WALL.prony_tau_s, strict=True)):
@@ -71,17 +79,18 @@ def section(found: Relaxation | None = None) -> PageSection:
             Check(f"time constant tau{k + 1} read from the force", found.tau[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
         )
     left = 1 - sum(WALL.prony_g)
-    checks.append(Check("ratio left for ever", float(1 - found.g.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
+    checks.append(Check("remaining ratio", float(1 - found.g.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
     text = (
-        f"A sphere of {RADIUS_M * 1e3:g} mm held {DEPTH_M * 1e3:g} mm deep for {HOLD_S:g} s; two exponentials fitted to its "
-        "force without knowledge of the scenario. Displacements are held, so the force must relax by the material's own series."
+        f"A sphere of {SETUP.radius_m * 1e3:g} mm held {SETUP.depth_m * 1e3:g} mm deep for {SETUP.hold_s:g} s; two exponentials "
+        "fitted to its force without access to the scenario. Displacements are held, so the force relaxes by the "
+        "series of the material."
     )
     data = {"time_s": found.time, "ratio": found.ratio, "g": found.g, "tau_s": found.tau}
     return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8), data)
 
 
 def draw(figure: Figure, found: Relaxation) -> None:
-    """The force ratio over the logarithm of time, with the scenario's series."""
+    """Draw the force ratio over the logarithm of time, with the series of the scenario."""
     axes = figure.subplots()
     axes.plot(found.time, found.ratio, ".", color=COLOURS[0], ms=3, label="tissue")
     expected = series(found.time, WALL.prony_g[0], WALL.prony_tau_s[0], WALL.prony_g[1], WALL.prony_tau_s[1])

@@ -1,4 +1,4 @@
-"""The results of a validation as a table, as JSON, as figures and as a Markdown page."""
+"""Results of a validation as a table, as JSON, as figures and as a Markdown page."""
 
 from __future__ import annotations
 
@@ -11,14 +11,13 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
-from palpate_validation.check import Check, PageSection
-from palpate_validation.plots import write_figure
+from palpate_validation.check import Check, PageSection, write_figure
 
-WORDS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
+MARKS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
 
 
 def number(value: float) -> str:
-    """A figure with three or four digits that mean something."""
+    """Return a number with about three significant digits."""
     if value == 0:
         return "0"
     if abs(value) < 1e-3 or abs(value) >= 1e5:
@@ -27,24 +26,24 @@ def number(value: float) -> str:
 
 
 def table(sections: Sequence[PageSection]) -> Table:
-    """All checks, section by section."""
-    out = Table("what", "measured", "bound", "against", "", box=None, pad_edge=False)
+    """Return a table of all checks."""
+    out = Table("check", "measured", "bound", "against", "", box=None, pad_edge=False)
     out.columns[1].justify = "right"
     for section in sections:
         out.add_row(f"[bold]{section.title}[/]")
         for check in section.checks:
             value = f"{number(check.measured)} {check.unit}".strip()
-            out.add_row(f"  {check.name}", value, check.bound, check.against, WORDS[check.passed])
+            out.add_row(f"  {check.name}", value, check.bound, check.against, MARKS[check.passed])
     return out
 
 
 def failures(sections: Sequence[PageSection]) -> list[Check]:
-    """The checks outside their bounds."""
+    """Return the checks outside their bounds."""
     return [check for section in sections for check in section.checks if check.passed is False]
 
 
 def write(sections: Sequence[PageSection], out: Path) -> None:
-    """Writes validate.json and a PNG for each section that draws into the folder `out`, which is made if need be."""
+    """Write validate.json and a PNG per section with a figure to the folder `out`, which is created if needed."""
     out.mkdir(parents=True, exist_ok=True)
     facts = {
         section.name: {
@@ -66,14 +65,14 @@ def write(sections: Sequence[PageSection], out: Path) -> None:
 
 
 def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> None:
-    """Writes the Markdown page and its small PNGs into the folder `images`, which is made if need be."""
+    """Write the Markdown page, and its small PNGs to the folder `images`, which is created if needed."""
     images.mkdir(parents=True, exist_ok=True)
     where = images.relative_to(page.parent).as_posix()
     lines = [
         "# Validation",
         "",
-        "The physics against independent references, as `palpate validate --docs docs/validation.md` measured it.",
-        "Every bound is a test in `tests/benchmarks`. Costs are of a busy two-core machine: read them as ratios.",
+        "The physics against independent references, measured by `palpate validate --docs docs/validation.md`.",
+        "Every bound is a test in `tests/benchmarks`. Costs were measured on a busy two-core machine: compare ratios.",
     ]
     for section in sections:
         lines += ["", f"## {section.title}", "", section.text, "", "| | measured | bound | against |", "|---|---|---|---|"]
@@ -87,7 +86,7 @@ def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> Non
 
 
 def show(section: PageSection, out: Path = Path("out/research")) -> None:
-    """Prints one section's checks and writes its files: what a study of its own under `research` does with its result."""
+    """Print the checks of one section and write its files, for a study in `research`."""
     write([section], out)
     console = Console()
     Console(width=max(150, console.width)).print(table([section]))
@@ -95,7 +94,7 @@ def show(section: PageSection, out: Path = Path("out/research")) -> None:
 
 
 def _plain(value: Any) -> Any:
-    """The value as JSON takes it, floats to seven digits, what is not finite as null."""
+    """Return the value for JSON: floats with seven digits, null if not finite."""
     plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
     if isinstance(plain, Mapping):
         return {str(key): _plain(item) for key, item in plain.items()}

@@ -1,4 +1,4 @@
-"""Access control with real sessions: a secure router passes what the rows say and nothing else."""
+"""Access control with real sessions: a secure router passes the messages of the contract and no others."""
 
 import json
 import time
@@ -38,7 +38,7 @@ class Bus:
         return self.sessions[name]
 
     def passes(self, sender: str, reader: str, key: str) -> bool:
-        """Whether what `sender` puts on `key` reaches `reader`; a message that is allowed shows that the way is open."""
+        """Return True if a message of `sender` on `key` reaches `reader`; an allowed message shows that both are connected."""
         open_key = message_key(f"palpate/advance/{sender}", "palpation_msgs/msg/Advance", 0)
         if reader == VIEWER:
             open_key = topic_key(RULES.topics["joint_states"], 0)
@@ -92,7 +92,7 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
         ("robot", VIEWER, "sim/tool_state", False),
     ],
 )
-def test_a_message_passes_where_its_row_says_so(bus: Bus, sender: str, reader: str, topic: str, allowed: bool) -> None:
+def test_a_message_passes_as_in_its_row(bus: Bus, sender: str, reader: str, topic: str, allowed: bool) -> None:
     assert bus.passes(sender, reader, topic_key(RULES.topics[topic], 0)) is allowed
 
 
@@ -112,10 +112,10 @@ def test_a_report_is_of_its_own_role_and_chunks_reach_the_recorder_alone(bus: Bu
 
 def test_a_viewer_sends_nothing(bus: Bus) -> None:
     key = topic_key(RULES.topics["operator/request"], 0)
-    heard: SimpleQueue[zenoh.Sample] = SimpleQueue()
-    subscriber = bus.join("supervisor").declare_subscriber(key, zenoh.handlers.Callback(heard.put, indirect=False))
+    received: SimpleQueue[zenoh.Sample] = SimpleQueue()
+    subscriber = bus.join("supervisor").declare_subscriber(key, zenoh.handlers.Callback(received.put, indirect=False))
     end = time.monotonic() + 20
-    while heard.empty() and time.monotonic() < end:  # until the way is open
+    while received.empty() and time.monotonic() < end:  # until both are connected
         bus.join(VIEWER).put(key, b"viewer")
         bus.join("conductor").put(key, b"conductor")
         time.sleep(0.02)
@@ -123,7 +123,7 @@ def test_a_viewer_sends_nothing(bus: Bus) -> None:
         bus.join(VIEWER).put(key, b"viewer")
         time.sleep(0.02)
     subscriber.undeclare()
-    said = {heard.get_nowait().payload.to_bytes() for _ in range(heard.qsize())}
+    said = {received.get_nowait().payload.to_bytes() for _ in range(received.qsize())}
     assert said == {b"conductor"}
 
 
@@ -140,7 +140,7 @@ def test_an_operator_may_ask_the_conductor_to_stop(bus: Bus, who: str, allowed: 
     queryable.undeclare()
 
 
-def test_no_one_lives_under_anothers_name(bus: Bus) -> None:
+def test_a_member_cannot_use_the_name_of_another(bus: Bus) -> None:
     watch = GraphWatch(bus.join("conductor"), 0)
     false = NodeTokens(bus.join("camera"), "robot", 0)
     true = NodeTokens(bus.join("camera"), "camera", 0)
@@ -155,7 +155,7 @@ def test_no_one_lives_under_anothers_name(bus: Bus) -> None:
 
 @pytest.mark.parametrize("certificate", [False, True])
 def test_a_stranger_cannot_connect(bus: Bus, tmp_path: Path, certificate: bool) -> None:
-    """Without a certificate, and with one of an authority of its own."""
+    """Without a certificate, and with one of another authority."""
     init(tmp_path / "own", ("robot",))
     config = zenoh_config(BusOptions(mode="client", router=bus.endpoint, tls=tmp_path / "own" / "robot"))
     config.insert_json5("transport/link/tls/root_ca_certificate", json.dumps(str(bus.keys / "ca.pem")))
@@ -165,7 +165,7 @@ def test_a_stranger_cannot_connect(bus: Bus, tmp_path: Path, certificate: bool) 
         zenoh.open(config)
 
 
-def test_without_encryption_nobody_connects(bus: Bus) -> None:
+def test_without_encryption_no_member_connects(bus: Bus) -> None:
     with pytest.raises(BusConfigError):
         open_session(BusOptions(mode="client", router=bus.endpoint.replace("tls/", "tcp/")))
 
@@ -188,7 +188,7 @@ def test_a_late_joiner_gets_a_latched_topic_through_the_router(bus: Bus) -> None
 
 
 def test_every_row_has_its_rules() -> None:
-    """From the rows alone: who may put a topic's key into the router, and who gets it out."""
+    """Derived from the rows: roles that may send on a topic's key, and roles that may receive it."""
     block = access_control(RULES)
     policy = {p["subjects"][0]: set(p["rules"]) for p in block["policies"]}
 
@@ -202,10 +202,10 @@ def test_every_row_has_its_rules() -> None:
     for topic in RULES.topics.values():
         key = topic_key(topic, 7)
         for role in RULES.roles:
-            hears = role in topic.readers or (role == WATCHER and topic.name in watched(RULES))
+            receives = role in topic.readers or (role == WATCHER and topic.name in watched(RULES))
             assert may(role, "ingress", "put", key) is (role == topic.producer), (role, topic.name)
-            assert may(role, "egress", "put", key) is hears, (role, topic.name)
-            assert may(role, "ingress", "declare_subscriber", key) is hears, (role, topic.name)
+            assert may(role, "egress", "put", key) is receives, (role, topic.name)
+            assert may(role, "ingress", "declare_subscriber", key) is receives, (role, topic.name)
         assert topic.visibility != "sim" or topic.name not in watched(RULES)
         assert may(VIEWER, "egress", "put", key) is (topic.visibility == "public"), topic.name
         assert not may(VIEWER, "ingress", "put", key)

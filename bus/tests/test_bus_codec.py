@@ -7,9 +7,9 @@ from hypothesis import strategies as st
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec, stubs
-from palpate_bus.messages.names import PACKAGES, TYPE_NAMES
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
+from palpate_bus.messages.typestore import PACKAGES, TYPE_NAMES
 from palpate_bus.testing.strategies import messages
 
 TYPES = sorted(

@@ -1,4 +1,4 @@
-"""The contract enforced live: every fault is named with topic, sender, expected and got, within a second of the bus."""
+"""Tests of the monitor: each fault is reported with topic, sender, expected and received value within a second of bus time."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ MAKE = {"joint_states": joint_state, "ft/wrench": wrench, "control/joint_torque"
 
 @dataclass
 class Bus:
-    """Three 1 kHz topics on a simulated clock, at half real time; `meddle` may change or drop what is sent."""
+    """Three 1 kHz topics on a simulated clock, at half real time; `meddle` may change or drop messages."""
 
     monitor: Monitor = field(default_factory=lambda: Monitor(RULES))
     tick: int = 0
@@ -89,7 +89,7 @@ def test_a_healthy_bus_has_no_violation_at_any_speed() -> None:
 
 @pytest.mark.parametrize("rate", [0.25, 1.0])
 def test_a_wall_clock_run_is_judged_at_its_own_rate(rate: float) -> None:
-    """There stamps need not go with the sequence numbers: who is late goes on at the present tick."""
+    """In wall-clock mode stamps need not match sequence numbers: a late service continues at the present tick."""
     bus = Bus(monitor=Monitor(RULES, rate), factor=1 / rate)
     bus.run(3000, lambda name, t, _: MAKE[name](t + 200 * MS if t > 1000 * MS else t))
     assert bus.named == {}
@@ -236,7 +236,7 @@ def test_a_topic_that_lags_behind_the_others_is_too_old() -> None:
 
 
 def test_the_next_run_on_the_same_bus_is_judged_by_itself() -> None:
-    """A router stays, and so does a monitor; what the first run sent is older than all that the second sends."""
+    """Router and monitor outlive a run; messages of the first run are older than those of the second."""
     bus = Bus()
     bus.run(3000)
     for generation in (1, 2):
@@ -252,7 +252,7 @@ def test_the_next_run_on_the_same_bus_is_judged_by_itself() -> None:
 
 
 def test_a_sender_that_returns_is_judged_again() -> None:
-    """A link that was lost for a moment takes all tokens with it."""
+    """A link that is lost briefly removes all tokens."""
     bus = Bus()
     bus.run(1500)
     bus.monitor.set_entities([], bus.factor * bus.tick / 1000)

@@ -1,4 +1,4 @@
-"""The recorder's process and its chunks."""
+"""Tests of the recorder's process and its chunks."""
 
 from __future__ import annotations
 
@@ -97,7 +97,7 @@ def chunk(topic: str, stamp: int, sequence: int) -> bytes:
 
 
 class Bus:
-    """A member of a bus on which a conductor says `commands`, one a look, and the robot has sent a chunk."""
+    """Member of a bus on which a conductor sends `commands`, one per poll, and the robot has sent a chunk."""
 
     role = "recorder"
 
@@ -108,7 +108,7 @@ class Bus:
         self.reports: list[ServiceReport] = []
         self.chunks = Queue(chunk("joint_states", 7 * MS, 8))
         self.there: deque[str] = deque()
-        """Who is still on the bus, a look each; then nobody."""
+        """Return the roles on the bus, one set per call, then none."""
 
     def internal_subscription(self, name: str, type_name: str) -> Queue:
         if name == "palpate/control":
@@ -158,7 +158,7 @@ def test_a_lost_role_is_not_waited_for() -> None:
     lost = [said(RunControl.LOST, role) for role in PRODUCERS if role != "robot"]
     member: Any = Bus(said(RunControl.HELLO), *lost, said(RunControl.END))
     RecorderNode(Kept(), member).run()
-    assert member.reports[-1].tick == 50 * MS  # as far as the robot, the only one that is left
+    assert member.reports[-1].tick == 50 * MS  # tick of the robot, the only remaining role
 
 
 def test_without_conductor_and_services_the_recording_is_completed() -> None:

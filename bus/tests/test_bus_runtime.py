@@ -64,10 +64,10 @@ def test_quantiles_are_those_of_the_values_to_within_a_bin() -> None:
         ages.add(value)
     for part in (0.5, 0.99):
         assert ages.quantile(part) == pytest.approx(np.quantile(values, part), abs=2 * BIN_NS, rel=0.01)
-    told = ages.as_ms()
-    assert told["max"] == round(max(values) / 1e6, 3)
-    assert told["mean"] == pytest.approx(np.mean(values) / 1e6, abs=1e-3)
-    assert told["p50"] < told["p99"] < told["max"]
+    reported = ages.as_ms()
+    assert reported["max"] == round(max(values) / 1e6, 3)
+    assert reported["mean"] == pytest.approx(np.mean(values) / 1e6, abs=1e-3)
+    assert reported["p50"] < reported["p99"] < reported["max"]
 
 
 def test_an_empty_histogram_and_extreme_values() -> None:

@@ -16,8 +16,7 @@ from hypothesis import strategies as st
 from palpate_bus.contract import contract
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire import rmw
-from palpate_bus.wire.rmw import AttachmentWriter
-from palpate_bus.wire.tags import KEY_SIZE, TAG_SIZE, Tagger, make_key, read_key
+from palpate_bus.wire.rmw import KEY_SIZE, TAG_SIZE, AttachmentWriter, Tagger, make_key, read_key
 from palpate_bus.wire.transport import HELLO, Subscription
 
 KEY = bytes(range(KEY_SIZE))

@@ -1,4 +1,4 @@
-"""How processes find each other: options, meshes, routers, and sessions that end in order."""
+"""Tests of connections between processes: options, meshes, routers, and the end of sessions."""
 
 import os
 import signal
@@ -16,8 +16,8 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, mesh, open_session, session, zenoh_config
 
 
-def heard(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = b"x", key: str = "test/key") -> bytes | None:
-    """What the subscriber gets within ten seconds of sending, sent again and again."""
+def received(publisher: zenoh.Session, subscriber: zenoh.Session, payload: bytes = b"x", key: str = "test/key") -> bytes | None:
+    """Return the message that the subscriber receives within ten seconds of repeated sending."""
     queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
     declared = subscriber.declare_subscriber(key, zenoh.handlers.Callback(queue.put, indirect=False))
     end = time.monotonic() + 10
@@ -72,7 +72,7 @@ def test_a_configuration_file_is_used(tmp_path: Path) -> None:
     file = tmp_path / "bus.json5"
     file.write_text(f"{{ mode: 'peer', listen: {{ endpoints: ['unixsock-stream/{tmp_path}/f.sock'] }} }}")
     with session(BusOptions(file=file)) as ours, session(BusOptions(connect=(f"unixsock-stream/{tmp_path}/f.sock",))) as theirs:
-        assert heard(ours, theirs) == b"x"
+        assert received(ours, theirs) == b"x"
 
 
 def test_an_endpoint_in_use_is_an_error(tmp_path: Path) -> None:
@@ -106,9 +106,9 @@ def test_a_port_in_use_has_a_message_of_one_line() -> None:
 def test_a_mesh_carries_messages_of_every_size(tmp_path: Path, lowlatency: tuple[str, ...], size: int) -> None:
     options = mesh(["a", "b"], tmp_path, lowlatency=lowlatency)
     payload = bytes(range(256)) * (size // 256) + bytes(size % 256)
-    with session(options["b"]) as b, session(options["a"]) as a:  # the later one of the mesh first: it tries again
-        assert heard(a, b, payload) == payload
-        assert heard(b, a, payload) == payload
+    with session(options["b"]) as b, session(options["a"]) as a:  # the later member first: it retries
+        assert received(a, b, payload) == payload
+        assert received(b, a, payload) == payload
 
 
 def test_every_pair_of_a_mesh_has_one_link() -> None:
@@ -121,26 +121,26 @@ def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/router.sock"
     router = open_session(BusOptions(mode="router", listen=(endpoint,)))
     with session(BusOptions(router=endpoint)) as a, session(BusOptions(router=endpoint)) as b:
-        assert heard(a, b) == b"x"
+        assert received(a, b) == b"x"
         with session(BusOptions(router=endpoint, mode="client")) as client:
-            assert heard(a, client) == b"x"
-            assert heard(client, b) == b"x"
+            assert received(a, client) == b"x"
+            assert received(client, b) == b"x"
         end = time.monotonic() + 10
         while b.zid() not in a.info.peers_zid() and time.monotonic() < end:
             time.sleep(0.01)
         assert b.zid() in a.info.peers_zid()
         assert close_session(router)
-        assert heard(a, b, key="test/after") == b"x"
+        assert received(a, b, key="test/after") == b"x"
 
 
-def test_router_command_routes_until_it_is_told_to_end(tmp_path: Path) -> None:
+def test_router_command_routes_until_a_signal(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/router.sock"
     router = subprocess.Popen([sys.executable, "-m", "palpate_bus.wire.router", endpoint], stdout=subprocess.PIPE, text=True)
     try:
         assert router.stdout is not None
         assert endpoint in router.stdout.readline()
         with session(BusOptions(mode="client", router=endpoint)) as a, session(BusOptions(mode="client", router=endpoint)) as b:
-            assert heard(a, b) == b"x"
+            assert received(a, b) == b"x"
         router.send_signal(signal.SIGTERM)
         assert router.wait(timeout=30) == 0
     finally:
@@ -157,7 +157,7 @@ def test_router_command_refuses_what_it_cannot_listen_on() -> None:
 
 
 def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:
-    """Left to itself, zenoh hangs for ten seconds at interpreter exit and then prints a panic."""
+    """Without closing, zenoh hangs for ten seconds at interpreter exit and then prints a panic."""
     options = mesh(["a", "b"], tmp_path)
     program = (
         "import zenoh; from queue import SimpleQueue; from palpate_bus.wire.zenoh_config import open_session\n"
@@ -188,14 +188,14 @@ def test_closing_twice_is_harmless() -> None:
 
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_closed_session_keeps_no_shared_memory(tmp_path: Path) -> None:
-    """A process that runs one examination after another would have 17 MB more with each."""
+    """Otherwise each examination in a process would leak 17 MB."""
 
     def mapped() -> int:
         return Path("/proc/self/maps").read_text(encoding="utf-8").count("/dev/shm/")
 
     options, before = mesh(["a", "b"], tmp_path), mapped()
     with session(options["a"]) as a, session(options["b"]) as b:
-        assert heard(a, b, bytes(200_000)) is not None
+        assert received(a, b, bytes(200_000)) is not None
         assert mapped() > before
     del a, b
     end = time.monotonic() + 10
@@ -211,7 +211,7 @@ from palpate_bus.wire.zenoh_config import mesh, session
 options = mesh(["a", "b"], Path(sys.argv[1]))
 with session(options["a"]) as a, session(options["b"]):
     a.put("test/key", b"")
-    time.sleep(1)  # until they are linked, and each pool has started
+    time.sleep(1)  # until they are connected and each pool has started
     threads = {name.read_text().partition("-")[0] for name in Path("/proc/self/task").glob("*/comm")}
     print(*threads)
 """
@@ -219,11 +219,11 @@ with session(options["a"]) as a, session(options["b"]):
 
 @pytest.mark.parametrize(("own", "pools"), [(None, {"net", "tx"}), ("(acc: (worker_threads: 1))", {"net", "tx", "rx", "acc"})])
 def test_sockets_are_read_by_the_threads_that_watch_them(tmp_path: Path, own: str | None, pools: set[str]) -> None:
-    """Unless the environment has pools of its own."""
+    """Except if the environment defines pools."""
     environment = {name: value for name, value in os.environ.items() if name != "ZENOH_RUNTIME"}
     if own is not None:
         environment["ZENOH_RUNTIME"] = own
     words = [sys.executable, "-c", POOLS_PROGRAM, str(tmp_path)]
     threads = subprocess.run(words, env=environment, capture_output=True, text=True, check=True).stdout.split()
-    if sys.platform == "linux":  # elsewhere threads do not tell their names
+    if sys.platform == "linux":  # other systems do not publish thread names
         assert set(threads) & {"net", "tx", "rx", "acc"} == pools

@@ -1,4 +1,4 @@
-"""When a service takes its conductor for lost: by a clock that the test sets."""
+"""Tests of the detection of a lost conductor, with a clock that the test sets."""
 
 from __future__ import annotations
 
@@ -11,15 +11,7 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages import RunControl, codec
 from palpate_bus.runtime import conductor_link
-from palpate_bus.runtime.conductor_link import (
-    BUSY_S,
-    CONTROL_TYPE,
-    HEARTBEAT,
-    LOCKSTEP_BUSY_S,
-    LOCKSTEP_SILENT_S,
-    ConductorLink,
-    RunAborted,
-)
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, HEARTBEAT, TIMES, ConductorLink, RunAborted
 from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.transport import ReceivedSample
 
@@ -33,7 +25,7 @@ class Queue:
     waiting: deque[bytes] = field(default_factory=deque)
     garbage: int = 0
     given: int = 0
-    """Number of the message that was given last; one that is replayed has it again."""
+    """Number of the last message; a replayed message repeats it."""
     latest: bytes = b""
 
     def get(self, timeout: float | None) -> ReceivedSample | None:
@@ -49,7 +41,7 @@ class Queue:
 
 
 class Bus:
-    """A member of a bus on which only a conductor speaks, and the time."""
+    """Member of a bus with a conductor only, and the time."""
 
     def __init__(self, monkeypatch: pytest.MonkeyPatch, runtime: str) -> None:
         monkeypatch.setenv("PALPATE_RUNTIME", runtime)
@@ -77,7 +69,7 @@ class Bus:
         self.queues[name].waiting.append(codec.encode(message, CONTROL_TYPE))
 
     def link(self, grace_s: float = 0.0) -> ConductorLink:
-        """A link that has heard the start and a beat."""
+        """Return a link that has received the start and a heartbeat."""
         member: Any = self
         link = ConductorLink(member, grace_s)
         self.say(RunControl.GRANT)
@@ -87,7 +79,7 @@ class Bus:
         return link
 
     def silence(self, link: ConductorLink, seconds: float, step_s: float = STEP_S) -> float:
-        """Lets `seconds` pass; returns after which the conductor was lost, infinity when it was not."""
+        """Advance the clock by `seconds`; return the time at which the conductor was lost, infinity if it was not."""
         begin = self.now
         while self.now - begin < seconds:
             self.now += step_s
@@ -117,7 +109,7 @@ def test_a_conductor_with_a_heartbeat_is_not_lost(wallclock: Bus) -> None:
 
 def test_a_conductor_that_runs_but_gets_no_core_is_waited_for(wallclock: Bus) -> None:
     wallclock.runs = True
-    assert BUSY_S < wallclock.silence(wallclock.link(grace_s=9.0), 10.0) < BUSY_S + 0.1
+    assert TIMES.busy_s < wallclock.silence(wallclock.link(grace_s=9.0), 10.0) < TIMES.busy_s + 0.1
 
 
 def test_a_service_that_was_itself_kept_from_a_core_does_not_blame_the_conductor(wallclock: Bus) -> None:
@@ -153,13 +145,13 @@ def test_a_conductor_that_returns_is_not_lost(wallclock: Bus) -> None:
 def test_in_lockstep_the_silence_may_be_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = Bus(monkeypatch, "lockstep")
     link = bus.link(grace_s=9.0)
-    assert LOCKSTEP_SILENT_S < bus.silence(link, 10.0) < LOCKSTEP_SILENT_S + 0.1
+    assert TIMES.lockstep_silent_s < bus.silence(link, 10.0) < TIMES.lockstep_silent_s + 0.1
 
 
 def test_in_lockstep_a_conductor_without_a_core_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = Bus(monkeypatch, "lockstep")
     bus.runs = True
-    assert LOCKSTEP_BUSY_S < bus.silence(bus.link(grace_s=9.0), 60.0) < LOCKSTEP_BUSY_S + 0.1
+    assert TIMES.lockstep_busy_s < bus.silence(bus.link(grace_s=9.0), 60.0) < TIMES.lockstep_busy_s + 0.1
 
 
 def test_a_conductor_without_a_heartbeat_has_the_limit_of_a_start(wallclock: Bus) -> None:

@@ -13,8 +13,7 @@ from pathlib import Path
 import pytest
 
 from palpate_bus.runs import run_folder
-from palpate_bus.runs.announcement import Announcement, Run, live
-from palpate_bus.runs.joining import NoBus, find, find_all
+from palpate_bus.runs.announcement import Announcement, NoBus, Run, find, find_all, live
 from palpate_bus.runs.run_folder import RunFolder, remove_leftovers
 from palpate_bus.wire.zenoh_config import TLS_FILES
 

@@ -138,7 +138,7 @@ class Tissue(Service):
         if t == 500 * MS and "TOY_TISSUE_DOES" in os.environ:
             misbehave(os.environ["TOY_TISSUE_DOES"])
         h = header(t, "world")
-        tool = inbox.latest("sim/tool_state")  # by the wall clock a service may step before it comes
+        tool = inbox.latest("sim/tool_state")  # in wall-clock mode a service may step before the first message
         x = 1.0 if tool is None else float(np.cos(tool.pose.position.x))
         out: dict[str, Any] = {"sim/contact_wrench": WrenchStamped(h, wrench(x))}
         if t % (10 * MS) == 0:
@@ -256,7 +256,7 @@ TOYS: dict[str, type[Service]] = {toy.role: toy for toy in EVERY}
 
 
 def transport(session: zenoh.Session) -> Transport:
-    """The usual one, or with `TOPIC KIND SECONDS` on the command line one that has this fault from that simulated second on."""
+    """Return the default transport, or with `TOPIC KIND SECONDS` on the command line one with this fault from then on."""
     if len(sys.argv) == 2:
         return Transport(session)
     from palpate_benchmarks.faulty import FaultyTransport, InjectedFault

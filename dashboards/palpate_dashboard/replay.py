@@ -26,10 +26,9 @@ from palpate_bus.messages import RunControl, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
 from palpate_bus.runs.announcement import Run, live
-from palpate_bus.runs.operator_keys import OperatorKeys
-from palpate_bus.runs.operator_requests import order
+from palpate_bus.runs.operator import OperatorKeys, order
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.observer import IDLE_S, ObservedService
+from palpate_bus.runtime.observer import LIMITS, ObservedService
 from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import RECORDING
 from palpate_bus.wire.zenoh_config import session
@@ -202,7 +201,7 @@ def follow(run: Run, service: DashboardService, report: Callable[[str], None], k
         end = ""
         while not end:
             if not observed.drain_and_step():
-                sleep(IDLE_S)
+                sleep(LIMITS.idle_s)
             for word in keys.pressed():
                 report(order(operator, run.domain, word, "a key of palpate dashboard"))
             while (sample := control.get(0)) is not None:

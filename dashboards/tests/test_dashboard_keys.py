@@ -18,13 +18,13 @@ import pytest
 from test_dashboard_browser import free_ports, start
 
 from palpate_bus.runs.announcement import Run
-from palpate_bus.runs.operator_keys import HINT, OperatorKeys
+from palpate_bus.runs.operator import HINT, OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
 from palpate_dashboard import replay
 
 KEYS_PROGRAM = """
 import sys, time
-from palpate_bus.runs.operator_keys import OperatorKeys
+from palpate_bus.runs.operator import OperatorKeys
 with OperatorKeys() as keys:
     print("attached" if keys.attached else "not attached", flush=True)
     while True:

@@ -40,7 +40,7 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
     from palpate.console import EXIT_TROUBLE, print_json
-    from palpate_bus.runs.joining import NoBus
+    from palpate_bus.runs.announcement import NoBus
     from palpate_models.scenario.load import load_scenario
 
     if role not in SUITES:

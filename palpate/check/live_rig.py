@@ -21,7 +21,7 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.joining import NoBus
+from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch, NodeTokens, gid
 from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
 from palpate_bus.wire.transport import Publisher, Subscription

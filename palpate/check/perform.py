@@ -23,7 +23,7 @@ from palpate.check.suites import DURATION_S, check
 from palpate.console import table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.joining import NoBus
+from palpate_bus.runs.announcement import NoBus
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import dump_scenario, view_of

@@ -34,7 +34,7 @@ from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.numerics.maps import half_width
 from palpate_models.scenario.load import exam_input
-from palpate_planning.contact import CONTACT_ON_N
+from palpate_planning.contact import THRESHOLDS
 
 _NO_TRIANGLES = np.empty(0, np.uint32)
 _NO_SHARES = np.empty(0, np.float32)
@@ -206,7 +206,7 @@ def _state(
 ) -> Any:
     """Return `exam/state` at time `t` [ns]; `felt` is the measured depth [m] and force [N]."""
     depth, force = felt
-    touching = force > CONTACT_ON_N
+    touching = force > THRESHOLDS.on_n
     return exam_state(
         t,
         phase,

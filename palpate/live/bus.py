@@ -13,7 +13,7 @@ import typer
 import zenoh
 
 from palpate_bus.contract import Contract
-from palpate_bus.runs.joining import BusTarget, NoBus, find
+from palpate_bus.runs.announcement import BusTarget, NoBus, find
 from palpate_bus.security.access import public
 from palpate_bus.wire.zenoh_config import BusOptions, session
 

@@ -51,7 +51,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     While it shows a live run, keys in its terminal are an operator's controls: s soft stop (the arm retreats and waits),
     e emergency stop (the driver holds), r release.
     """
-    from palpate_bus.runs.joining import named_runs
+    from palpate_bus.runs.announcement import named_runs
     from palpate_dashboard.picture import film, take
 
     console = Console(stderr=True, highlight=False, soft_wrap=True)
@@ -75,7 +75,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
 
 def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
     """Follows a run to its end; unless `leave`, keeps showing it afterwards."""
-    from palpate_bus.runs.operator_keys import HINT, OperatorKeys
+    from palpate_bus.runs.operator import HINT, OperatorKeys
     from palpate_dashboard.replay import follow
     from palpate_dashboard.service import DashboardService
     from palpate_dashboard.sinks import Live, address

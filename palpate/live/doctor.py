@@ -19,7 +19,7 @@ from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import Contract, contract
 from palpate_bus.monitor.health import TopicHealth, Violation
-from palpate_bus.monitor.live import LiveMonitor
+from palpate_bus.monitor.monitor import LiveMonitor
 from palpate_bus.runs.announcement import live as live_runs
 from palpate_bus.runs.announcement import versions
 from palpate_bus.runs.run_folder import remove_leftovers

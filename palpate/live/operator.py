@@ -12,8 +12,8 @@ from rich.markup import escape
 
 from palpate.console import EXIT_FAILED, say
 from palpate.live.bus import ChosenRun
-from palpate_bus.runs.joining import find, find_all
-from palpate_bus.runs.operator_requests import NoConductorError, ask
+from palpate_bus.runs.announcement import find, find_all
+from palpate_bus.runs.operator import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
 from palpate_errors import PalpateError
 

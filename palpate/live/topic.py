@@ -23,7 +23,7 @@ from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, join
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runs.joining import NoBus
+from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
 
 REPORT_PERIOD_S = 1.0

@@ -23,7 +23,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import Following, Scenario
-from palpate_planning.contact import CONTACT_OFF_N, CONTACT_ON_N, ContactMeasurement
+from palpate_planning.contact import THRESHOLDS, ContactMeasurement
 from palpate_planning.interruptions import WALL
 from palpate_planning.stroke import (
     PUSHING,
@@ -44,7 +44,7 @@ from palpate_planning.strokes.path import Ints, SurfacePath, lay
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
 from palpate_planning.wall.surface import Foot, PerceivedSurface
-from palpate_planning.wall.wall import Wall, WallPlace
+from palpate_planning.wall.wall import Wall, WallEstimate
 
 _DENSE_M: Final = 0.0003
 """Spacing of the places of a path: about the travel of the indenter in a period."""
@@ -241,7 +241,7 @@ class QuickExamination:
     def _measured(self) -> ContactMeasurement:
         """Return the contact as measured at the end of the latest period."""
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
-        return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallPlace(0.0, 0.0, self.uncertainty_m), *measured)
+        return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallEstimate(0.0, 0.0, self.uncertainty_m), *measured)
 
     def _period(self, stage: StrokeStage, contact: ContactMeasurement) -> PeriodRow:
         """Move the indenter for a period, with the errors of this examination."""
@@ -259,7 +259,7 @@ class QuickExamination:
         self._force = float(path.gains[at] @ force) + loop.tared(k)
         along = float(path.normal[at] @ force)
         self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
-        self._touching = self._force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        self._touching = self._force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         self._open = not self._gated or abs(loop.followed * excursion) < WALL.gate_m
         limited = is_limited(stage, motion)
         return PeriodRow(

@@ -29,7 +29,7 @@ from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import seen, true_pose, whole_scenario
 from palpate_models.scenario.patterns import stations
 from palpate_models.scenario.schema import Exam, Following, Scenario
-from palpate_perception.pipeline import MESH_MARGIN_M, MESH_STEP_M
+from palpate_perception.pipeline import PIPELINE
 from palpate_planning.interruptions import WALL
 
 PERIOD_S: Final = 0.010
@@ -231,7 +231,8 @@ class Patient:
 def seen_lattice(exam: Exam) -> Array:
     """Return points of the perceived mesh: over the region and a margin [m], shape (n, 2)."""
     x, y = (
-        stations(centre, size + 2 * MESH_MARGIN_M, MESH_STEP_M) for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
+        stations(centre, size + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
+        for centre, size in zip(exam.centre_m, exam.region_m, strict=True)
     )
     return np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
 

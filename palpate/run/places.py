@@ -20,8 +20,7 @@ import typer
 from palpate.service import command as service_command
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.runs.announcement import Run
-from palpate_bus.runs.joining import named_runs
+from palpate_bus.runs.announcement import Run, named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES

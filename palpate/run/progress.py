@@ -12,8 +12,7 @@ from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn
 from palpate.run.outlook import Outlook, duration_text
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.operator_keys import HINT, OperatorKeys
-from palpate_bus.runs.operator_requests import WORDS
+from palpate_bus.runs.operator import HINT, WORDS, OperatorKeys
 from palpate_conductor.outcome import RunProgress
 from palpate_models.scenario.schema import Exam, Mode
 

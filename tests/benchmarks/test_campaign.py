@@ -15,11 +15,12 @@ import psutil
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import CaseOutcome, CaseOver, FaultCase, FaultFinding, _conclude, _Watch, cases
-from palpate_benchmarks.campaign_tables import csv_text, from_csv, markdown
+from palpate_benchmarks.campaign import CaseOver, _conclude, _Watch, cases
+from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
+from palpate_benchmarks.faults import markdown
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
-from palpate_benchmarks.whole_cases import FIXED, _judge, _no_more, drawn, fixed, is_whole
+from palpate_benchmarks.whole_cases import FIXED, _freeze_usage, _judge, drawn, fixed, is_whole
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -134,7 +135,7 @@ def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: Cas
     progress = in_phase(phase, "aborted: planning/setpoint refused")
     case = watch()
     with pytest.raises(CaseOver) as over:
-        case.tell(progress)
+        case.on_progress(progress)
     _conclude(case.finding, case, replace(result(progress.collected), failure=over.value.failure))
     assert case.finding.outcome is outcome
     assert case.finding.good
@@ -142,8 +143,8 @@ def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: Cas
 
 
 def test_a_fault_of_the_assessment_shows_after_the_scan() -> None:
-    watch("assessment/map", "assessment").tell(in_phase(ExamState.PHASE_RETURN))
-    watch().tell(in_phase(ExamState.PHASE_SCAN))
+    watch("assessment/map", "assessment").on_progress(in_phase(ExamState.PHASE_RETURN))
+    watch().on_progress(in_phase(ExamState.PHASE_SCAN))
 
 
 def test_an_end_that_names_no_role_is_bad() -> None:
@@ -163,7 +164,7 @@ def found(where: str, detected_ms: float, peak_force_n: float) -> FaultFinding:
 def test_the_page_sums_up_and_marks_bad_cases() -> None:
     fine, slow = found("robot", 20.0, 5.5), found("tissue", 40.0, 26.0)
     page = markdown([fine, slow])
-    assert "1 of 2 as they should be; the largest force was 26.0 N." in page
+    assert "1 of 2 cases passed; the largest force was 26.0 N." in page
     assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
     assert "**!** lockstep, kill tissue: tissue lost" in page
     assert "robot lost" not in page
@@ -177,7 +178,7 @@ def test_findings_are_read_back_from_their_file() -> None:
 
 
 def test_a_file_of_other_columns_is_refused() -> None:
-    with pytest.raises(ValueError, match="wants the columns kind, where"):
+    with pytest.raises(ValueError, match="must have the columns kind, where"):
         from_csv("mode,fault\nlockstep,kill\n")
 
 
@@ -215,7 +216,7 @@ def test_a_memory_limit_stops_an_allocation() -> None:
     words = [sys.executable, "-c", "import sys\nprint(flush=True)\nsys.stdin.readline()\nbytes(10**9)"]
     process = psutil.Popen(words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
     process.stdout.readline()
-    _no_more(process, psutil.RLIMIT_AS)
+    _freeze_usage(process, psutil.RLIMIT_AS)
     _, said = process.communicate("\n")
     assert "MemoryError" in said
 

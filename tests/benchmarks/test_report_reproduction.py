@@ -15,8 +15,8 @@ from palpate.report.archive import Evidence, completed, write_evidence
 from palpate.truth.surface import Touched
 from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
+from palpate_reproduction.page import chosen_moments
 from palpate_reproduction.render import BACKGROUND, Body, Viewpoint, picture
-from palpate_reproduction.reproduction import chosen_moments
 
 
 def square(z: float, color: tuple[float, float, float], half: float = 1.0) -> Body:
@@ -72,7 +72,7 @@ def evidence(phase: list[int], force: list[float]) -> Evidence:
 def test_the_moments_are_of_their_phases() -> None:
     one = evidence([0, 1, 1, 3, 3, 4, 4, 5, 5, 5, 5, 6, 7], [0, 0, 0, 0, 0, 1, 2, 2, 2, 9, 2, 1, 0])
     chosen = {words: time for words, time, _ in chosen_moments(one)}
-    assert 1 <= chosen["looking"] <= 2
+    assert 1 <= chosen["camera burst"] <= 2
     assert 3 <= chosen["approaching"] <= 4
     assert 5 <= chosen["descending"] <= 6
     assert chosen["scanning, on the stiff area"] == 9

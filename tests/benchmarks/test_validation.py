@@ -127,14 +127,14 @@ def test_dropped_on_our_surface_it_oscillates_and_settles() -> None:
     assert 2.5e-3 < soft.deepest < 3.5e-3
     assert 0.9e-3 < soft.settled < 1.1e-3
     assert soft.oscillations >= 2
-    assert soft.last_force == pytest.approx(drop.MASS_KG * drop.GRAVITY, rel=0.01)
+    assert soft.last_force == pytest.approx(drop.SETUP.mass_kg * drop.GRAVITY, rel=0.01)
 
 
 def test_dropped_on_a_rigid_surface_it_stops() -> None:
     rigid = drop.drop_in_dart(None, seconds=0.3)
     assert rigid.oscillations == 0
     assert rigid.deepest < 0.3e-3
-    assert rigid.last_force == pytest.approx(drop.MASS_KG * drop.GRAVITY, rel=0.01)
+    assert rigid.last_force == pytest.approx(drop.SETUP.mass_kg * drop.GRAVITY, rel=0.01)
 
 
 def test_the_tool_would_sink_deep_into_the_default_wall() -> None:

@@ -14,7 +14,7 @@ from palpate.report.results import truth_of_run
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import FEATURES
 from palpate_models.scenario.load import load_scenario
-from palpate_validation.indentation import SPACING_M, at_depths
+from palpate_validation.people import PRESS, at_depths
 from research import assessment_calibration, guarding_calibration, people_fit, reassessed, soak
 from research import depth as depth_study
 from research.assessment_calibration import WeighedPatient, reported, slope
@@ -156,7 +156,7 @@ def test_people_are_fitted_by_the_wall_that_made_the_force() -> None:
     """The fit finds a wall, its offset and its k_w again from a force that such a wall gave."""
 
     def simulated(length: float, beta: float) -> np.ndarray:
-        depth = np.arange(221) * SPACING_M
+        depth = np.arange(221) * PRESS.spacing_m
         return length * depth + depth**1.5 * length**2 + beta**2 * depth**4
 
     force = 2e5 * at_depths(simulated(0.015, 90.0), 0.0005)

@@ -4,7 +4,6 @@ They are created from .msg files when this module is imported. `names.py` lists 
 declares their fields for type checkers.
 """
 
-from palpate_bus.messages.names import TYPE_NAMES
-from palpate_bus.messages.typestore import message_type
+from palpate_bus.messages.typestore import TYPE_NAMES, message_type
 
 globals().update({short: message_type(name) for short, name in TYPE_NAMES.items()})

@@ -13,8 +13,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.cdr import ENCAPSULATION
-from palpate_bus.messages.struct_codecs import STRUCT_CODECS, fitted
+from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS, fitted
 from palpate_bus.messages.typestore import (
     CodecError,
     array_dtype,

@@ -13,8 +13,7 @@ from typing import Any
 
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.names import TYPE_NAMES
-from palpate_bus.messages.typestore import array_dtype, store
+from palpate_bus.messages.typestore import TYPE_NAMES, array_dtype, store
 
 STUB = Path(__file__).with_name("__init__.pyi")
 

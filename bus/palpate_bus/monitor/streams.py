@@ -16,8 +16,27 @@ from typing import NamedTuple
 from palpate_bus.contract import MS, Topic
 from palpate_bus.contract.conformance import ViolationKind as Kind
 
-WINDOW_S = 0.7
-"""Averaging window of rates [s], wall time; a wrong rate is found within a second."""
+
+@dataclass(frozen=True)
+class StreamTuning:
+    """Tolerances of rate, silence and age."""
+
+    window_s: float = 0.7
+    """Averaging window of rates [s], wall time; a wrong rate is found within a second."""
+    rate_tolerance: float = 0.2
+    least_off: int = 3
+    """A rate is wrong when more than this many messages, and more than `rate_tolerance` of them, are missing or too many."""
+    silence_ns: int = 100 * MS
+    """Bus time without a message after which a topic is silent."""
+    grace_s: float = 0.5
+    """Time after a first message until its rate is checked."""
+    ages: int = 5
+    """Number of checks over which the median age is taken."""
+    slack_ms: float = 100.0
+    """Wall time of one check of all topics [ms]."""
+
+
+TUNING = StreamTuning()
 
 
 class Passed(NamedTuple):
@@ -45,13 +64,13 @@ class Stream:
     stamp: int | None = None
     sent: int = 0
     window: deque[tuple[float, int, int, int | None, int]] = field(default_factory=deque)
-    """(now, messages, bytes, stamp, source time) at each check of the last `WINDOW_S`."""
+    """(now, messages, bytes, stamp, source time) at each check of the last `TUNING.window_s`."""
     ages: deque[float] = field(default_factory=lambda: deque(maxlen=16))
 
     def mark(self, now: float) -> None:
         """Add the current counts to the window."""
         self.window.append((now, self.count, self.size, self.stamp, self.sent))
-        while len(self.window) > 2 and now - self.window[1][0] >= WINDOW_S:
+        while len(self.window) > 2 and now - self.window[1][0] >= TUNING.window_s:
             self.window.popleft()
 
     def passed(self) -> Passed:
@@ -59,19 +78,6 @@ class Stream:
         first, last = self.window[0], self.window[-1]
         progress = None if first[3] is None or last[3] is None else last[3] - first[3]
         return Passed(last[0] - first[0], last[1] - first[1], last[2] - first[2], progress, last[4] - first[4])
-
-
-RATE_TOLERANCE = 0.2
-LEAST_OFF = 3
-"""A rate is wrong when more than this many messages, and more than `RATE_TOLERANCE` of them, are missing or too many."""
-SILENCE_NS = 100 * MS
-"""Bus time without a message after which a topic is silent."""
-GRACE_S = 0.5
-"""Time after a first message until its rate is checked."""
-AGES = 5
-"""Number of checks over which the median age is taken."""
-SLACK_MS = 100.0
-"""Wall time of one check of all topics [ms]."""
 
 
 class BusTime(NamedTuple):
@@ -103,7 +109,7 @@ def bus_time(streams: Iterable[Stream], rate: float | None) -> BusTime:
     moved, newest = [], []
     for stream in streams:
         passed = stream.passed()
-        if passed.stamps is not None and passed.seconds >= GRACE_S:
+        if passed.stamps is not None and passed.seconds >= TUNING.grace_s:
             moved.append((passed.stamps, passed.seconds))
             newest.append(stream.stamp or 0)
     if not moved:
@@ -116,17 +122,17 @@ def bus_time(streams: Iterable[Stream], rate: float | None) -> BusTime:
 def timing_problems(topic: Topic, stream: Stream, time: BusTime, rate: float | None, now: float) -> Iterator[TimingProblem]:
     """Yield violations of rate and age of a periodic topic's stream; `now` [s] is the clock of its marks."""
     own = stream.passed()
-    if now - stream.began < GRACE_S or own.seconds < GRACE_S:
+    if now - stream.began < TUNING.grace_s or own.seconds < TUNING.grace_s:
         return
     wanted = f"{1000 / topic.period_ms:g} {'Hz' if rate == 1.0 else 'Hz of simulated time'}"
     if not own.messages:
-        if is_due(topic, time) and time.passed > SILENCE_NS:
+        if is_due(topic, time) and time.passed > TUNING.silence_ns:
             yield TimingProblem(Kind.SILENT, wanted, f"nothing for {own.seconds:.1f} s")
         return
     spent = own.sent * rate if rate else own.stamps
     if spent:
         off = abs(own.messages - spent / topic.period)
-        if off > LEAST_OFF and off > RATE_TOLERANCE * spent / topic.period:
+        if off > TUNING.least_off and off > TUNING.rate_tolerance * spent / topic.period:
             unit = wanted.partition(" ")[2]
             yield TimingProblem(Kind.RATE, wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
     yield from _age(topic, stream, time, rate)
@@ -134,11 +140,11 @@ def timing_problems(topic: Topic, stream: Stream, time: BusTime, rate: float | N
 
 def is_due(topic: Topic, time: BusTime) -> bool:
     """True if enough bus time passed for several messages of a periodic topic."""
-    return time.passed / topic.period > LEAST_OFF
+    return time.passed / topic.period > TUNING.least_off
 
 
 def _age(topic: Topic, stream: Stream, time: BusTime, rate: float | None) -> Iterator[TimingProblem]:
-    if topic.max_age_ms is None or len(stream.ages) < AGES:
+    if topic.max_age_ms is None or len(stream.ages) < TUNING.ages:
         return
     if rate:
         age = median(stream.ages) * rate
@@ -146,5 +152,5 @@ def _age(topic: Topic, stream: Stream, time: BusTime, rate: float | None) -> Ite
             yield TimingProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
     elif stream.stamp is not None and time.now is not None:
         behind = (time.now - stream.stamp) / MS - topic.period_ms
-        if behind > topic.max_age_ms + SLACK_MS * max(time.progress or 0.0, 1.0):
+        if behind > topic.max_age_ms + TUNING.slack_ms * max(time.progress or 0.0, 1.0):
             yield TimingProblem(Kind.AGE, f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")

@@ -1,1 +1,1 @@
-"""Runtimes that step services in lockstep or by the wall clock, over zenoh or in one process."""
+"""Runtimes that step services in lockstep or in wall-clock mode, over zenoh or in one process."""

@@ -16,7 +16,7 @@ from palpate_errors import RunError
 Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
 CONDUCTOR = "conductor"
-"""The only observer that a run needs: without it there is no result."""
+"""The only observer that every run needs, since it makes the result."""
 BETWEEN = -1
 """The number of no role, between two steps."""
 

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import json
 import logging
+from dataclasses import dataclass
 from time import monotonic
 from typing import Any, Final
 
@@ -25,24 +26,34 @@ log = logging.getLogger(__name__)
 CONDUCTOR: Final = "conductor"
 HEARTBEAT: Final = "palpate/heartbeat"
 CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
-POLL_S = 0.05
-"""Period at which a waiting node polls for control messages."""
-PROGRESS_S = 0.2
-"""Period of progress reports, wall clock."""
-CONDUCTOR_SILENT_S = 10.0
-"""Time without a message after which the conductor is lost before the run starts, or if it has no heartbeat."""
-CONDUCTOR_AWAITED_S = 120.0
-"""The same before its first message: containers on a busy machine start tens of seconds apart."""
-LOCKSTEP_SILENT_S = 3.0
-"""The same in lockstep, where time stands without grants."""
-LONGEST_POLL_S = 0.1
-"""Longest silence counted between two polls: a node that polls later was itself without a core, and perhaps others were."""
-GONE_S = 0.01
-"""Period at which the conductor's token is checked, and time for which it must be missing: its last message may be in transit."""
-BUSY_S = 2.0
-"""Limit for a silent conductor whose process runs, so that it is starved of CPU."""
-LOCKSTEP_BUSY_S = 30.0
-"""The same in lockstep, where waiting is safe: an overloaded machine starves a conductor for seconds."""
+
+
+@dataclass(frozen=True)
+class LinkTimes:
+    """Times of the link to the conductor."""
+
+    poll_s: float = 0.05
+    """Period at which a waiting node polls for control messages."""
+    progress_s: float = 0.2
+    """Period of progress reports, wall clock."""
+    silent_s: float = 10.0
+    """Time without a message after which the conductor is lost before the run starts, or if it has no heartbeat."""
+    awaited_s: float = 120.0
+    """As `silent_s`, before the first message: containers on a busy machine start tens of seconds apart."""
+    lockstep_silent_s: float = 3.0
+    """As `silent_s`, in lockstep, where time does not advance without grants."""
+    longest_poll_s: float = 0.1
+    """Longest silence counted between two polls: a node that polls later was itself starved of CPU, and perhaps others too."""
+    token_gone_s: float = 0.01
+    """Period of checks of the conductor's token, and time for which it must be missing: a message may be in transit."""
+    busy_s: float = 2.0
+    """Limit for a silent conductor whose process runs, so that it is starved of CPU."""
+    lockstep_busy_s: float = 30.0
+    """As `busy_s`, in lockstep, where waiting is safe: an overloaded machine starves a conductor for seconds."""
+
+
+TIMES: Final = LinkTimes()
+
 
 CONDUCTOR_LOST_LOG: Final = "conductor_lost: %s"
 """Log format of every service; `palpate faults` finds it in the logs of runs that lost their conductor."""
@@ -51,7 +62,7 @@ TRANSPORT_LOST: Final = "the router of the bus does not answer"
 
 def longest_silence_s(rules: Contract, wallclock: bool) -> float:
     """Return the silence [s] after which a conductor that has sent a heartbeat counts as lost."""
-    return rules.internal[HEARTBEAT].deadline / NS if wallclock else LOCKSTEP_SILENT_S
+    return rules.internal[HEARTBEAT].deadline / NS if wallclock else TIMES.lockstep_silent_s
 
 
 class RunAborted(RunError):
@@ -69,9 +80,9 @@ class ConductorLink:
         self._decode = codec.decoder(CONTROL_TYPE)
         wallclock = Settings.read().runtime == "wallclock"
         self._deadline_s = longest_silence_s(member.rules, wallclock)
-        self._busy_s = BUSY_S if wallclock else LOCKSTEP_BUSY_S
+        self._busy_s = TIMES.busy_s if wallclock else TIMES.lockstep_busy_s
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
-        self._patience_s = CONDUCTOR_AWAITED_S
+        self._patience_s = TIMES.awaited_s
         self._granted = self._beating = False
         self._control_sequence = self._beat_sequence = 0
         """Last sequence numbers of control and heartbeat; duplicates are ignored."""
@@ -114,7 +125,7 @@ class ConductorLink:
 
     def _on_message(self) -> None:
         self._silent_s = 0.0
-        self._patience_s = self._deadline_s if self._granted and self._beating else CONDUCTOR_SILENT_S
+        self._patience_s = self._deadline_s if self._granted and self._beating else TIMES.silent_s
         if self.lost:
             log.warning("the conductor is back")
             self.lost = ""
@@ -122,7 +133,7 @@ class ConductorLink:
     def _poll_heartbeat(self) -> None:
         """Process received heartbeats and count the silence."""
         now = monotonic()
-        since, self._polled = min(now - self._polled, LONGEST_POLL_S), now
+        since, self._polled = min(now - self._polled, TIMES.longest_poll_s), now
         beat = None
         while (sample := self._beats.get(0)) is not None:
             if sample.sequence > self._beat_sequence:
@@ -131,7 +142,7 @@ class ConductorLink:
             self._on_heartbeat(beat.payload)
             return
         self._silent_s += since
-        if self.lost or now - self._checked < GONE_S:
+        if self.lost or now - self._checked < TIMES.token_gone_s:
             return
         self._checked = now
         before, self._missed = self._missed, CONDUCTOR in self._member.gone()
@@ -189,7 +200,7 @@ class Reports:
 
     def progress(self, tick: int, waiting_for: str = "") -> None:
         """Report progress if the last report is old enough, with new suspicions about senders."""
-        if monotonic() - self._last > PROGRESS_S:
+        if monotonic() - self._last > TIMES.progress_s:
             suspicions = self._member.suspicions()
             for complaint in (*self._member.complaints(), *suspicions):
                 log.error("%s", complaint)

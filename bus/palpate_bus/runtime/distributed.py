@@ -17,7 +17,7 @@ import numpy as np
 
 from palpate_bus.contract import Contract, Edge
 from palpate_bus.messages import Advance, RunControl, ServiceReport, codec
-from palpate_bus.runtime.conductor_link import POLL_S
+from palpate_bus.runtime.conductor_link import TIMES
 from palpate_bus.runtime.group import Group
 from palpate_bus.runtime.lockstep import NEVER, ForgedSenderError, InputBuffer, LockstepError, Packet, Sent, Stepper
 from palpate_bus.runtime.member import Member
@@ -50,7 +50,7 @@ class LockstepNode(Node):
     def _join(self) -> None:
         """Answer the conductor's hellos until it grants the first tick."""
         while self._horizon < 0:
-            message = self._link.poll(POLL_S)
+            message = self._link.poll(TIMES.poll_s)
             if message is not None and message.command == RunControl.HELLO:
                 for seat in self._seats:
                     seat.output.hello()
@@ -115,7 +115,7 @@ class LockstepNode(Node):
         while t > self._horizon:
             if self._last:
                 return False
-            message = self._link.poll(POLL_S)
+            message = self._link.poll(TIMES.poll_s)
             if message is not None:
                 self._obey(message)
             for seat in self._seats:
@@ -197,7 +197,7 @@ class RemoteInputs:
             sample = source.get(0)
             if sample is None:
                 waited = True
-                sample = source.get(POLL_S)
+                sample = source.get(TIMES.poll_s)
             if sample is None:
                 idle(buffer.topic.name)
             elif source is data:

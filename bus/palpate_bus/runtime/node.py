@@ -9,7 +9,7 @@ from dataclasses import replace
 from typing import Any
 
 from palpate_bus.messages import RunControl, ServiceReport
-from palpate_bus.runtime.conductor_link import POLL_S, ConductorLink, Reports, RunAborted
+from palpate_bus.runtime.conductor_link import TIMES, ConductorLink, Reports, RunAborted
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.runtime.lockstep import NEVER, Sent, Stepper
 from palpate_bus.runtime.member import Member
@@ -122,6 +122,6 @@ class Node(ABC):
     def _await_end(self) -> None:
         """Wait for the conductor's END message."""
         while True:
-            message = self._link.poll(POLL_S)
+            message = self._link.poll(TIMES.poll_s)
             if message is not None and message.command == RunControl.END:
                 return

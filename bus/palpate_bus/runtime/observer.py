@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from contextlib import suppress
+from dataclasses import dataclass
 from time import monotonic, sleep
 from typing import Any
 
@@ -26,14 +27,22 @@ from palpate_bus.wire.transport import decoded
 
 log = logging.getLogger(__name__)
 
-IDLE_S = 0.005
-RING = 64
-"""Messages kept of a periodic topic: enough for one period of an observer at 1 kHz."""
-FIFO = 1 << 17
-LEAVE_S = 2.0
-"""Limit for observed services to leave after the end of the run; they leave at once."""
-OBSERVERS_STAY_S = 8.0
-"""Limit without a conductor: longer than that of the observed services, see `wallclock`."""
+
+@dataclass(frozen=True)
+class ObserverLimits:
+    """Times and queue lengths of an observer."""
+
+    idle_s: float = 0.005
+    ring: int = 64
+    """Messages kept of a periodic topic: enough for one period of an observer at 1 kHz."""
+    fifo: int = 1 << 17
+    leave_s: float = 2.0
+    """Limit for observed services to leave after the end of the run; they leave at once."""
+    stay_s: float = 8.0
+    """Limit without a conductor: longer than that of the observed services, see `wallclock`."""
+
+
+LIMITS = ObserverLimits()
 
 
 class _Feed:
@@ -42,7 +51,7 @@ class _Feed:
     def __init__(self, member: Member, topic: Topic, lossless: bool) -> None:
         self.topic = topic
         key = member.observed(topic)
-        channel: Any = zenoh.handlers.FifoChannel(FIFO) if lossless else zenoh.handlers.RingChannel(RING)
+        channel: Any = zenoh.handlers.FifoChannel(LIMITS.fifo) if lossless else zenoh.handlers.RingChannel(LIMITS.ring)
         if topic.latched:
             self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
                 member.session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
@@ -151,7 +160,7 @@ class ObservingNode(ABC):
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
         self._member = member
-        self._link = ConductorLink(member, OBSERVERS_STAY_S)
+        self._link = ConductorLink(member, LIMITS.stay_s)
         self._reports = Reports(member)
         self._observed = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
 
@@ -191,7 +200,7 @@ class ObservingNode(ABC):
                     if not busy:
                         if self._link.lost and not self._member.alive(self._observed):
                             raise RunAborted(self._link.lost)
-                        sleep(IDLE_S)
+                        sleep(LIMITS.idle_s)
                     self._report()
                 elif message.command == RunControl.HELLO:
                     self._hello()
@@ -221,11 +230,11 @@ class ObservingNode(ABC):
 
     def _drain_rest(self) -> None:
         """Receive what is in transit: the conductor's message may overtake messages that others sent before it."""
-        end = monotonic() + LEAVE_S
+        end = monotonic() + LIMITS.leave_s
         while self._member.alive(self._observed) and monotonic() < end:
             if not self._drain():
-                sleep(IDLE_S)
-        sleep(IDLE_S)  # a token's end and the data before it are not ordered either
+                sleep(LIMITS.idle_s)
+        sleep(LIMITS.idle_s)  # a token's end and the data before it are not ordered either
         while self._drain():
             pass
 

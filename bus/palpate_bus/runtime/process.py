@@ -104,15 +104,15 @@ class Standstill(NamedTuple):
 
     @property
     def stopped(self) -> bool:
-        """True if a signal stopped it. One that a debugger stopped counts as making progress."""
+        """True if a signal stopped it. A process stopped by a debugger counts as making progress."""
         return self.status == str(psutil.STATUS_STOPPED)
 
 
 class Activity:
-    """Tells slow processes from frozen ones: a slow one uses processor time or waits for a core."""
+    """Distinguishes slow processes from frozen ones: a slow one uses processor time or waits for a core."""
 
     def __init__(self, pid: int) -> None:
-        """Raises psutil.Error if there is no such process."""
+        """Raises psutil.Error if the process does not exist."""
         self.pid = pid
         self._process = psutil.Process(pid)
         self._used = self._usage()

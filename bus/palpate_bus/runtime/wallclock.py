@@ -2,8 +2,8 @@
 
 `t` counts periods since the common start, with absolute deadlines, so that no drift builds up. A late step is counted as an
 overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick by tick, unless it is later
-than `CATCH_UP` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps must stay
-on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks the
+than `TIMES.catch_up_ns` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps
+must stay on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks the
 contract is dropped where it is sent or received, so that its readers act as on silence.
 
 On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
@@ -73,15 +74,23 @@ class LatencyHistogram:
 
 log = logging.getLogger(__name__)
 
-CATCH_UP = 200 * MS
-"""Lag [ns] beyond which a critical role skips to the present tick."""
-HANDSHAKE_POLL_S = 0.02
-WITHOUT_CONDUCTOR_S = 4.0
-"""Time for which services continue without a conductor, so that planning lifts the arm clear of the patient."""
-PHYSICS_STAYS_S = 0.5
-"""Additional time for critical roles, so that a driver enters safe hold after its commander has left."""
-READ_NS = 100_000
-"""Two clocks read within this time [ns] count as read at once."""
+
+@dataclass(frozen=True)
+class WallClockTimes:
+    """Times of a service in wall-clock mode."""
+
+    catch_up_ns: int = 200 * MS
+    """Lag [ns] beyond which a critical role skips to the present tick."""
+    handshake_poll_s: float = 0.02
+    without_conductor_s: float = 4.0
+    """Time for which services continue without a conductor, so that planning lifts the arm clear of the patient."""
+    physics_stays_s: float = 0.5
+    """Additional time for critical roles, so that a driver enters safe hold after its commander has left."""
+    clock_read_ns: int = 100_000
+    """Two clocks read within this time [ns] count as read at once."""
+
+
+TIMES = WallClockTimes()
 
 
 def _awaited(edge: Edge, topic: Topic) -> bool:
@@ -96,7 +105,7 @@ def _on_monotonic_clock(wall: int, now: Callable[[], int]) -> int:
     """
     while True:
         before, read, after = monotonic_ns(), now(), monotonic_ns()
-        if after - before < READ_NS:
+        if after - before < TIMES.clock_read_ns:
             return (before + after) // 2 + wall - read
 
 
@@ -107,8 +116,8 @@ class WallClockNode(Node):
         self._member = member
         self._stepper = Stepper(service, member.rules, strict=False, refuse=self._refuse)
         self._seat = Seat(self._stepper, member)
-        stays = PHYSICS_STAYS_S if self._stepper.role.critical else 0.0
-        super().__init__((self._seat,), member, WITHOUT_CONDUCTOR_S + stays)
+        stays = TIMES.physics_stays_s if self._stepper.role.critical else 0.0
+        super().__init__((self._seat,), member, TIMES.without_conductor_s + stays)
         self._now = member.transport.now
         self._data = {
             name: member.subscription(buffer.topic, history=buffer.topic.latched)
@@ -136,7 +145,7 @@ class WallClockNode(Node):
         The conductor repeats the start for services that replace another during the run.
         """
         while True:
-            message = self._link.poll(HANDSHAKE_POLL_S)
+            message = self._link.poll(TIMES.handshake_poll_s)
             self._receive(0)  # a faster service may have sent its latched topics already
             if message is None:
                 continue
@@ -168,7 +177,7 @@ class WallClockNode(Node):
 
     def _loop(self) -> None:
         period = self._stepper.role.period
-        catch_up = CATCH_UP if self._stepper.role.critical and self._seat.service.catches_up else period
+        catch_up = TIMES.catch_up_ns if self._stepper.role.critical and self._seat.service.catches_up else period
         t = self._await_inputs()
         while self._end is None or t <= self._end:
             late = self._passed() - t
@@ -220,7 +229,7 @@ class WallClockNode(Node):
             self._seat.progress(missing)
             if self._end is not None:  # the missing input will not be sent
                 return self._end + 1
-            message = self._link.poll(HANDSHAKE_POLL_S if needed else None)
+            message = self._link.poll(TIMES.handshake_poll_s if needed else None)
             if message is not None:
                 self._obey(message)
         period = self._stepper.role.period

@@ -3,13 +3,13 @@
     python -m palpate_bus.security.access > access.json5      # the `access_control` part of zenohd's configuration
 
 A member is identified by the common name of its certificate (`keys.py`), or with `--users` by its zenoh user name
-(`transport/auth/usrpwd` with a dictionary file; keep that file out of the repository). Peers that talk directly do not pass the
-router, so services are clients of it (`PALPATE_MODE=client`) where this must hold: `palpate run --secure`.
+(`transport/auth/usrpwd` with a dictionary file; keep that file out of the repository). Messages between peers do not pass the
+router, so in a secure run (`palpate run --secure`) services are its clients (`PALPATE_MODE=client`).
 
-What follows from the rows: data of a topic goes from its producer to its readers, with the history of latched topics and the
-queries for it; control messages (grants, the end) come from the conductor alone; reports and chunks for the recorder come from
-the role that they name, and go to the conductor and the recorder alone; liveliness tokens are of a role's own node, for everybody
-to see. Anything else is denied.
+The rules derived from the contract: the producer of a topic may send it and its readers may receive it, including the history of
+latched topics and queries for it; only the conductor sends control messages (grants, the end); a role sends its own reports and
+chunks, which only the conductor and the recorder receive; a role declares liveliness tokens of its own node, which all members
+may read. Anything else is denied.
 """
 
 from __future__ import annotations

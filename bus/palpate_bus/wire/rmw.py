@@ -1,7 +1,7 @@
-"""The wire as rmw_zenoh has it in ROS 2 Jazzy: key expressions and the attachment of every message.
+"""Wire format of rmw_zenoh in ROS 2 Jazzy: key expressions, the attachment of every message, and authentication tags.
 
 A topic's key is `<domain>/<topic>/<DDS type>/<RIHS01 hash>`, for example
-`0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber meet only when all
+`0/ft/wrench/geometry_msgs::msg::dds_::WrenchStamped_/RIHS01_8dc3de...`. Publisher and subscriber connect only if all
 four agree; `any_type_key` finds peers that differ only in type or hash.
 
 The attachment is 33 bytes, or 41 with a tag, as zenoh's serializer writes (int64, int64, 16 bytes) since rmw_zenoh_cpp 0.2.4
@@ -13,23 +13,80 @@ The attachment is 33 bytes, or 41 with a tag, as zenoh's serializer writes (int6
 | 8 | 8 | source time stamp [ns] |
 | 16 | 1 | length of the GID, 16 |
 | 17 | 16 | GID of the publisher (see `liveliness.gid`) |
-| 33 | 8 | not of rmw_zenoh: the tag, if the run has a key and the contract requires one (see `tags`); ROS 2 ignores it |
+| 33 | 8 | tag, if the run has a key and the contract requires one; not part of rmw_zenoh, ROS 2 ignores it |
 
 Sources: ros2/rmw_zenoh, `docs/design.md` and, in `rmw_zenoh_cpp/src/detail/`, `attachment_helpers.cpp`,
 `liveliness_utils.cpp` and `type_support_common.cpp`.
+
+Only processes with the key of a run can send messages with a valid tag. A tag is BLAKE2s (RFC 7693) with the run's key, 8 bytes,
+over the key expression, the attachment and the payload. It follows
+rmw_zenoh's fields in the attachment, which ROS 2 ignores. The key is a file that only its owner can read (PALPATE_KEY);
+`palpate run` makes one per run. The contract decides which messages carry a tag (`tagged`).
 """
 
 from __future__ import annotations
 
+import os
 import re
+import secrets
 import struct
 from dataclasses import dataclass
 from functools import lru_cache
+from hashlib import blake2s
+from hmac import compare_digest
+from pathlib import Path
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages.codec import type_hash
-from palpate_bus.wire.tags import TAG_SIZE
+from palpate_bus.settings import BusConfigError
 from palpate_errors import UserError
+
+TAG_SIZE = 8
+"""Bytes; one guess in 1.8e19 is right."""
+KEY_SIZE = 32
+
+
+class Tagger:
+    """Makes and checks the tags of messages on one key expression."""
+
+    __slots__ = ("_begin",)
+
+    def __init__(self, key: bytes, expression: str) -> None:
+        self._begin = blake2s(expression.encode(), key=key, digest_size=TAG_SIZE)
+
+    def tag(self, attachment: bytes, payload: bytes) -> bytes:
+        """Return the tag of a message; `attachment` has rmw_zenoh's fields only."""
+        mac = self._begin.copy()
+        mac.update(attachment)
+        mac.update(payload)
+        return mac.digest()
+
+    def holds(self, attachment: bytes, payload: bytes) -> bool:
+        """True if an attachment ends with the tag of its message."""
+        return compare_digest(attachment[-TAG_SIZE:], self.tag(attachment[:-TAG_SIZE], payload))
+
+
+def make_key(file: Path) -> Path:
+    """Write a new key to a file that is never readable to others. Raises OSError."""
+    with os.fdopen(os.open(file, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600), "wb") as opened:
+        opened.write(secrets.token_bytes(KEY_SIZE))
+    return file
+
+
+def read_key(file: Path | None) -> bytes | None:
+    """Return the key in a file; None without a file. Raises BusConfigError if it is invalid or readable to others."""
+    if file is None:
+        return None
+    try:
+        key, mode = file.read_bytes(), file.stat().st_mode
+    except OSError as error:
+        raise BusConfigError(f"PALPATE_KEY is {file}: cannot be read: {error.strerror}") from None
+    if mode & 0o077:
+        raise BusConfigError(f"PALPATE_KEY is {file}: others may read it (mode {mode & 0o777:04o}); allowed is 0600")
+    if len(key) != KEY_SIZE:
+        raise BusConfigError(f"PALPATE_KEY is {file}: has {len(key)} bytes; a key has {KEY_SIZE}")
+    return key
+
 
 GID_SIZE = 16  # RMW_GID_STORAGE_SIZE
 ATTACHMENT_SIZE = 8 + 8 + 1 + GID_SIZE

@@ -16,8 +16,7 @@ import zenoh
 from palpate_bus.contract import Qos, contract
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.settings import Settings
-from palpate_bus.wire.rmw import AttachmentWriter, WireError, hello_key, parse_key, unpack
-from palpate_bus.wire.tags import Tagger, read_key
+from palpate_bus.wire.rmw import AttachmentWriter, Tagger, WireError, hello_key, parse_key, read_key, unpack
 
 HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""

@@ -19,7 +19,7 @@ from palpate_bus.contract import Contract
 from palpate_bus.messages import DiagnosticStatus, KeyValue
 from palpate_bus.messages.stamps import NS
 from palpate_bus.monitor.health import RECENT_S, SeenViolation, topic_statuses
-from palpate_bus.monitor.live import LiveMonitor
+from palpate_bus.monitor.monitor import LiveMonitor
 from palpate_bus.security.access import WATCHER, watched
 from palpate_conductor.watchdog import RoleProgress
 

@@ -12,7 +12,7 @@ from time import monotonic, time_ns
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runs.operator_requests import TIME_REQUESTS
+from palpate_bus.runs.operator import TIME_REQUESTS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed, Timing

@@ -1,4 +1,4 @@
-"""Operator interface: a zenoh queryable that forwards requests to `operator/request`, see `palpate_bus.runs.operator_requests`.
+"""Operator interface: a zenoh queryable that forwards requests to `operator/request`, see `palpate_bus.runs.operator`.
 
 It answers once the supervisor confirms or refuses the request.
 """
@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.messages import SupervisorState
-from palpate_bus.runs.operator_requests import CONFIRM_S, TIME_REQUESTS, WORDS, request_key
+from palpate_bus.runs.operator import CONFIRM_S, TIME_REQUESTS, WORDS, request_key
 from palpate_errors import UserError
 
 

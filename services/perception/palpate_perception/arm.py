@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -13,14 +14,22 @@ from palpate_models.robot import lbr
 from palpate_models.robot.kinematics import link_transforms
 from palpate_models.scenario.schema import Robot
 
-MARGIN_M: Final = 0.02
-"""Combined error of hand-eye calibration, arm and camera [m] (docs/errors.md)."""
-DENT_M: Final = 0.06
-"""Radius around the indenter in which the wall may be dented, and is ignored [m]."""
+
+@dataclass(frozen=True)
+class MaskMargins:
+    """Margins of the arm's mask."""
+
+    arm_m: float = 0.02
+    """Combined error of hand-eye calibration, arm and camera [m] (docs/errors.md)."""
+    dent_m: float = 0.06
+    """Radius around the indenter in which the wall may be dented, and is ignored [m]."""
+
+
+MARGINS: Final = MaskMargins()
 
 
 class ArmMask:
-    """Hides the rays of a camera that pass the arm."""
+    """Mask of camera rays that pass the arm."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
@@ -33,12 +42,12 @@ class ArmMask:
         """
         starts, ends, radii = self._segments(q)
         towards = z[:, np.newaxis] * r_W  # from the camera to the wall
-        hidden = passes(towards, starts - p_WC, ends - p_WC, radii + MARGIN_M)
-        dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < DENT_M
+        hidden = passes(towards, starts - p_WC, ends - p_WC, radii + MARGINS.arm_m)
+        dented: NDArray[np.bool_] = np.linalg.norm(p_WC + towards - ends[-1], axis=1) < MARGINS.dent_m
         return hidden | dented
 
     def _segments(self, q: Array) -> tuple[Array, Array, Array]:
-        """Ends of the capsules' axes in world [m], shape (m, 3) each, and radii [m], shape (m,); the indenter is the last."""
+        """Return ends of the capsules' axes in world [m], shape (m, 3) each, and radii [m], shape (m,); the indenter is last."""
         X_WL = np.eye(4)
         starts, ends, radii = [], [], []
         for _, link, X_PL in link_transforms(q, self._robot):

@@ -7,11 +7,12 @@ The displacement is a level and two stochastic oscillators, one at the breathing
     x_j(t + h)   = exp(-h / T) R(j w h) x_j(t) + noise
     d            = mean + level + x_1[0] + x_2[0]
 
-each of them with a constant variance. These, and the rate, are renewed from the last half minute: amplitude and period wander.
+each with a constant variance. Variances and rate are re-estimated from the last half minute, since amplitude and period change.
 """
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -19,26 +20,35 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 
-RATES_PER_MIN: Final = (4.0, 40.0)
-"""Breaths a minute that are looked for."""
-LEAST_S: Final = 5.0
-"""Least history for an estimate of rate and amplitude [s]."""
-MEMORY_S: Final = 30.0
-"""History from which rate and amplitude are estimated [s]."""
-RENEWAL_S: Final = 1.0
-COHERENCE_S: Final = 8.0
-"""T, coherence time of phase and amplitude: two breaths, which differ by a fifth in length and a third in depth."""
-LEVEL_S: Final = 20.0
-"""T_0."""
-SHARES: Final = (0.5, 0.5, 0.125)
-"""Standard deviations of level and oscillators, in peak-to-peak amplitudes."""
-LEAST_M: Final = 2e-4
-"""A wall that moves by less is still [m]: then the filter's forecast is the level."""
-_GRID_PER_MIN: Final = np.arange(RATES_PER_MIN[0], RATES_PER_MIN[1], 0.5)
+
+@dataclass(frozen=True)
+class BreathTuning:
+    """Tuning of the breath filter."""
+
+    rates_per_min: tuple[float, float] = (4.0, 40.0)
+    """Range of breathing rates."""
+    least_s: float = 5.0
+    """Least history for an estimate of rate and amplitude [s]."""
+    memory_s: float = 30.0
+    """History from which rate and amplitude are estimated [s]."""
+    renewal_s: float = 1.0
+    coherence_s: float = 8.0
+    """T, coherence time of phase and amplitude: two breaths, which differ by a fifth in length and a third in depth."""
+    level_s: float = 20.0
+    """Time constant T_0 of the level."""
+    shares: tuple[float, float, float] = (0.5, 0.5, 0.125)
+    """SDs of level and oscillators, relative to the peak-to-peak amplitude."""
+    least_m: float = 2e-4
+    """Least amplitude; a wall that moves less is still, and the forecast is the level."""
+
+
+TUNING: Final = BreathTuning()
+
+_GRID_PER_MIN: Final = np.arange(TUNING.rates_per_min[0], TUNING.rates_per_min[1], 0.5)
 
 
 class BreathFilter:
-    """Follows one displacement."""
+    """Kalman filter of one displacement."""
 
     def __init__(self, t_s: Array, d: Array) -> None:
         """Initialise from earlier displacements `d` [m] at times `t_s` [s], shape (n,) each, evenly spaced."""
@@ -51,10 +61,10 @@ class BreathFilter:
         self._P = self._stationary
         for t, value in zip(t_s, d, strict=True):
             self.forward(float(t))
-            self.update(float(value), LEAST_M)
+            self.update(float(value), TUNING.least_m)
 
     def forward(self, t_s: float) -> tuple[float, float]:
-        """Predicts to time `t_s` [s]: displacement [m] expected then, and its standard deviation [m]."""
+        """Predict to time `t_s` [s]; return the expected displacement and its SD [m]."""
         F = self._transition(np.array((t_s - self._t_s,)))[0]
         self._t_s = t_s
         self._x = F @ self._x
@@ -62,21 +72,21 @@ class BreathFilter:
         return self._mean + float(self._H @ self._x), self.sigma
 
     def update(self, d: float, sigma: float) -> None:
-        """Takes a displacement [m] with its standard deviation [m], seen at the time last predicted to."""
+        """Update with a displacement and its SD [m], measured at the time of the last prediction."""
         S = float(self._H @ self._P @ self._H) + sigma**2
         gain = self._P @ self._H / S
         self._x = self._x + gain * (d - self._mean - float(self._H @ self._x))
         self._P = self._P - np.outer(gain, self._H @ self._P)
 
     def remember(self, d: float) -> None:
-        """Add a displacement [m], at the time last predicted to, to the history of rate and amplitude."""
+        """Add a displacement [m], measured at the time of the last prediction, to the history of rate and amplitude."""
         self._times.append(self._t_s)
         self._seen.append(d)
-        if self._t_s - self._renewed_s > RENEWAL_S:
-            while self._times[0] < self._t_s - MEMORY_S:
+        if self._t_s - self._renewed_s > TUNING.renewal_s:
+            while self._times[0] < self._t_s - TUNING.memory_s:
                 del self._times[0], self._seen[0]
             self._renewed_s = self._t_s
-            if self._times[-1] - self._times[0] >= LEAST_S:  # else the wall was hidden for long: it breathes as it did before
+            if self._times[-1] - self._times[0] >= TUNING.least_s:  # otherwise the wall was hidden for long: keep the estimates
                 self._learn()
 
     def forget(self, d: float) -> None:
@@ -85,17 +95,17 @@ class BreathFilter:
         self._P = self._stationary.copy()
 
     def forecast(self, ahead_s: Array) -> Array:
-        """Return the expected displacement [m] at `ahead_s` after the time last predicted to, shape (n,) of both."""
+        """Return the expected displacement [m] at `ahead_s` after the time of the last prediction, shape (n,) each."""
         return np.asarray(self._mean + self._transition(ahead_s) @ self._x @ self._H)
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the displacement at the time last predicted to [m]."""
+        """SD of the displacement at the time of the last prediction [m]."""
         return float(np.sqrt(max(self._H @ self._P @ self._H, 0.0)))
 
     @property
     def depth(self) -> float:
-        """Mean depth of the breaths, peak to peak [m]: that of the sine of equal variance."""
+        """Mean peak-to-peak depth of the breaths [m]: that of a sine of equal variance."""
         return self._depth
 
     def _learn(self) -> None:
@@ -103,17 +113,17 @@ class BreathFilter:
         mean = float(d.mean())
         self._x[0] += self._mean - mean
         self._mean = mean
-        self._depth = max(float(2 * np.sqrt(2) * d.std()), LEAST_M)
+        self._depth = max(float(2 * np.sqrt(2) * d.std()), TUNING.least_m)
         self._rate = 2 * np.pi / 60 * strongest_rate(t, d - mean)
-        scale = self._depth * np.array((SHARES[0], SHARES[1], SHARES[1], SHARES[2], SHARES[2]))
+        scale = self._depth * np.array((TUNING.shares[0], TUNING.shares[1], TUNING.shares[1], TUNING.shares[2], TUNING.shares[2]))
         self._stationary = np.diag(scale**2)
 
     def _transition(self, h: Array) -> Array:
-        """F over times `h` [s], shape (n,): shape (n, 5, 5)."""
+        """Return F over times `h` [s], shape (n,): shape (n, 5, 5)."""
         F = np.zeros((len(h), 5, 5))
-        F[:, 0, 0] = np.exp(-h / LEVEL_S)
+        F[:, 0, 0] = np.exp(-h / TUNING.level_s)
         for j in (1, 2):
-            kept, angle = np.exp(-h / COHERENCE_S), j * self._rate * h
+            kept, angle = np.exp(-h / TUNING.coherence_s), j * self._rate * h
             i = 2 * j - 1
             F[:, i, i] = F[:, i + 1, i + 1] = kept * np.cos(angle)
             F[:, i, i + 1] = kept * np.sin(angle)
@@ -122,11 +132,11 @@ class BreathFilter:
 
 
 def strongest_rate(t_s: Array, d: Array) -> float:
-    """Breaths a minute of the strongest sine in `d` at times `t_s` [s], shape (n,) each, under a Hann window."""
+    """Return the breaths per minute of the strongest sine in `d` at times `t_s` [s], shape (n,) each, under a Hann window."""
     length = max(float(t_s[-1] - t_s[0]), 1e-3)
     window = 1 - np.cos(2 * np.pi * (t_s - t_s[0]) / length)
     rates = _GRID_PER_MIN[60 / length < _GRID_PER_MIN]
     if not len(rates):
-        return float(RATES_PER_MIN[0])
+        return float(TUNING.rates_per_min[0])
     waves: NDArray[np.complex128] = np.exp(-2j * np.pi / 60 * np.outer(rates, t_s))
     return float(rates[np.argmax(np.abs(waves @ (window * d)))])

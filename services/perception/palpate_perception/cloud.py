@@ -18,10 +18,21 @@ from scipy.spatial import cKDTree
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.schema import Exam
 
-HEIGHT_M: Final = (-0.16, 0.06)
-"""Heights in A that may be abdomen. The arm hovers higher; the wall falls away by its whole height at most."""
-TABLE_CLEARANCE_M: Final = 0.02
-"""Points this near to the table's top are the table."""
+
+@dataclass(frozen=True)
+class CloudTuning:
+    """Limits of the cropped cloud."""
+
+    height_m: tuple[float, float] = (-0.16, 0.06)
+    """Range of heights in A that may be abdomen: below the hovering arm, and down to the whole height of the body."""
+    table_clearance_m: float = 0.02
+    """Distance from the table's top within which points belong to the table."""
+    jump: float = 0.015
+    """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
+    more than a surface seen at 75 deg and less than from the arm to the skin."""
+
+
+CROP: Final = CloudTuning()
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,14 +51,9 @@ class Intrinsics:
         return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)
 
 
-JUMP: Final = 0.015
-"""Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
-more than a surface seen at 75 deg and less than from the arm to the skin."""
-
-
 @dataclass(frozen=True, slots=True)
 class Cloud:
-    """n points with the pixels that they come from."""
+    """n points with their pixels."""
 
     p_W: Array
     """Positions [m] in world, shape (n, 3)."""
@@ -57,7 +63,7 @@ class Cloud:
     """Row and column in the fused window, shape (n, 2)."""
 
     def where(self, keep: NDArray[np.bool_]) -> Cloud:
-        """The points of a mask, shape (n,)."""
+        """Return the points of a mask, shape (n,)."""
         return Cloud(self.p_W[keep], self.sigma[keep], self.pixel[keep])
 
 
@@ -70,7 +76,7 @@ class RegionBox:
 
     @classmethod
     def of(cls, exam: Exam, margin: float, z: tuple[float, float]) -> RegionBox:
-        """The exam's region, wider by `margin` [m] on each side, between the heights `z` [m]."""
+        """Return the region of an exam, wider by `margin` [m] on each side, between the heights `z` [m]."""
         (cx, cy), (width, height) = exam.centre_m, exam.region_m
         half_x, half_y = width / 2 + margin, height / 2 + margin
         return cls((cx - half_x, cy - half_y, z[0]), (cx + half_x, cy + half_y, z[1]))
@@ -87,7 +93,7 @@ class RegionBox:
 
 
 def deproject(depth: Array, K: Array, origin: tuple[int, int] = (0, 0)) -> Array:
-    """Points in C [m], shape (height, width, 3), of a depth image [m]; NaN where it is.
+    """Return the points of a depth image [m] in C [m], shape (height, width, 3); NaN stays NaN.
 
     K: intrinsics, shape (3, 3). `origin`: row and column of the image's first pixel in the full image.
     """
@@ -98,14 +104,14 @@ def deproject(depth: Array, K: Array, origin: tuple[int, int] = (0, 0)) -> Array
 
 
 def project(p_C: Array, K: Array) -> tuple[Array, Array]:
-    """Pixel coordinates u, v, shapes (n,), of points in C, shape (n, 3), in front of the camera."""
+    """Return pixel coordinates u, v, shapes (n,), of points in C, shape (n, 3), in front of the camera."""
     return K[0, 0] * p_C[:, 0] / p_C[:, 2] + K[0, 2], K[1, 1] * p_C[:, 1] / p_C[:, 2] + K[1, 2]
 
 
 def window(box: RegionBox, X_CA: Array, K: Array, shape: tuple[int, int]) -> tuple[slice, slice]:
-    """Rows and columns of the image that can see the box; empty slices when none can.
+    """Return rows and columns of the image that can show the box; empty slices if none can.
 
-    The whole image when a corner is behind the camera.
+    Returns the whole image if a corner is behind the camera.
     """
     p_C = apply(X_CA, box.corners)
     if p_C[:, 2].min() < 0.01:
@@ -119,26 +125,26 @@ def window(box: RegionBox, X_CA: Array, K: Array, shape: tuple[int, int]) -> tup
 
 
 def to_world(p_C: Array, sigma: Array, X_WC: Array) -> Cloud:
-    """Step 1: organised points in C, shape (height, width, 3), as a cloud in world, invalid points still in."""
+    """Step 1: convert organised points in C, shape (height, width, 3), to a cloud in world, with invalid points."""
     pixel = np.argwhere(np.ones(sigma.shape, np.bool_))
     return Cloud(apply(X_WC, p_C.reshape(-1, 3)), sigma.ravel(), pixel)
 
 
 def remove_invalid(cloud: Cloud) -> Cloud:
-    """Step 2: without points that have no depth."""
+    """Step 2: remove points without depth."""
     return cloud.where(np.asarray(np.isfinite(cloud.p_W).all(axis=1), np.bool_))
 
 
 def crop(cloud: Cloud, X_WA: Array, box: RegionBox, floor_m: float) -> Cloud:
-    """Step 3: the points in the box and above the height `floor_m` in world (the table's top, with its noise)."""
+    """Step 3: keep the points in the box and above the height `floor_m` in world (the table's top plus noise)."""
     inside = box.holds(apply(inverse(X_WA), cloud.p_W))
     return cloud.where(np.asarray(inside & (cloud.p_W[:, 2] > floor_m)))
 
 
 def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
-    """Step 3, its end: of the sheets into which depth jumps part the cloud, that with most points `inside`.
+    """Step 3, second part: split the cloud into sheets at depth jumps and keep the one with most points `inside`.
 
-    What hovers above the skin (arm, tool, stray pixels) is on other sheets. `depth`: the fused window [m]; `inside`:
+    Objects above the skin (arm, tool, stray pixels) are on other sheets. `depth`: the fused window [m]; `inside`:
     mask of the points in the region without its margin, shape (n,).
     """
     n = len(cloud.p_W)
@@ -151,7 +157,7 @@ def main_sheet(cloud: Cloud, depth: Array, inside: NDArray[np.bool_]) -> Cloud:
         (index[1:], index[:-1], depth[1:], depth[:-1]),
         (index[:, 1:], index[:, :-1], depth[:, 1:], depth[:, :-1]),
     ):
-        joined = (a >= 0) & (b >= 0) & (np.abs(za - zb) < JUMP * za)
+        joined = (a >= 0) & (b >= 0) & (np.abs(za - zb) < CROP.jump * za)
         pairs.append((a[joined], b[joined]))
     a, b = (np.concatenate(side) for side in zip(*pairs, strict=True))
     _, sheet = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)

@@ -1,34 +1,96 @@
-"""Takes the small depth images: watches the wall for about two breaths after a trigger, then follows it."""
+"""Following of the wall in the small depth images: observation for about two breaths after a trigger, then tracking.
+
+The drift of the camera's depth is measured on the table, which does not move. The depth of a camera that warms up changes by
+millimetres in minutes, equally at every pixel (docs/errors.md), and a tracked wall would seem to sink or to rise. The table's
+pixels show the drift alone,
+
+    z_i(t) = z_i + b(t) + noise,
+
+and its part slower than `DRIFT.tau_s` is subtracted from all depths.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, inverse
+from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall
 from palpate_perception.arm import ArmMask
 from palpate_perception.cloud import Intrinsics, RegionBox
-from palpate_perception.drift import CameraDrift
 from palpate_perception.fusion import Image
 from palpate_perception.tracker import NOTHING, Followed, Tracker, WallAverage, shift_between
-from palpate_perception.wall import SeenWall, UnseenWallError
+from palpate_perception.wall import WALL_FIT, WallNotVisibleError, WallPixels, steady
 
-LONGEST_S: Final = 10.0
-"""A watch lasts no longer."""
-STILL_S: Final = 5.0
-"""Time without motion after which a wall is still [s]."""
-STILL_M: Final = 0.001
-"""Between its 5th and 95th percentile the mean depth of a still wall differs by less."""
-BREATHS: Final = 2
+
+@dataclass(frozen=True)
+class DriftTuning:
+    """Tuning of the camera's drift."""
+
+    table_distance_m: float = 0.04
+    """Distance from the table's top within which a point belongs to the table: the calibration has errors of centimetres."""
+    tau_s: float = 10.0
+    """Time constant of the drift [s]: errors shared by neighbouring pixels last for seconds, warming up for minutes."""
+    least_pixels: int = 50
+    """Least number of table pixels in view; with fewer the drift estimate is kept."""
+
+
+DRIFT: Final = DriftTuning()
+
+
+class CameraDrift:
+    """Drift of the depth since an observation."""
+
+    def __init__(self, frames: Array, camera: Intrinsics, t_s: float) -> None:
+        """Start with an observation that ended at `t_s` [s]: depth [m], shape (frames, height, width), NaN where unknown."""
+        pixel, depth, noise = steady(frames)
+        r_W = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel] @ camera.X_WC[:3, :3].T
+        height = camera.X_WC[2, 3] + depth * r_W[:, 2]
+        table = np.abs(height - TABLE_TOP_M) < DRIFT.table_distance_m
+        table[table] &= noise[table] < WALL_FIT.edge_noise * np.median(noise[table]) if table.any() else False
+        self.pixel: NDArray[np.intp] = pixel[table]
+        """Flat indices of the pixels that show the table, shape (n,)."""
+        self.depth: Array = depth[table]
+        """Their first depth [m], shape (n,)."""
+        self.r_W: Array = r_W[table]
+        """Viewing rays of unit z in world axes, shape (n, 3)."""
+        self.drift = 0.0
+        """Current estimate [m]."""
+        self._last_s = t_s
+
+    def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> float:
+        """Return the drift [m] after an image exposed at `t_s` [s]: depths [m] and mask of hidden pixels, (n,) each."""
+        seen = np.isfinite(depth) & ~hidden
+        if np.count_nonzero(seen) >= DRIFT.least_pixels:
+            now = float(np.median((depth - self.depth)[seen]))
+            self.drift += (1 - np.exp((self._last_s - t_s) / DRIFT.tau_s)) * (now - self.drift)
+        self._last_s = t_s
+        return self.drift
+
+
+@dataclass(frozen=True)
+class WatchTuning:
+    """End of the observation that follows a trigger."""
+
+    longest_s: float = 10.0
+    """Longest observation."""
+    still_s: float = 5.0
+    """Time without motion after which a wall is still [s]."""
+    still_m: float = 0.001
+    """Range of the mean depth, from its 5th to its 95th percentile, below which a wall is still."""
+    breaths: int = 2
+
+
+WATCH: Final = WatchTuning()
 
 
 class Watch:
-    """The small images of one look."""
+    """Observation of the wall in the small images of one scan."""
 
     def __init__(self, camera: Intrinsics, X_WA: Array, exam: Exam) -> None:
         self.camera = camera
@@ -41,7 +103,7 @@ class Watch:
         self._images: list[Image] = []
 
     def add(self, t_s: float, image: Image, arm: ArmMask, q: Array | None) -> None:
-        """Takes an image [m], exposed at `t_s` [s] with the arm at the joint positions `q` [rad], which are not known if None."""
+        """Add an image [m] exposed at `t_s` [s] with the arm at joint positions `q` [rad], None if unknown."""
         seen = image.copy()
         if q is not None:
             z = np.nan_to_num(image.ravel().astype(float), nan=0.5)
@@ -52,36 +114,36 @@ class Watch:
     def over(self) -> bool:
         """True after two breaths, with a still wall, or at the time limit."""
         lasted = self._times[-1] - self._times[0] if self._times else 0.0
-        if lasted < STILL_S:
+        if lasted < WATCH.still_s:
             return False
         with np.errstate(invalid="ignore"):
             height = -np.array([np.nanmean(image[self._middle]) for image in self._images])
-        if lasted >= LONGEST_S or not np.isfinite(height).all():
-            return lasted >= LONGEST_S
+        if lasted >= WATCH.longest_s or not np.isfinite(height).all():
+            return lasted >= WATCH.longest_s
         low, high = np.quantile(height, (0.05, 0.95))
-        return bool(high - low < STILL_M or rises(height, low, high) > BREATHS)
+        return bool(high - low < WATCH.still_m or rises(height, low, high) > WATCH.breaths)
 
-    def learn(self) -> tuple[SeenWall, Array, Array, CameraDrift]:
-        """The wall, its displacements [m] at the times [s] of the images, and what follows the camera's drift from there.
+    def learn(self) -> tuple[WallPixels, Array, Array, CameraDrift]:
+        """Return the wall, the times of the images [s], the displacements then [m], and the camera's drift from there.
 
-        Raises UnseenWallError.
+        Raises WallNotVisibleError.
         """
         if not self._images:
-            raise wall.UnseenWallError("no small image has come")
+            raise wall.WallNotVisibleError("no small image received")
         frames = np.array(self._images, np.float64)
         found, d = wall.learn(frames, self.camera, self._X_WA, self._exam)
         return found, np.array(self._times), d, CameraDrift(frames, self.camera, self._times[-1])
 
 
 def rises(height: Array, low: float, high: float) -> int:
-    """Return how often a height rises from the lower third between `low` and `high` to the upper one."""
+    """Return the number of rises of a height from the lower to the upper third between `low` and `high`."""
     part = (height - low) / (high - low)
     ends = part[(part < 1 / 3) | (part > 2 / 3)] > 0.5
     return int(np.count_nonzero(ends[1:] & ~ends[:-1]))
 
 
 class Follower:
-    """The wall between two looks."""
+    """Follows the wall between two scans."""
 
     def __init__(self, exam: Exam, X_WA: Array, robot: Robot) -> None:
         self._exam, self._X_WA = exam, X_WA
@@ -97,7 +159,7 @@ class Follower:
         """Number of images of each state."""
 
     def begin(self, asked_s: float) -> None:
-        """A look begins with the images from the time `asked_s` [s] on."""
+        """Start a scan with the images from `asked_s` [s] on."""
         self._watch, self._watching, self._asked_s = None, True, asked_s
 
     def take(self, t_s: float, depth: Image, camera: Intrinsics | None, q: Array | None) -> Followed:
@@ -119,10 +181,10 @@ class Follower:
         """True if the wall was observed for long enough, or is not in view."""
         return self._watch is None or self._watch.over()
 
-    def end(self) -> tuple[SeenWall, Array, Array] | None:
-        """Ends the watch: the wall, which is followed from now on, and its displacements [m] by time [s].
+    def end(self) -> tuple[WallPixels, Array, Array] | None:
+        """End the observation and track its wall; return the wall, the times of the images [s] and the displacements [m].
 
-        None when it was not seen; then what was followed before is followed on.
+        Returns None if the wall was not visible; then tracking continues with the previous wall.
         """
         watch, self._watch, self._watching = self._watch, None, False
         if watch is None:
@@ -130,7 +192,7 @@ class Follower:
         drifted = 0.0 if self._drift is None else self._drift.drift
         try:
             wall, times, d, self._drift = watch.learn()
-        except UnseenWallError:
+        except WallNotVisibleError:
             return None
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
         corners = np.array([(cx + i * width / 2, cy + j * height / 2, 0.0) for i in (-1, 1) for j in (-1, 1)])

@@ -1,8 +1,8 @@
 """Fusion of a burst of depth frames into one, pixel by pixel.
 
-A frame has 2 mm of noise and is rounded to steps of 3 mm at 1 m. The noise dithers the rounding, so the mean over
-frames converges to the true depth; the median would stick to the steps. So: the median finds the surface, and the mean
-is over the frames within a gate about it, which leaves out the frames in which the pixel looked past an edge.
+A frame has 2 mm of noise and is rounded to steps of 3 mm at 1 m. The noise dithers the rounding, so the mean over frames
+converges to the true depth, which the median does not. The mean is taken over the frames within a gate about the median, which
+excludes frames in which the pixel shows something behind an edge.
 """
 
 from __future__ import annotations
@@ -22,53 +22,53 @@ GATE: Final = 6.0
 
 
 def frame_sigma(z: Image) -> Image:
-    """Standard deviation [m] of a frame's depth at depth `z` [m], seen head-on (Nguyen 2012)."""
+    """Return the SD [m] of a frame's depth at depth `z` [m] for a perpendicular surface (Nguyen 2012)."""
     return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2, np.float32)
 
 
 @dataclass(frozen=True, slots=True)
 class FusedDepth:
-    """One depth image of many, all of the same shape."""
+    """Depth image fused from several; all arrays have the same shape."""
 
     depth: Image
     """Mean depth [m], NaN where no frame was valid."""
     sigma: Image
-    """Standard deviation of that mean [m], NaN likewise."""
+    """Standard deviation of the mean [m], NaN where no frame was valid."""
     frames: int
     """Number of fused frames."""
 
 
 class DepthFusion:
-    """Collects the frames of a burst. Only `window` (rows, columns) is kept of each."""
+    """Collects the frames of a burst, cropped to `window` (rows, columns)."""
 
     def __init__(self, window: tuple[slice, slice]) -> None:
         self.window = window
         self._frames: list[Image] = []
 
     def add(self, depth: Image) -> None:
-        """Adds a frame [m], shape (height, width), NaN where invalid. Raises ValueError if its size changed."""
+        """Add a frame [m], shape (height, width), NaN where invalid. Raises ValueError if its size differs."""
         cut = np.array(depth[self.window], np.float32)
         if self._frames and cut.shape != self._frames[0].shape:
-            raise ValueError(f"depth frame: window of shape {cut.shape}, frames before had {self._frames[0].shape}")
+            raise ValueError(f"depth frame: window of shape {cut.shape}; previous frames had {self._frames[0].shape}")
         self._frames.append(cut)
 
     @property
     def frames(self) -> int:
-        """Number of frames so far."""
+        """Number of frames."""
         return len(self._frames)
 
     def level(self, displacements: Array, per_metre: Image) -> None:
-        """Takes the breath out of the frames: the wall was displaced by `displacements` [m], shape (frames,), in them.
+        """Remove breathing from the frames, in which the wall was displaced by `displacements` [m], shape (frames,).
 
-        `per_metre`: by how much depth changes for a displacement of 1 m, of the window's shape.
+        `per_metre`: change of depth per displacement, of the window's shape.
         """
         self._frames = [frame - np.float32(d) * per_metre for frame, d in zip(self._frames, displacements, strict=True)]
 
     def motion(self, depth: Image, pixel: NDArray[np.intp]) -> float:
-        """Standard deviation [m] over the frames of their mean offset from `depth` at some pixels.
+        """Return the SD [m] over the frames of their mean offset from `depth` at pixels.
 
-        `pixel`: rows and columns in the window, shape (n, 2). Noise averages out over thousands of pixels, so what is
-        left is a surface that moves, as in breathing.
+        `pixel`: rows and columns in the window, shape (n, 2). Noise averages out over thousands of pixels; a moving surface, as
+        in breathing, remains.
         """
         row, column = pixel[:, 0], pixel[:, 1]
         offset = np.stack([frame[row, column] for frame in self._frames]) - depth[row, column]
@@ -77,7 +77,7 @@ class DepthFusion:
         return float(np.std(mean))
 
     def fused(self) -> FusedDepth:
-        """The fused window. Raises ValueError when no frame is in."""
+        """Return the fused window. Raises ValueError without frames."""
         if not self._frames:
             raise ValueError("no depth frame to fuse: call add first")
         stack = np.sort(np.stack(self._frames), axis=0)  # NaN goes last

@@ -1,4 +1,4 @@
-"""From a fused depth image to a surface and palpation targets: the paper's five steps (section III.A), in its order."""
+"""Surface and palpation targets from a fused depth image, by the paper's five steps (section III.A)."""
 
 from __future__ import annotations
 
@@ -13,23 +13,32 @@ from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface, visibility
-from palpate_perception.cloud import HEIGHT_M, TABLE_CLEARANCE_M, Cloud, Intrinsics, RegionBox
+from palpate_perception.cloud import CROP, Cloud, Intrinsics, RegionBox
 from palpate_perception.fusion import DepthFusion, FusedDepth
-from palpate_perception.surface import HeightField
+from palpate_perception.surface import FittedSurface
 from palpate_perception.visibility import Gaps, ViewReason
 from palpate_perception.wall import BreathingMode
 
-MARGIN_M: Final = 0.03
-"""The cloud is cropped this much wider than the region, so that the surface at its edge has data on both sides."""
-MESH_MARGIN_M: Final = 0.025
-"""The surface mesh reaches this much further than the region."""
-MESH_STEP_M: Final = 0.005
-MOTION_M: Final = 5e-4
-"""A standard deviation over the frames above this is worth a remark: noise alone gives less than a tenth of it."""
+
+@dataclass(frozen=True)
+class PipelineTuning:
+    """Sizes and limits of the five steps."""
+
+    margin_m: float = 0.03
+    """Margin of the cropped cloud around the region, so that the surface at the region's edge has data on both sides."""
+    mesh_margin_m: float = 0.025
+    """Margin of the surface mesh around the region."""
+    mesh_step_m: float = 0.005
+    motion_m: float = 5e-4
+    """SD of the surface over the frames above which a remark is added; noise causes less than a tenth of it."""
+    least_coverage: float = 0.95
+    """Least part of the region in view; below it no targets are returned."""
+
+
+PIPELINE: Final = PipelineTuning()
+
 HERE: Final[Array] = np.zeros(2)
-"""The shift of a patient who has not moved."""
-MIN_COVERAGE: Final = 0.95
-"""With less of the region in view there are no targets."""
+"""Shift of a patient who has not moved."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +54,7 @@ class Targets:
 
     @classmethod
     def none(cls) -> Targets:
-        """No target."""
+        """Return an empty list of targets."""
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint32))
 
 
@@ -58,9 +67,9 @@ class PerceivedMesh:
     n_W: Array
     """Outward unit normals, shape (n, 3)."""
     triangles: NDArray[np.uint32]
-    """Counter-clockwise from outside, shape (m, 3)."""
+    """Triangles, counter-clockwise seen from outside, shape (m, 3)."""
     lifts: Array
-    """The breathing's mode, shape (n,); zero where it is not known."""
+    """Breathing mode, shape (n,); zero if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -69,19 +78,19 @@ class Perceived:
 
     cloud: Cloud
     mesh: PerceivedMesh | None
-    """None when too little was seen."""
+    """None if too little was in view."""
     targets: Targets
     sigma: float
-    """Standard deviation [m] of the surface in the region, as the fit estimates it (noise; no calibration error)."""
+    """Standard deviation [m] of the surface in the region, estimated by the fit (noise, without calibration error)."""
     frames: int
     coverage: float
-    """Part of the region of interest that was seen."""
+    """Part of the region of interest in view."""
     reason: ViewReason
-    """Why there are no targets."""
+    """Reason for missing targets."""
     message: str
-    """The reason, or a remark about the targets, as text for people; empty when there is neither."""
-    field: HeightField | None = None
-    """The surface over x and y of A; None when too little was seen."""
+    """Text for the reason, or a remark about the targets; empty if there is neither."""
+    field: FittedSurface | None = None
+    """Surface over x and y of A; None if too little was in view."""
 
 
 class Pipeline:
@@ -91,20 +100,20 @@ class Pipeline:
         """`X_WA`: registered pose of the abdomen in world, shape (4, 4)."""
         self._exam = exam
         self._X_WA, self._X_AW = X_WA, inverse(X_WA)
-        self._box = RegionBox.of(exam, MARGIN_M, HEIGHT_M)
-        self._region = RegionBox.of(exam, 0.0, HEIGHT_M)
+        self._box = RegionBox.of(exam, PIPELINE.margin_m, CROP.height_m)
+        self._region = RegionBox.of(exam, 0.0, CROP.height_m)
 
     def fusion(self, camera: Intrinsics) -> DepthFusion:
-        """An empty fusion of the part of the image that sees the region."""
+        """Return an empty fusion for the part of the image that shows the region."""
         X_CA = inverse(camera.X_WC) @ self._X_WA
         return DepthFusion(cloud.window(self._box, X_CA, camera.K, camera.shape))
 
     def perceive(
         self, fusion: DepthFusion, camera: Intrinsics, mode: BreathingMode | None = None, shift: Array = HERE
     ) -> Perceived:
-        """Runs the five steps on the fused frames; `mode` is the breathing's, if it is known.
+        """Run the five steps on the fused frames; `mode` is the breathing mode, if known.
 
-        Targets and mesh lie where a patient has them who was shifted by `shift` in A [m], shape (2,).
+        Targets and mesh are shifted with the patient by `shift` in A [m], shape (2,).
         """
         fused = fusion.fused()
         origin = (fusion.window[0].start, fusion.window[1].start)
@@ -113,19 +122,21 @@ class Pipeline:
         organised = cloud.deproject(depth, camera.K, origin)
         points = cloud.to_world(organised, np.asarray(fused.sigma, np.float64), camera.X_WC)  # 1
         points = cloud.remove_invalid(points)  # 2
-        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + TABLE_CLEARANCE_M)  # 3
+        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + CROP.table_clearance_m)  # 3
         points = cloud.main_sheet(points, depth, self._region.holds(apply(self._X_AW, points.p_W)))
         p_A = apply(self._X_AW, points.p_W)
 
         seen = visibility.seen(p_A, self._exam)
         coverage = float(np.mean(seen))
-        if coverage < MIN_COVERAGE:
+        if coverage < PIPELINE.least_coverage:
             gaps = self._gaps(seen, p_A, depth, origin, camera)
-            message = f"{100 * coverage:.0f} % of the region of interest seen, {100 * MIN_COVERAGE:.0f} % needed: {gaps}"
+            message = (
+                f"{100 * coverage:.0f} % of the region of interest seen, {100 * PIPELINE.least_coverage:.0f} % needed: {gaps}"
+            )
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, gaps.reason, message)
 
-        if (away := float(np.abs(shift).max())) > MARGIN_M:  # beyond what is cropped, fitted and judged for what is missing
-            message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * MARGIN_M:.0f} mm)"
+        if (away := float(np.abs(shift).max())) > PIPELINE.margin_m:  # outside the cropped and fitted area
+            message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * PIPELINE.margin_m:.0f} mm)"
             return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, ViewReason.PATIENT_MOVED, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
@@ -148,23 +159,23 @@ class Pipeline:
         return visibility.gaps(missing, len(seen), X_CA, camera.K, depth, origin, camera.shape)
 
     def _motion(self, fusion: DepthFusion, fused: FusedDepth, points: Cloud, p_A: Array, camera: Intrinsics) -> float:
-        """Standard deviation over the frames of the surface's height in the region [m]."""
+        """Return the SD over the frames of the surface's height in the region [m]."""
         inside = self._region.holds(p_A)
         pixel = points.pixel[inside]
         drop = apply(self._X_AW, camera.X_WC[np.newaxis, :3, 3])[0, 2] - p_A[inside, 2]
         height_per_depth = float(np.mean(np.abs(drop / fused.depth[pixel[:, 0], pixel[:, 1]])))
         return height_per_depth * fusion.motion(fused.depth, pixel)
 
-    def _on(self, field: HeightField, xy: Array) -> tuple[Array, Array]:
-        """Positions and normals in world of the surface at `xy` in A, shape (n, 2)."""
+    def _on(self, field: FittedSurface, xy: Array) -> tuple[Array, Array]:
+        """Return positions and normals of the surface in world at `xy` in A, shape (n, 2)."""
         p_A, n_A = _in_A(field, xy)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
-    def _mesh(self, field: HeightField, p_A: Array, mode: BreathingMode | None, shift: Array) -> PerceivedMesh:
-        """The surface on a regular grid, without the nodes that have no datum about them (past the abdomen's edge)."""
+    def _mesh(self, field: FittedSurface, p_A: Array, mode: BreathingMode | None, shift: Array) -> PerceivedMesh:
+        """Return the surface on a regular grid, without nodes that have no data nearby (outside the abdomen)."""
         (cx, cy), (width, height) = self._exam.centre_m, self._exam.region_m
-        x = stations(cx + shift[0], width + 2 * MESH_MARGIN_M, MESH_STEP_M)
-        y = stations(cy + shift[1], height + 2 * MESH_MARGIN_M, MESH_STEP_M)
+        x = stations(cx + shift[0], width + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
+        y = stations(cy + shift[1], height + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         nodes, known = cloud.downsample(p_A, x, y)
         keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
@@ -177,8 +188,8 @@ class Pipeline:
         return PerceivedMesh(p_W, n_W, new[triangles].astype(np.uint32), lifts)
 
 
-def _in_A(field: HeightField, xy: Array) -> tuple[Array, Array]:
-    """Positions [m] and outward unit normals in A of the surface at `xy` in A [m], shape (n, 2)."""
+def _in_A(field: FittedSurface, xy: Array) -> tuple[Array, Array]:
+    """Return positions [m] and outward unit normals of the surface in A at `xy` in A [m], shape (n, 2)."""
     return np.column_stack((xy, field.height(xy[:, 0], xy[:, 1]))), field.normal(xy[:, 0], xy[:, 1])
 
 
@@ -187,13 +198,13 @@ def _remarks(guessed: int, nodes: int, motion: float) -> str:
     remarks = []
     if guessed:
         remarks.append(f"{guessed} of {nodes} targets lie in small gaps and are interpolated")
-    if motion > MOTION_M:
-        remarks.append(f"the surface moved while it was seen, by {1e3 * motion:.1f} mm (standard deviation): breathing?")
+    if motion > PIPELINE.motion_m:
+        remarks.append(f"the surface moved during the burst by {1e3 * motion:.1f} mm (standard deviation), probably breathing")
     return "; ".join(remarks)
 
 
 def _grown(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
-    """A mask of the grid, wider by some cells in each direction."""
+    """Return a mask of the grid, dilated by `cells` in each direction."""
     for _ in range(cells):
         padded = np.pad(mask, 1)
         mask = padded[1:-1, 1:-1] | padded[:-2, 1:-1] | padded[2:, 1:-1] | padded[1:-1, :-2] | padded[1:-1, 2:]

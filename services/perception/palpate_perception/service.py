@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -18,7 +19,7 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception import messages
 from palpate_perception.cloud import Cloud, Intrinsics
-from palpate_perception.follower import LONGEST_S, Follower
+from palpate_perception.follower import WATCH, Follower
 from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
@@ -26,14 +27,23 @@ from palpate_perception.visibility import ViewReason
 from palpate_perception.wall import BreathingMode
 
 IMAGE: Final = "camera/depth/image_raw"
-CORRECTED_EVERY_NS: Final = 5 * NS
-"""Period of surface corrections [ns]."""
-PATIENCE_NS: Final = 1 * NS
-"""Wait for missing frames after the expected end of a burst [ns]."""
+
+
+@dataclass(frozen=True)
+class PerceptionTimes:
+    """Times of the service."""
+
+    correction_period_ns: int = 5 * NS
+    """Period of surface corrections [ns]."""
+    frame_wait_ns: int = 1 * NS
+    """Wait for missing frames after the expected end of a burst [ns]."""
+
+
+TIMES: Final = PerceptionTimes()
 
 
 class PerceptionService(Service):
-    """One burst of depth frames in; one cloud, one surface and one list of targets out, and how the wall moves all the time."""
+    """Publishes cloud, surface and targets for each burst of depth frames, and the wall's motion for each small image."""
 
     role: ClassVar[str] = "perception"
 
@@ -46,14 +56,14 @@ class PerceptionService(Service):
         self._X_AW = inverse(X_WA)
         self._last: Perceived | None = None
         self._corrected = 0
-        """When the surface was corrected, or published, last [ns]."""
+        """Time of the last surface or correction [ns]."""
         self._bursts = 0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Publish the wall's motion for each small image; start a scan on a trigger, and publish its surface when complete."""
         for trigger in inbox.new("planning/camera_trigger"):
             asked = nanoseconds(trigger.header.stamp)
-            self._burst = _Burst(asked, int(trigger.frames), t + int(trigger.frames) * self._period + PATIENCE_NS)
+            self._burst = _Burst(asked, int(trigger.frames), t + int(trigger.frames) * self._period + TIMES.frame_wait_ns)
             self._follower.begin(asked / NS)
             self._bursts += 1
         motions = [self._follow(image, inbox) for image in inbox.new("camera/follow/depth")]
@@ -66,17 +76,17 @@ class PerceptionService(Service):
         camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
         try:
             depth = depth_in_metres("camera/follow/depth", image)
-        except ValueError:  # of another encoding: nothing is seen
+        except ValueError:  # unknown encoding: ignore the image
             depth, camera = np.empty((0, 0), np.float32), None
         q = None if status is None else np.asarray(status.position, np.float64)
         return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
 
     def _correction(self, t: int) -> dict[str, Message | list[Message]]:
-        """Now and then, how far outward of the surface that was published last the images since show the wall."""
+        """Return the correction of the published surface by the mean of the images since, once per period."""
         last, average = self._last, self._follower.average
         if self._burst is not None or last is None or last.mesh is None or last.field is None or average is None:
             return {}
-        if t < self._corrected + CORRECTED_EVERY_NS:
+        if t < self._corrected + TIMES.correction_period_ns:
             return {}
         self._corrected = t
         outward = average.outward_of(last.field, self._X_AW)
@@ -94,7 +104,7 @@ class PerceptionService(Service):
         burst.waiting += [image for image in images if nanoseconds(image.header.stamp) >= burst.asked]
         self._fuse(burst, inbox)
         full = burst.fusion is not None and burst.fusion.frames >= burst.wanted
-        watched = self._follower.watched or t >= burst.asked + LONGEST_S * NS + PATIENCE_NS
+        watched = self._follower.watched or t >= burst.asked + WATCH.longest_s * NS + TIMES.frame_wait_ns
         given_up = bool(burst.wrong) or inbox.lost("camera") or (not full and watched and t >= burst.deadline)
         if not given_up and not (full and watched):
             return {}
@@ -133,7 +143,7 @@ class PerceptionService(Service):
         }
 
     def _fuse(self, burst: _Burst, inbox: Inbox) -> None:
-        """Adds the waiting frames, once intrinsics and pose are known (over a network they may arrive later)."""
+        """Add the waiting frames once intrinsics and pose are known; over a network they may arrive later."""
         if not burst.waiting:
             return
         if burst.camera is None:
@@ -197,13 +207,13 @@ def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
         why = f"frames received, but no camera/depth/camera_info or no pose of {frame!r} in world"
     else:
         reason = ViewReason.NO_FRAMES
-        why = f"no frame on camera/depth/image_raw within {PATIENCE_NS / NS:.0f} s of the expected end of the burst"
+        why = f"no frame on camera/depth/image_raw within {TIMES.frame_wait_ns / NS:.0f} s of the expected end of the burst"
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
-    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"nothing seen: {why}")
+    return Perceived(empty, None, Targets.none(), 0.0, 0, 0.0, reason, f"no surface: {why}")
 
 
 def targets(t: int, perceived: Perceived) -> Message:
-    """`palpation_msgs/PalpationTargets` in world."""
+    """Return `palpation_msgs/PalpationTargets` in world."""
     found = perceived.targets
     return PalpationTargets(
         header(t, FRAME),

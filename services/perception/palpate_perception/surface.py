@@ -1,4 +1,4 @@
-"""A smooth surface through a noisy point cloud: a height field z(x, y) in A by penalised cubic splines.
+"""Smooth surface through a noisy point cloud: a height field z(x, y) in A by penalised cubic splines.
 
     minimise  sum_i w_i (z_i - s(x_i, y_i))^2 + lambda E(s),   E = int s_xxx^2 + 3 s_xxy^2 + 3 s_xyy^2 + s_yyy^2
 
@@ -21,13 +21,22 @@ from scipy.sparse import coo_array, csr_array, kron
 
 from palpate_models.numerics.frames import Array
 
-CUTOFF_M: Final = 0.03
-"""Wave length that passes with half its amplitude: wider waves are shape, narrower ones noise."""
-KNOTS_PER_CUTOFF: Final = 4
+
+@dataclass(frozen=True)
+class SurfaceTuning:
+    """Tuning of the surface fit."""
+
+    cutoff_m: float = 0.03
+    """Wavelength that passes with half its amplitude: longer waves are shape, shorter ones noise."""
+    knots_per_cutoff: int = 4
+    tukey: float = 4.685
+    """Tukey's biweight for 95 % efficiency."""
+    rounds: int = 3
+
+
+TUNING: Final = SurfaceTuning()
+
 DEGREE: Final = 3
-TUKEY: Final = 4.685
-"""Tukey's biweight for 95 % efficiency."""
-ROUNDS: Final = 3
 
 
 class KnotAxis:
@@ -42,17 +51,17 @@ class KnotAxis:
         self._splines = BSpline(self.knots, np.eye(self.size), DEGREE)
 
     def values(self, x: Array, derivative: int = 0) -> Array:
-        """Basis functions (or a derivative) at `x` [m], shape (n, size)."""
+        """Return the basis functions (or a derivative) at `x` [m], shape (n, size)."""
         clipped = np.clip(x, self.low, self.high)
         return np.asarray(self._splines(clipped, nu=derivative), np.float64)
 
     def local(self, x: Array) -> tuple[Array, NDArray[np.intp]]:
-        """The DEGREE + 1 basis functions that are not zero at `x`, and their indices, shapes (n, DEGREE + 1)."""
+        """Return the DEGREE + 1 basis functions that are not zero at `x`, and their indices, shapes (n, DEGREE + 1)."""
         rows = BSpline.design_matrix(np.clip(x, self.low, self.high), self.knots, DEGREE)
         return rows.data.reshape(-1, DEGREE + 1), rows.indices.reshape(-1, DEGREE + 1).astype(np.intp)
 
     def gram(self, derivative: int) -> Array:
-        """Int b_i^(d) b_j^(d) dx, shape (size, size), exact by Gauss-Legendre quadrature."""
+        """Return int b_i^(d) b_j^(d) dx, shape (size, size), exact by Gauss-Legendre quadrature."""
         node, weight = np.polynomial.legendre.leggauss(DEGREE + 1)
         left = self.knots[DEGREE : -DEGREE - 1]
         x = (left[:, np.newaxis] + self.step * (node + 1) / 2).ravel()
@@ -61,8 +70,8 @@ class KnotAxis:
 
 
 @dataclass(frozen=True, slots=True)
-class HeightField:
-    """A fitted surface z = s(x, y) in A, with its covariance."""
+class FittedSurface:
+    """Fitted surface z = s(x, y) in A with its covariance."""
 
     x: KnotAxis
     y: KnotAxis
@@ -71,19 +80,19 @@ class HeightField:
     factor: Array
     """Cholesky factor of the normal matrix, lower band."""
     scale: float
-    """Standard deviation of the residuals over the one assumed."""
+    """Ratio of the residuals' standard deviation to the assumed one."""
 
     def height(self, x: Array, y: Array) -> Array:
-        """Z [m] at points, shapes (n,). Outside the fitted rectangle: the value at its nearest point."""
+        """Return z [m] at points, shapes (n,); outside the fitted rectangle the value at its nearest point."""
         return self._evaluate(x, y, 0, 0)
 
     def normal(self, x: Array, y: Array) -> Array:
-        """Outward (towards +z) unit normals in A, shape (n, 3)."""
+        """Return outward (towards +z) unit normals in A, shape (n, 3)."""
         n = np.stack((-self._evaluate(x, y, 1, 0), -self._evaluate(x, y, 0, 1), np.ones(len(x))), axis=1)
         return np.asarray(n / np.linalg.norm(n, axis=1, keepdims=True))
 
     def sigma(self, x: Array, y: Array) -> Array:
-        """Standard deviation [m] of the height at points, shape (n,): the posterior of the smoothing spline (Wahba)."""
+        """Return the SD [m] of the height at points, shape (n,): the posterior of the smoothing spline (Wahba)."""
         rows = np.einsum("ni,nj->nij", self.x.values(x), self.y.values(y)).reshape(len(x), -1)
         return np.asarray(self.scale * np.sqrt(np.einsum("nm,mn->n", rows, cho_solve_banded((self.factor, True), rows.T))))
 
@@ -93,16 +102,16 @@ class HeightField:
         )
 
 
-def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, float], cutoff_m: float = CUTOFF_M) -> HeightField:
-    """Fits points in A, shape (n, 3), of standard deviation `sigma` [m], shape (n,), over the rectangle low to high.
+def fit(
+    p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, float], cutoff_m: float = TUNING.cutoff_m
+) -> FittedSurface:
+    """Fit a surface to points in A, shape (n, 3), with SD `sigma` [m], shape (n,), over the rectangle low to high.
 
-    A wave of the length `cutoff_m` passes with half its amplitude.
-
-    Raises ValueError when there are fewer than ten points.
+    A wave of length `cutoff_m` passes with half its amplitude. Raises ValueError for fewer than ten points.
     """
     if len(p) < 10:
-        raise ValueError(f"surface fit: {len(p)} points, want at least 10")
-    x, y = (KnotAxis(a, b, cutoff_m / KNOTS_PER_CUTOFF) for a, b in zip(low, high, strict=True))
+        raise ValueError(f"surface fit: {len(p)} points, at least 10 are needed")
+    x, y = (KnotAxis(a, b, cutoff_m / TUNING.knots_per_cutoff) for a, b in zip(low, high, strict=True))
     rows = _rows(x, y, p)
     width = DEGREE * (y.size + 1)  # half band width of the normal matrix: neighbours in x are y.size apart
     weight = 1 / sigma**2
@@ -110,22 +119,22 @@ def fit(p: Array, sigma: Array, low: tuple[float, float], high: tuple[float, flo
     penalty = _band(_energy(x, y), width) * (cutoff_m / (2 * np.pi)) ** 6 / area
     level = float(np.median(p[:, 2]))
     scale, robust = 1.0, np.ones(len(p))
-    for _ in range(ROUNDS):
+    for _ in range(TUNING.rounds):
         w = weight * robust
         weighted = rows.multiply(w[:, np.newaxis]).tocsr()
         normal = _band(rows.T @ weighted, width) + w.sum() * penalty
-        # Corners that no datum constrains: a ridge of 1e-9 keeps the matrix definite, without a visible effect.
+        # A ridge of 1e-9 keeps the matrix definite in corners without data.
         normal[0] += 1e-9 * normal[0].mean()
         factor = cholesky_banded(normal, lower=True)
         c = cho_solve_banded((factor, True), weighted.T @ (p[:, 2] - level))
         residual = (p[:, 2] - level - rows @ c) / sigma
         scale = max(1.4826 * float(np.median(np.abs(residual))), 1e-6)
-        robust = np.clip(1 - (residual / (TUKEY * max(scale, 1.0))) ** 2, 0, None) ** 2
-    return HeightField(x, y, c.reshape(x.size, y.size) + level, factor, scale)  # B-splines sum to one
+        robust = np.clip(1 - (residual / (TUNING.tukey * max(scale, 1.0))) ** 2, 0, None) ** 2
+    return FittedSurface(x, y, c.reshape(x.size, y.size) + level, factor, scale)  # B-splines sum to one
 
 
 def _rows(x: KnotAxis, y: KnotAxis, p: Array) -> csr_array[Any]:
-    """Tensor-product basis at the points, sparse, shape (n, x.size * y.size)."""
+    """Return the tensor-product basis at the points, sparse, shape (n, x.size * y.size)."""
     (bx, ix), (by, iy) = x.local(p[:, 0]), y.local(p[:, 1])
     data = np.einsum("ni,nj->nij", bx, by).ravel()
     column = (ix[:, :, np.newaxis] * y.size + iy[:, np.newaxis, :]).ravel()
@@ -134,16 +143,16 @@ def _rows(x: KnotAxis, y: KnotAxis, p: Array) -> csr_array[Any]:
 
 
 def _energy(x: KnotAxis, y: KnotAxis) -> Any:
-    """Matrix of E, sparse, shape (x.size * y.size, the same)."""
+    """Return the matrix of E, sparse, square of size x.size * y.size."""
     gx, gy = ([csr_array(axis.gram(d)) for d in range(4)] for axis in (x, y))
     return sum(k * kron(gx[3 - d], gy[d]) for d, k in enumerate((1.0, 3.0, 3.0, 1.0)))
 
 
 def _band(matrix: Any, width: int) -> Array:
-    """Lower band of a symmetric sparse matrix as LAPACK wants it: entry (i, j) at [i - j, j], shape (width + 1, n)."""
+    """Return the lower band of a symmetric sparse matrix in LAPACK's format: entry (i, j) at [i - j, j], shape (width + 1, n)."""
     entries = coo_array(matrix)
     row, column = entries.coords
-    lower = (row >= column) & (row - column <= width)  # beyond the band the Gram matrices hold rounding errors only
+    lower = (row >= column) & (row - column <= width)  # entries outside the band are rounding errors
     band = np.zeros((width + 1, entries.shape[0]))
     np.add.at(band, (row[lower] - column[lower], column[lower]), entries.data[lower])
     return band

@@ -1,4 +1,4 @@
-"""Tracks the wall from one small depth image to the next.
+"""Tracking of the wall from one small depth image to the next.
 
 The outward displacements of the wall's pixels, y = (z - z_ref) / g, are explained by breathing and by the motion of a body on a
 table, a shift s_x, s_y and a turn theta about its long axis:
@@ -15,20 +15,13 @@ each of them (a jackknife, Efron and Stein 1981): with w the weights
 
 half of which is the error of the images that the wall model was fitted to.
 
-Registration of a patient who has moved compares the wall of one scan with that of the previous one, pixel by pixel.
+*Registration* (`shift_between`): after the patient has moved, the walls of two scans are compared pixel by pixel with the same
+model. The normals n_i are midway between both scans, which leaves no error of second order. Both walls are means over two
+breaths, so the remaining error is the systematic error of the camera, not pixel noise.
 
-A body on a table shifts along it by s_x, s_y and turns about its long axis by theta. The wall's pixels then measure the outward
-displacement
-
-    y_i = m_i d + n_i . (s_x, s_y, 0) + theta n_i . (e_y x p_i) + noise
-
-with the normals n_i midway between both scans, which leaves no error of second order. Both walls are means over two breaths, so
-the remaining error is the camera's systematic one, not pixel noise.
-
-The mean of all small images corrects the surface of a burst.
-
-A burst lasts two seconds, so camera errors of a few seconds are part of its surface. Small images continue for minutes. Pixel i,
-with the outward displacement y_i of the wall, gives the displacement of the wall without breathing
+*Average* (`WallAverage`): the mean of all small images corrects the surface of a burst. A burst lasts two seconds, so camera
+errors of a few seconds are part of its surface; small images continue for minutes. Pixel i, with the outward displacement y_i of
+the wall, gives the displacement of the wall without breathing
 
     r_i = mean of (y_i - m_i d)
 
@@ -48,16 +41,24 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array, apply
 from palpate_perception import surface
 from palpate_perception.breath_filter import BreathFilter
-from palpate_perception.surface import HeightField
-from palpate_perception.wall import SeenWall
+from palpate_perception.surface import FittedSurface
+from palpate_perception.wall import WallPixels
 
-SHIFT_PRIOR: Final = (0.010, 0.015, 0.015, 0.05)
-"""Standard deviations of the rise d [m], s_x, s_y [m] and theta [rad] of a body that moves."""
-SEEN_M: Final = 1.4e-3
-"""Equivalent independent error of a pixel in both scans [m]: 0.7 mm shared by four neighbours (docs/errors.md)."""
-SHIFT_TUKEY: Final = 5.0
-"""Tukey's biweight, in standard deviations of a pixel: clothes and arms move otherwise."""
-SHIFT_ROUNDS: Final = 4
+
+@dataclass(frozen=True)
+class ShiftTuning:
+    """Tuning of the registration of a patient who has moved."""
+
+    prior_sd: tuple[float, ...] = (0.010, 0.015, 0.015, 0.05)
+    """Standard deviations of the rise d [m], s_x, s_y [m] and theta [rad] of a body that moves."""
+    pixel_error_m: float = 1.4e-3
+    """Equivalent independent error of a pixel in both scans [m]: 0.7 mm shared by four neighbours (docs/errors.md)."""
+    tukey: float = 5.0
+    """Tukey's biweight, in standard deviations of a pixel: clothes and arms move otherwise."""
+    rounds: int = 4
+
+
+SHIFT: Final = ShiftTuning()
 
 
 def reasons(lifts: Array, n_A: Array, from_middle: Array) -> Array:
@@ -66,7 +67,7 @@ def reasons(lifts: Array, n_A: Array, from_middle: Array) -> Array:
     return np.column_stack((lifts, n_A[:, :2], turn))
 
 
-def shift_between(before: SeenWall, after: SeenWall, middle: Array, drift: float) -> Array:
+def shift_between(before: WallPixels, after: WallPixels, middle: Array, drift: float) -> Array:
     """Return the shift of the skin around `middle` (A, [m], shape (3,)) along the table [m], in A, shape (2,).
 
     `drift`: drift of the camera's depth between the scans [m]; in an oblique view it would look like a shift.
@@ -76,93 +77,120 @@ def shift_between(before: SeenWall, after: SeenWall, middle: Array, drift: float
     n_A = (before.n_A[i] + after.n_A[j]) / 2
     X = reasons((before.lifts[i] + after.lifts[j]) / 2, n_A, (before.p_A[i] + after.p_A[j]) / 2 - middle)
     motion: Array = np.zeros(4)
-    prior = np.diag(np.array(SHIFT_PRIOR) ** -2.0)
-    weight: Array = np.full(len(y), SEEN_M**-2.0)
-    for _ in range(SHIFT_ROUNDS):
+    prior = np.diag(np.array(SHIFT.prior_sd) ** -2.0)
+    weight: Array = np.full(len(y), SHIFT.pixel_error_m**-2.0)
+    for _ in range(SHIFT.rounds):
         motion = np.asarray(np.linalg.solve(X.T @ (weight[:, np.newaxis] * X) + prior, X.T @ (weight * y)))
-        scale = max(SEEN_M, 1.5 * float(np.median(np.abs(y - X @ motion))))
-        weight = np.clip(1 - ((y - X @ motion) / (SHIFT_TUKEY * scale)) ** 2, 0, None) ** 2 / scale**2
+        scale = max(SHIFT.pixel_error_m, 1.5 * float(np.median(np.abs(y - X @ motion))))
+        weight = np.clip(1 - ((y - X @ motion) / (SHIFT.tukey * scale)) ** 2, 0, None) ** 2 / scale**2
     return np.asarray(motion[1:3])
 
 
-FEWEST: Final = 30
-"""Least number of images of a pixel."""
-LEAST_PIXELS: Final = 12
-"""Fewer pixels over the surface correct nothing."""
-KEPT_M: Final = 2e-4
-"""Error of a pixel's mean [m] [A]; uniform, so it does not change weights."""
+@dataclass(frozen=True)
+class AverageTuning:
+    """Tuning of the surface correction from the mean of all small images."""
+
+    least_images: int = 30
+    """Least number of images of a pixel."""
+    least_pixels: int = 12
+    """Fewer pixels over the surface correct nothing."""
+    pixel_error_m: float = 2e-4
+    """Error of a pixel's mean [m] [A]; uniform, so it does not change weights."""
+
+
+AVERAGE: Final = AverageTuning()
 
 
 class WallAverage:
-    """The mean of what each pixel of the wall shows."""
+    """Mean of the displacement of each pixel of the wall."""
 
-    def __init__(self, wall: SeenWall, watched: int) -> None:
-        """The wall as `watched` images have shown it."""
+    def __init__(self, wall: WallPixels, watched: int) -> None:
+        """Start with the wall as the mean of `watched` images."""
         self._wall = wall
         self._images = np.full(len(wall.pixel), float(watched))
         self._sum = np.zeros(len(wall.pixel))
 
     def add(self, still: Array, seen: NDArray[np.bool_]) -> None:
-        """Takes an image: outward displacement without the breath [m], and which pixels showed the wall, shape (n,) each."""
+        """Add an image: outward displacement without the breath [m] and mask of visible pixels, shape (n,) each."""
         self._images += seen
         self._sum += np.where(seen, still, 0.0)
 
-    def outward_of(self, field: HeightField, X_AW: Array) -> HeightField | None:
+    def outward_of(self, field: FittedSurface, X_AW: Array) -> FittedSurface | None:
         """Return the outward offset of the wall from a surface [m], over its rectangle; None with too few pixels."""
         wall = self._wall
         z = wall.depth + wall.gain * self._sum / self._images
         x, y, height = apply(X_AW, wall.camera.X_WC[:3, 3] + z[:, np.newaxis] * wall.r_W).T
         low, high = ((getattr(field.x, end), getattr(field.y, end)) for end in ("low", "high"))
-        over = (self._images >= FEWEST) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
-        if np.count_nonzero(over) < LEAST_PIXELS:
+        over = (self._images >= AVERAGE.least_images) & (x > low[0]) & (x < high[0]) & (y > low[1]) & (y < high[1])
+        if np.count_nonzero(over) < AVERAGE.least_pixels:
             return None
         x, y, height = x[over], y[over], height[over]
         outward = (height - field.height(x, y)) * field.normal(x, y)[:, 2]
-        return surface.fit(np.column_stack((x, y, outward)), np.full(len(x), KEPT_M), low, high)
+        return surface.fit(np.column_stack((x, y, outward)), np.full(len(x), AVERAGE.pixel_error_m), low, high)
 
 
 FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
 """Forecast times after an exposure [s]."""
-PATCH_M: Final = 0.11
-"""Size of a patch [m], larger than the correlation length of pixel errors: 25 pixels of a poor camera, 5 cm (docs/errors.md)."""
-SHARED_M: Final = 1.5e-4
-"""Initial SD of the displacement error shared by neighbouring pixels [m]."""
-SHARED_S: Final = 20.0
-"""Time constant of its running estimate [s]."""
-REACH_M: Final = 0.06
-"""Largest distance of a wall pixel from the expected wall [m]."""
-TUKEY: Final = 5.0
-"""Tukey's biweight, in standard deviations of a pixel."""
-LEAST_SHARE: Final = 0.015
-"""Least share of the wall's weight in view; below it the wall is lost."""
-SURPRISE: Final = 5.0
-"""Innovation, in standard deviations, from which a displacement is not a normal breath."""
-SURPRISE_M: Final = 2.5e-3
-"""Least innovation of such a displacement [m]."""
-DEEP: Final = 2.2
-"""Depth of a deep breath, as a multiple of the usual depth."""
-CALM_S: Final = 0.6
-"""Time after the last surprise until the wall is quiet again [s]."""
-KEPT: Final = 0.7
-"""Part of what was left over that counts on at the next image. Over the six images that count so, white noise falls to what
-neighbours and successive images share, which does not fall: their mean is about as certain as one image's white noise says."""
-MOVED_M: Final = 0.002
-"""Least patient motion [m]: root mean square over the region's corners, without a common rise."""
-MOVED_SQUARED: Final = 14.0
-"""Motion is detected when its squared Mahalanobis distance exceeds this multiple of the running mean.
 
-Largest value in three consecutive images (tuning seeds): 8.5 for 35 persons who breathe quietly (89 min), 8.9 for 10 with poor
-equipment (25 min); at least 73 for 60 shifts of 10 mm, 23 for one along a body of uniform height."""
-USUAL_S: Final = 20.0
-"""Time constant of the running mean [s] (floor 1): shared pixel errors, which are not in the covariance, raise it."""
-UNUSUAL: Final = 3.0
-"""Samples of the running mean are clipped at this multiple, so that a starting motion does not raise it."""
-DRIFT_S: Final = 8.0
-"""Slower changes are camera drift, not patient motion [s]."""
-GAP_S: Final = 0.2
-"""An image does not speak for more time than this, however long nothing was seen before it: the patient may have moved then."""
-MOVED_IMAGES: Final = 3
-"""Number of consecutive images that must exceed the threshold."""
+
+@dataclass(frozen=True)
+class TrackerTuning:
+    """Tuning of the tracking of breathing."""
+
+    patch_m: float = 0.11
+    """Size of a patch [m]; errors are correlated over less: 25 pixels of a poor camera, 5 cm (docs/errors.md)."""
+    shared_error_m: float = 1.5e-4
+    """Initial SD of the displacement error shared by neighbouring pixels [m]."""
+    shared_error_tau_s: float = 20.0
+    """Time constant of the estimate of that SD [s]."""
+    reach_m: float = 0.06
+    """Largest distance of a wall pixel from the expected wall [m]."""
+    tukey: float = 5.0
+    """Tukey's biweight, in standard deviations of a pixel."""
+    least_share: float = 0.015
+    """Least share of the wall's weight in view; below it the wall is lost."""
+    surprise: float = 5.0
+    """Innovation, in standard deviations, from which a displacement is not a normal breath."""
+    surprise_m: float = 2.5e-3
+    """Least innovation of such a displacement [m]."""
+    deep: float = 2.2
+    """Depth of a deep breath, as a multiple of the usual depth."""
+    calm_s: float = 0.6
+    """Time after the last surprise until the wall is quiet again [s]."""
+    gap_s: float = 0.2
+    """Largest time that one image represents, also after a gap in which the patient may have moved [s]."""
+
+
+TRACKING: Final = TrackerTuning()
+
+
+@dataclass(frozen=True)
+class MotionTuning:
+    """Tuning of the detection of patient motion."""
+
+    memory: float = 0.7
+    """Weight of the previous residuals at the next image.
+
+    It averages about six images. White noise falls by that to the level of the errors shared by neighbouring pixels, which do not
+    fall, so the average is about as accurate as the white noise of one image."""
+    least_m: float = 0.002
+    """Least patient motion [m]: root mean square over the region's corners, without a common rise."""
+    threshold: float = 14.0
+    """Motion is detected when its squared Mahalanobis distance exceeds this multiple of the running mean.
+
+    Largest value in three images in a row (tuning seeds): 8.5 for 35 persons with quiet breathing (89 min), 8.9 for 10 with poor
+    equipment (25 min); at least 73 for 60 shifts of 10 mm, 23 for one along a body of uniform height."""
+    mean_tau_s: float = 20.0
+    """Time constant of the running mean [s], which is at least 1. Shared pixel errors, not in the covariance, raise it."""
+    mean_clip: float = 3.0
+    """Samples of the running mean are clipped at this multiple, so that a starting motion does not raise it."""
+    drift_tau_s: float = 8.0
+    """Slower changes are camera drift, not patient motion [s]."""
+    images: int = 3
+    """Number of consecutive images that must exceed the threshold."""
+
+
+MOTION: Final = MotionTuning()
 
 
 class State(Enum):
@@ -186,7 +214,7 @@ class Followed:
     sigma: float
     """Standard deviation of the displacement [m]."""
     shift: Array
-    """Displacement of the body since the first look, in A [m], shape (3,)."""
+    """Displacement of the body since the first scan, in A [m], shape (3,)."""
 
 
 NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.zeros(3))
@@ -196,8 +224,8 @@ NOTHING: Final = Followed(State.LOST, 0.0, np.zeros(len(FORECAST_S)), 0.1, np.ze
 class Tracker:
     """Follows one wall."""
 
-    def __init__(self, wall: SeenWall, t_s: Array, d: Array, corners: Array) -> None:
-        """A wall displaced by `d` [m] at times `t_s` [s], shape (n,) each; `corners` of the region in A, shape (m, 3)."""
+    def __init__(self, wall: WallPixels, t_s: Array, d: Array, corners: Array) -> None:
+        """Start with a wall displaced by `d` [m] at times `t_s` [s], (n,) each; `corners` of the region in A, shape (m, 3)."""
         self.wall = wall
         self.average = WallAverage(wall, len(t_s))
         """Mean of the images of a quiet wall."""
@@ -206,12 +234,12 @@ class Tracker:
         self._reasons = reasons(wall.lifts, wall.n_A, wall.p_A - middle)
         self._corners = corners - middle
         self._patch = _patches(wall.p_A)
-        self._shared = SHARED_M**2
+        self._shared = TRACKING.shared_error_m**2
         self._certainty = (wall.gain / wall.sigma) ** 2
         self._whole = float(self._certainty @ wall.lifts**2)
         self._precision = np.zeros((4, 4))
         self._pull = np.zeros(4)
-        self._prior = np.diag(np.array(SHIFT_PRIOR) ** -2.0)
+        self._prior = np.diag(np.array(SHIFT.prior_sd) ** -2.0)
         self._calm_s = float(t_s[-1])
         self._drift = np.zeros(4)
         self._usual = 1.0
@@ -225,27 +253,30 @@ class Tracker:
         return self._moved
 
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
-        """Takes the wall's pixels of an image exposed at `t_s` [s]: depth [m], and whether the arm may hide it, (n,) each."""
+        """Process the wall's pixels of an image exposed at `t_s` [s]: depth [m] and mask of hidden pixels, (n,) each."""
         expected, spread = self._filter.forward(t_s)
         y = (depth - self.wall.depth) / self.wall.gain
-        use = np.isfinite(depth) & ~hidden & (np.abs(y - self.wall.lifts * expected) < REACH_M)
+        use = np.isfinite(depth) & ~hidden & (np.abs(y - self.wall.lifts * expected) < TRACKING.reach_m)
         y = np.where(use, y, 0.0)
         weight = np.where(use, self._certainty, 0.0)
-        if float(weight @ self.wall.lifts**2) < LEAST_SHARE * self._whole:
+        if float(weight @ self.wall.lifts**2) < TRACKING.least_share * self._whole:
             return self._result(State.MOVED if self._moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         if not weight.any():
             return self._result(State.MOVED if self._moved else State.LOST, expected)
         still = y - self.wall.lifts * d
-        elapsed = min(t_s - self._last_s, GAP_S)
+        elapsed = min(t_s - self._last_s, TRACKING.gap_s)
         self._weigh_error(elapsed, still, weight)
         self._weigh_motion(elapsed, still, weight)
         self._last_s = t_s
         noise = float(np.sqrt(1 / (weight @ self.wall.lifts**2) + self._shared))
         surprise = abs(d - expected)
-        if surprise > max(SURPRISE * np.hypot(spread, noise), SURPRISE_M) or d > DEEP * self._filter.depth + SURPRISE_M:
-            self._calm_s = t_s + CALM_S
-        if surprise > SURPRISE * np.hypot(spread, noise) and surprise > SURPRISE_M:
+        if (
+            surprise > max(TRACKING.surprise * np.hypot(spread, noise), TRACKING.surprise_m)
+            or d > TRACKING.deep * self._filter.depth + TRACKING.surprise_m
+        ):
+            self._calm_s = t_s + TRACKING.calm_s
+        if surprise > TRACKING.surprise * np.hypot(spread, noise) and surprise > TRACKING.surprise_m:
             self._filter.forget(d)
         else:
             self._filter.update(d, noise)
@@ -263,13 +294,13 @@ class Tracker:
         return Followed(state, float(d), self._filter.forecast(FORECAST_S), sigma, shift)
 
     def _displacement(self, y: Array, weight: Array, expected: float) -> tuple[float, Array]:
-        """The breath alone [m], and the weights with which pixels count for it: Tukey's biweight, about the median first."""
+        """Return the displacement by the breath [m] and the pixels' weights: Tukey's biweight, first about the median."""
         lifts = self.wall.lifts
         clear = (weight > 0) & (lifts > 0.3)
         d = float(np.median(y[clear] / lifts[clear])) if clear.any() else expected
         robust = weight
         for _ in range(2):
-            away = (y - lifts * d) ** 2 * self._certainty / TUKEY**2
+            away = (y - lifts * d) ** 2 * self._certainty / TRACKING.tukey**2
             robust = weight * np.clip(1 - away, 0, None) ** 2
             d = float(robust @ (lifts * y)) / max(float(robust @ lifts**2), 1e-9)
         return d, robust
@@ -278,20 +309,20 @@ class Tracker:
         """Update the shared pixel error by the residual [m], shape (n,), of an image `elapsed_s` [s] after the last."""
         variance = jackknife(left, weight, self.wall.lifts, self._patch)
         if variance is not None:
-            self._shared += (1 - np.exp(-elapsed_s / SHARED_S)) * (0.5 * variance - self._shared)
+            self._shared += (1 - np.exp(-elapsed_s / TRACKING.shared_error_tau_s)) * (0.5 * variance - self._shared)
 
     def _weigh_motion(self, elapsed_s: float, left: Array, weight: Array) -> None:
-        """Counts what an image, `elapsed_s` [s] after the last, leaves over [m], shape (n,), for the rigid motion."""
+        """Update the rigid motion by the residual [m], shape (n,), of an image `elapsed_s` [s] after the last."""
         weighted = weight[:, np.newaxis] * self._reasons
-        self._precision = KEPT * self._precision + (1 - KEPT) * self._reasons.T @ weighted
-        self._pull = KEPT * self._pull + (1 - KEPT) * weighted.T @ left
-        moving = self.moved_by > MOVED_M and self.evidence > MOVED_SQUARED * self._usual
+        self._precision = MOTION.memory * self._precision + (1 - MOTION.memory) * self._reasons.T @ weighted
+        self._pull = MOTION.memory * self._pull + (1 - MOTION.memory) * weighted.T @ left
+        moving = self.moved_by > MOTION.least_m and self.evidence > MOTION.threshold * self._usual
         self._votes = self._votes + 1 if moving else 0
         if not self._votes and not self._moved:
-            evidence = min(self.evidence, UNUSUAL * self._usual)
-            self._usual = max(1.0, self._usual + (1 - np.exp(-elapsed_s / USUAL_S)) * (evidence - self._usual))
-            self._drift += (1 - np.exp(-elapsed_s / DRIFT_S)) * (self._motion - self._drift)
-        self._moved = self._moved or self._votes >= MOVED_IMAGES
+            evidence = min(self.evidence, MOTION.mean_clip * self._usual)
+            self._usual = max(1.0, self._usual + (1 - np.exp(-elapsed_s / MOTION.mean_tau_s)) * (evidence - self._usual))
+            self._drift += (1 - np.exp(-elapsed_s / MOTION.drift_tau_s)) * (self._motion - self._drift)
+        self._moved = self._moved or self._votes >= MOTION.images
 
     @property
     def _motion(self) -> Array:
@@ -326,6 +357,6 @@ def jackknife(left: Array, weight: Array, lifts: Array, patch: NDArray[np.intp])
 
 
 def _patches(p_A: Array) -> NDArray[np.intp]:
-    """The number of the patch of the wall in which each place lies [m], shape (n, 3) -> (n,)."""
-    cell = np.floor((p_A[:, :2] - p_A[:, :2].min(axis=0)) / PATCH_M).astype(np.intp)
+    """Return the number of the patch of the wall for each position [m], shape (n, 3) -> (n,)."""
+    cell = np.floor((p_A[:, :2] - p_A[:, :2].min(axis=0)) / TRACKING.patch_m).astype(np.intp)
     return np.asarray(np.unique(cell, axis=0, return_inverse=True)[1]).ravel()

@@ -13,19 +13,25 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.schema import Exam
 from palpate_perception.cloud import project
 
-CELL_M: Final = 0.01
-"""Edge of the cells in which coverage is counted: five pixels of a Kinect at 1.1 m."""
-CLEARANCE_M: Final = 0.025
-"""Points nearer than the expected surface by more hide it; points farther by more are not the abdomen [m]."""
+
+@dataclass(frozen=True)
+class VisibilityTuning:
+    """Sizes of the search for gaps."""
+
+    cell_m: float = 0.01
+    """Edge of the cells in which coverage is counted: five pixels of a Kinect at 1.1 m."""
+    clearance_m: float = 0.025
+    """Distance from the expected surface above which a nearer point hides it and a farther one is not the abdomen."""
+    crest_m: float = 0.03
+    """Largest height of the abdomen in A, whose origin is the umbilicus [m]."""
 
 
-CREST_M: Final = 0.03
-"""Largest height of the abdomen in A, whose origin is the umbilicus [m]."""
+TUNING: Final = VisibilityTuning()
 
 
 def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
-    """Centres of the region's cells in A, xy [m], shape (nx * ny, 2), and (nx, ny)."""
-    counts = tuple(max(round(length / CELL_M), 1) for length in exam.region_m)
+    """Return the centres of the region's cells in A, xy [m], shape (nx * ny, 2), and (nx, ny)."""
+    counts = tuple(max(round(length / TUNING.cell_m), 1) for length in exam.region_m)
     axes = [
         centre + length * ((np.arange(count) + 0.5) / count - 0.5)
         for centre, length, count in zip(exam.centre_m, exam.region_m, counts, strict=True)
@@ -46,7 +52,7 @@ def seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
 def quadric(p_A: Array, xy: Array) -> Array:
     """Return the height [m] at `xy`, shape (m, 2), of a quadric through a cloud: an estimate for gaps.
 
-    The umbilicus' height, 0, if the cloud is too small.
+    Returns 0, the height of the umbilicus, if the cloud is too small.
     """
     if len(p_A) < 100:
         return np.zeros(len(xy))
@@ -55,7 +61,7 @@ def quadric(p_A: Array, xy: Array) -> Array:
         x, y = q[:, 0], q[:, 1]
         return np.stack((np.ones(len(q)), x, y, x * x, x * y, y * y), axis=1)
 
-    # A weak prior of a flat wall at the umbilicus' height keeps the guess sane when only a corner was seen.
+    # A weak prior of a flat wall at the umbilicus bounds the estimate if only a corner is in view.
     prior = np.diag(np.sqrt(len(p_A)) * np.array([1e-3, 2e-3, 2e-3, 3e-4, 3e-4, 3e-4]))
     system, right = np.vstack((rows(p_A), prior)), np.concatenate((p_A[:, 2], np.zeros(6)))
     return np.asarray(rows(xy) @ np.linalg.lstsq(system, right)[0])
@@ -83,14 +89,14 @@ HINTS: Final = {
     ViewReason.SELF_OCCLUDED: "hidden behind the abdomen itself: place the camera higher",
     ViewReason.OUT_OF_IMAGE: "outside the image: turn the camera towards the region",
     ViewReason.NO_DEPTH: "no depth: seen at too grazing an angle or out of range",
-    ViewReason.BEYOND_ABDOMEN: "no abdomen there: the surface lies deeper, the region reaches past its edge",
+    ViewReason.BEYOND_ABDOMEN: "no abdomen: the surface is deeper, the region extends past the edge",
     ViewReason.TOO_FEW_POINTS: "seen by too few pixels, or cut off by a jump in depth",
 }
 
 
 @dataclass(frozen=True, slots=True)
 class Gaps:
-    """Parts of the region that were not seen, by reason."""
+    """Parts of the region that were not in view, by reason."""
 
     shares: dict[ViewReason, float]
     """Fraction of the region, largest first, without those of at most half a percent."""
@@ -115,7 +121,7 @@ class Gaps:
 def gaps(
     missing: Array, total: int, X_CA: Array, K: Array, depth: Array, origin: tuple[int, int], image: tuple[int, int]
 ) -> Gaps:
-    """Return why cells were not seen.
+    """Return the reasons for which cells were not in view.
 
     `missing`: points expected in those cells, in A [m], shape (m, 3); `total`: number of cells of the region; `depth`: the
     fused window [m], whose first pixel is `origin` of an image of shape `image`.
@@ -132,9 +138,9 @@ def gaps(
     measured = np.full(len(missing), np.nan)
     measured[held] = depth[row[held], column[held]]
     nearer = p_C[:, 2] - measured
-    behind, beyond = inside & (nearer > CLEARANCE_M), inside & (nearer < -CLEARANCE_M)
-    before_it = apply(inverse(X_CA), p_C * (measured / p_C[:, 2])[:, np.newaxis])  # what is seen instead, in A
-    itself = behind & (before_it[:, 2] < CREST_M)
+    behind, beyond = inside & (nearer > TUNING.clearance_m), inside & (nearer < -TUNING.clearance_m)
+    before_it = apply(inverse(X_CA), p_C * (measured / p_C[:, 2])[:, np.newaxis])  # the point in view instead, in A
+    itself = behind & (before_it[:, 2] < TUNING.crest_m)
     hidden = behind & ~itself
     none = inside & np.isnan(measured)
     before = float(np.max(nearer[hidden], initial=0.0))

@@ -23,78 +23,86 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
-from palpate_perception.cloud import HEIGHT_M, TABLE_CLEARANCE_M, Intrinsics, RegionBox
+from palpate_perception.cloud import CROP, Intrinsics, RegionBox
 from palpate_perception.fusion import Image
 
-MARGIN_M: Final = 0.12
-"""Margin of the tracked area around the region [m]; it distinguishes a shift from a breath."""
-HALF_M: Final = 0.22
-"""Least half width of the tracked area [m]."""
-CUTOFF_M: Final = 0.06
-"""Shorter waves of the wall are not seen by pixels 14 mm apart."""
-DEGREE: Final = 4
-"""Total degree of the mode's polynomial."""
-UNKNOWN_M: Final = 2e-3
-"""Noise of a pixel without an estimate [m]."""
-VALID: Final = 0.7
-"""A pixel that was seen in fewer of the frames is left out."""
-STEEP: Final = 0.35
-"""A pixel whose ray meets the wall at a smaller cosine is left out: a little error of its place is a large one of depth."""
-EDGE: Final = 2.5
-"""Noise, as a multiple of the usual, from which a pixel is at an edge and left out."""
-STILL_M: Final = 3e-4
-"""A wall that moves by a smaller standard deviation is still: then every part of it is expected to move alike."""
-EXPIRED: Final = 0.05
-"""Share of the time in which the wall seems lower than at the end of expiration, for the noise of an image's displacement."""
-LEAST_PIXELS: Final = 60
+
+@dataclass(frozen=True)
+class WallFitTuning:
+    """Tuning of the wall model."""
+
+    margin_m: float = 0.12
+    """Margin of the tracked area around the region [m]; it distinguishes a shift from a breath."""
+    half_m: float = 0.22
+    """Least half width of the tracked area [m]."""
+    cutoff_m: float = 0.06
+    """Cut-off wavelength of the wall's surface [m]; the pixels are 14 mm apart."""
+    degree: int = 4
+    """Total degree of the mode's polynomial."""
+    unknown_noise_m: float = 2e-3
+    """Noise of a pixel without an estimate [m]."""
+    valid_share: float = 0.7
+    """Least fraction of the frames in which a pixel must be valid."""
+    least_cosine: float = 0.35
+    """Least cosine between ray and normal; below it a small lateral error causes a large depth error."""
+    edge_noise: float = 2.5
+    """Noise, as a multiple of the median, above which a pixel counts as an edge and is excluded."""
+    still_m: float = 3e-4
+    """SD of the displacement below which the wall is still [m]; then the mode is uniform."""
+    expired_share: float = 0.05
+    """Quantile of the displacement that is taken as the end of expiration; noise makes lower values."""
+    least_pixels: int = 60
 
 
-class UnseenWallError(ValueError):
-    """Too little of the wall was in view to learn anything."""
+WALL_FIT: Final = WallFitTuning()
+
+
+class WallNotVisibleError(ValueError):
+    """Too little of the wall was in view to fit the model."""
 
 
 @dataclass(frozen=True, slots=True)
 class BreathingMode:
-    """Breathing amplitude of each place, relative to the largest in the region: a polynomial in x and y of A."""
+    """Breathing amplitude at a position, relative to the largest in the region: a polynomial in x and y of A."""
 
     low: Array
     """Lower corner of the fitted rectangle in A [m], shape (2,)."""
     high: Array
     """Upper corner [m], shape (2,)."""
     coefficients: Array
-    """Coefficients of the products of Legendre polynomials that `basis` gives."""
+    """Coefficients of the products of Legendre polynomials of `basis`."""
 
     def __call__(self, p_A: Array) -> Array:
-        """The mode, between 0 and 1, at places in A [m], shape (n, 2 or 3): shape (n,)."""
+        """Return the mode, between 0 and 1, shape (n,), at positions in A [m], shape (n, 2 or 3)."""
         return np.clip(basis(p_A, self.low, self.high) @ self.coefficients, 0.0, 1.0)
 
 
 @dataclass(frozen=True, slots=True)
-class SeenWall:
-    """The wall as n pixels of the small image see it."""
+class WallPixels:
+    """Wall model at the n pixels of the small image that show it."""
 
     pixel: NDArray[np.intp]
     """Flat indices, shape (n,)."""
     depth: Array
-    """At the end of expiration [m], shape (n,)."""
+    """Depth at the end of expiration [m], shape (n,)."""
     gain: Array
     """g: change of depth by outward displacement, shape (n,), negative."""
     sigma: Array
     """Noise of a frame's depth [m], shape (n,)."""
     p_A: Array
-    """Places [m], shape (n, 3)."""
+    """Positions in A [m], shape (n, 3)."""
     n_A: Array
     """Outward unit normals, shape (n, 3)."""
     mode: BreathingMode
     lifts: Array
-    """The mode at the pixels, shape (n,)."""
+    """Mode at the pixels, shape (n,)."""
     r_W: Array
     """Viewing rays of unit z in the camera's frame, shape (n, 3)."""
     camera: Intrinsics
     """Intrinsics of the small image."""
 
     def depth_per_metre(self, camera: Intrinsics, window: tuple[slice, slice]) -> Image:
-        """By how much depth changes for a displacement of 1 m, g m, in a window (rows, columns) of another of its images."""
+        """Return the change of depth per displacement, g m, in a window (rows, columns) of another image of this camera."""
         rows, columns = (np.arange(part.start, part.stop) for part in window)
         v, u = np.meshgrid(*(to_small(x, i, camera.K, self.camera.K) for x, i in ((rows, 1), (columns, 0))), indexing="ij")
         values = np.full(self.camera.shape, np.nan)
@@ -104,43 +112,49 @@ class SeenWall:
 
 
 def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
-    """Coordinates in the small image [px] of those in another of the same camera, along x (axis 0) or y (1)."""
+    """Convert coordinates along x (axis 0) or y (1) [px] from another image of the camera to the small image."""
     return np.asarray((x - K[axis, 2]) / K[axis, axis] * K_small[axis, axis] + K_small[axis, 2])
 
 
 def watched(exam: Exam) -> RegionBox:
     """Return the tracked area, in A."""
-    return RegionBox.of(exam, max(MARGIN_M, HALF_M - min(exam.region_m) / 2), HEIGHT_M)
+    return RegionBox.of(exam, max(WALL_FIT.margin_m, WALL_FIT.half_m - min(exam.region_m) / 2), CROP.height_m)
 
 
 def basis(p_A: Array, low: Array, high: Array) -> Array:
-    """Products of Legendre polynomials of total degree up to DEGREE over a rectangle, at places, shape (n, 2 or 3)."""
+    """Products of Legendre polynomials of total degree up to WALL_FIT.degree over a rectangle, at places, shape (n, 2 or 3)."""
     x, y = (2 * (np.clip(p_A[:, :2], low, high) - low) / (high - low) - 1).T
-    columns = legendre.legvander2d(x, y, [DEGREE, DEGREE]).reshape(len(x), DEGREE + 1, DEGREE + 1)
-    i, j = np.indices((DEGREE + 1, DEGREE + 1))
-    return np.asarray(columns[:, i + j <= DEGREE])
+    columns = legendre.legvander2d(x, y, [WALL_FIT.degree, WALL_FIT.degree]).reshape(
+        len(x), WALL_FIT.degree + 1, WALL_FIT.degree + 1
+    )
+    i, j = np.indices((WALL_FIT.degree + 1, WALL_FIT.degree + 1))
+    return np.asarray(columns[:, i + j <= WALL_FIT.degree])
 
 
-def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[SeenWall, Array]:
-    """The wall, and its displacement [m] in each frame, shape (frames,), from small depth images, shape (frames, height, width).
+def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[WallPixels, Array]:
+    """Fit the wall to small depth images, shape (frames, height, width), NaN where a pixel is invalid or hidden.
 
-    NaN where a pixel is invalid or hidden. Raises UnseenWallError when too few pixels show the wall.
+    Returns the wall and its displacement [m] in each frame, shape (frames,). Raises WallNotVisibleError.
     """
     pixel, mean, sigma = steady(frames)
     X_AC = inverse(X_WA) @ camera.X_WC
     r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
     p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
     box = watched(exam)
-    keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE_TOP_M + TABLE_CLEARANCE_M)
-    keep[keep] &= sigma[keep] < EDGE * np.median(sigma[keep]) if keep.any() else False
-    if np.count_nonzero(keep) < LEAST_PIXELS:
-        raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image show the wall, want {LEAST_PIXELS}")
-    field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], CUTOFF_M)
+    keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE_TOP_M + CROP.table_clearance_m)
+    keep[keep] &= sigma[keep] < WALL_FIT.edge_noise * np.median(sigma[keep]) if keep.any() else False
+    if np.count_nonzero(keep) < WALL_FIT.least_pixels:
+        raise WallNotVisibleError(
+            f"{np.count_nonzero(keep)} pixels of the small image show the wall, want {WALL_FIT.least_pixels}"
+        )
+    field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], WALL_FIT.cutoff_m)
     n_A = field.normal(p_A[:, 0], p_A[:, 1])
     slope = np.einsum("ij,ij->i", n_A, r_C @ X_AC[:3, :3].T)
-    keep &= -slope > STEEP * np.linalg.norm(r_C, axis=1)
-    if np.count_nonzero(keep) < LEAST_PIXELS:
-        raise UnseenWallError(f"{np.count_nonzero(keep)} pixels of the small image see the wall well, want {LEAST_PIXELS}")
+    keep &= -slope > WALL_FIT.least_cosine * np.linalg.norm(r_C, axis=1)
+    if np.count_nonzero(keep) < WALL_FIT.least_pixels:
+        raise WallNotVisibleError(
+            f"{np.count_nonzero(keep)} pixels of the small image show the wall at a usable angle, want {WALL_FIT.least_pixels}"
+        )
     pixel, gain = pixel[keep], 1 / slope[keep]
     mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
 
@@ -151,28 +165,34 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[S
     d = outward @ weight / (weight @ lifts)
     if not mode.coefficients[1:].any():  # still: what d shows is noise
         d = np.zeros(len(d))
-    expired = float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), EXPIRED)) if len(d) > 2 else float(d.min())
+    expired = (
+        float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), WALL_FIT.expired_share)) if len(d) > 2 else float(d.min())
+    )
     depth = mean + gain * lifts * expired
     r_W = r_C[keep] @ camera.X_WC[:3, :3].T
-    return SeenWall(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
+    return WallPixels(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
 
 
 def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
-    """The pixels that were mostly seen (flat), with their mean depth and the noise of a frame [m], shape (n,) each."""
+    """Return the mostly valid pixels (flat), their mean depth and the noise of a frame [m], shape (n,) each."""
     flat = frames.reshape(len(frames), -1)
-    pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > VALID)
+    pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > WALL_FIT.valid_share)
     seen = flat[:, pixel]
     step = np.diff(without_gaps(seen), axis=0)
-    between = np.isfinite(seen[1:]) & np.isfinite(seen[:-1])  # a step into a gap or out of it is not noise alone
+    between = np.isfinite(seen[1:]) & np.isfinite(seen[:-1])  # steps at the edges of gaps are not noise
     noise = np.sqrt(np.sum(np.where(between, step, 0.0) ** 2, axis=0) / np.maximum(between.sum(axis=0), 1) / 2)
-    sigma = np.where(between.any(axis=0), noise, UNKNOWN_M) if len(frames) > 2 else np.full(len(pixel), UNKNOWN_M)
+    sigma = (
+        np.where(between.any(axis=0), noise, WALL_FIT.unknown_noise_m)
+        if len(frames) > 2
+        else np.full(len(pixel), WALL_FIT.unknown_noise_m)
+    )
     return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
 
 
 def without_gaps(seen: Array) -> Array:
-    """Depths of pixels, shape (frames, n), with what a frame lacks (NaN) between those before and after it.
+    """Return depths of pixels, shape (frames, n), with gaps (NaN) interpolated over the frames.
 
-    Real cameras' holes flicker: a pixel that is not seen for a frame does not stand still in it.
+    Holes of real cameras flicker, and the wall continues to move in a gap.
     """
     filled, k = seen.copy(), np.arange(len(seen))
     for column in np.flatnonzero(~np.isfinite(seen).all(axis=0)):
@@ -182,18 +202,18 @@ def without_gaps(seen: Array) -> Array:
 
 
 def _mode(outward: Array, certainty: Array, p_A: Array, exam: Exam) -> BreathingMode:
-    """The mode of outward displacements [m], shape (frames, n), whose noise is 1 / `certainty` [1/m], shape (n,)."""
+    """Return the mode of outward displacements [m], shape (frames, n), with noise 1 / `certainty` [1/m], shape (n,)."""
     low, high = p_A[:, :2].min(axis=0), p_A[:, :2].max(axis=0)
     waves = basis(p_A, low, high)
     Q, R = np.linalg.qr(certainty[:, np.newaxis] * waves)
     score, size, shape = np.linalg.svd((certainty * outward) @ Q, full_matrices=False)
     coefficients = np.linalg.solve(R, shape[0])
-    region = RegionBox.of(exam, 0.0, HEIGHT_M)
+    region = RegionBox.of(exam, 0.0, CROP.height_m)
     inside = region.holds(p_A)
     lifts = waves @ coefficients
     most = lifts[inside if inside.any() else slice(None)]
     most = most[np.argmax(np.abs(most))]
-    if np.std(score[:, 0]) * size[0] * abs(most) < STILL_M:
+    if np.std(score[:, 0]) * size[0] * abs(most) < WALL_FIT.still_m:
         level = np.zeros(len(coefficients))
         level[0] = 1.0
         return BreathingMode(low, high, level)

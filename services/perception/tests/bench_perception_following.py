@@ -1,4 +1,4 @@
-"""How well the wall is followed, against the truth: camera and perception alone, an arm that palpates in view, no other service.
+"""Error of the followed wall against the truth, with camera, perception and a palpating arm in view; no other service.
 
 Run: `python services/perception/tests/bench_perception_following.py [SECONDS]`; prints the README's table.
 """
@@ -28,7 +28,7 @@ from palpate_perception.service import PerceptionService
 
 TICK = 100 * MS
 LOOK_S = 12.0
-"""The arm stays away for so long."""
+"""Time before the arm comes into view."""
 READY = np.array((0.0, 0.45, 0.0, -1.4, 0.0, 1.2, 0.0))
 """About the ready posture, the tool downwards [rad]."""
 CASES: dict[str, tuple[str, int, tuple[str, ...]]] = {
@@ -57,7 +57,7 @@ class HandedInbox(HandInbox):
 
 
 class Patient:
-    """What the camera would see of a patient, from the truth."""
+    """True body of a patient as input of the camera."""
 
     def __init__(self, case: Scenario) -> None:
         self.model = build_phantom(case.phantom, case.seed)
@@ -75,7 +75,7 @@ class Patient:
 
 
 def reach(case: Scenario, p_W: Array, q: Array, rounds: int) -> Array:
-    """Joint positions [rad] with the indenter at `p_W` [m], pointing down: damped least squares, beginning at `q`."""
+    """Return joint positions [rad] with the indenter at `p_W` [m], pointing down: damped least squares from `q`."""
     for _ in range(rounds):
         X = tool_pose(q, case.robot)
         tilt = np.cross(X[:3, 2], (0.0, 0.0, -1.0))
@@ -86,7 +86,7 @@ def reach(case: Scenario, p_W: Array, q: Array, rounds: int) -> Array:
 
 
 def arm(case: Scenario, t: int, q: Array, q_true: Array) -> tuple[Any, Any]:
-    """robot/status as the arm tells it, and sim/link_poses as it is."""
+    """Return robot/status with the measured joints, and sim/link_poses with the true ones."""
     zero = np.zeros(7)
     status = RobotStatus(
         header(t), RobotStatus.MODE_ACTIVE, 0, "", q, zero, Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), zero, 0
@@ -100,11 +100,11 @@ def arm(case: Scenario, t: int, q: Array, q_true: Array) -> tuple[Any, Any]:
 
 @dataclass
 class Run:
-    """What was told, one row a small image after the look."""
+    """Published motion, one row per small image after the first scan."""
 
     t_s: list[float] = field(default_factory=list)
     state: list[int] = field(default_factory=list)
-    told: list[Array] = field(default_factory=list)
+    motion: list[Array] = field(default_factory=list)
     uncertainty: list[float] = field(default_factory=list)
     cost_s: list[float] = field(default_factory=list)
     shift: list[Array] = field(default_factory=list)
@@ -114,10 +114,10 @@ class Run:
 
 
 def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float = 0.0) -> tuple[Run, Patient]:
-    """A look, then `seconds` [s] of strokes over the region, and a second look at `again_s` [s]."""
+    """Run a scan, then `seconds` [s] of strokes over the region, and a second scan at `again_s` [s]."""
     patient, result = Patient(case), Run()
     camera, perception = CameraService(plant_input(case)), PerceptionService(exam_input(case))
-    seen, heard = HandedInbox(), HandedInbox().receive(camera.start())
+    seen, inputs = HandedInbox(), HandedInbox().receive(camera.start())
     X_WA = np.array(exam_input(case).X_WA)
     (cx, cy), (width, height) = case.exam.centre_m, case.exam.region_m
     err = np.random.default_rng(case.seed).normal(0.0, 0.001, 7)  # zeros of the joints, as errors.arm
@@ -138,8 +138,8 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float
         begun = thread_time()
         sent = dict(camera.step(t, seen))
         small = {topic: sent[topic] for topic in sent if topic.startswith("camera/follow")}
-        heard.receive({**image, **small, "robot/status": status, **trigger})
-        out = perception.step(t, heard)
+        inputs.receive({**image, **small, "robot/status": status, **trigger})
+        out = perception.step(t, inputs)
         cost = thread_time() - begun
         image = {topic: sent[topic] for topic in sent if topic not in small}
         if "perception/surface" in out:
@@ -151,7 +151,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float
         (message,) = out["perception/motion"]
         result.t_s.append(nanoseconds(message.header.stamp) / NS)
         result.state.append(message.state)
-        result.told.append(np.array((message.displacement, *message.forecast[1:])))
+        result.motion.append(np.array((message.displacement, *message.forecast[1:])))
         result.uncertainty.append(message.uncertainty)
         result.shift.append(np.array((message.shift.x, message.shift.y)))
         result.cost_s.append(cost)
@@ -159,7 +159,7 @@ def run(case: Scenario, seconds: float, arm_in_view: bool = True, again_s: float
 
 
 def heights(result: Run, patient: Patient) -> tuple[Array, Array]:
-    """Mode and height error [m] of the perceived surface against the wall at the end of expiration, at its vertices."""
+    """Return mode and height error [m] of the perceived surface against the wall at the end of expiration, at its vertices."""
     p_W = np.asarray(result.surface.vertices, np.float64).reshape(-1, 3)
     p_A = apply(inverse(patient.X_WA), p_W)
     front = patient.model.normals[:, 2] > 0.3
@@ -180,10 +180,10 @@ def main() -> None:
         scenario, seed, settings = CASES[name]
         case = load_scenario(scenario, settings, seed)
         result, patient = run(case, seconds)
-        t, state, told = np.array(result.t_s), np.array(result.state), np.array(result.told)
+        t, state, motion = np.array(result.t_s), np.array(result.state), np.array(result.motion)
         quiet = state == SurfaceMotion.QUIET
         error = [
-            1e3 * np.sqrt(np.mean((told[quiet, k] - [patient.curve.excursion(x + 0.05 * k) for x in t[quiet]]) ** 2))
+            1e3 * np.sqrt(np.mean((motion[quiet, k] - [patient.curve.excursion(x + 0.05 * k) for x in t[quiet]]) ** 2))
             for k in (0, 2, 4)
         ]
         share = 100 * np.bincount(state, minlength=4) / len(state)

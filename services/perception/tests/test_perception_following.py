@@ -1,4 +1,4 @@
-"""Following the wall: the breath filter, the arm's mask, and what is told of breaths, coughs, shifts and a hidden wall."""
+"""Tests of wall following: breath filter, arm mask, and reports of breaths, coughs, shifts and a hidden wall."""
 
 from __future__ import annotations
 
@@ -25,19 +25,19 @@ def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: 
 
 
 def test_after_a_long_gap_the_wall_breathes_as_before() -> None:
-    """A camera that was gone for longer than is remembered: one image tells neither rate nor amplitude."""
+    """After a gap longer than the filter's memory one image determines neither rate nor amplitude."""
     t = 0.1 * np.arange(400)
     t[100:] += 40.0
     d = 0.004 * (1 - np.cos(2 * np.pi * t / 4))
     breath = BreathFilter(t[:100], d[:100])
-    told = []
+    reported = []
     for k in range(100, 160):
         expected, sigma = breath.forward(t[k])
-        told.append((expected - d[k], sigma))
+        reported.append((expected - d[k], sigma))
         breath.update(d[k], 0.0003)
         breath.remember(d[k])
         assert breath.depth == pytest.approx(0.008, rel=0.1)
-    errors, sigmas = np.array(told[10:]).T
+    errors, sigmas = np.array(reported[10:]).T
     assert np.sqrt(np.mean((errors / sigmas) ** 2)) < 1.5
 
 
@@ -82,25 +82,25 @@ def test_the_arm_hides_what_lies_below_it() -> None:
 
 def test_quiet_breathing_is_followed_with_typical_errors_while_the_arm_palpates() -> None:
     result, patient = followed("phantom.breathing.peak_to_peak_m=0.008")
-    state, told = np.array(result.state), np.array(result.told)
+    state, reported = np.array(result.state), np.array(result.motion)
     assert np.mean(state == SurfaceMotion.QUIET) > 0.9
-    error = told[:, 2] - [patient.curve.excursion(t + 0.1) for t in result.t_s]
+    error = reported[:, 2] - [patient.curve.excursion(t + 0.1) for t in result.t_s]
     assert np.sqrt(np.mean(error**2)) < 0.7e-3
     assert np.abs(error).max() < 5e-3
-    assert np.ptp(told[:, 0]) > 4e-3, "it does breathe"
+    assert np.ptp(reported[:, 0]) > 4e-3, "it does breathe"
 
 
 @pytest.mark.parametrize("level", ["typical", "poor"])
-def test_what_neighbouring_pixels_err_by_together_is_told(level: str) -> None:
-    """Over a minute the displacement errs by about as much as is told, with a camera of either kind."""
+def test_the_error_shared_by_neighbouring_pixels_is_reported(level: str) -> None:
+    """Over a minute the error of the displacement agrees with the reported SD, with a camera of either kind."""
     result, patient = followed(f"errors={level}", "phantom.breathing.peak_to_peak_m=0.008", seconds=60.0)
-    told = np.array([displacement[0] for displacement in result.told])
+    reported = np.array([displacement[0] for displacement in result.motion])
     lifted = np.array([patient.curve.excursion(t) for t in result.t_s])
-    ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(told - lifted)
+    ratio = np.sqrt(np.mean(np.square(result.uncertainty))) / np.std(reported - lifted)
     assert 0.6 < ratio < 1.6
 
 
-def test_patches_that_differ_tell_the_variance_and_one_that_tells_most_does_not() -> None:
+def test_jackknife_needs_several_patches() -> None:
     patch, one = np.repeat(np.arange(4), 5), np.ones(20)
     left = np.repeat((3e-4, -3e-4, 3e-4, -3e-4), 5)
     assert jackknife(left, one, one, patch) == pytest.approx(4 * (1e-4) ** 2)
@@ -113,12 +113,12 @@ def test_a_camera_that_warms_up_moves_no_wall() -> None:
     result, patient = run(case, 60.0)
     t, warmer = np.array(result.t_s), draw_errors(case.errors, case.seed).camera.warm_up_m
     assert abs(warmer) * (np.exp(-t[0] / 100) - np.exp(-t[-1] / 100)) > 1.5e-3, "it drifts"
-    error = np.array(result.told)[:, 0] - [patient.curve.excursion(at) for at in t]
+    error = np.array(result.motion)[:, 0] - [patient.curve.excursion(at) for at in t]
     assert abs(error[t > t[-1] - 15].mean() - error[t < t[0] + 15].mean()) < 0.5e-3
 
 
 def bent(outward: np.ndarray, xy: np.ndarray) -> float:
-    """What an offset, a tilt and a bowl leave of a surface's error, root mean square over its vertices."""
+    """Return the RMS error of a surface over its vertices after removing an offset, a tilt and a bowl."""
     x, y = (xy - xy.mean(axis=0)).T
     smooth = np.column_stack((np.ones(len(x)), x, y, x**2, x * y, y**2))
     return float(np.std(outward - smooth @ np.linalg.lstsq(smooth, outward, rcond=None)[0]))
@@ -138,7 +138,7 @@ def test_what_the_camera_sees_bent_for_seconds_averages_out() -> None:
 def test_a_still_wall_moves_by_next_to_nothing() -> None:
     result, _ = followed(scenario="clean", seconds=5.0)
     assert set(result.state) == {SurfaceMotion.QUIET}
-    assert np.abs(result.told).max() < 0.4e-3
+    assert np.abs(result.motion).max() < 0.4e-3
 
 
 def test_a_cough_spoils_and_passes() -> None:
@@ -172,7 +172,7 @@ def test_a_shift_along_a_body_that_is_much_the_same_along_its_length_is_noticed(
 
 
 @pytest.mark.parametrize("kind", ["shift", "turn"])
-def test_a_second_look_tells_where_the_patient_who_moved_lies(kind: str) -> None:
+def test_a_second_scan_finds_the_patient_who_moved(kind: str) -> None:
     case = load_scenario("restless", ("exam.region_m=[0.1, 0.1]", f"phantom.motion.kind={kind}", "phantom.motion.at_s=14"), 3)
     result, patient = run(case, seconds=18.0, arm_in_view=False, again_s=16.0)
     assert result.state[-1] == SurfaceMotion.QUIET
@@ -183,11 +183,11 @@ def test_a_second_look_tells_where_the_patient_who_moved_lies(kind: str) -> None
     assert np.abs(result.shift[-1] - moved)[1] < 4e-3, "along the body the wall is flat"
     p_A = apply(inverse(np.array(exam_input(case).X_WA)), np.asarray(result.surface.vertices, np.float64).reshape(-1, 3))
     centre = (p_A[:, :2].min(axis=0) + p_A[:, :2].max(axis=0)) / 2
-    assert np.abs(centre - case.exam.centre_m - result.shift[-1]).max() < 3e-3, "the mesh lies where the body lies"
+    assert np.abs(centre - case.exam.centre_m - result.shift[-1]).max() < 3e-3, "the mesh moves with the body"
 
 
 def test_pixels_whose_holes_flicker_show_the_whole_breath_and_no_less_noise() -> None:
-    """A pixel that was not seen for a frame did not stand still in it."""
+    """A gap of one frame is interpolated, since the wall moves in it."""
     rng = np.random.default_rng(1)
     breath = 0.004 * np.sin(np.arange(80) * 2 * np.pi / 40)
     frames = 1.0 + breath[:, None] + rng.normal(0.0, 0.002, (80, 200))
@@ -199,6 +199,6 @@ def test_pixels_whose_holes_flicker_show_the_whole_breath_and_no_less_noise() ->
     assert abs(np.median(sigma) - 0.002) < 0.0002
 
 
-def test_a_jackknife_of_nothing_tells_nothing() -> None:
+def test_a_jackknife_without_weights_gives_none() -> None:
     nothing = np.zeros(6)
     assert jackknife(nothing, nothing, np.ones(6), np.array([0, 0, 1, 1, 2, 2])) is None

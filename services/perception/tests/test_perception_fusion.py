@@ -84,5 +84,5 @@ def test_errors_name_what_is_wrong() -> None:
     with pytest.raises(ValueError, match="no depth frame"):
         DepthFusion(WHOLE).fused()
     fusion = fuse([np.ones(SHAPE, np.float32)])
-    with pytest.raises(ValueError, match="frames before had"):
+    with pytest.raises(ValueError, match="previous frames had"):
         fusion.add(np.ones((5, 5), np.float32))

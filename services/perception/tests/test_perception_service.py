@@ -48,7 +48,7 @@ def skin(case: Scenario, rise: float = 0.0) -> Any:
 
 @cache
 def default_look() -> dict[str, Any]:
-    """What the default scenario shows: several tests look at it."""
+    """Result of the default scenario, shared by several tests."""
     return look(scenario())
 
 
@@ -59,17 +59,17 @@ def look(
     rises: tuple[float, ...] = (0.0,),
     perception: PerceptionService | None = None,
 ) -> dict[str, Any]:
-    """What perception publishes after a burst by the camera: topics to messages."""
+    """Return the messages of perception after a burst of the camera, by topic."""
     exam = plant_input(case)
     camera, perception = CameraService(exam), perception or PerceptionService(exam)
     wanted = frames or case.camera.frames
     seen = HandInbox().receive({"sim/link_poses": links} if links else {})
-    heard = HandInbox().receive(camera.start())
+    inputs = HandInbox().receive(camera.start())
     trigger = {"planning/camera_trigger": CameraTrigger(header(5 * MS), wanted)}
     images: dict[str, Any] = {}
     for k in range(1, 120):
         start = trigger if k == 1 else {}
-        sent = perception.step(k * TICK, heard.receive({**start, **images}))
+        sent = perception.step(k * TICK, inputs.receive({**start, **images}))
         if "perception/targets" in sent:
             return dict(sent)
         images = dict(camera.step(k * TICK, seen.receive({"sim/surface": skin(case, rises[k % len(rises)]), **start})))
@@ -77,7 +77,7 @@ def look(
 
 
 def whole(sent: Any) -> dict[str, Any]:
-    """What a camera sends that has no small images."""
+    """Return the messages of a camera without small images."""
     return {topic: sent[topic] for topic in sent if not topic.startswith("camera/follow")}
 
 
@@ -209,7 +209,7 @@ def test_the_robot_beside_the_region_does_no_harm() -> None:
     assert rms(surface_error(case, sent)) < 0.2e-3
 
 
-def test_a_camera_that_looks_aside_is_told_so() -> None:
+def test_a_camera_that_points_elsewhere_is_reported() -> None:
     targets = look(scenario("camera.look_at_m=[2.0, -1.0, 1.5]"), 1)["perception/targets"]
     assert len(targets.positions) == 0
     assert targets.coverage == 0.0
@@ -223,7 +223,7 @@ def test_a_region_past_the_abdomen_has_no_targets() -> None:
 
 
 def test_a_wrong_extrinsic_calibration_shifts_the_surface_accordingly() -> None:
-    # The optical frame told is 4 mm too far back along its axis, so everything is seen 4 mm nearer to it.
+    # The published optical frame is 4 mm too far back along its axis, so all depths are 4 mm too small.
     case, shift = scenario("errors.hand_eye.offset.xyz_m=[0.0, 0.0, 0.004]"), 0.004
     error = surface_error(case, look(case))
     towards = np.array(case.camera.position_m) - np.array(case.camera.look_at_m)
@@ -260,7 +260,7 @@ def test_a_wall_that_breathes_is_perceived_at_the_end_of_expiration() -> None:
 
 def test_a_still_wall_is_answered_after_five_seconds_and_moves_by_nothing() -> None:
     (message,) = default_look()["perception/motion"]
-    assert message.state == SurfaceMotion.LOST, "told before there is a surface"
+    assert message.state == SurfaceMotion.LOST, "published before there is a surface"
     assert 5.0 < nanoseconds(default_look()["perception/targets"].header.stamp) / 1e9 < 6.0
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate_perception import surface
-from palpate_perception.surface import CUTOFF_M, fit
+from palpate_perception.surface import TUNING, fit
 
 LOW, HIGH = (-0.13, -0.13), (0.13, 0.13)
 RNG = np.random.default_rng
@@ -38,7 +38,7 @@ def test_a_quadric_is_reproduced_without_bias() -> None:
     np.testing.assert_allclose(field.height(x, y), dome(x, y), atol=2e-7)
 
 
-@pytest.mark.parametrize(("length", "gain"), [(3 * CUTOFF_M, 1.0), (CUTOFF_M, 0.5), (0.6 * CUTOFF_M, 0.05)])
+@pytest.mark.parametrize(("length", "gain"), [(3 * TUNING.cutoff_m, 1.0), (TUNING.cutoff_m, 0.5), (0.6 * TUNING.cutoff_m, 0.05)])
 def test_waves_pass_as_the_cut_off_says(length: float, gain: float) -> None:
     def wave(x: np.ndarray, y: np.ndarray) -> np.ndarray:
         return 1e-3 * np.sin(2 * np.pi * (x + 0.003) / length)
@@ -107,7 +107,7 @@ def test_a_sharp_dimple_without_noise_is_not_taken_for_stray_points() -> None:
 
 
 def test_too_few_points_are_an_error() -> None:
-    with pytest.raises(ValueError, match="9 points, want at least 10"):
+    with pytest.raises(ValueError, match="9 points, at least 10"):
         fit(np.zeros((9, 3)), np.ones(9), LOW, HIGH)
 
 

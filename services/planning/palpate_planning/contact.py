@@ -6,6 +6,7 @@ F_S - R_SW m g at rest while nothing is touched, in whatever orientations. Torqu
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -15,7 +16,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.wall.surface import Foot
-from palpate_planning.wall.wall import Wall, WallPlace
+from palpate_planning.wall.wall import Wall, WallEstimate
 
 
 class ToolWeight:
@@ -62,10 +63,17 @@ class ToolWeight:
         return np.asarray(R_WS @ (wrench_S[:3] - self.bias) - self.weight_W + self.mass * a_W)
 
 
-CONTACT_ON_N = 0.3
-"""Normal force that counts as contact: more than noise and the drift since the last tare."""
-CONTACT_OFF_N = 0.15
-"""Contact ends below this normal force."""
+@dataclass(frozen=True)
+class ContactThresholds:
+    """Contact force at which contact begins and ends."""
+
+    on_n: float = 0.3
+    """Normal force that counts as contact: more than noise and the drift since the last tare."""
+    off_n: float = 0.15
+    """Contact ends below this normal force."""
+
+
+THRESHOLDS = ContactThresholds()
 
 
 class SensorReading(NamedTuple):
@@ -90,7 +98,7 @@ class ContactMeasurement(NamedTuple):
     """Orientation of the force/torque sensor, shape (3, 3)."""
     foot: Foot
     """The point of the perceived surface under the indenter."""
-    wall: WallPlace
+    wall: WallEstimate
     """Height of the skin above it; its standard deviation is that of the depth."""
     depth: float
     """Radius less the signed distance of the sphere's centre from the present unpressed skin [m]; negative: gap."""
@@ -126,7 +134,7 @@ class ContactSensing:
         self._velocity = velocity
         force_W = self.weight.contact(R_WS, reading.wrench_S, acceleration)
         force = float(force_W @ foot.n_W)
-        self._touching = self.weight.tared and force > (CONTACT_OFF_N if self._touching else CONTACT_ON_N)
+        self._touching = self.weight.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         return ContactMeasurement(
             reading.q,
             X_WI,

@@ -14,7 +14,7 @@ from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactSensing, ToolWeight
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, TrajectoryFollower
-from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
@@ -205,7 +205,7 @@ class ExaminationSequence:
             self._averaged = now.averaged
         self._requested.receive(now.request)
         if now.motion is not None:
-            self._sense.wall.breath.hear(now.motion, now.t)
+            self._sense.wall.breath.receive(now.motion, now.t)
         course.contact = self._sense.sense(now.reading, now.t)
         status.steady = status.force_limited = False
         status.depth_setpoint = course.contact.depth
@@ -253,7 +253,7 @@ class ExaminationSequence:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
         course, rest, sense, before = self._course, self._rest, self._sense, self._before
         course.perceived, self._averaged = perceived, None
-        sense.wall = sense.wall.seen_again(perceived.surface) if rest.moves else Wall(perceived.surface, sense.wall.breath)
+        sense.wall = sense.wall.rescanned(perceived.surface) if rest.moves else Wall(perceived.surface, sense.wall.breath)
         count = self.status.target_count = len(perceived.positions)
         self.status.view_blocked = False
         text = f"planning over {count} targets"
@@ -379,7 +379,7 @@ class ExaminationSequence:
             course.enter(Phase.LOOK, now.t, "the patient has moved: looking again", Reason.PATIENT_MOVED)
         elif more and cause.reason in REPLANNED and rest.replans < EXAM.replans_max:
             rest.replans, rest.wanted = rest.replans + 1, wanted
-            rest.bend = max(rest.bend or STRAIGHT_RAD, palpation.bend_needed)
+            rest.bend = max(rest.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
             course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause.reason)
         else:
             self._correct(out)

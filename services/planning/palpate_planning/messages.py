@@ -14,7 +14,7 @@ from palpate_planning.status import ExamStatus
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import HIDDEN_M, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
-from palpate_planning.wall.wall import TouchedSkin
+from palpate_planning.wall.wall import PublishedTouch
 
 COINCIDENT_M = 1e-4
 """Consecutive targets closer than this have no path between them."""
@@ -50,7 +50,7 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
     )
 
 
-def touch_message(t: int, touched: TouchedSkin) -> Message:
+def touch_message(t: int, touched: PublishedTouch) -> Message:
     """Return `palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
     point = Point(*touched.p_W.tolist())
     return SkinTouch(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -30,15 +31,24 @@ from palpate_planning.stroke import (
     travel,
 )
 from palpate_planning.stroke_motion import StrokeMotion
-from palpate_planning.strokes.segments import HOVER_M, STRETCHED, Segment
-from palpate_planning.wall.wall import TouchedSkin, Wall
+from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
+from palpate_planning.wall.wall import PublishedTouch, Wall
 
-REQUEST_TIMEOUT_S = 60.0
-"""The arm waits this long to be asked for the next stroke."""
-UNNOTICED_M = 0.03
-"""Path length discarded before detected patient motion [m]; detection takes about 1 s."""
-REPEAT_M = 0.010
-"""Path length repeated after an interruption [m]; detection takes about 0.2 s."""
+
+@dataclass(frozen=True)
+class PalpationTuning:
+    """Tuning of repeated and requested strokes."""
+
+    request_timeout_s: float = 60.0
+    """The arm waits this long to be asked for the next stroke."""
+    unnoticed_m: float = 0.03
+    """Path length discarded before detected patient motion [m]; detection takes about 1 s."""
+    repeat_m: float = 0.010
+    """Path length repeated after an interruption [m]; detection takes about 0.2 s."""
+
+
+TUNING = PalpationTuning()
+
 HIDDEN = Cause(Reason.WALL_HIDDEN, "the arm hides the wall from the camera")
 NOT_TRACKED = Cause(Reason.WALL_NOT_TRACKED, "the wall could not be tracked")
 REPLANNED = frozenset({Reason.ARM_STRETCHED, Reason.WALL_HIDDEN})
@@ -60,7 +70,7 @@ class PalpationStep(NamedTuple):
     """Index of the latest target reached."""
     taring: bool = False
     """True if the arm rests in free air: what the sensor reads now is bias."""
-    touched: TouchedSkin | None = None
+    touched: PublishedTouch | None = None
     """The touch of this step, if there was one."""
 
 
@@ -259,9 +269,9 @@ class Palpation:
         waited = Duration(self._motion.period_s)
         while True:
             now = yield StrokeStage.WAIT
-            self._motion.depth.step(-HOVER_M, STROKE.lift_mps)
-            if waited.update(True) > REQUEST_TIMEOUT_S:
-                text = f"no further stroke was requested within {REQUEST_TIMEOUT_S:g} s"
+            self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
+            if waited.update(True) > TUNING.request_timeout_s:
+                text = f"no further stroke was requested within {TUNING.request_timeout_s:g} s"
                 self._recovery.left = Cause(Reason.NO_REQUEST, text)
             if self._recovery.ending:
                 return False
@@ -309,7 +319,7 @@ class Palpation:
         motion, descent = self._motion, self._descent
         setpoint = motion.setpoint(t, contact, rate)
         if motion.segment.free is not None:
-            return PalpationStep(setpoint, self.stage, -HOVER_M, False, False, int(motion.segment.path.targets[-1]))
+            return PalpationStep(setpoint, self.stage, -SEGMENTS.hover_m, False, False, int(motion.segment.path.targets[-1]))
         if self._recovery.displacement is not None:
             setpoint = self._recovery.displacement.move(setpoint)
         limited = is_limited(self.stage, motion)
@@ -350,7 +360,7 @@ class Palpation:
         elif self._watch.ended:
             self.leave(self._watch.ended)
         elif self._watch.spoiled and self.stage in PRESSING:
-            back = REPEAT_M if sliding else 0.0
+            back = TUNING.repeat_m if sliding else 0.0
             self._recovery.repeat(self._motion.segment, self._motion.along.position, back, NOT_TRACKED)
             self._interrupt()
         elif self._watch.leaps:
@@ -373,7 +383,7 @@ class Palpation:
         later = [int(i) for path in strokes for i in path.targets]
         slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
         reached = self._recovery.reached(self._motion.along.position, slid=slid)
-        behind = UNNOTICED_M if self._watch.moved else 0.0
+        behind = TUNING.unnoticed_m if self._watch.moved else 0.0
         ahead = self._recovery.leave(cause, self._motion.segment, reached - behind, later)
         self.ahead = frozenset(later) if cause.reason is Reason.WALL_HIDDEN else ahead
 

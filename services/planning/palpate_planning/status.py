@@ -15,7 +15,7 @@ from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation
-from palpate_planning.wall.wall import TouchedSkin
+from palpate_planning.wall.wall import PublishedTouch
 
 
 class Phase(IntEnum):
@@ -120,7 +120,7 @@ class ExamStep:
     """Ask the camera for a burst now."""
     path: Array | None = None
     """Planned poses of the indenter at depth, shape (n, 4, 4), once."""
-    touched: TouchedSkin | None = None
+    touched: PublishedTouch | None = None
     """The touch of this step, if there was one."""
     correction: tuple[Array, Array] | None = None
     """Of the perceived surface's vertices, as by `Wall.corrected`, once: when the strokes are over."""

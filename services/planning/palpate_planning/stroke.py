@@ -14,9 +14,9 @@ from typing import Final, NamedTuple, TypeVar
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.stroke_motion import MOTION, StrokeMotion
-from palpate_planning.strokes.segments import HOVER_M
+from palpate_planning.strokes.segments import SEGMENTS
 from palpate_planning.wall.touch import FELT_N, Onset
-from palpate_planning.wall.wall import TouchedSkin
+from palpate_planning.wall.wall import PublishedTouch
 
 
 @dataclass(frozen=True)
@@ -24,7 +24,7 @@ class StrokeTuning:
     """Tolerances, times and heights of a stroke."""
 
     hop_height_m: float = 0.010
-    """Least height between strokes; it is `HOVER_M` on free motions and where the surface is uncertain."""
+    """Least height between strokes; it is `SEGMENTS.hover_m` on free motions and where the surface is uncertain."""
     lift_mps: float = 0.12
     settled_error_m: float = 0.0005
     """An indentation has settled when its depth error stays below this for `settled_s`, or after `settle_timeout_s`."""
@@ -117,7 +117,7 @@ class Duration:
 
 def clearance(sigma: float) -> float:
     """Return the height [m] at which skin that is known within `sigma` [m] is not touched, and from which it is sought."""
-    return min(max(STROKE.hop_height_m, TOUCH.sigmas * sigma + TOUCH.margin_m), HOVER_M)
+    return min(max(STROKE.hop_height_m, TOUCH.sigmas * sigma + TOUCH.margin_m), SEGMENTS.hover_m)
 
 
 def press(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
@@ -247,7 +247,7 @@ class Descent:
         """Number of the present or latest descent, from 1 on."""
         self.taring = False
         """True if the arm is at rest in free air, so that the sensor reads bias and weight."""
-        self.touched: TouchedSkin | None = None
+        self.touched: PublishedTouch | None = None
         """The touch, in the period in which it was found."""
         self.start()
 

@@ -12,12 +12,12 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
-from palpate_planning.motion.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS
 from palpate_planning.motion.timing import JerkLimitedAxis
 from palpate_planning.periods import SECOND
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
-from palpate_planning.strokes.path import ACCELERATION, PathPoint
-from palpate_planning.strokes.segments import HOVER_M, Segment
+from palpate_planning.strokes.path import LIMITS, PathPoint
+from palpate_planning.strokes.segments import SEGMENTS, Segment
 from palpate_planning.wall.wall import Wall
 
 
@@ -70,8 +70,8 @@ class StrokeMotion:
         self._exam, self._limits, self._radius = exam, limits, radius
         self.period_s, self.speed_mps, self.wall = period_s, exam.speed_mps, wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
-        self.regulation = Regulation(-HOVER_M, 0.0, -HOVER_M, 0.0, False, 0.0)
-        self.depth = self._depth_axis(-HOVER_M)
+        self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
+        self.depth = self._depth_axis(-SEGMENTS.hover_m)
         """Target depth [m], negative above the surface."""
         self.joined = False
         """True if the commanded depth continues that of the arm; after a free motion it has to be measured first."""
@@ -91,7 +91,7 @@ class StrokeMotion:
         self.joined = self.joined and segment.free is None
         speed = self.speed_mps if segment.contact else MOTION.transfer_mps
         self._speed_limit = segment.path.speed_limit(speed, self._limits)
-        self._acceleration = ACCELERATION if segment.contact else MOTION.transfer_acceleration_mps2
+        self._acceleration = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
         self._sample = 0.0
@@ -133,7 +133,7 @@ class StrokeMotion:
 
     def free_height(self, t: int) -> float:
         """Return the height [m] above the skin at `t` [ns] for free motions, which keep clear of the perceived surface, too."""
-        return HOVER_M + max(0.0, -self.wall.outward(self.point.p, t))
+        return SEGMENTS.hover_m + max(0.0, -self.wall.outward(self.point.p, t))
 
     @property
     def ended(self) -> bool:
@@ -152,7 +152,7 @@ class StrokeMotion:
         the elbow bends less than planned, and will do so by as much on the rest of the plan.
         """
         lost = self.point.q[ELBOW] ** 2 - q[ELBOW] ** 2
-        return float(np.sqrt(max(TOO_STRAIGHT_RAD**2 + lost, 0.0)))
+        return float(np.sqrt(max(KINEMATIC_LIMITS.too_straight_rad**2 + lost, 0.0)))
 
     @property
     def bend_ahead(self) -> float:

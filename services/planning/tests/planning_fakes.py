@@ -1,4 +1,4 @@
-"""A world in which planning's tests close the loop: an ideal robot on set-points, a spring tissue, a perfect view."""
+"""Closed loop for the tests of planning: an ideal robot that follows set-points, a spring tissue, a perfect camera."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ PERIODS = Periods(contract().roles["planning"].period, contract().roles["camera"
 PERIOD_S = PERIODS.step_s
 
 BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
-"""A placement from which all of the small regions of the tests are in reach."""
+"""Placement from which the regions of the tests are in reach."""
 
 
 def known(robot: Robot = BASE, **exam: object) -> ExamInput:
@@ -53,7 +53,7 @@ def grid_mesh(half: tuple[float, float], step: float = 0.006) -> tuple[Array, ND
 
 
 def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
-    """What a perfect perception gives: surface, all of which breathes alike, and targets in snake or raster order."""
+    """Return surface and targets in snake or raster order from an ideal perception; the whole surface moves with the breath."""
     X_WA = np.array(settings.X_WA)
     exam = settings.exam
     half = (exam.region_m[0] / 2 + 0.04, exam.region_m[1] / 2 + 0.04)
@@ -72,12 +72,12 @@ def seen_dome(settings: ExamInput) -> PerceivedAbdomen:
 
 
 def hertz(newton_at_10mm: float) -> Callable[[float], float]:
-    """Force [N] by depth [m] as the tissue's foundation has it."""
+    """Return the force [N] of the tissue's foundation by depth [m]."""
     return lambda depth: newton_at_10mm * (max(depth, 0.0) / 0.01) ** 1.45
 
 
 class World:
-    """Closes the loop about an `Exam`, one planning period a step."""
+    """Closed loop around an `Exam`, one planning period per step."""
 
     def __init__(
         self,
@@ -91,11 +91,11 @@ class World:
         """
         self.excursion = excursion
         self.calm, self.moved, self.shift_A = True, False, (0.0, 0.0)
-        """What is said about the motion; a look finds the patient where he is now."""
+        """Published state of the motion; a new scan finds the patient at the present position."""
         self.hides: Callable[[Array], bool] = lambda p_WI: False
-        """Whether the arm hides the wall with the indenter at a place [m]: nothing is known of the breath then."""
+        """True if the arm hides the wall with the indenter at a position [m]; then the breath is unknown."""
         self.misled = 0.0
-        """Forecasts err by so much [m], one outward and the next inward."""
+        """Error of the forecasts [m], alternating outward and inward."""
         self.settings, self.force = settings, force or hertz(2.4)
         self.exam = ExaminationSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
@@ -163,13 +163,13 @@ class World:
         status = self.exam.status
         self.rows.append((status.phase, status.steady, status.force_limited, status.depth_setpoint, self.depth, self.pressed))
         self.setpoints.append(outcome.setpoint)
-        if not self.stop or self.soft:  # else the driver holds
+        if not self.stop or self.soft:  # otherwise the driver holds
             self._obey(outcome.setpoint)
         self.t += PERIODS.step
         return outcome
 
     def _motion(self) -> BreathObservation:
-        """Perception's word about an exposure 0.1 s ago."""
+        """Return perception's motion message for an exposure 0.1 s ago."""
         assert self.excursion is not None
         stamp = self.t - 100 * MS
         forecast = np.array([self.excursion((stamp + k * FORECAST_STEP) / SECOND) for k in range(11)])

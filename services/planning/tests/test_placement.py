@@ -9,7 +9,7 @@ import pytest
 from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
-from palpate_planning.placement.redundancy import TASK_TOLERANCE, PostureSequence, plan_redundancy, prepare
+from palpate_planning.placement.redundancy import RESOLUTION, PostureSequence, plan_redundancy, prepare
 from palpate_planning.placement.symbolic import REACH_LENGTH_M, arm, base_of, surface_frames
 
 ROBOT = Robot()
@@ -92,7 +92,7 @@ def test_frames_are_right_handed_with_the_normal_last() -> None:
 def test_every_target_is_met_within_limits(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
     positions, normals, postures = scan
     assert postures.reachable.all() and postures.refined
-    assert postures.residual.max() < TASK_TOLERANCE
+    assert postures.residual.max() < RESOLUTION.task_tolerance
     model = pin.buildModelFromXML(urdf(ROBOT))
     data = model.createData()
     for q, p, n in zip(postures.q, positions, normals, strict=True):

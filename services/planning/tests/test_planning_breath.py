@@ -1,4 +1,4 @@
-"""The breath as perception forecasts it, and what is done when it is not as forecast."""
+"""Tests of breathing forecasts and of the reaction to deviations from them."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ def breathing(t_s: float) -> float:
     return 0.004 * (1 - float(np.cos(2 * np.pi * 14 / 60 * t_s)))
 
 
-def test_without_a_word_the_wall_is_at_rest() -> None:
+def test_without_a_message_the_wall_is_at_rest() -> None:
     breath = Breath()
     assert breath.displacement(5 * SECOND) == 0.0
     assert breath.calm(5 * SECOND)
@@ -39,22 +39,22 @@ def test_without_a_word_the_wall_is_at_rest() -> None:
 
 def test_in_between_the_forecast_is_interpolated() -> None:
     breath = Breath()
-    breath.hear(motion(SECOND, 0.0, 0.001, 0.003), SECOND + 100 * MS)
+    breath.receive(motion(SECOND, 0.0, 0.001, 0.003), SECOND + 100 * MS)
     assert breath.displacement(SECOND + 75 * MS) == pytest.approx(0.002)
     assert breath.displacement(3 * SECOND) == pytest.approx(0.003)
 
 
 def test_a_new_forecast_is_joined_without_a_step() -> None:
     breath = Breath()
-    breath.hear(motion(0, 0.002, 0.002), 100 * MS)
-    breath.hear(motion(100 * MS, 0.004, 0.004), 200 * MS)
+    breath.receive(motion(0, 0.002, 0.002), 100 * MS)
+    breath.receive(motion(100 * MS, 0.004, 0.004), 200 * MS)
     assert breath.displacement(200 * MS) == pytest.approx(0.002)
     assert breath.displacement(200 * MS + round(TUNING.join_s * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
 
 
 def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
     breath = Breath()
-    breath.hear(motion(0, 0.0, 0.0), 0)
+    breath.receive(motion(0, 0.0, 0.0), 0)
     assert breath.calm(400 * MS)
     assert not breath.calm(600 * MS)
 
@@ -62,12 +62,12 @@ def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
 def test_a_spoiled_wall_is_left_alone_until_it_has_been_calm() -> None:
     breath = Breath()
     watch = WallWatch(breath, Following.FOLLOW, DT)
-    breath.hear(motion(0, 0.0, calm=False), 0)
+    breath.receive(motion(0, 0.0, calm=False), 0)
     watch.step(0, contact_lost=False)
     assert watch.spoiled and not watch.calm
     steps = 0
     while not watch.calm:
-        breath.hear(motion(0, 0.0), 0)
+        breath.receive(motion(0, 0.0), 0)
         watch.step(0, contact_lost=False)
         steps += 1
     assert steps * DT == pytest.approx(WALL.calm_s, abs=0.02)
@@ -87,7 +87,7 @@ def test_a_contact_that_is_lost_again_and_again_ends_the_strokes() -> None:
 def test_a_wall_is_hidden_after_a_while_but_not_by_an_arm_that_is_leaving() -> None:
     breath = Breath()
     watch = WallWatch(breath, Following.FOLLOW, DT)
-    breath.hear(motion(0, 0.0, calm=False)._replace(seen=False), 0)
+    breath.receive(motion(0, 0.0, calm=False)._replace(seen=False), 0)
     for leaving, hidden in ((True, False), (False, True), (True, False)):
         for _ in range(round(1.1 * WALL.hidden_timeout_s / DT)):
             watch.step(0, contact_lost=False, on_free_motion=leaving)
@@ -98,13 +98,13 @@ def test_gated_samples_are_those_of_the_end_of_expiration() -> None:
     breath = Breath()
     watch = WallWatch(breath, Following.GATE, DT)
     for displacement, open_ in ((0.0, True), (0.006, False)):
-        breath.hear(motion(0, displacement), 0)
+        breath.receive(motion(0, displacement), 0)
         watch.step(SECOND, contact_lost=False)
         assert watch.open is open_
 
 
 @pytest.mark.parametrize(("following", "most"), [("follow", 6e-4), ("gate", 6e-4)])
-def test_a_breathing_wall_is_palpated_at_the_depth_asked_for(following: str, most: float) -> None:
+def test_a_breathing_wall_is_palpated_at_the_requested_depth(following: str, most: float) -> None:
     world = World(known(region_m=(0.025, 0.0125), breathing=following), offset=0.006, excursion=breathing)
     world.run()
     assert world.exam.status.phase is Phase.DONE
@@ -113,7 +113,7 @@ def test_a_breathing_wall_is_palpated_at_the_depth_asked_for(following: str, mos
     assert np.sqrt(np.mean((steady - 0.010) ** 2)) < most
 
 
-def test_what_a_cough_spoils_is_repeated() -> None:
+def test_a_part_disturbed_by_a_cough_is_repeated() -> None:
     world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
     for _ in range(30):
@@ -132,8 +132,8 @@ def test_what_a_cough_spoils_is_repeated() -> None:
     assert world.exam.status.targets_skipped == 0
 
 
-def test_the_rest_of_a_stroke_that_is_given_up_is_passed_above_the_skin() -> None:
-    """The next way begins at the stroke's end: the set-point is not to jump there."""
+def test_the_rest_of_an_abandoned_stroke_is_passed_above_the_skin() -> None:
+    """The next motion starts at the end of the stroke, and the set-point must not jump there."""
     world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
     for _ in range(RECOVERY.repeats_max + 1):
         world.run(lambda: world.exam.status.phase is Phase.SCAN)
@@ -151,7 +151,7 @@ def test_the_rest_of_a_stroke_that_is_given_up_is_passed_above_the_skin() -> Non
 
 
 def moved_in_the_second_stroke(*answers: PerceivedAbdomen | PerceptionFailure) -> World:
-    """An examination in which the patient has moved, within a second of when that was said; later looks have these answers."""
+    """Return an examination within a second of detected patient motion; later scans have these answers."""
     world = World(known(region_m=(0.025, 0.025)), excursion=breathing)
     world.answers += answers
     for _ in range(2):
@@ -166,7 +166,7 @@ def moved_in_the_second_stroke(*answers: PerceivedAbdomen | PerceptionFailure) -
     return world
 
 
-def test_a_patient_who_moves_is_looked_at_again_and_the_rest_is_felt() -> None:
+def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     world = moved_in_the_second_stroke()
     strokes = world.exam.status.stroke
     assert world.exam.status.phase is Phase.LOOK
@@ -183,7 +183,7 @@ def test_a_patient_who_moves_is_looked_at_again_and_the_rest_is_felt() -> None:
     assert status.targets_skipped == 0
 
 
-def test_a_patient_who_moved_and_is_not_seen_again_is_assessed_as_far_as_he_was_felt() -> None:
+def test_a_patient_who_moved_out_of_view_is_assessed_from_the_samples_before() -> None:
     world = moved_in_the_second_stroke(PerceptionFailure(Cause(Reason.VIEW_FAILED, "a curtain")))
     world.run()
     status = world.exam.status
@@ -192,19 +192,19 @@ def test_a_patient_who_moved_and_is_not_seen_again_is_assessed_as_far_as_he_was_
     assert world.exam.skipped.popitem()[1].reason is Reason.PATIENT_MOVED
 
 
-def test_what_was_seen_is_told_for_the_past_alone() -> None:
+def test_measured_displacements_cover_the_past_only() -> None:
     breath = Breath()
-    breath.hear(motion(SECOND, 0.001, 0.0), SECOND + 100 * MS)
-    breath.hear(motion(SECOND + 100 * MS, 0.003, 0.0), SECOND + 200 * MS)
+    breath.receive(motion(SECOND, 0.001, 0.0), SECOND + 100 * MS)
+    breath.receive(motion(SECOND + 100 * MS, 0.003, 0.0), SECOND + 200 * MS)
     assert breath.seen(np.array([SECOND, SECOND + 50 * MS])) == pytest.approx([0.001, 0.002])
     assert breath.seen(np.array([SECOND, SECOND + 150 * MS])) is None
 
 
-def test_a_forecast_is_the_less_sure_the_older_and_the_worse_those_before_were() -> None:
+def test_uncertainty_grows_with_age_and_previous_errors_of_forecasts() -> None:
     good, bad = Breath(), Breath()
     for k in range(10):
         for breath, step in ((good, 0.0), (bad, 5e-4)):
-            breath.hear(motion(k * 100 * MS, *[(-1) ** k * step] * 11), (k + 1) * 100 * MS)
+            breath.receive(motion(k * 100 * MS, *[(-1) ** k * step] * 11), (k + 1) * 100 * MS)
     t = SECOND + 50 * MS
     assert good.uncertainty(t) == pytest.approx(3e-4)
     assert bad.uncertainty(t) > 5e-4
@@ -215,7 +215,7 @@ def test_the_forecast_is_read_at_the_times_that_the_message_says() -> None:
     assert FORECAST_STEP == SurfaceMotion.FORECAST_STEP_MS * MS
 
 
-def test_a_wall_that_is_known_now_better_now_worse_is_lifted_off_all_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_lifting_ends_with_a_changing_uncertainty_of_the_wall(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(Breath, "uncertainty", lambda breath, t: 0.003 + 0.001 * np.sin(t / 37_000_000))
     world = World(known(region_m=(0.025, 0.0125)), excursion=breathing)
     world.run()

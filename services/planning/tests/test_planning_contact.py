@@ -1,4 +1,4 @@
-"""Contact force from the sensor, and regulation of depth."""
+"""Tests of contact force and depth regulation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from palpate_planning.setpoints import NORMAL_STIFFNESS
 
 
 def reading(R_WS: np.ndarray, force_W: np.ndarray, bias: np.ndarray, mass: float, com: np.ndarray) -> np.ndarray:
-    """What a sensor reads, written down independently: weight at the centre of mass, contact force at the tip."""
+    """Return a sensor reading, computed independently: weight at the centre of mass, contact force at the tip."""
     weight = R_WS.T @ np.array((0, 0, -mass * GRAVITY))
     contact = R_WS.T @ force_W
     torque = np.cross(com, weight) + np.cross((0, 0, 0.1), contact)
@@ -64,7 +64,7 @@ def test_the_mass_comes_from_the_robots_tables() -> None:
     assert ToolWeight.of(Robot(tool_mass_kg=0.5)).mass == pytest.approx(0.5)
 
 
-def test_taring_anew_forgets_the_old_bias() -> None:
+def test_a_second_taring_replaces_the_bias() -> None:
     tool = ToolWeight(0.35)
     for value in (1.0, 2.0):
         tool.start_tare()
@@ -155,7 +155,7 @@ def test_a_hard_surface_is_not_pressed_with_more_than_the_limit_for_long() -> No
     assert rows[-1, 3] < LIMIT_N
 
 
-def test_sideways_force_makes_depth_yield_as_normal_force_does() -> None:
+def test_lateral_force_reduces_depth_like_normal_force() -> None:
     regulator = DepthRegulator(0.01, NORMAL_STIFFNESS, LIMIT_N, 0.02)
     regulator.reset(0.01)
     for _ in range(100):

@@ -1,4 +1,4 @@
-"""The examination from home to done, in closed loop with a spring tissue and an ideal robot."""
+"""Tests of the whole examination in closed loop with a spring tissue and an ideal robot."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from planning_fakes import PERIOD_S, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
-from palpate_planning.motion.kinematics import ELBOW, TOO_STRAIGHT_RAD
+from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
 from palpate_planning.reasons import Cause, Reason
 from palpate_planning.status import Observation, PerceptionFailure, Phase
@@ -125,8 +125,8 @@ def test_no_tissue_where_it_should_be_gives_up() -> None:
     assert world.exam.status.reason is Reason.NO_TISSUE
 
 
-def test_a_touch_ends_on_skin_too_soft_to_be_felt_while_forecasts_err() -> None:
-    """How deep the skin is sought rises and falls with every forecast."""
+def test_a_touch_ends_on_very_soft_skin_with_wrong_forecasts() -> None:
+    """The depth limit of the descent changes with every forecast."""
     world = World(known(region_m=(0.025, 0.0125)), hertz(0.4), excursion=lambda t: 4e-3 * float(np.sin(2 * np.pi * t / 4)))
     world.misled = 4e-4
     world.run(seconds=60.0)
@@ -152,7 +152,7 @@ def test_hard_surface_is_pressed_with_no_more_than_the_working_limit() -> None:
     assert world.exam.status.phase is Phase.DONE
 
 
-def test_soft_stop_passes_over_targets_then_gives_up() -> None:
+def test_soft_stop_skips_targets_then_gives_up() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
     world.force = lambda depth: 40.0 if depth > 0.001 else 0.0
@@ -172,19 +172,21 @@ def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:
     assert next(iter(world.exam.skipped.values())).reason is Reason.OUT_OF_REACH
 
 
-def test_an_arm_does_not_stretch_to_skin_that_lies_deeper_than_it_was_seen() -> None:
+def test_the_arm_does_not_stretch_to_skin_deeper_than_perceived() -> None:
     world = World(known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), offset=-0.02)
     bend = []
     while world.exam.status.end_tick < 0:
         world.step()
         bend.append(-world.q[ELBOW])
     assert world.exam.status.phase is Phase.DONE
-    assert min(bend[500:]) > 0.75 * TOO_STRAIGHT_RAD, "after it has left home, and to the side to which it was planned"
+    assert min(bend[500:]) > 0.75 * KINEMATIC_LIMITS.too_straight_rad, (
+        "after it has left home, and to the side to which it was planned"
+    )
     assert STRETCHED in world.exam.skipped.values()
     assert any(row[1] for row in world.rows), "it measured where it reaches"
 
 
-def test_an_arm_that_hides_the_wall_passes_over_that_stroke_and_goes_on() -> None:
+def test_a_stroke_on_which_the_arm_hides_the_wall_is_skipped() -> None:
     world = World(known(pattern="raster", region_m=(0.05, 0.05)), excursion=lambda t: 0.0)
     lines = np.unique(np.round(world.dome.positions[:, 1], 4))
     world.hides = lambda p_WI: bool(abs(p_WI[1] - lines[1]) < 0.005 and p_WI[0] > np.median(world.dome.positions[:, 0]))
@@ -204,15 +206,15 @@ def test_no_target_in_reach_aborts() -> None:
     assert world.exam.status.reason is Reason.NO_PATH
 
 
-def test_blocked_view_moves_on_and_says_so() -> None:
+def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
     world = World(known())
     world.answers = [PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "view blocked by the arm")), world.dome]
-    told = []
+    states = []
     while world.exam.status.phase is not Phase.PLAN:
         world.step()
-        told.append((world.exam.status.view_blocked, world.exam.status.reason))
+        states.append((world.exam.status.view_blocked, world.exam.status.reason))
         assert world.t < 30e9
-    assert (True, Reason.VIEW_BLOCKED) in told
+    assert (True, Reason.VIEW_BLOCKED) in states
     assert not world.exam.status.view_blocked
     assert not np.allclose(world.q, world.exam._views.postures[0], atol=0.1)
 
@@ -226,14 +228,14 @@ def test_three_blocked_views_abort() -> None:
     assert world.exam._views.failed == 3
 
 
-def test_without_a_free_posture_to_look_from_it_says_what_to_check() -> None:
+def test_without_a_free_scan_posture_the_message_names_the_settings() -> None:
     world = World(known())
     world.exam._views.postures.clear()
     world.run()
     assert world.exam.status.reason is Reason.VIEW_UNREACHABLE
 
 
-def test_silent_perception_is_tried_again_and_given_up() -> None:
+def test_the_scan_is_repeated_without_an_answer_then_given_up() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.LOOK)
     while world.exam.status.end_tick < 0:
@@ -266,7 +268,7 @@ def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None
     assert max(speeds) < 0.036
 
 
-def test_before_the_robot_is_heard_nothing_is_asked_of_it() -> None:
+def test_without_robot_status_there_is_no_setpoint() -> None:
     world = World(known())
     outcome = world.exam.step(Observation(0, None))
     assert outcome.contact is None

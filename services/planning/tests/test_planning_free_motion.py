@@ -1,4 +1,4 @@
-"""Free motions: the background worker, following a trajectory, and what happens after missed steps."""
+"""Tests of free motions: background worker, trajectory following, and missed steps."""
 
 from __future__ import annotations
 
@@ -15,14 +15,7 @@ from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.timing import (
-    BRAKED_NS,
-    JOINT_ACCELERATION,
-    RESTART_NS,
-    JointTrajectory,
-    RestartRamp,
-    joint_trajectory,
-)
+from palpate_planning.motion.timing import JOINT_ACCELERATION, TIMING, JointTrajectory, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.status import Phase
@@ -30,7 +23,7 @@ from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.surface import Foot
-from palpate_planning.wall.wall import WallPlace, plane
+from palpate_planning.wall.wall import WallEstimate, plane
 
 
 def test_in_lockstep_the_result_is_due_at_its_time_whether_it_is_there_or_not() -> None:
@@ -52,7 +45,7 @@ def test_on_a_wall_clock_an_unfinished_task_is_not_due() -> None:
     assert task.due(1050)
 
 
-def test_what_the_work_raises_is_raised_again() -> None:
+def test_exceptions_of_the_worker_are_raised() -> None:
     def fail() -> int:
         raise KeyError("why")
 
@@ -68,7 +61,7 @@ DOWN, ONE = np.diag([1.0, -1.0, -1.0]), np.zeros(1, dtype=int)
 PLACE = SurfacePath(np.zeros(1), np.zeros((1, 3)), -DOWN[None, 2], DOWN[None], GOAL[None], ONE, ONE)
 FOOT = Foot(np.zeros(3), np.array([0.0, 0.0, 1.0]), 0.02, np.zeros(2))
 ABOVE = ContactMeasurement(
-    START, np.eye(4), np.eye(3), FOOT, WallPlace(0.0, 0.0, 0.01), -0.02, 0.0, 0.0, (FOOT.p_W, FOOT.n_W), False
+    START, np.eye(4), np.eye(3), FOOT, WallEstimate(0.0, 0.0, 0.01), -0.02, 0.0, 0.0, (FOOT.p_W, FOOT.n_W), False
 )
 
 
@@ -100,7 +93,7 @@ def free_palpation() -> Palpation:
 
 
 def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:
-    """Touches have moved the wall by centimetres: the arm is not where the motion was planned from."""
+    """After a correction of centimetres the arm is not at the planned start."""
     aside = np.array((0.0, 0.02, 0.0, 0.07, 0.0, 0.0, 0.0))
     palpation, ramp = free_palpation(), RestartRamp()
     times = ticks(5, 10 * MS, len(MOTION) - 1)
@@ -116,10 +109,10 @@ MOVERS = {"follower": followed, "free segment": palpated}
 
 def test_the_rate_is_one_on_time_and_comes_up_from_none_after_a_gap() -> None:
     ramp = RestartRamp()
-    assert [ramp.step(t) for t in ticks(5, BRAKED_NS, 10)] == [1.0] * 10
+    assert [ramp.step(t) for t in ticks(5, TIMING.braked_ns, 10)] == [1.0] * 10
     ramp = RestartRamp()
-    rates = [ramp.step(t) for t in ticks(5, BRAKED_NS + 10 * MS, 50)]
-    rise = RESTART_NS // (10 * MS)
+    rates = [ramp.step(t) for t in ticks(5, TIMING.braked_ns + 10 * MS, 50)]
+    rise = TIMING.restart_ns // (10 * MS)
     assert rates[:5] == [1.0] * 5
     assert rates[5 : 5 + rise] == pytest.approx(np.arange(rise) / rise)
     assert rates[5 + rise :] == [1.0] * (45 - rise)
@@ -135,7 +128,7 @@ def test_on_time_every_sample_is_taken_as_it_is(mover: str) -> None:
 
 @pytest.mark.parametrize("late", [40 * MS, 190 * MS])
 @pytest.mark.parametrize("mover", MOVERS)
-def test_after_a_gap_a_motion_goes_on_from_a_stand_where_it_was(mover: str, late: int) -> None:
+def test_after_a_gap_a_motion_resumes_from_rest(mover: str, late: int) -> None:
     middle = len(MOTION) // 2
     setpoints = MOVERS[mover](ticks(middle, late, len(MOTION) + 30))
     before, first = setpoints[middle - 1 : middle + 1]
@@ -167,7 +160,7 @@ def test_between_samples_a_trajectory_is_interpolated() -> None:
     assert qd == pytest.approx(np.full(7, 2.5))
 
 
-def test_an_examination_that_is_kept_waiting_starts_its_motion_anew() -> None:
+def test_after_a_long_gap_an_examination_restarts_its_motion() -> None:
     world = World(known(region_m=(0.025, 0.0125)))
     world.q = world.q + np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     world.run(
@@ -182,7 +175,7 @@ def test_an_examination_that_is_kept_waiting_starts_its_motion_anew() -> None:
     assert world.exam.status.phase is Phase.DONE, world.exam.status.message
 
 
-def test_after_a_pause_in_a_free_motion_the_palpation_goes_on_with_the_next_segment() -> None:
+def test_after_a_pause_in_a_free_motion_the_palpation_continues_with_the_next_segment() -> None:
     palpation = free_palpation()
     palpation.step(0, ABOVE)
     palpation.pause()

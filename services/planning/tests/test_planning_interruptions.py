@@ -1,4 +1,4 @@
-"""Stops, pushes and a wall that moves unexpectedly: the examination waits, continues where it was, or ends."""
+"""Tests of stops, pushes and unexpected motion of the wall: the examination waits, resumes or ends."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import WALL, WallWatch
 from palpate_planning.motion.timing import JointTrajectory
-from palpate_planning.palpation import REQUEST_TIMEOUT_S
+from palpate_planning.palpation import TUNING
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
@@ -30,7 +30,7 @@ def stopped_in(phase: Phase, *, soft: bool, seconds: float = 1.0) -> World:
     world.run(lambda: world.exam.status.phase is phase)
     for _ in range(20):
         world.step()
-    if world.exam.status.phase is not phase:  # shorter than that
+    if world.exam.status.phase is not phase:  # the phase is shorter
         world = World(known(region_m=(0.025, 0.0125)))
         world.run(lambda: world.exam.status.phase is phase)
     world.stop, world.soft = STOPPED, soft
@@ -41,7 +41,7 @@ def stopped_in(phase: Phase, *, soft: bool, seconds: float = 1.0) -> World:
 
 @pytest.mark.parametrize("soft", [True, False], ids=["soft", "emergency"])
 @pytest.mark.parametrize("phase", PHASES, ids=lambda phase: phase.name)
-def test_released_it_goes_on_and_misses_nothing(phase: Phase, soft: bool) -> None:
+def test_after_a_release_it_resumes_without_losses(phase: Phase, soft: bool) -> None:
     world = stopped_in(phase, soft=soft)
     status = world.exam.status
     assert status.phase is Phase.HELD
@@ -54,7 +54,7 @@ def test_released_it_goes_on_and_misses_nothing(phase: Phase, soft: bool) -> Non
     centres = np.array([s.p_WD for s, row in zip(world.setpoints, world.rows, strict=True) if row[1]])
     for target in world.dome.positions:
         assert np.linalg.norm(centres - target, axis=1).min() < 0.009
-    assert max(row[5] for row in world.rows) < 5.0, "going on presses no harder than before"
+    assert max(row[5] for row in world.rows) < 5.0, "after the stop the force is not larger"
 
 
 def test_a_soft_stop_in_contact_retreats_along_the_normal_and_waits() -> None:
@@ -87,7 +87,7 @@ def test_a_soft_stop_that_becomes_an_emergency_stop_is_left_to_the_driver() -> N
 
 @pytest.mark.parametrize("phase", [Phase.HOME, Phase.PLAN, Phase.SCAN], ids=lambda phase: phase.name)
 @pytest.mark.parametrize("stopped", [True, False], ids=["stopped", "running"])
-def test_an_operator_who_has_had_enough_gets_the_arm_home(phase: Phase, stopped: bool) -> None:
+def test_an_end_request_brings_the_arm_home(phase: Phase, stopped: bool) -> None:
     world = stopped_in(phase, soft=False, seconds=1.0 if stopped else 0.0)
     world.stop = world.stop if stopped else NO_CAUSE
     world.end = Cause(Reason.OPERATOR_END, "enough")
@@ -100,7 +100,7 @@ def test_an_operator_who_has_had_enough_gets_the_arm_home(phase: Phase, stopped:
     assert world.pressed == 0.0
 
 
-def test_nobody_releases_it() -> None:
+def test_without_a_release_it_ends() -> None:
     world = stopped_in(Phase.SCAN, soft=False)
     world.run()
     status = world.exam.status
@@ -110,7 +110,7 @@ def test_nobody_releases_it() -> None:
 
 
 def drawn_sideways(world: World) -> float:
-    """Runs to the end; how far [m] a set-point is from an arm that is in the tissue, across the normal, at most."""
+    """Run to the end; return the largest lateral distance [m] between set-point and an arm in the tissue."""
     begun, worst = len(world.rows), 0.0
     while world.exam.status.end_tick < 0 and len(world.rows) < begun + 500:
         p_W = world.kinematics.pose(world.q)[:3, 3]
@@ -132,7 +132,7 @@ def push(world: World, aside: float, down: float) -> None:
     world.q = solution.q
 
 
-def test_an_arm_that_was_pushed_aside_does_not_go_on_pressing() -> None:
+def test_an_arm_that_was_pushed_laterally_stops_pressing() -> None:
     world = stopped_in(Phase.SCAN, soft=False)
     world.q = world.q + np.array([0.08, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
     world.stop = NO_CAUSE
@@ -143,7 +143,7 @@ def test_an_arm_that_was_pushed_aside_does_not_go_on_pressing() -> None:
 
 @pytest.mark.parametrize("phase", [Phase.SCAN, Phase.RETRACT], ids=lambda phase: phase.name)
 @pytest.mark.parametrize("deeper", [False, True], ids=["as deep", "deeper"])
-def test_an_arm_that_was_pushed_a_little_aside_lifts_before_it_goes_back(phase: Phase, deeper: bool) -> None:
+def test_an_arm_that_was_pushed_a_little_lifts_before_it_returns(phase: Phase, deeper: bool) -> None:
     world = stopped_in(phase, soft=False)
     push(world, 0.015, 0.004 if deeper else 0.0)
     world.stop = NO_CAUSE
@@ -152,7 +152,7 @@ def test_an_arm_that_was_pushed_a_little_aside_lifts_before_it_goes_back(phase: 
     assert world.exam.status.targets_skipped == 0
 
 
-def test_an_arm_that_was_pushed_into_the_tissue_between_two_strokes_lifts_before_it_goes_on() -> None:
+def test_an_arm_that_was_pushed_into_the_tissue_between_strokes_lifts_first() -> None:
     world = World(known(region_m=(0.025, 0.025), pattern="raster"))
     world.run(lambda: getattr(world.exam._course.palpation, "stage", None) is StrokeStage.TRANSFER)
     assert world.exam._course.palpation is not None
@@ -225,12 +225,12 @@ def test_above_the_skin_nothing_is_pushed_back() -> None:
         assert np.abs(world.step().setpoint.F_W).max() < 1e-9
 
 
-def test_a_wall_that_is_calm_for_less_than_is_asked_for_ends_the_strokes_too() -> None:
+def test_short_calm_intervals_end_the_strokes_too() -> None:
     breath, watch = Breath(), None
     watch = WallWatch(breath, Following.FOLLOW, 0.1)
     for k in range(round(1.2 * WALL.calm_timeout_s / 0.1)):
         calm = k % 14 < 7  # 0.7 s each
-        breath.hear(BreathObservation(k * 100_000_000, np.zeros(11), 1e-4, calm), k * 100_000_000)
+        breath.receive(BreathObservation(k * 100_000_000, np.zeros(11), 1e-4, calm), k * 100_000_000)
         watch.step(k * 100_000_000, contact_lost=False)
     assert watch.ended
 
@@ -244,7 +244,7 @@ def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
     assert sorted(palpation.ahead) == list(range(world.exam.status.target_count))
 
 
-def test_a_place_asked_for_moves_with_the_body() -> None:
+def test_a_requested_position_moves_with_the_body() -> None:
     moved = PressRequest(3, np.array((0.01, 0.02))).moved(np.array((0.008, -0.003)))
     assert moved.xy is not None
     assert np.allclose(moved.xy, (0.018, 0.017))
@@ -257,14 +257,14 @@ def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> N
     inspired = BreathObservation(0, np.full(11, 0.006), 1e-4, calm=True)
     for k in range(round((WALL.gate_closed_max_s + WALL.calm_timeout_s + 1) / 0.1)):
         t = k * 100_000_000
-        breath.hear(inspired._replace(stamp=t), t)
+        breath.receive(inspired._replace(stamp=t), t)
         watch.step(t, contact_lost=False)
         assert watch.spoiled == (k * 0.1 > WALL.gate_closed_max_s - 0.05)
         assert not watch.leaps
     assert watch.ended
     for _ in range(round(1.5 * WALL.calm_s / 0.1)):
         t += 100_000_000
-        breath.hear(inspired._replace(stamp=t, forecast=np.zeros(11)), t)
+        breath.receive(inspired._replace(stamp=t, forecast=np.zeros(11)), t)
         watch.step(t, contact_lost=False)
     assert watch.calm
 
@@ -315,10 +315,10 @@ def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> No
     assert world.exam.status.phase is Phase.ABORTED
 
 
-def test_a_search_that_asks_for_nothing_is_not_waited_for() -> None:
+def test_a_search_without_requests_ends_the_strokes() -> None:
     world = World(known(pattern="search", **SMALL))
     world.run(lambda: world.exam.status.message == StrokeStage.WAIT.value)
     began = world.t
-    world.run(seconds=2 * REQUEST_TIMEOUT_S + 60.0)
+    world.run(seconds=2 * TUNING.request_timeout_s + 60.0)
     assert world.exam.status.phase is Phase.DONE, world.exam.status.message
-    assert (world.t - began) / 1e9 < REQUEST_TIMEOUT_S + 15.0
+    assert (world.t - began) / 1e9 < TUNING.request_timeout_s + 15.0

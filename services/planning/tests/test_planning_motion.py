@@ -1,4 +1,4 @@
-"""Kinematics, collision scene, free motion and its timing."""
+"""Tests of kinematics, collision scene, free motion and timing."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
-from palpate_planning.motion.kinematics import ELBOW, STRAIGHT_RAD, ArmKinematics
+from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene, with_skirt
 from palpate_planning.motion.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
@@ -35,7 +35,7 @@ def above(x: float, y: float, gap: float) -> np.ndarray:
 
 
 AROUND = (np.array([1.3, 0.9, 0.0, -1.2, 0.0, 1.0, 0.0]), np.array([-1.3, 0.9, 0.0, -1.2, 0.0, 1.0, 0.0]))
-"""From one side of the abdomen to the other, low: the straight motion sweeps through it."""
+"""Low postures at both sides of the abdomen: the straight motion between them collides with it."""
 
 
 def test_inverse_kinematics_meets_position_and_axis() -> None:
@@ -62,7 +62,7 @@ def test_free_spin_meets_the_axis_only() -> None:
     assert KINEMATICS.pose(KINEMATICS.solve(turned, np.array(lbr.HOME)).q)[:3, 0] == pytest.approx(turned[:3, 0], abs=1e-3)
 
 
-def test_out_of_reach_is_said_not_hidden() -> None:
+def test_an_unreachable_pose_is_reported() -> None:
     X = KINEMATICS.pose(np.array(lbr.HOME))
     X[:3, 3] = (3.0, 0.0, 1.0)
     solution = KINEMATICS.solve(X, np.array(lbr.HOME))
@@ -154,15 +154,15 @@ def test_rounded_and_timed_motion_of_the_planner_is_free() -> None:
     assert all(SCENE.free(q) for q in trajectory.q)
 
 
-def test_what_only_a_stretched_arm_reaches_is_skipped() -> None:
+def test_targets_that_need_a_stretched_arm_are_skipped() -> None:
     far = known(Robot(base_xy_m=(-0.22, 0.0)), region_m=(0.15, 0.0125), centre_m=(0.0, 0.0))
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME))
     assert {REACH, STRETCHED} == set(examination.skipped.values())
-    assert min(np.abs(segment.path.q[:, ELBOW]).min() for segment in examination.segments) > STRAIGHT_RAD
+    assert min(np.abs(segment.path.q[:, ELBOW]).min() for segment in examination.segments) > KINEMATIC_LIMITS.straight_rad
 
 
-def test_paths_are_laid_where_the_elbow_is_bent(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Between targets, too: they are not left out beforehand here."""
+def test_paths_keep_the_elbow_bent(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also between targets: the filter of targets is switched off here."""
     monkeypatch.setattr("palpate_planning.strokes.plan.stretched", lambda q, bend: False)
     far, bend = known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), 0.5
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME), bend=bend)
@@ -220,7 +220,7 @@ def test_an_axis_that_stood_still_starts_from_rest() -> None:
         assert (axis.position, axis.velocity, axis.acceleration) == (fresh.position, fresh.velocity, fresh.acceleration)
 
 
-def test_look_postures_leave_the_view_free_and_differ() -> None:
+def test_scan_postures_leave_the_view_free_and_differ() -> None:
     postures = look_postures(known(Robot()))
     assert len(postures) >= 3
     assert np.array_equal(postures[0], lbr.HOME)

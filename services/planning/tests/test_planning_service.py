@@ -1,4 +1,4 @@
-"""The service: contract's messages in and out, encoded and decoded as on the bus."""
+"""Tests of the service with messages encoded and decoded as on the bus."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_AC
 
 
 def sent(outbox: Any) -> dict[str, Any]:
-    """The outbox after its way over the bus; fails where a message does not fit its type or its ranges."""
+    """Return the outbox encoded and decoded; fails if a message does not fit its type or ranges."""
     out = {}
     for name, message in outbox.items():
         topic = OUTPUTS[name]
@@ -75,9 +75,9 @@ class BusWorld(World):
         self.exam = self.service._exam
         self.inbox = HandInbox()
         self.seen: Callable[[Any], None] = lambda surface: None
-        """What becomes of a perceived surface on its way, ..."""
+        """Change of a perceived surface on the bus."""
         self.targets: Callable[[Any], None] = lambda targets: None
-        """... and of the targets."""
+        """Change of the targets on the bus."""
         self.states: list[Any] = []
         self.events: list[str] = []
 
@@ -135,7 +135,7 @@ def test_an_examination_over_messages() -> None:
     assert facts["peak_force_N"] < 4.0
 
 
-def test_the_first_step_asks_the_arm_for_nothing() -> None:
+def test_the_first_step_sends_no_setpoint() -> None:
     service = create(Scenario(robot=BASE, exam=Exam()))
     out = sent(service.step(0, HandInbox()))
     assert out["planning/setpoint"].mode == ControlMode.JOINT
@@ -194,7 +194,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
         assert state.end_tick == -1
 
 
-def test_a_surface_that_is_damaged_is_looked_at_again() -> None:
+def test_a_damaged_surface_causes_a_new_scan() -> None:
     world, damaged = BusWorld(), []
 
     def damage(mesh: Any) -> None:
@@ -211,7 +211,7 @@ def test_a_surface_that_is_damaged_is_looked_at_again() -> None:
     assert world.service.finish()["refused_messages"] == 1
 
 
-def test_targets_at_one_place_are_looked_for_again() -> None:
+def test_coincident_targets_cause_a_new_scan() -> None:
     world, looks = BusWorld(), []
 
     def double(targets: Any) -> None:
@@ -225,7 +225,7 @@ def test_targets_at_one_place_are_looked_for_again() -> None:
     assert len(looks) == 2
 
 
-def test_a_motion_that_is_damaged_is_passed_over() -> None:
+def test_a_damaged_motion_message_is_skipped() -> None:
     service = create(Scenario(robot=BASE))
     inbox = HandInbox()
     inbox.put("robot/status", status(0, np.array(lbr.HOME), np.zeros(6)))
@@ -238,7 +238,7 @@ def test_a_motion_that_is_damaged_is_passed_over() -> None:
         inbox.events = {}
 
 
-def test_values_that_are_none_are_passed_over() -> None:
+def test_values_that_are_not_finite_are_skipped() -> None:
     service = create(Scenario(robot=BASE))
     inbox = HandInbox()
     q = np.array(lbr.HOME)

@@ -13,7 +13,7 @@ from palpate_models.scenario.patterns import TOUCHES_M
 from palpate_models.scenario.schema import Mode
 from palpate_planning.interruptions import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
-from palpate_planning.strokes.coverage import SAMPLE_M, strokes, touches, transfer
+from palpate_planning.strokes.coverage import TUNING, strokes, touches, transfer
 from palpate_planning.strokes.path import SurfacePath, angular_velocity, centre, frame, lay, least_twist, pose
 from palpate_planning.wall.surface import PerceivedSurface
 
@@ -52,7 +52,7 @@ def test_a_snake_is_one_stroke_without_corners() -> None:
     (stroke,) = strokes(xy, lines, np.ones(len(xy), dtype=bool), True, Mode.CONTINUOUS, SPACING)
     steps = np.diff(stroke.xy, axis=0)
     lengths = np.linalg.norm(steps, axis=1)
-    assert lengths.max() < 1.5 * SAMPLE_M
+    assert lengths.max() < 1.5 * TUNING.sample_m
     turns = np.arccos(np.clip((steps[1:] * steps[:-1]).sum(axis=1) / (lengths[1:] * lengths[:-1]), -1, 1))
     assert turns.max() < 0.5, "a semicircle of 6.25 mm in steps of 2 mm turns by 0.32 rad a step"
     assert stroke.xy[:, 0].max() < 5 * SPACING + 0.6 * SPACING

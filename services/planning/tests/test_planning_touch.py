@@ -1,4 +1,4 @@
-"""Where the skin is, from depth and force of a slow descent."""
+"""Tests of the skin's depth from depth and force of a slow descent."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from palpate_planning.wall.touch import FELT_N, TUNING, Onset, find_touch
 
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
-    """Rows of depth [m] and force [N] every 0.14 mm, until the force is felt; `stiffness` [N] at 4 mm."""
+    """Rows of depth [m] and force [N] every 0.14 mm, until contact is detected; `stiffness` [N] at 4 mm."""
     depth = np.arange(onset - 0.008, onset + 0.016, 0.00014)
     force = stiffness * (np.maximum(depth - onset, 0.0) / 0.004) ** exponent
     force = force + bias + noise * np.random.default_rng(seed).standard_normal(len(depth))
@@ -48,7 +48,7 @@ def test_on_bone_the_skin_is_where_force_begins() -> None:
     assert touch.sigma == TUNING.unfitted_sd_m
 
 
-def test_a_wall_that_was_not_where_it_was_forecast_moves_the_touch() -> None:
+def test_a_wrong_forecast_shifts_the_touch() -> None:
     onset = Onset()
     for k, (depth, force) in enumerate(descent(0.003, 1.5, 1.3, 0.0, 0.0)):
         onset.add(float(depth), float(force), k, 0.001)

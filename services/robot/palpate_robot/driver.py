@@ -41,7 +41,7 @@ class DriverTuning:
     ahead_ns: int = 500_000_000
     """A command stamped further ahead comes from a wrong clock, so its expiry is meaningless. Larger than the lag of a driver
     behind
-    its own timer (`palpate_bus.runtime.wallclock.CATCH_UP`) plus the validity."""
+    its own timer (`palpate_bus.runtime.wallclock.TIMES`) plus the validity."""
 
 
 TUNING: Final = DriverTuning()

@@ -12,18 +12,28 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
-TOLERANCE_M = 1e-4
-"""Position error at which inverse kinematics is solved."""
-TOLERANCE_RAD = 1e-3
-"""Error of the tool axis at which inverse kinematics is solved."""
+
+
+@dataclass(frozen=True)
+class KinematicLimits:
+    """Tolerances of the inverse kinematics, and limits of the elbow."""
+
+    tolerance_m: float = 1e-4
+    """Position error at which inverse kinematics is solved."""
+    tolerance_rad: float = 1e-3
+    """Error of the tool axis at which inverse kinematics is solved."""
+    straight_rad: float = 0.2
+    """Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
+    perceived
+    surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
+    too_straight_rad: float = 0.15
+    """Smallest elbow angle in contact, where the skin may be deeper than perceived."""
+
+
+KINEMATIC_LIMITS = KinematicLimits()
+
 ELBOW = 3
 """Index of the joint that determines the distance from shoulder to wrist."""
-STRAIGHT_RAD = 0.2
-"""Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
-perceived
-surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
-TOO_STRAIGHT_RAD = 0.15
-"""Smallest elbow angle in contact, where the skin may be deeper than perceived."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +43,7 @@ class IkSolution:
     q: Array
     """Joint positions [rad], shape (7,)."""
     ok: bool
-    """True if the pose is met to `TOLERANCE_M` and `TOLERANCE_RAD` within the limits."""
+    """True if the pose is met to `KINEMATIC_LIMITS.tolerance_m` and `KINEMATIC_LIMITS.tolerance_rad` within the limits."""
     error_m: float
     """Position error of the sphere's centre [m]."""
     error_rad: float
@@ -106,7 +116,7 @@ class ArmKinematics:
             cost = error_m + 0.1 * error_rad
             if cost < best[0]:
                 best = (cost, q, error_m, error_rad)
-            if error_m < TOLERANCE_M / 10 and error_rad < TOLERANCE_RAD / 10:
+            if error_m < KINEMATIC_LIMITS.tolerance_m / 10 and error_rad < KINEMATIC_LIMITS.tolerance_rad / 10:
                 break
             A = np.vstack((J[:3], R_IW @ J[3:]))[:rows]
             b = np.concatenate((gap, turn))[:rows]
@@ -115,7 +125,9 @@ class ArmKinematics:
             q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
             q = np.clip(q, -self.upper, self.upper)
         _, q, error_m, error_rad = best
-        return IkSolution(q, error_m < TOLERANCE_M and error_rad < TOLERANCE_RAD, error_m, error_rad)
+        return IkSolution(
+            q, error_m < KINEMATIC_LIMITS.tolerance_m and error_rad < KINEMATIC_LIMITS.tolerance_rad, error_m, error_rad
+        )
 
 
 def _turn_of_axis(z_I: Array) -> Array:

@@ -6,6 +6,7 @@ queries; planning ends on an iteration count, never on time; shortcuts are greed
 
 from __future__ import annotations
 
+from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -15,16 +16,23 @@ from palpate_errors import RunError
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.scene import STEP_RAD, CollisionScene
+from palpate_planning.motion.scene import COLLISION, CollisionScene
 from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, rounded
 
-ITERATIONS = 6000
-"""Largest number of RRT-Connect iterations."""
-RANGE_RAD = 0.4
-"""Longest extension of the tree."""
 
-BLENDS_RAD = (0.25, 0.1, 0.03)
-"""Blend lengths of corners, tried in order until the rounded path is free."""
+@dataclass(frozen=True)
+class PlannerTuning:
+    """Tuning of the motion planner."""
+
+    iterations: int = 6000
+    """Largest number of RRT-Connect iterations."""
+    range_rad: float = 0.4
+    """Longest extension of the tree."""
+    blends_rad: tuple[float, float, float] = (0.25, 0.1, 0.03)
+    """Blend lengths of corners, tried in order until the rounded path is free."""
+
+
+TUNING = PlannerTuning()
 
 
 class NoPathError(RunError):
@@ -34,7 +42,7 @@ class NoPathError(RunError):
 def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
     """Return way points, shape (n, 7), of a collision-free path from q0 to q1 within +-bound [rad], ends included.
 
-    Raises NoPathError if an end collides or after `ITERATIONS`.
+    Raises NoPathError if an end collides or after `TUNING.iterations`.
     """
     for name, q in (("start", q0), ("goal", q1)):
         if not scene.free(q):
@@ -49,7 +57,7 @@ def timed_motion(
 ) -> JointTrajectory:
     """Return a collision-free motion from q0 to q1 within all limits, sampled every `period_s`. Raises NoPathError."""
     points = plan(scene, q0, q1, kinematics.upper, seed)
-    for blend in BLENDS_RAD:
+    for blend in TUNING.blends_rad:
         smooth = rounded(points, blend)
         if len(points) == 2 or scene.path_free(smooth):
             return joint_trajectory(kinematics, smooth, limits, period_s)
@@ -67,7 +75,7 @@ def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed
     space.setBounds(bounds)
     information = base.SpaceInformation(space)
     information.setStateValidityChecker(lambda state: scene.free(np.array([state[i] for i in range(7)])))
-    information.setStateValidityCheckingResolution(STEP_RAD / space.getMaximumExtent())
+    information.setStateValidityCheckingResolution(COLLISION.step_rad / space.getMaximumExtent())
     information.setup()
     start, goal = space.allocState(), space.allocState()
     for i in range(7):
@@ -75,14 +83,14 @@ def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed
     problem = base.ProblemDefinition(information)
     problem.setStartAndGoalStates(start, goal)
     planner = geometric.RRTConnect(information)
-    planner.setRange(RANGE_RAD)
+    planner.setRange(TUNING.range_rad)
     planner.setProblemDefinition(problem)
     planner.setup()
-    iterations = iter(range(ITERATIONS))
+    iterations = iter(range(TUNING.iterations))
     planner.solve(base.PlannerTerminationCondition(lambda: next(iterations, None) is None))
     if not problem.hasExactSolution():
         ends = f"from {np.round(q0, 3).tolist()} to {np.round(q1, 3).tolist()}"
-        raise NoPathError(f"no collision-free motion {ends} in {ITERATIONS} iterations")
+        raise NoPathError(f"no collision-free motion {ends} in {TUNING.iterations} iterations")
     return np.array([[state[i] for i in range(7)] for state in problem.getSolutionPath().getStates()])
 
 

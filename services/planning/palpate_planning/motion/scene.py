@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
 from itertools import pairwise
 
 import coal
@@ -15,12 +16,21 @@ from palpate_models.robot import lbr, table
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
-MARGIN_M = 0.010
-"""Clearance of free motion: more than half the motion of any point of the arm between two checks."""
-STEP_RAD = 0.02
-"""Largest joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
-SELF_APART = 3
-"""Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits."""
+
+@dataclass(frozen=True)
+class CollisionTuning:
+    """Margins and resolution of collision checks."""
+
+    margin_m: float = 0.010
+    """Clearance of free motion: more than half the motion of any point of the arm between two checks."""
+    step_rad: float = 0.02
+    """Largest joint step between two checks of a motion: 19 mm at the tool at 0.95 m of reach."""
+    links_apart: int = 3
+    """Links at least this many joints apart are checked against each other; closer ones cannot collide within the limits."""
+
+
+COLLISION = CollisionTuning()
+
 TOOL_LINKS = ("ft_sensor", "indenter")
 """Stand-off and sphere, which are below the rest surface while indenting."""
 
@@ -80,7 +90,7 @@ class CollisionScene:
         robot: Robot,
         abdomen: tuple[Array, NDArray[np.int64]] | None = None,
         tool_may_touch: bool = False,
-        margin: float = MARGIN_M,
+        margin: float = COLLISION.margin_m,
     ) -> None:
         """`tool_may_touch`: allows contact of stand-off and sphere with the abdomen."""
         self._model = kinematics.model
@@ -93,7 +103,7 @@ class CollisionScene:
             obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
         for k, (link, shape) in enumerate(arm):
             for other, other_shape in arm[:k]:
-                if lbr.LINK_NAMES.index(link) - lbr.LINK_NAMES.index(other) >= SELF_APART:
+                if lbr.LINK_NAMES.index(link) - lbr.LINK_NAMES.index(other) >= COLLISION.links_apart:
                     self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
             for name, obstacle in obstacles:
                 mounted = link == "lbr_link_0" or (link == "lbr_link_1" and name == "robot_base")
@@ -126,8 +136,8 @@ class CollisionScene:
         return found
 
     def motion_free(self, q0: Array, q1: Array) -> bool:
-        """Return True if the straight joint-space motion from q0 to q1 is free, checked every `STEP_RAD`, ends included."""
-        steps = max(1, int(np.ceil(float(np.abs(q1 - q0).max()) / STEP_RAD)))
+        """True if the straight joint-space motion from q0 to q1 is free, checked every `COLLISION.step_rad` with both ends."""
+        steps = max(1, int(np.ceil(float(np.abs(q1 - q0).max()) / COLLISION.step_rad)))
         order = sorted(range(steps + 1), key=lambda k: -(k & -k) if k else -steps)  # coarse first, to fail early
         return all(self.free(q0 + (q1 - q0) * (k / steps)) for k in order)
 

@@ -20,12 +20,22 @@ from palpate_planning.periods import MS
 
 JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
 """Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
-RISE_S = 0.15
-"""Rise time of the acceleration: jerk limit = acceleration / RISE_S."""
-BRAKED_NS = 30 * MS
-"""Time without a set-point after which control has stopped the arm (`ReferenceTuning.bridged_periods`)."""
-RESTART_NS = 300 * MS
-"""Time in which an interrupted motion returns to its speed [A]."""
+
+
+@dataclass(frozen=True)
+class TimingTuning:
+    """Acceleration of free motions and their restart after a gap."""
+
+    rise_s: float = 0.15
+    """Rise time of the acceleration: jerk limit = acceleration / rise time."""
+    braked_ns: int = 30 * MS
+    """Time without a set-point after which control has stopped the arm (`ReferenceTuning.bridged_periods`)."""
+    restart_ns: int = 300 * MS
+    """Time in which an interrupted motion returns to its speed [A]."""
+
+
+TIMING: Final = TimingTuning()
+
 _FINISHED: Final = ruckig.Result.Finished
 _UNDER_WAY: Final = (ruckig.Result.Working, _FINISHED)
 
@@ -84,12 +94,12 @@ class RestartRamp:
 
     def step(self, t: int) -> float:
         """Return the number of trajectory samples to advance at `t` [ns]: exactly 1, or less after missed steps."""
-        if self._last is not None and t - self._last > BRAKED_NS:
+        if self._last is not None and t - self._last > TIMING.braked_ns:
             self._restarted = t
         self._last = t
         if self._restarted is None:
             return 1.0
-        rate = (t - self._restarted) / RESTART_NS
+        rate = (t - self._restarted) / TIMING.restart_ns
         if rate < 1.0:
             return rate
         self._restarted = None
@@ -183,7 +193,7 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
     acceleration = float((0.5 * JOINT_ACCELERATION / np.maximum(np.abs(tangent), 1e-9)).min())
     limit = SpeedLimit(s, speed, 0.7 * acceleration)
-    axis = JerkLimitedAxis(0.0, acceleration, acceleration / RISE_S, period_s)
+    axis = JerkLimitedAxis(0.0, acceleration, acceleration / TIMING.rise_s, period_s)
     positions, rates = [0.0], [0.0]
     while not axis.step(float(s[-1]), limit.at(axis.position + axis.velocity * period_s)):
         positions.append(axis.position)

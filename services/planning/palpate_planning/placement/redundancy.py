@@ -25,13 +25,21 @@ from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_fr
 
 Mask = NDArray[np.bool_]
 
-TASK_TOLERANCE = 1e-5
-"""Residual at which a target is reached [m, rad]."""
-PROJECTION_STEPS = 12
-"""Gauss-Newton steps that project a posture onto its target."""
-_IK_STEPS = 40
-_DESCENT = 0.05
-_LARGEST_STEP_RAD = 0.15
+
+@dataclass(frozen=True)
+class ResolutionTuning:
+    """Numerical tuning of the redundancy resolution."""
+
+    task_tolerance: float = 1e-5
+    """Residual at which a target is reached [m, rad]."""
+    projection_steps: int = 12
+    """Gauss-Newton steps that project a posture onto its target."""
+    ik_steps: int = 40
+    descent: float = 0.05
+    largest_step_rad: float = 0.15
+
+
+RESOLUTION = ResolutionTuning()
 
 
 class Batch:
@@ -81,7 +89,7 @@ class Batch:
             if descent:
                 move += push
             largest = np.abs(move).max(axis=1, keepdims=True)
-            q = q + move * np.minimum(1.0, _LARGEST_STEP_RAD / np.maximum(largest, 1e-12))
+            q = q + move * np.minimum(1.0, RESOLUTION.largest_step_rad / np.maximum(largest, 1e-12))
             q = np.clip(q, -self.limit, self.limit)
         return q
 
@@ -91,7 +99,7 @@ class Batch:
 
     def search(self, q: Array) -> Array:
         """Return inverse kinematics from postures `q` with low cost, shape (n, 7)."""
-        return self.solve(self.solve(q, _IK_STEPS, _DESCENT), PROJECTION_STEPS, 0.0)
+        return self.solve(self.solve(q, RESOLUTION.ik_steps, RESOLUTION.descent), RESOLUTION.projection_steps, 0.0)
 
     def from_one(self, start: Array) -> Array:
         """Return inverse kinematics of all targets from one posture, shape (n, 7)."""
@@ -108,15 +116,23 @@ class Batch:
         residual = np.linalg.norm(self.task(q)[0], axis=1)
         facing = self.facing(q)
         wrong = facing <= 0
-        return np.where(wrong, np.maximum(residual, 1 - facing), residual), (residual < TASK_TOLERANCE) & ~wrong
+        return np.where(wrong, np.maximum(residual, 1 - facing), residual), (residual < RESOLUTION.task_tolerance) & ~wrong
 
 
-KNOTS = 32
-"""Largest number of optimised targets; postures in between are interpolated and projected onto their targets."""
-SMOOTHNESS = 2.0
-"""Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
-PRESSING_FORCE_N = 15.0
-"""Normal force in the cost of postures: the working force limit."""
+@dataclass(frozen=True)
+class PostureTuning:
+    """Tuning of the optimised postures."""
+
+    knots: int = 32
+    """Largest number of optimised targets; postures in between are interpolated and projected onto their targets."""
+    smoothness: float = 2.0
+    """Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
+    pressing_force_n: float = 15.0
+    """Normal force in the cost of postures: the working force limit."""
+
+
+POSTURES = PostureTuning()
+
 _IPOPT_STEPS, _SAMPLES = 80, 16
 
 
@@ -147,7 +163,7 @@ def plan_redundancy(
     q_seed: Array,
     *,
     joint_margin_rad: float = 0.05,
-    force_n: float = PRESSING_FORCE_N,
+    force_n: float = POSTURES.pressing_force_n,
 ) -> PostureSequence:
     """Return postures that move the indenter along targets with the tool's z axis opposite to the surface normals.
 
@@ -187,10 +203,10 @@ def plan_redundancy(
     return _judge(batch, q, refined)
 
 
-def prepare(robot: Robot, force_n: float = PRESSING_FORCE_N) -> None:
+def prepare(robot: Robot, force_n: float = POSTURES.pressing_force_n) -> None:
     """Build the CasADi functions and the solver of `plan_redundancy` in advance."""
     arm(robot)
-    _program(_at_origin(robot), KNOTS, force_n)
+    _program(_at_origin(robot), POSTURES.knots, force_n)
 
 
 def _at_origin(robot: Robot) -> Robot:
@@ -232,7 +248,7 @@ def _knots(batch: Batch, reachable: Mask) -> NDArray[np.intp]:
     """Return indices of the optimised targets: reachable, evenly spaced along the path, ends included."""
     candidates = np.flatnonzero(reachable)
     s = _path_length(batch.positions)[candidates]
-    wanted = np.linspace(s[0], s[-1], min(KNOTS, len(candidates)))
+    wanted = np.linspace(s[0], s[-1], min(POSTURES.knots, len(candidates)))
     nearest = np.unique(np.abs(s[None, :] - wanted[:, None]).argmin(axis=1))
     return np.asarray(candidates[nearest])
 
@@ -248,7 +264,7 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     bases = ca.repmat(base, 1, count)
     travel = Q[:, 1:] - Q[:, :-1]
     cost = ca.sum2(functions.cost.map(count)(Q, bases, force)[0])
-    cost += SMOOTHNESS * ca.dot(weights, ca.sum1(travel**2).T)
+    cost += POSTURES.smoothness * ca.dot(weights, ca.sum1(travel**2).T)
     residual = functions.task.map(count)(Q, bases, P, frames)[0]
     problem = {
         "x": ca.vec(Q),
@@ -287,7 +303,7 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
     optimal = np.array(result["x"]).reshape(len(knots), 7)
     within = np.clip(s, s[knots[0]], s[knots[-1]])
     between = PchipInterpolator(s[knots], optimal)(within)
-    return batch.solve(between, PROJECTION_STEPS, 0.0), True
+    return batch.solve(between, RESOLUTION.projection_steps, 0.0), True
 
 
 def _keep_best(batch: Batch, before: Array, after: Array) -> Array:

@@ -22,10 +22,18 @@ from palpate_models.scenario.schema import Mode
 Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
-SAMPLE_M = 0.002
-"""Spacing of the samples of a stroke."""
-JOIN_SPACINGS = 2.5
-"""Line ends farther apart than this many spacings are not joined in contact."""
+
+@dataclass(frozen=True)
+class CoverageTuning:
+    """Sampling and joining of scan lines."""
+
+    sample_m: float = 0.002
+    """Spacing of the samples of a stroke."""
+    join_spacings: float = 2.5
+    """Line ends farther apart than this many spacings are not joined in contact."""
+
+
+TUNING = CoverageTuning()
 
 
 @dataclass(frozen=True, slots=True)
@@ -33,7 +41,7 @@ class Stroke:
     """A curve to follow at depth. A single sample is a point to indent."""
 
     xy: Array
-    """Samples in frame A [m], about `SAMPLE_M` apart, shape (n, 2)."""
+    """Samples in frame A [m], about `TUNING.sample_m` apart, shape (n, 2)."""
     targets: Ints
     """Indices of the targets that it visits, in order, shape (m,)."""
     visits: Ints
@@ -48,7 +56,7 @@ def line_through(points: Array) -> tuple[Array, Ints]:
         return points.copy(), np.zeros(1, dtype=np.int64)
     chords = np.maximum(np.linalg.norm(np.diff(points, axis=0), axis=1), 1e-6)
     knots = np.concatenate(([0.0], np.cumsum(chords)))
-    counts = np.maximum(1, np.round(chords / SAMPLE_M).astype(int))
+    counts = np.maximum(1, np.round(chords / TUNING.sample_m).astype(int))
     u = np.concatenate([np.linspace(a, b, k, endpoint=False) for (a, b), k in zip(pairwise(knots), counts, strict=True)])
     u = np.append(u, knots[-1])
     curve = CubicSpline(knots, points, bc_type="natural") if len(points) > 2 else None
@@ -64,7 +72,7 @@ def arc(p0: Array, t0: Array, p1: Array, t1: Array) -> Array:
     gap = float(np.linalg.norm(p1 - p0))
     b1, b2 = p0 + t0 * (2 / 3 * gap), p1 - t1 * (2 / 3 * gap)
     length = 0.5 * (gap + float(np.linalg.norm(b1 - p0) + np.linalg.norm(b2 - b1) + np.linalg.norm(p1 - b2)))
-    u = np.linspace(0.0, 1.0, max(2, round(length / SAMPLE_M)) + 1)[1:-1, None]
+    u = np.linspace(0.0, 1.0, max(2, round(length / TUNING.sample_m)) + 1)[1:-1, None]
     return np.asarray((1 - u) ** 3 * p0 + 3 * u * (1 - u) ** 2 * b1 + 3 * u**2 * (1 - u) * b2 + u**3 * p1)
 
 
@@ -113,7 +121,7 @@ def strokes(
     merged: list[Stroke] = []
     for piece in pieces:
         last = merged[-1] if merged else None
-        near = last is not None and np.linalg.norm(piece.xy[0] - last.xy[-1]) <= JOIN_SPACINGS * spacing
+        near = last is not None and np.linalg.norm(piece.xy[0] - last.xy[-1]) <= TUNING.join_spacings * spacing
         follows = last is not None and last.targets[-1] == piece.targets[0] - 1 and last.targets[-1] not in breaks
         if last is None or not near or not follows or min(len(last.xy), len(piece.xy)) < 2:
             merged.append(piece)
@@ -143,5 +151,5 @@ def transfer(a: Array, b: Array) -> Array:
     length = float(np.linalg.norm(b - a))
     if length < 1e-6:
         return a[None].copy()
-    n = max(2, round(length / SAMPLE_M) + 1)
+    n = max(2, round(length / TUNING.sample_m) + 1)
     return np.asarray(a + (b - a) * np.linspace(0.0, 1.0, n)[:, None])

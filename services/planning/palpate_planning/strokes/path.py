@@ -7,6 +7,7 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 from __future__ import annotations
 
 from bisect import bisect_right
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -70,12 +71,21 @@ def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
 
 Ints = NDArray[np.int64]
 
-LATERAL_ACCELERATION = 0.3
-"""Largest v^2/r in curves in contact [m/s^2] [A]."""
-TURN_RATE = 0.6
-"""Largest rate at which the tool axis turns in contact [rad/s] [A]."""
-ACCELERATION = 0.2
-"""Tangential acceleration in contact [m/s^2] [A]."""
+
+@dataclass(frozen=True)
+class PathLimits:
+    """Limits of the motion along a path."""
+
+    lateral_acceleration_mps2: float = 0.3
+    """Largest v^2/r in curves in contact [m/s^2] [A]."""
+    turn_rate_radps: float = 0.6
+    """Largest rate at which the tool axis turns in contact [rad/s] [A]."""
+    acceleration_mps2: float = 0.2
+    """Tangential acceleration in contact [m/s^2] [A]."""
+
+
+LIMITS = PathLimits()
+
 _STEP_M = 1e-4
 """Path length of the finite difference of the orientation."""
 
@@ -134,7 +144,7 @@ class SurfacePath:
     def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
         """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast."""
         if self.length == 0.0:
-            return SpeedLimit(self.s, np.array([speed]), ACCELERATION)
+            return SpeedLimit(self.s, np.array([speed]), LIMITS.acceleration_mps2)
         dp = np.gradient(self.p, self.s, axis=0)
         curvature = np.linalg.norm(np.gradient(dp, self.s, axis=0), axis=1)
         turn = np.linalg.norm(np.gradient(self.n, self.s, axis=0), axis=1)
@@ -142,12 +152,12 @@ class SurfacePath:
         allowed = np.minimum.reduce(
             [
                 np.full(len(self.s), speed),
-                np.sqrt(LATERAL_ACCELERATION / np.maximum(curvature, 1e-6)),
-                TURN_RATE / np.maximum(turn, 1e-6),
+                np.sqrt(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6)),
+                LIMITS.turn_rate_radps / np.maximum(turn, 1e-6),
                 1.0 / np.maximum(joints.max(axis=1), 1e-6),
             ]
         )
-        return SpeedLimit(self.s, allowed, 0.7 * ACCELERATION)
+        return SpeedLimit(self.s, allowed, 0.7 * LIMITS.acceleration_mps2)
 
 
 def compile_ahead() -> None:

@@ -12,7 +12,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot import lbr
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.motion.kinematics import STRAIGHT_RAD, ArmKinematics, stretched
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics, stretched
 from palpate_planning.motion.planner import NoPathError, timed_motion
 from palpate_planning.motion.scene import CollisionScene, ViewPyramid, region_corners
 from palpate_planning.motion.timing import JointTrajectory
@@ -26,10 +26,18 @@ from palpate_planning.wall.surface import PerceivedSurface
 
 Ints = NDArray[np.int64]
 
-VIEW_MARGIN_M = 0.03
-"""Margin about the region that the view includes: perception needs the surface there."""
-TURNS_RAD = (0.0, 1.2, -1.2, 2.2, -2.2)
-"""Turns of the whole arm away from the table."""
+
+@dataclass(frozen=True)
+class ScanPostures:
+    """Camera view and turns of the arm during a scan of the surface."""
+
+    view_margin_m: float = 0.03
+    """Margin about the region that the view includes: perception needs the surface there."""
+    turns_rad: tuple[float, ...] = (0.0, 1.2, -1.2, 2.2, -2.2)
+    """Turns of the whole arm away from the table."""
+
+
+SCAN = ScanPostures()
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,7 +112,7 @@ class ExamPlanner:
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
         xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
-        postures, skipped = self._reachable(perceived, xy, q_now, contact, bend or STRAIGHT_RAD)
+        postures, skipped = self._reachable(perceived, xy, q_now, contact, bend or KINEMATIC_LIMITS.straight_rad)
         segments = SegmentPlanner(
             self._kinematics,
             contact,
@@ -112,7 +120,7 @@ class ExamPlanner:
             postures,
             known.robot.indenter_radius_m,
             exam.depth_m,
-            bend or STRAIGHT_RAD,
+            bend or KINEMATIC_LIMITS.straight_rad,
             lambda q0, q1: self._motion(free, q0, q1),
         )
         joined = scan_of(exam, perceived.surface.in_A).joined
@@ -170,12 +178,12 @@ def look_postures(known: ExamInput) -> list[Array]:
     They are the home posture, turned about the vertical.
     """
     kinematics = ArmKinematics(known.robot, known.limits)
-    size = (known.exam.region_m[0] + 2 * VIEW_MARGIN_M, known.exam.region_m[1] + 2 * VIEW_MARGIN_M)
+    size = (known.exam.region_m[0] + 2 * SCAN.view_margin_m, known.exam.region_m[1] + 2 * SCAN.view_margin_m)
     corners = region_corners(np.array(known.X_WA), known.exam.centre_m, size)
     view = ViewPyramid(kinematics, known.robot, np.array(known.camera.position_m), corners)
     scene = CollisionScene(kinematics, known.robot)
     postures = []
-    for turn in TURNS_RAD:
+    for turn in SCAN.turns_rad:
         q = np.array(lbr.HOME)
         q[0] += turn
         if scene.free(q):

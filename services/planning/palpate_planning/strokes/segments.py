@@ -18,11 +18,20 @@ from palpate_planning.strokes.coverage import Stroke, transfer
 from palpate_planning.strokes.path import SurfacePath, centre, lay, least_twist, pose
 from palpate_planning.wall.surface import PerceivedSurface
 
-HOVER_M = 0.025
-"""Height of the sphere's deepest point above the surface before, between and after strokes: twice the usual error of the
-perceived surface (`wall.correction`)."""
-POSTURE_EVERY = 4
-"""Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
+
+@dataclass(frozen=True)
+class SegmentTuning:
+    """Heights and sampling of segments."""
+
+    hover_m: float = 0.025
+    """Height of the sphere's deepest point above the surface before, between and after strokes: twice the usual error of the
+    perceived surface (`wall.wall`)."""
+    posture_every: int = 4
+    """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
+
+
+SEGMENTS = SegmentTuning()
+
 REACH = Cause(Reason.OUT_OF_REACH, "out of the arm's reach")
 STRETCHED = Cause(Reason.ARM_STRETCHED, "within reach of a stretched arm only")
 
@@ -135,7 +144,7 @@ class SegmentPlanner:
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
-            goal = pose(least_twist(-n, self._R_ref), centre(p, n, self._radius, -HOVER_M))
+            goal = pose(least_twist(-n, self._R_ref), centre(p, n, self._radius, -SEGMENTS.hover_m))
             near = self._postures[piece.targets[end]]
             solution = self._kinematics.solve(goal, near, near)
             good = solution.ok and self._scene.free(solution.q)
@@ -153,7 +162,7 @@ class SegmentPlanner:
         key = (_place(before, -1), _place(after, 0))
         if key not in self._paths:
             xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
-            path, troubles = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -HOVER_M)
+            path, troubles = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -SEGMENTS.hover_m)
             start, goal = self.hover(before, -1), self.hover(after, 0)
             if not troubles:
                 self._paths[key] = (Segment(path, contact=False), NO_CAUSE)
@@ -172,7 +181,7 @@ class SegmentPlanner:
         centres = centre(p, n, self._radius, depth)
         known = self._postures[stroke.targets]
         near = np.column_stack([np.interp(s, s[stroke.visits], known[:, j]) for j in range(7)])
-        solved = np.unique(np.concatenate((np.arange(0, len(s), POSTURE_EVERY), stroke.visits, [len(s) - 1])))
+        solved = np.unique(np.concatenate((np.arange(0, len(s), SEGMENTS.posture_every), stroke.visits, [len(s) - 1])))
         q = np.empty((len(solved), 7))
         troubles: Troubles = []
         for row, i in enumerate(solved):

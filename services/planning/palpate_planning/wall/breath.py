@@ -70,8 +70,8 @@ class Breath:
         self._steps, self._growths = 0.0, 0.0
         """Weighted number of steps, and weighted sum of r^2 in `uncertainty` [m^2/s^2]."""
 
-    def hear(self, motion: BreathObservation, t: int) -> None:
-        """Takes the newest motion of perception at `t` [ns]."""
+    def receive(self, motion: BreathObservation, t: int) -> None:
+        """Update with the latest motion of perception at `t` [ns]."""
         before, last = self.displacement(t), self._motion
         self._motion, self._gap = motion, 0.0
         self._seen.append((motion.stamp, float(motion.forecast[0])))

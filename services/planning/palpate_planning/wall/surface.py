@@ -87,9 +87,7 @@ class BicubicField:
     """Height and slopes over a plane, interpolated by bicubic B-splines (twice continuously differentiable)."""
 
     def __init__(self, x: Array, y: Array, values: Array) -> None:
-        """Takes height [m], slope along x and slope along y at grid lines x (nx,) and y (ny,) [m]: `values`, shape (nx, ny,
-        3).
-        """
+        """`values`: height [m] and slopes along x and y at grid lines x (nx,) and y (ny,) [m], shape (nx, ny, 3)."""
         along_x = make_interp_spline(x, values, k=3, bc_type="clamped", axis=0)
         along_xy = make_interp_spline(y, along_x.c, k=3, bc_type="clamped", axis=1)
         self.spline = BicubicSpline(along_x.t, along_xy.t, np.ascontiguousarray(along_xy.c.swapaxes(0, 1)))

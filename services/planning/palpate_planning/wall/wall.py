@@ -4,26 +4,185 @@ At a position x in A's xy plane the wall is outward of the perceived surface by
 
     c(x) + m(x) w(t)
 
-with the correction c (`correction`), the breathing mode m (`perception/surface`) and the displacement w where m is 1 (`breath`).
+with the correction c (`SurfaceCorrection`), the breathing mode m (`perception/surface`) and the displacement w where m is 1
+(`breath`). The correction is a Gaussian process. Camera and arm agree to centimetres, but the error is smooth: an offset, a tilt,
+and a bending field of the camera (parameters of `CorrectionPrior`),
+
+    k(x, x') = offset_m^2 + tilt_rad^2 x.x' + a^2 field_m^2 exp(-|x - x'|^2 / (2 field_length_m^2)).
+
+Each touch measures c at its position with an independent error s_i and the error of the breathing estimate b_i, which persists
+for some seconds and is shared with the next touch. From n touches (Rasmussen and Williams 2006, eq. 2.25 and 2.26)
+
+    c(x) = k(x)^T (K + S)^-1 y,     var c(x) = k(x, x) - k(x)^T (K + S)^-1 k(x),
+    S_ij = s_i^2 [i = j] + b_i b_j exp(-|t_i - t_j| / PRIOR.persistence_s).
+
+The roughness a of the error is estimated: of a few values the one with the highest posterior probability (their eq. 2.30).
+Without camera error a becomes small, and the surface is known to within the error of a touch.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import NearestNDInterpolator
+from scipy.linalg import cho_factor, cho_solve
 
 from palpate_models.numerics.frames import Array
 from palpate_planning.periods import SECOND
 from palpate_planning.wall.breath import Breath
-from palpate_planning.wall.correction import FeltHeight, SurfaceCorrection
 from palpate_planning.wall.surface import Foot, PerceivedSurface
 from palpate_planning.wall.touch import Onset, SkinDepth
 
+ROUGHNESSES = 2.0 ** np.arange(-5, 2)
+"""Candidate values of a."""
 
-class TouchedSkin(NamedTuple):
+
+@dataclass(frozen=True)
+class CorrectionPrior:
+    """Prior of the correction."""
+
+    offset_m: float = 0.012
+    """SD of the offset before any touch: camera and its calibration, arm and warm-up together [C]."""
+    tilt_rad: float = 0.025
+    """SD of the tilt about two axes: a laterally displaced camera sees a curved wall tilted, by 18 mrad on 12 tuning patients."""
+    field_m: float = 0.0006
+    """SD of the remaining camera field and of its drift beyond the fused frames: 0.50 mm on these patients."""
+    field_length_m: float = 0.020
+    """Correlation length of that field, from the variogram of these patients."""
+    log_roughness_sd: float = 0.5
+    """SD of log a about its expected value [A]."""
+    persistence_s: float = 10.0
+    """Time constant of depth errors shared by neighbouring pixels."""
+    mean_image_roughness: float = 0.35
+    """Expected a of a surface averaged over the images of a whole examination."""
+
+
+PRIOR = CorrectionPrior()
+
+
+class HeightMeasurement(NamedTuple):
+    """Height of the skin measured by a touch."""
+
+    xy_A: Array
+    """Position in A [m], shape (2,)."""
+    height: float
+    """Distance outward of the perceived surface [m]."""
+    sigma: float
+    """SD of the independent error [m]."""
+    breath_sigma: float = 0.0
+    """SD of the breathing estimate's error, which persists for some seconds [m]."""
+    t_s: float = 0.0
+    """Time [s]."""
+
+
+class SurfaceCorrection:
+    """The outward correction c(x) [m] and its SD. Positions are in A's xy plane [m]."""
+
+    def __init__(self, expected_roughness: float = 1.0) -> None:
+        """`expected_roughness`: expected a, 1 for the surface of one camera burst."""
+        self._expected = expected_roughness
+        self._touches: tuple[HeightMeasurement, ...] = ()
+        self._blurred = np.empty(0)
+        """Variance added to each touch by later scans of the surface [m^2]."""
+        self._learn()
+
+    @property
+    def roughness(self) -> float:
+        """Estimated roughness a of the error [1]."""
+        return self._fit.roughness
+
+    def touch(self, touch: HeightMeasurement) -> None:
+        """Add a touch."""
+        self._touches = (*self._touches, touch)
+        self._blurred = np.append(self._blurred, 0.0)
+        self._learn()
+
+    def revise(self, touch: HeightMeasurement) -> None:
+        """Replace the latest touch."""
+        self._touches = (*self._touches[:-1], touch)
+        self._learn()
+
+    def blur(self) -> None:
+        """Account for a new scan of the surface: earlier touches still inform offset and tilt, but not the field."""
+        self._blurred = self._blurred + 2 * (self._fit.roughness * PRIOR.field_m) ** 2
+        self._learn()
+
+    def _learn(self) -> None:
+        self._places = np.array([touch.xy_A for touch in self._touches]).reshape(-1, 2)
+        heights = np.array([touch.height for touch in self._touches])
+        errors = _errors(self._touches) + np.diag(self._blurred)
+        fits = (_fit(float(a), self._expected, self._places, heights, errors) for a in ROUGHNESSES)
+        self._fit = max(fits, key=lambda fit: fit.log_probability)
+
+    def averaged(self, outward: Callable[[Array], Array]) -> SurfaceCorrection:
+        """Return the correction, from the same touches, of a better surface, `outward` [m] of this one at positions (n, 2)."""
+        better = SurfaceCorrection(PRIOR.mean_image_roughness)
+        less = outward(self._places)
+        better._touches = tuple(t._replace(height=t.height - h) for t, h in zip(self._touches, less.tolist(), strict=True))
+        better._blurred = self._blurred
+        better._learn()
+        return better
+
+    def height(self, xy_A: Array) -> float:
+        """Return c [m] at a position, shape (2,)."""
+        return float(_covariance(xy_A, self._places, self._fit.roughness) @ self._fit.weights)
+
+    def sigma(self, xy_A: Array) -> float:
+        """Return the SD of c [m] at a position, shape (2,)."""
+        return self.at(xy_A)[1]
+
+    def at(self, xy_A: Array) -> tuple[float, float]:
+        """Return c and its SD [m] at a position, shape (2,)."""
+        height, sigma = self.over(xy_A[None])
+        return float(height[0]), float(sigma[0])
+
+    def over(self, xy_A: Array) -> tuple[Array, Array]:
+        """Return c and its SD [m] at positions, shape (n, 2): shapes (n,)."""
+        prior = PRIOR.offset_m**2 + PRIOR.tilt_rad**2 * (xy_A**2).sum(axis=1) + self._fit.roughness**2 * PRIOR.field_m**2
+        k = _covariance(xy_A, self._places, self._fit.roughness)
+        known = ((k @ self._fit.precision) * k).sum(axis=1)
+        return k @ self._fit.weights, np.sqrt(np.maximum(prior - known, 0.0))
+
+
+class _Fit(NamedTuple):
+    """The process given the touches for one roughness."""
+
+    roughness: float
+    precision: Array
+    """(K + S)^-1 [1/m^2]: evaluated at every step, changed rarely."""
+    weights: Array
+    """(K + S)^-1 y [1/m]."""
+    log_probability: float
+    """Log probability of touches and roughness up to a constant."""
+
+
+def _errors(touches: Sequence[HeightMeasurement]) -> Array:
+    """Return S, the covariance of the errors of n touches [m^2], shape (n, n)."""
+    own, breath, t = np.array([(touch.sigma, touch.breath_sigma, touch.t_s) for touch in touches]).reshape(-1, 3).T
+    return np.asarray(np.diag(own**2) + np.outer(breath, breath) * np.exp(-np.abs(t[:, None] - t) / PRIOR.persistence_s))
+
+
+def _fit(roughness: float, expected: float, places: Array, heights: Array, errors: Array) -> _Fit:
+    """Fit the process with expected roughness `expected` to touches at positions (n, 2) with heights (n,) [m] and errors S."""
+    factor = cho_factor(_covariance(places, places, roughness) + errors, lower=True)
+    weights = cho_solve(factor, heights)
+    prior = -0.5 * (math.log(roughness / expected) / PRIOR.log_roughness_sd) ** 2
+    evidence = -0.5 * float(heights @ weights) - float(np.log(np.diag(factor[0])).sum())
+    return _Fit(roughness, cho_solve(factor, np.eye(len(heights))), weights, prior + evidence)
+
+
+def _covariance(a: Array, b: Array, roughness: float) -> Array:
+    """Return the prior covariance of positions a, shape (..., 2), and b, shape (n, 2): shape (..., n)."""
+    apart = ((a[..., None, :] - b) ** 2).sum(axis=-1)
+    field = PRIOR.field_m**2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
+    return np.asarray(PRIOR.offset_m**2 + PRIOR.tilt_rad**2 * (a @ b.T) + roughness**2 * field)
+
+
+class PublishedTouch(NamedTuple):
     """One touch of the skin, as published on `exam/touches`."""
 
     p_W: Array
@@ -39,7 +198,7 @@ class TouchedSkin(NamedTuple):
     """SD of `expected` [m]."""
 
 
-class WallPlace(NamedTuple):
+class WallEstimate(NamedTuple):
     """Estimated wall at one position, outward of the perceived surface at the end of expiration."""
 
     correction: float
@@ -54,7 +213,7 @@ class Wall:
     """Estimated position of the skin and its uncertainty."""
 
     def __init__(self, perceived: PerceivedSurface, breath: Breath) -> None:
-        """Starts without correction."""
+        """Start without correction."""
         self.perceived, self.breath = perceived, breath
         self.correction = SurfaceCorrection()
         self.shift_A = np.zeros(2)
@@ -63,7 +222,7 @@ class Wall:
         self._touched: tuple[Foot, float] | None = None
         """Foot of the latest touch and the correction there before it [m]."""
 
-    def seen_again(self, perceived: PerceivedSurface) -> Wall:
+    def rescanned(self, perceived: PerceivedSurface) -> Wall:
         """Return the wall for a new perceived surface; keeps the offset and tilt learned from touches."""
         wall = Wall(perceived, self.breath)
         wall.correction, wall._first = self.correction, self._first
@@ -104,23 +263,25 @@ class Wall:
         """Return the SD of the wall's height [m] at a position, shape (2,), at `t` [ns]."""
         return self.at(xy_A, t).sigma
 
-    def at(self, xy_A: Array, t: int) -> WallPlace:
+    def at(self, xy_A: Array, t: int) -> WallEstimate:
         """Return the wall at a position, shape (2,), at `t` [ns]."""
         (correction, sigma), share = self.correction.at(xy_A), self.perceived.breathing(xy_A)
-        return WallPlace(correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t)))
+        return WallEstimate(
+            correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t))
+        )
 
-    def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[TouchedSkin, float]:
-        """Updates the correction with a touch under `foot` at `t` [ns]; returns the touch and the change in wall height [m]."""
+    def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[PublishedTouch, float]:
+        """Update the correction by a touch under `foot` at `t` [ns]; return the touch and the change in wall height [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
         moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)
-        felt = FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
-        self.correction.touch(felt)
+        measured = HeightMeasurement(foot.xy_A, before - touch.depth, touch.sigma, moved, t / SECOND)
+        self.correction.touch(measured)
         self._touched = foot, before
-        observed = TouchedSkin(foot.p_W, stroke, felt.height, math.hypot(touch.sigma, moved), before, before_sigma)
+        observed = PublishedTouch(foot.p_W, stroke, measured.height, math.hypot(touch.sigma, moved), before, before_sigma)
         return observed, self.correction.height(foot.xy_A) - before
 
     def revise(self, onset: Onset) -> float | None:
-        """Refits the last touch with measured instead of forecast breathing; returns the change in wall height [m].
+        """Refit the last touch with measured instead of forecast breathing; return the change in wall height [m].
 
         Returns None while the breathing is not measured. With the forecast the error of a touch is 0.5 to 1.2 mm, with measured
         breathing half of that.
@@ -132,7 +293,9 @@ class Wall:
         share, previous = self.perceived.breathing(foot.xy_A), self.correction.height(foot.xy_A)
         touch = onset.touch_again(share * seen)
         moved = share * self.breath.seen_uncertainty
-        self.correction.revise(FeltHeight(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND))
+        self.correction.revise(
+            HeightMeasurement(foot.xy_A, before - touch.depth, touch.sigma, moved, float(onset.times[-1]) / SECOND)
+        )
         return self.correction.height(foot.xy_A) - previous
 
 

@@ -1,0 +1,144 @@
+"""`palpate faults`: runs the fault campaign and shows its findings in the terminal and on docs/faults.md."""
+
+from __future__ import annotations
+
+import tempfile
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Annotated
+
+import typer
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from palpate.console import EXIT_FAILED, CaseDisplay, output_file, refuse
+from palpate.report.files import docs_option, write_part, write_text
+from palpate_benchmarks.fault_cases import KINDS, CaseOutcome, FaultFinding, csv_text, from_csv, in_order
+
+MODES = ("lockstep", "wallclock")
+WIDTH = 200
+"""Least width of the table in characters."""
+COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
+SUMMARY = (
+    "mode",
+    "fault",
+    "cases",
+    "passed",
+    "detected",
+    "after: median, longest [ms]",
+    "largest force [N]",
+    "outcomes",
+)
+
+
+def faults(  # noqa: PLR0913 - the options of a command
+    mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
+    kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all by default.")] = None,
+    only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
+    out: Annotated[Path, output_file("File for the findings; cases in it are skipped.", "--out", "-o")] = Path("faults.csv"),
+    docs: Annotated[Path | None, docs_option("faults")] = None,
+    again: Annotated[bool, typer.Option("--again", help="Repeat cases that are in the file.")] = False,
+    limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
+    random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
+    seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
+) -> None:
+    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the findings."""
+    from palpate_benchmarks.campaign import cases, forks, run_case
+    from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
+
+    console = Console(stderr=True, width=max(WIDTH, Console().width))
+    modes, kinds = mode or MODES, kind or KINDS
+    for name, given, known in (("--mode", modes, MODES), ("--kind", kinds, KINDS)):
+        for value in given:
+            if value not in known:
+                refuse(f"{name} {value}: allowed are {', '.join(known)}")
+    found = _load(out)
+    todo = [*fixed(modes, kinds, only or ()), *cases(modes, kinds, only or ()), *drawn(random, seed, modes)]
+    if not todo:
+        refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
+    if not again:
+        done = {finding.identity for finding in found}
+        todo = [case for case in todo if (case.kind, case.where, case.mode, case.at_s) not in done]
+    todo = todo[:limit]
+    started_by = forks()
+    with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
+        display.show(0, len(todo), "")
+        for number, case in enumerate(todo, 1):
+            finding = run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by)
+            found = [f for f in found if f.identity != finding.identity] + [finding]
+            write_text(out, csv_text(found))
+            mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
+            display.show(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
+    Console(width=max(WIDTH, Console().width)).print(table(found))
+    if docs is not None:
+        write_part(docs, "faults", markdown(found))
+    if any(not finding.good for finding in found):
+        raise typer.Exit(EXIT_FAILED)
+
+
+def _load(path: Path) -> list[FaultFinding]:
+    """Return the findings in a file, without those whose fault was not injected: they are run again."""
+    if not path.exists():
+        return []
+    try:
+        found = from_csv(path.read_text(encoding="utf-8"))
+    except ValueError as error:
+        refuse(f"--out {path}: holds no findings of this command: {error}")
+    return [finding for finding in found if finding.injected_s is not None]
+
+
+def table(findings: Sequence[FaultFinding]) -> Table:
+    """Return the table for a terminal, one row per case."""
+    shown = Table(*COLUMNS, box=None)
+    for finding in in_order(findings):
+        shown.add_row(*map(escape, _row(finding)), style=None if finding.good else "bold red")
+    return shown
+
+
+def _row(finding: FaultFinding) -> tuple[str, ...]:
+    after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
+    peak = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
+    force = f"{finding.peak_force_before_n:.1f}, {peak}"
+    return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
+
+
+def markdown(findings: Sequence[FaultFinding]) -> str:
+    """Return the summary for the documentation; `csv_text` has every case."""
+    good = sum(f.good for f in findings)
+    largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
+    lines = [f"{good} of {len(findings)} cases passed; the largest force was {largest:.1f} N.", ""]
+    lines += _markdown_table(SUMMARY, _summary(findings))
+    bad = [f"**!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in in_order(findings) if not f.good]
+    return "\n".join([*lines, *([""] if bad else []), *bad]) + "\n"
+
+
+def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "/").replace("\n", " ") for cell in cells) + " |"
+
+    return [line(head), "|---" * len(head) + "|", *map(line, rows)]
+
+
+def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
+    """Return one row per mode and kind."""
+    rows: list[tuple[str, ...]] = []
+    for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
+        cases = [f for f in findings if (f.mode, f.kind) == (mode, kind)]
+        after = [f.detected_ms for f in cases if f.detected_ms is not None]
+        outcomes = Counter(f.reaction if f.outcome is CaseOutcome.ENDED else "continued" for f in cases)
+        rows.append(
+            (
+                mode,
+                kind,
+                str(len(cases)),
+                str(sum(f.good for f in cases)),
+                str(len(after)),
+                f"{median(after):.0f}, {max(after):.0f}" if after else "",
+                f"{max(f.peak_force_n or 0.0 for f in cases):.1f}",
+                ", ".join(f"{outcome} {count}" for outcome, count in outcomes.most_common()),
+            )
+        )
+    return rows
