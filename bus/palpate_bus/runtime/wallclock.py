@@ -3,8 +3,8 @@
 `t` counts periods since the common start, with absolute deadlines, so that no drift builds up. A late step is counted as an
 overrun. The service of a critical role simulates physics, which has to keep time: it catches up tick by tick, unless it is later
 than `TIMES.catch_up_ns` or drives real hardware. All others skip to the present tick, since an old command is useless and stamps
-must stay on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks the
-contract is dropped where it is sent or received, so that its readers act as on silence.
+must stay on the common clock. No service waits for another; expiry protects the readers of a late sample. A message that breaks
+the contract is dropped where it is sent or received, so that its readers act as on silence.
 
 On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
 """
