@@ -27,6 +27,7 @@ AT_REST: Final[dict[str, Any]] = {
     "stroke": 0,
     "patient_moved": False,
     "reason": ExamState.REASON_NONE,
+    "culprit": "",
 }
 """Fields without contact."""
 

@@ -6,18 +6,23 @@ Run: `palpate study moved --runs -o FOLDER`, then `python -m research.moved FOLD
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Final
 
 import numpy as np
 import typer
 
-from palpate.report.archive import EvidenceError, read_evidence
+from palpate.report.archive import FILE, EvidenceError, read_evidence
+from palpate_bus.contract import contract
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.codec import Message, decode
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.recordings import open_recording
+from palpate_models.numerics.frames import Array
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import ScenarioError, load_scenario
 
-NOTICED: Final = "the patient has moved"
-"""Text of `exam/state` on detection."""
 LIFTED_S: Final = 3.0
 """Time after the start of the motion until the arm is clear of the skin [s]."""
 
@@ -42,8 +47,7 @@ def noticed(folder: Path) -> Noticed:
     """Return the detection of the motion in the run of a folder. Raises EvidenceError or ScenarioError."""
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
     at_s = BodyMotion(scenario.phantom.motion, scenario.seed).at_s
-    detected = np.array([event.time_s for event in evidence.events if event.text == NOTICED])
-    looked = np.array([event.time_s for event in evidence.events if event.text.startswith(f"{NOTICED}: ")])
+    detected, looked = _reported(folder)
     during = (evidence.true_time >= at_s) & (evidence.true_time < at_s + LIFTED_S)
     over = at_s > evidence.time[-1]
     return Noticed(
@@ -53,6 +57,20 @@ def noticed(folder: Path) -> Noticed:
         peak_force_n=float(np.max(evidence.true_force[during], initial=0.0)),
         looked_s=float(np.min(looked[looked >= at_s], initial=np.inf)) - at_s,
     )
+
+
+def _reported(folder: Path) -> tuple[Array, Array]:
+    """Return when planning detected a motion and when it began to look again [s], shapes (n,) and (m,)."""
+    kind = contract().topics["exam/state"].type
+    states = [decode(message.payload, kind) for message in open_recording(folder / FILE).messages(["exam/state"])]
+    changes = [(before, state) for before, state in pairwise(states) if state.reason == ExamState.REASON_PATIENT_MOVED]
+    detected = [state for before, state in changes if before.reason != state.reason]
+    looked = [state for before, state in changes if before.phase != state.phase == ExamState.PHASE_LOOK]
+    return np.array([_seconds(state) for state in detected]), np.array([_seconds(state) for state in looked])
+
+
+def _seconds(state: Message) -> float:
+    return nanoseconds(state.header.stamp) / NS
 
 
 def main(folders: Annotated[list[Path], typer.Argument(help="Folders of runs whose patients move.")]) -> None:

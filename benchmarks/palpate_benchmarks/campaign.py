@@ -7,14 +7,13 @@ its delay, the peak true force, and the outcome of the run. Delays are wall time
 
 from __future__ import annotations
 
-import re
 import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from math import isfinite
 from pathlib import Path
 from time import monotonic
-from typing import Any, Final, NamedTuple
+from typing import Any, Final
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
@@ -59,12 +58,17 @@ class CaseOver(RunFailed):
         super().__init__(FailureCode.STOPPED, text)
 
 
-class Sign(NamedTuple):
-    """A message that reports a problem."""
+@dataclass(frozen=True)
+class Sign:
+    """A message that reports a problem. The text does not count in comparisons."""
 
     source: str
     """Role that reported it (supervisor, driver or planning); empty for the conductor."""
-    text: str
+    code: int
+    """Cause or reason; for the conductor the number of its message."""
+    culprit: str
+    """Role or topic at fault, if the message has one."""
+    text: str = field(compare=False)
 
     def __str__(self) -> str:
         return f"{self.source}: {self.text}" if self.source else self.text
@@ -102,7 +106,7 @@ class _Watch:
         if self.finding.injected_s is None:
             self._inject(progress)
             return
-        new = [sign for sign in _signs(progress) if sign not in (*self.signs, *self.before)]
+        new = [sign for sign in signs_of(progress) if sign not in (*self.signs, *self.before)]
         if new and not self.signs:
             self.finding.detected_ms = round((monotonic() - self.since) * 1e3, 1)
             self.finding.sign = str(new[0])
@@ -141,7 +145,7 @@ class _Watch:
         if progress.t - self.phase_since < self.case.at_s * NS and wanted == ExamState.PHASE_SCAN:
             return
         self.finding.injected_s = _now_s(progress, wallclock=self.case.wallclock)
-        self.since, self.before = monotonic(), _signs(progress)
+        self.since, self.before = monotonic(), signs_of(progress)
         number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(self.case.kind, signal.SIGUSR1)
         self.local.running[self.target].send_signal(number)
 
@@ -152,19 +156,20 @@ def _now_s(progress: RunProgress, *, wallclock: bool) -> float:
     return max(received, received / progress.real_time_factor - WALLCLOCK_LEAD / NS) if wallclock else received
 
 
-def _signs(progress: RunProgress) -> list[Sign]:
+def signs_of(progress: RunProgress) -> list[Sign]:
     """Return all messages that report a problem."""
-    found = [Sign("", text) for text in progress.trouble]
+    found = [Sign("", number, "", text) for number, text in enumerate(progress.trouble)]
     collected = progress.collected
-    if collected.supervisor is not None and collected.supervisor.level != SupervisorState.LEVEL_OK:
-        found.append(Sign("supervisor", collected.supervisor.reason))
+    stop = collected.supervisor
+    if stop is not None and stop.level != SupervisorState.LEVEL_OK:
+        found.append(Sign("supervisor", stop.cause, stop.culprit, stop.reason))
     held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
-    found += [Sign("driver", status.reason) for status in held]
+    found += [Sign("driver", status.cause, status.culprit, status.reason) for status in held]
     exam = collected.exam
     if exam is not None and (
         exam.phase in (ExamState.PHASE_HELD, ExamState.PHASE_ABORTED) or exam.reason == ExamState.REASON_SERVICE_LOST
     ):
-        found.append(Sign("planning", exam.message))
+        found.append(Sign("planning", exam.reason, exam.culprit, exam.message))
     return found
 
 
@@ -236,7 +241,7 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     collected = result.collected
     last = RunProgress(0, 0.0, collected, ())
     if finding.injected_s is not None:
-        watch.signs += [sign for sign in _signs(last) if sign not in (*watch.signs, *watch.before)]
+        watch.signs += [sign for sign in signs_of(last) if sign not in (*watch.signs, *watch.before)]
         failed = result.failure is not None and not (watch.outcome is not None and watch.outcome.unharmed)
         if finding.detected_ms is None and (watch.signs or failed):
             finding.detected_ms = round((monotonic() - watch.since) * 1e3, 1)
@@ -254,10 +259,10 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
     if finding.injected_s is None:
         finding.outcome, finding.ended = CaseOutcome.ENDED, f"the fault was not injected: {finding.ended}"
     finding.reaction = _reaction(collected, finding.outcome)
-    producer = contract().topics[finding.where].producer if finding.where in contract().topics else finding.where
-    found = {*result.lost, *(() if result.failure is None else (*result.failure.roles, *result.failure.topics))}
-    texts = [finding.ended, *(sign.text for sign in watch.signs)]
-    finding.named = not found.isdisjoint((finding.where, producer)) or mentioned((finding.where, producer), texts)
+    blamed = {*result.lost, *(sign.culprit for sign in (*watch.signs, *signs_of(last)))}
+    if result.failure is not None:
+        blamed.update(result.failure.roles, result.failure.topics)
+    finding.named = not with_producers(blamed).isdisjoint(with_producers({finding.where}))
 
 
 def set_peaks(finding: FaultFinding, forces: Sequence[tuple[int, float]], split: float) -> None:
@@ -267,10 +272,11 @@ def set_peaks(finding: FaultFinding, forces: Sequence[tuple[int, float]], split:
     finding.peak_force_n = round(max(after), 2) if after else None
 
 
-def mentioned(names: Iterable[str], texts: Iterable[str]) -> bool:
-    """True if one of the texts has one of the names as a word."""
-    text = " ".join(texts)
-    return any(re.search(rf"(?<![\w/]){name}(?!\w)", text) for name in names)
+def with_producers(names: Iterable[str]) -> set[str]:
+    """Return these roles and topics, and the roles that publish the topics."""
+    topics = contract().topics
+    names = set(names)
+    return names | {topics[name].producer for name in names if name in topics}
 
 
 def _reaction(collected: Any, outcome: CaseOutcome) -> str:

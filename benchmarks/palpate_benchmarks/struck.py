@@ -30,7 +30,7 @@ from palpate.run.group import apart
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, measure
-from palpate_benchmarks.campaign import PATIENCE, SETTINGS, forks
+from palpate_benchmarks.campaign import PATIENCE, SETTINGS, forks, signs_of
 from palpate_benchmarks.fault_cases import LIMITS
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
@@ -76,7 +76,7 @@ class Struck:
     status: int | None
     """Exit status of the conductor; None if it hung."""
     said: dict[str, Any]
-    """Result printed by the conductor: failure, lost roles and received forces; empty if it was killed."""
+    """Result printed by the conductor: failure, lost roles, signs of the fault and received forces; empty if it was killed."""
     struck_s: float
     """Simulated time of the fault."""
     left_after_s: float
@@ -211,7 +211,9 @@ def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...
         result = conduct(session, roles, report_depth, local.ended, timing, PATIENCE)
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
     failure = None if result.failure is None else asdict(result.failure)
-    print(f"{RESULT}{json.dumps({'failure': failure, 'lost': list(result.lost), 'forces': forces})}", flush=True)
+    signs = [asdict(sign) for sign in signs_of(RunProgress(0, 0.0, result.collected, ()))]
+    said = {"failure": failure, "lost": list(result.lost), "signs": signs, "forces": forces}
+    print(f"{RESULT}{json.dumps(said)}", flush=True)
     close_session(session)
     local.stop(patience_s=3.0)
 

@@ -21,10 +21,10 @@ import psutil
 from palpate.report.archive import EvidenceError
 from palpate.report.recovery import recovered
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.campaign import mentioned, set_peaks
+from palpate_benchmarks.campaign import Sign, set_peaks, with_producers
 from palpate_benchmarks.fault_cases import SCARCE_KINDS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, TIMES, Blow, Struck, calm_rate, kept_rate, strike
-from palpate_bus.messages import ExamState, RobotStatus
+from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.recordings import RecordingError
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
@@ -48,6 +48,14 @@ KINDS: Final = ("kill", "freeze")
 PARTITION: Final = "partition"
 NETWORK: Final = "network"
 MACHINE: Final = "machine"
+LATE: Final = frozenset(
+    {
+        ("driver", RobotStatus.CAUSE_COMMAND_EXPIRED),
+        ("driver", RobotStatus.CAUSE_DEVICE),
+        ("supervisor", SupervisorState.CAUSE_SILENT),
+    }
+)
+"""Sources and causes of the signs of a machine that is too slow."""
 
 
 @dataclass(frozen=True)
@@ -123,10 +131,10 @@ def _run(case: FaultCase, folder: Path, rate: float) -> Struck | None:
 
 
 def _culprits(case: FaultCase) -> list[str]:
-    """Return roles, failure codes and keywords; the reported cause has to name one of them."""
+    """Return the roles or failure codes; the reported cause has to name one of them."""
     if case.kind == PARTITION:
-        return ["transport", FailureCode.TRANSPORT_LOST]
-    return ["machine", "processor", "late", "expired"] if case.kind == "starve" else case.where.split(TOGETHER)
+        return [FailureCode.TRANSPORT_LOST]
+    return [MACHINE, FailureCode.BLOCKED] if case.kind == "starve" else case.where.split(TOGETHER)
 
 
 def _blow(case: FaultCase) -> Blow:
@@ -199,22 +207,28 @@ def _run_partitioned(case: FaultCase, folder: Path, rate: float) -> Struck | Non
         subprocess.run(["ip", "netns", "del", name], check=True)
 
 
-def _judge(finding: FaultFinding, struck: Struck, roles: Sequence[str]) -> None:
+def _judge(finding: FaultFinding, struck: Struck, culprits: Sequence[str]) -> None:
     finding.injected_s = struck.struck_s
     finding.hung = struck.status is None or bool(struck.staying)
     failure: dict[str, Any] = struck.said.get("failure") or {}
     if not struck.said:
         failure, finding.kept = _recovered(struck.folder)
     text = failure.get("text", "")
-    finding.sign = _first_sign(struck) if CONDUCTOR in roles else text or ", ".join(struck.said.get("lost", ()))
+    finding.sign = _first_sign(struck) if CONDUCTOR in culprits else text or ", ".join(struck.said.get("lost", ()))
     if failure:
         finding.outcome, finding.ended = CaseOutcome.ENDED, text
     elif finding.kind in KINDS:
         finding.outcome, finding.ended = CaseOutcome.CONTINUED_WITHOUT, "completed without the disabled role"
     else:
         finding.outcome, finding.ended = CaseOutcome.COMPLETED, "complete"
-    found = {failure.get("code"), *failure.get("roles", ()), *struck.said.get("lost", ())}
-    finding.named = not found.isdisjoint(roles) or mentioned(roles, (finding.sign, finding.ended))
+    signs = [Sign(**sign) for sign in struck.said.get("signs", ())]
+    topics = (*failure.get("topics", ()), *(sign.culprit for sign in signs))
+    blamed = {failure.get("code"), *failure.get("roles", ()), *struck.said.get("lost", ()), *with_producers(topics)}
+    if any((sign.source, sign.code) in LATE for sign in signs):
+        blamed.add(MACHINE)
+    if CONDUCTOR in culprits and finding.sign:
+        blamed.add(CONDUCTOR)
+    finding.named = not blamed.isdisjoint(culprits)
     _measure(finding, struck)
     remove_leftovers()
     finding.left_behind = str(struck.own) if struck.own.exists() else ""

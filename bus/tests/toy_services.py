@@ -108,7 +108,7 @@ def _status(h: Any, x: Any, lost: bool) -> Any:
     fields = {name: x for name in ("applied_torque", "position", "velocity") if name in RobotStatus.__dataclass_fields__}
     if "wrench" in RobotStatus.__dataclass_fields__:
         fields["wrench"] = wrench()
-    return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", commands_rejected=0, **fields)
+    return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", culprit="", commands_rejected=0, **fields)
 
 
 class Control(Service):
@@ -123,7 +123,7 @@ class Control(Service):
                 pass
         joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")
         torque = np.sin(1.1 * joints.position + 1e-9 * t + (setpoint.joint_position if setpoint else 0.0))
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, duration_message(50 * MS), "")}
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, duration_message(50 * MS), "", "")}
 
 
 class Tissue(Service):
@@ -190,6 +190,7 @@ class Planning(Service):
                 0,
                 False,
                 0,
+                "",
             ),
         }
         if t % (500 * MS) == 0:
@@ -248,7 +249,7 @@ class Supervisor(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         depth = min(0.1, abs(float(inbox.latest("robot/status").position[0])))
-        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0)}
+        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0, "")}
 
 
 EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)

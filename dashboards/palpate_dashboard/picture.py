@@ -10,6 +10,7 @@ import io
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import groupby, takewhile
 from pathlib import Path
 from typing import Any
@@ -27,16 +28,25 @@ from palpate_models.scenario.load import load_scenario
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
 """WebGL without a graphics card."""
-TIMEOUT_S = 400
-"""A software rasteriser on a busy machine takes a minute or two for its first picture."""
-SCREENSHOT_INTERVAL_S = 3.0
-STABLE_FRACTION = 0.001
-"""Share of pixels that may still change between two screenshots."""
-DRAWN_COLOURS = 3_000
-"""A page with the scene drawn has more colours than this; before that it has at most two thousand."""
-COLOURS = 256
-BAR_PX = 36
-"""Height of the viewer's own top bar, which is cropped: it names the machine."""
+
+
+@dataclass(frozen=True)
+class Screenshots:
+    """When a page in a browser is drawn, and its picture."""
+
+    timeout_s: int = 400
+    """A software rasteriser on a busy machine takes a minute or two for its first picture."""
+    interval_s: float = 3.0
+    stable_share: float = 0.001
+    """Share of pixels that may still change between two screenshots."""
+    drawn_colours: int = 3_000
+    """A page with the scene drawn has more colours than this; before that it has at most two thousand."""
+    colours: int = 256
+    bar_px: int = 36
+    """Height of the viewer's own top bar, which is cropped: it names the machine."""
+
+
+SCREENSHOTS = Screenshots()
 FRAMES, FRAME_S, LAST_S, FILM_PX, FILM_COLOURS = 16, 0.6, 3.0, (840, 507), 96
 """Film: number of frames, duration of each and of the last one, size, number of colours."""
 
@@ -61,7 +71,7 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=list(ARGUMENTS))
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")
-        page.set_default_timeout(1000 * TIMEOUT_S)
+        page.set_default_timeout(1000 * SCREENSHOTS.timeout_s)
         page.goto(f"{address(port)}&renderer=webgl")
         try:
             yield page
@@ -71,9 +81,9 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
 
 
 def screenshot(page: Page) -> Pixels:
-    """Return the page below its top bar after a few seconds, shape (height - BAR_PX, width, 3)."""
-    page.wait_for_timeout(1000 * SCREENSHOT_INTERVAL_S)
-    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[BAR_PX:]
+    """Return the page below its top bar after a few seconds, shape (height less the bar, width, 3)."""
+    page.wait_for_timeout(1000 * SCREENSHOTS.interval_s)
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[SCREENSHOTS.bar_px :]
 
 
 @contextmanager
@@ -127,15 +137,15 @@ def film(folder: Path, target: Path, port: int, size: tuple[int, int], report: C
 
 def _small(image: Pixels) -> Image.Image:
     """Return the picture quantised to few colours, keeping rare ones."""
-    return Image.fromarray(image).quantize(COLOURS, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
+    return Image.fromarray(image).quantize(SCREENSHOTS.colours, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
 def _settled(page: Page) -> Pixels:
     before = screenshot(page)
-    for _ in range(int(TIMEOUT_S / SCREENSHOT_INTERVAL_S)):
+    for _ in range(int(SCREENSHOTS.timeout_s / SCREENSHOTS.interval_s)):
         image = screenshot(page)
         changed = float(np.mean(np.any(image != before, axis=2)))
-        if changed < STABLE_FRACTION and len(np.unique(image.reshape(-1, 3), axis=0)) > DRAWN_COLOURS:
+        if changed < SCREENSHOTS.stable_share and len(np.unique(image.reshape(-1, 3), axis=0)) > SCREENSHOTS.drawn_colours:
             return image
         before = image
-    raise NoPicture(f"the browser did not draw the page within {TIMEOUT_S} s")
+    raise NoPicture(f"the browser did not draw the page within {SCREENSHOTS.timeout_s} s")

@@ -6,6 +6,7 @@ It sends nothing, so it cannot change a run. Late messages are skipped.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from time import perf_counter
@@ -39,21 +40,30 @@ from palpate_models.scenario.schema import Robot, Scenario
 
 FILE: Final = "recording.rrd"
 CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
-MESH_PERIOD: Final = 100 * MS
-PLOT_PERIOD: Final = 50 * MS
-TEXT_PERIOD: Final = 500 * MS
-IMAGE_PERIOD: Final = 500 * MS
-MAP_PERIOD: Final = 1000 * MS
-SPARSE_PERIOD: Final = 2000 * MS
-"""Period of meshes and images in a sparse recording."""
-POSE_PERIOD: Final = 100 * MS
-"""Period of link poses in a sparse recording."""
+
+
+@dataclass(frozen=True)
+class ViewPeriods:
+    """Periods of what is drawn [ns], simulated."""
+
+    mesh_ns: int = 100 * MS
+    plot_ns: int = 50 * MS
+    text_ns: int = 500 * MS
+    image_ns: int = 500 * MS
+    map_ns: int = 1000 * MS
+    sparse_ns: int = 2000 * MS
+    """Period of meshes and images in a sparse recording."""
+    pose_ns: int = 100 * MS
+    """Period of link poses in a sparse recording."""
+    send_ns: int = 1000 * MS
+    """Simulated time per chunk of the file."""
+    send_live_ns: int = 200 * MS
+    """The same with a live viewer."""
+
+
+PERIODS = ViewPeriods()
 FORECAST_INDEX: Final = 4
 """The drawn forecast of the breathing motion: 0.2 s ahead, about what planning uses."""
-SEND_PERIOD: Final = 1000 * MS
-"""Simulated time per chunk of the file."""
-SEND_PERIOD_LIVE: Final = 200 * MS
-"""The same with a live viewer."""
 ABOVE_SKIN_M: Final = 0.002
 """Height of outlines above the surface."""
 FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
@@ -94,7 +104,7 @@ class DashboardService(Service):
         layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, plane.bounds)
         self._recording = open_recording(path, live, layout, scenario.name, "" if path is None else run_of(path.parent))
         self._force_depth = ForceDepth(self._recording, plane)
-        self._send_period = SEND_PERIOD_LIVE if paced and live != Live() else SEND_PERIOD
+        self._send_period = PERIODS.send_live_ns if paced and live != Live() else PERIODS.send_ns
         self._columns = Columns(self._recording)
         self._scene = SceneView(self._recording, self._columns)
         self._map = MapView(self._recording, exam.region_m, exam.centre_m)
@@ -123,24 +133,24 @@ class DashboardService(Service):
         self._busy_s = 0.0
         often = full or live != Live()
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/surface", MESH_PERIOD if often else SPARSE_PERIOD, self._surface),
+            ("sim/surface", PERIODS.mesh_ns if often else PERIODS.sparse_ns, self._surface),
             ("truth/phantom", 0, self._phantom),
             ("tf_static", 0, self._tf_static),
-            ("camera/depth/camera_info", IMAGE_PERIOD, self._camera_info),
-            ("camera/depth/image_raw", IMAGE_PERIOD if often else SPARSE_PERIOD, self._depth),
-            ("perception/points", IMAGE_PERIOD, self._points),
-            ("perception/surface", IMAGE_PERIOD, self._perceived),
+            ("camera/depth/camera_info", PERIODS.image_ns, self._camera_info),
+            ("camera/depth/image_raw", PERIODS.image_ns if often else PERIODS.sparse_ns, self._depth),
+            ("perception/points", PERIODS.image_ns, self._points),
+            ("perception/surface", PERIODS.image_ns, self._perceived),
             ("perception/targets", 0, self._targets),
-            ("perception/motion", PLOT_PERIOD, self._wall),
+            ("perception/motion", PERIODS.plot_ns, self._wall),
             ("planning/path", 0, self._path_planned),
-            ("exam/state", PLOT_PERIOD, self._exam),
-            ("truth/indentation", PLOT_PERIOD, self._indentation),
-            ("truth/patient", PLOT_PERIOD, self._patient),
-            ("sim/link_poses", PLOT_PERIOD if often else POSE_PERIOD, self._link_poses),
-            ("robot/status", PLOT_PERIOD, self._robot_status),
-            ("assessment/map", MAP_PERIOD, self._stiffness),
+            ("exam/state", PERIODS.plot_ns, self._exam),
+            ("truth/indentation", PERIODS.plot_ns, self._indentation),
+            ("truth/patient", PERIODS.plot_ns, self._patient),
+            ("sim/link_poses", PERIODS.plot_ns if often else PERIODS.pose_ns, self._link_poses),
+            ("robot/status", PERIODS.plot_ns, self._robot_status),
+            ("assessment/map", PERIODS.map_ns, self._stiffness),
             ("assessment/findings", 0, self._findings),
-            ("diagnostics", TEXT_PERIOD, self._diagnostics),
+            ("diagnostics", PERIODS.text_ns, self._diagnostics),
         )
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -274,9 +284,9 @@ class DashboardService(Service):
         self._force_depth.add(t, message.depth, message.normal_force, self._in_contact)
         self._plots.depth(t, message.depth, message.depth_setpoint)
         self._plots.progress(t, message.target_index, message.target_count)
-        if not self._is_due("text", t, TEXT_PERIOD):
+        if not self._is_due("text", t, PERIODS.text_ns):
             return
-        self._due["text"] = t + TEXT_PERIOD
+        self._due["text"] = t + PERIODS.text_ns
         self._plots.document(t, "text/status", text.status(self._name, phase, message, self._robot, self._speed))
 
     def _indentation(self, t: int, message: Message) -> None:

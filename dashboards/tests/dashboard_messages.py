@@ -224,14 +224,14 @@ def robot_status(t: int, torque: Array) -> Any:
         "applied_torque": torque,
         "commands_rejected": 0,
     }
-    return RobotStatus(header=header(t), mode=1, cause=0, reason="", **rest)
+    return RobotStatus(header=header(t), mode=1, cause=0, reason="", culprit="", **rest)
 
 
 def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:
     pressed = force > 0.1
     return ExamState(
         header(t, "world"), phase, message, visited, 200, 1, pressed, pressed, False, False, 0.01 if pressed else 0.0,
-        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, 1, False, 0,
+        depth, force, Point(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 1.0), -1, 0.0005, 0.0, 1, False, 0, "",
     )  # fmt: skip
 
 

@@ -17,7 +17,7 @@ import pytest
 from dashboard_messages import FakeInbox, run
 
 from palpate_dashboard import palette
-from palpate_dashboard.picture import BROWSERS, TIMEOUT_S, page_at, screenshot
+from palpate_dashboard.picture import BROWSERS, SCREENSHOTS, page_at, screenshot
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_models.scenario.schema import Scenario
@@ -51,14 +51,14 @@ def share(image: np.ndarray, color: palette.Rgba, reach: int) -> float:
 
 def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
     """Until `process` listens at `port`."""
-    until = monotonic() + TIMEOUT_S
+    until = monotonic() + SCREENSHOTS.timeout_s
     while monotonic() < until:
         assert process.poll() is None, f"it left with status {process.poll()}"
         with socket.socket() as probe:
             if probe.connect_ex(("127.0.0.1", port)) == 0:
                 return
         sleep(0.2)
-    pytest.fail(f"nothing listens at {port} after {TIMEOUT_S} s")
+    pytest.fail(f"nothing listens at {port} after {SCREENSHOTS.timeout_s} s")
 
 
 def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> np.ndarray:
@@ -66,7 +66,7 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> n
     pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")
-    until = monotonic() + TIMEOUT_S
+    until = monotonic() + SCREENSHOTS.timeout_s
     seen: dict[str, float] = {}
     with page_at(port, 1000, 700) as page:
         while monotonic() < until:
@@ -74,7 +74,7 @@ def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> n
             seen = {name: share(image, color, reach) for name, (color, reach, _) in wanted.items()}
             if all(seen[name] > least for name, (_, _, least) in wanted.items()):
                 return image
-    pytest.fail(f"not drawn within {TIMEOUT_S} s: {seen}")
+    pytest.fail(f"not drawn within {SCREENSHOTS.timeout_s} s: {seen}")
 
 
 def start(words: list[str], environment: dict[str, str], log: IO[str] | None = None) -> subprocess.Popen[bytes]:
@@ -112,7 +112,7 @@ def test_a_run_that_is_joined_late_is_drawn(tmp_path: Path) -> None:
     recording = tmp_path / "out" / "recording_mcap" / "recording_mcap_0.mcap"
     watching = None
     try:
-        until = monotonic() + TIMEOUT_S
+        until = monotonic() + SCREENSHOTS.timeout_s
         while not (recording.is_file() and recording.stat().st_size > 1_000_000):  # it has looked: the start is over
             assert running.poll() is None, "the run ended before it could be joined"
             assert monotonic() < until, "the run did not start"

@@ -7,8 +7,8 @@ from collections.abc import Iterable
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import SurfaceMesh
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 
@@ -48,8 +48,7 @@ def level(t: int, half: float, pitch: float, middle: Iterable[float]) -> Message
     """Return the `palpation_msgs/SurfaceMesh` at `t` [ns] of a level square about `middle` in world [m]."""
     x, y, triangles = grid(half, pitch)
     vertices = np.column_stack((x, y, np.zeros_like(x))) + np.array(tuple(middle))
-    up = np.tile((0.0, 0.0, 1.0), x.size).astype(np.float32)
-    return SurfaceMesh(header(t, "world"), vertices.astype(np.float32).ravel(), up, triangles.ravel(), np.empty(0, np.float32))
+    return mesh_message(header(t, "world"), vertices, np.tile((0.0, 0.0, 1.0), x.size), triangles)
 
 
 def depth_image(K: Array, X_AC: Array, shape: tuple[int, int], floor: float) -> Array:

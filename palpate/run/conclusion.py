@@ -6,6 +6,7 @@ import logging
 import tempfile
 from contextlib import nullcontext
 from pathlib import Path
+from typing import Final
 
 import typer
 from rich.console import Console
@@ -18,13 +19,21 @@ from palpate.run.folder import another_folder, megabytes_of
 from palpate.run.roles import write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import violations
-from palpate_bus.messages import RobotStatus
+from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunResult
 from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
+HOLD_REASONS: Final = (
+    ExamState.REASON_OPERATOR_STOP,
+    ExamState.REASON_ROBOT_HOLD,
+    ExamState.REASON_EMERGENCY_STOP,
+    ExamState.REASON_NOT_RELEASED,
+)
+"""Reasons for which planning gives up with a text that has the cause of the hold."""
 
 
 def conclude(
@@ -61,7 +70,10 @@ def conclude(
 def _hold_text(result: RunResult) -> str:
     """Return since when and why the arm is held, if the failure does not say it."""
     changes = result.collected.status_changes
-    if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD or changes[-1].reason in str(result.failure or ""):
+    if not changes or changes[-1].mode != RobotStatus.MODE_SAFE_HOLD:
+        return ""
+    exam, failure = result.collected.exam, result.failure
+    if failure is not None and failure.code is FailureCode.GAVE_UP and exam is not None and exam.reason in HOLD_REASONS:
         return ""
     return f"; the arm has been held since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
 

@@ -47,7 +47,7 @@ class Sent:
 
 
 def payload() -> bytes:
-    message = JointTorqueCommand(header(7_000_000_000_000), np.arange(7.0), duration_message(50_000_000), "")
+    message = JointTorqueCommand(header(7_000_000_000_000), np.arange(7.0), duration_message(50_000_000), "", "")
     return codec.encode(message, TOPIC.type)
 
 
@@ -116,10 +116,10 @@ def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
     return _Watch(FaultCase("nan", where, False), local, target, struck, since=1e12)
 
 
-def in_phase(phase: int, message: str = "") -> RunProgress:
+def in_phase(phase: int, culprit: str = "") -> RunProgress:
     messages = collected()
     last = messages.exam_states[-1]
-    messages.exam_states = [*messages.exam_states, ExamState(**{**vars(last), "phase": phase, "message": message})]
+    messages.exam_states = [*messages.exam_states, ExamState(**{**vars(last), "phase": phase, "culprit": culprit})]
     return RunProgress(0, 1.0, messages)
 
 
@@ -132,7 +132,7 @@ def in_phase(phase: int, message: str = "") -> RunProgress:
     ],
 )
 def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: CaseOutcome) -> None:
-    progress = in_phase(phase, "aborted: planning/setpoint refused")
+    progress = in_phase(phase, "planning/setpoint")
     case = watch()
     with pytest.raises(CaseOver) as over:
         case.on_progress(progress)

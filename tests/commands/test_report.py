@@ -16,12 +16,13 @@ from rich.console import Console
 
 from palpate.report.evidence import samples_of, steady_contact
 from palpate.report.page import write_page
-from palpate.report.results import Known, assemble, clean_world, in_words, print_findings, truth_of_run, write_results
+from palpate.report.results import Known, assemble, clean_world, print_findings, scores_text, truth_of_run, write_results
 from palpate.report.rows import Report
 from palpate.run.conclusion import conclude
 from palpate.run.roles import write_scenario_files
-from palpate_bus.messages import RobotStatus, Vector3, Wrench
+from palpate_bus.messages import ExamState, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header
+from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
@@ -128,7 +129,7 @@ def test_findings_on_the_console(scenario: Scenario, felt: Known) -> None:
     assert "1 matched, 0 missed, 0 false" in text.getvalue()
     for held in (True, False):
         findings = [replace(finding, ratio_held=held) for finding in report.scores.findings]
-        assert ("outside its 90 % band" in in_words(replace(report.scores, findings=findings))) == (not held)
+        assert ("outside its 90 % band" in scores_text(replace(report.scores, findings=findings))) == (not held)
 
 
 def test_without_a_copy_of_the_tissue_nothing_is_scored(scenario: Scenario, felt: Known, tmp_path: Path) -> None:
@@ -181,8 +182,8 @@ def folder(scenario: Scenario, tmp_path: Path) -> Path:
     return tmp_path
 
 
-def concluded(folder: Path, scenario: Scenario, messages: Collected, failure: str | None = None) -> None:
-    conclude(Console(quiet=True), folder, scenario, result(messages, failure), quiet=True)
+def concluded(folder: Path, scenario: Scenario, messages: Collected) -> None:
+    conclude(Console(quiet=True), folder, scenario, result(messages), quiet=True)
 
 
 def test_findings_that_break_the_contract_are_reported(
@@ -200,11 +201,14 @@ def test_a_held_arm_is_reported_once_with_the_failure(
     messages = collected()
     why = "emergency stop of the supervisor: planning is silent"
     zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
-    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0)
+    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0, "")
     messages.status_changes.append(held)
-    for failure in ("planning lost at 17.780 s", f"planning lost at 17.780 s: {why}"):
+    lost, gave_up = Failure(FailureCode.ROLE_LOST, "planning lost"), Failure(FailureCode.GAVE_UP, f"aborted: {why}")
+    aborted = {"phase": ExamState.PHASE_ABORTED, "reason": ExamState.REASON_EMERGENCY_STOP}
+    messages.exam_states = [ExamState(**{**vars(messages.exam_states[-1]), **aborted})]
+    for failure in (lost, gave_up):
         with pytest.raises(typer.Exit):
-            concluded(folder, scenario, messages, failure)
+            conclude(Console(quiet=True), folder, scenario, replace(result(messages), failure=failure), quiet=True)
         said = capsys.readouterr().err
         assert said.count(why) == 1
         assert "findings.confidence" not in said

@@ -190,6 +190,7 @@ class ExamState:
     stroke: int
     patient_moved: bool
     reason: int
+    culprit: str
 
 @dataclass
 class Finding:
@@ -247,6 +248,7 @@ class JointTorqueCommand:
     torque: NDArray[np.float64]
     valid_for: Duration
     problem: str
+    culprit: str
 
 @dataclass
 class OperatorRequest:
@@ -351,6 +353,7 @@ class RobotStatus:
     wrench: Wrench
     applied_torque: NDArray[np.float64]
     commands_rejected: int
+    culprit: str
 
 @dataclass
 class RunControl:
@@ -453,6 +456,7 @@ class SupervisorState:
     depth: float
     speed: float
     refusals: int
+    culprit: str
 
 @dataclass
 class SurfaceCorrection:

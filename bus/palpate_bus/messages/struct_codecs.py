@@ -104,7 +104,7 @@ _FLOAT64 = np.dtype(np.float64)
 
 _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
-_COMMAND = Struct("<56siII")  # torques, seconds and nanoseconds of valid_for, length of problem with its NUL
+_COMMAND = Struct("<56siI")  # torques, seconds and nanoseconds of valid_for
 _JOINTS = {gap: Struct(f"<I{gap}x56sI4x56sI4x56s") for gap in (0, 4)}  # position, velocity, effort of seven joints
 
 
@@ -160,17 +160,27 @@ def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
 def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
     """Convert `palpation_msgs/JointTorqueCommand`."""
     torque = fitted(message.torque, _FLOAT64, 7, "torque").tobytes()
-    problem = message.problem.encode() + b"\0"
     valid_for = message.valid_for
-    return pack_header(message.header, 8) + _COMMAND.pack(torque, valid_for.sec, valid_for.nanosec, len(problem)) + problem
+    command = _COMMAND.pack(torque, valid_for.sec, valid_for.nanosec)
+    return pack_header(message.header, 8) + command + _pack_texts((message.problem, message.culprit))
+
+
+@lru_cache(maxsize=64)
+def _pack_texts(texts: tuple[str, ...]) -> bytes:
+    """Return strings, from a four-byte boundary to the end of the last."""
+    data = b""
+    for text in texts:
+        data += bytes(-len(data) % 4) + pack_text(text)
+    return data
 
 
 def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
     """Convert `palpation_msgs/JointTorqueCommand`."""
     header, start = read_header(data, 8)
-    torque, sec, nanosec, length = _COMMAND.unpack_from(data, start)
-    problem, end = read_characters(data, start + _COMMAND.size, length)
-    return JointTorqueCommand(header, np.frombuffer(torque), Duration(sec, nanosec), problem), end
+    torque, sec, nanosec = _COMMAND.unpack_from(data, start)
+    problem, end = read_text(data, start + _COMMAND.size)
+    culprit, end = read_text(data, end)
+    return JointTorqueCommand(header, np.frombuffer(torque), Duration(sec, nanosec), problem, culprit), end
 
 
 def encode_joint_state(message: JointState) -> bytes:

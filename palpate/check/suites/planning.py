@@ -39,7 +39,7 @@ class PerfectFollower:
         weight = Wrench(Vector3(0.0, 0.0, WEIGHT_N), Vector3(0.0, 0.0, 0.0))
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
-        return RobotStatus(header(t), self.mode, cause, reason, self.q, velocity, weight, np.zeros(7), 0)
+        return RobotStatus(header(t), self.mode, cause, reason, self.q, velocity, weight, np.zeros(7), 0, "")
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

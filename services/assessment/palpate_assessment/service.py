@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
@@ -17,8 +18,9 @@ from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samp
 from palpate_assessment.seen_breath import SeenBreath
 from palpate_assessment.skin import KnownSkin
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, Vector3
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import point_message, vector_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
@@ -30,16 +32,25 @@ from palpate_models.scenario.schema import ExamInput, Following, Scenario
 from palpate_models.section import quadrant
 
 FRAME = contract().topics["assessment/map"].frame or ""
-PITCH = 0.005
-"""Pitch of the final map's grid [m]: a third of the radius in which the indenter feels."""
-MARGIN = 0.020
-"""The map's grid goes this far beyond the examined region [m]: so far a place is felt."""
-GROWING_PITCH = 0.008
-GROWING_SAMPLES = 200
-"""A growing map takes every n-th sample, so that it stays cheap."""
-GROWING_EVERY = 6 * NS
-GROWING_FIRST = 40
-"""Samples before the first growing map."""
+
+
+@dataclass(frozen=True)
+class MapTuning:
+    """Grids of the maps, and when a map of the growing samples is made."""
+
+    pitch_m: float = 0.005
+    """Pitch of the final map's grid [m]: a third of the radius in which the indenter feels."""
+    margin_m: float = 0.020
+    """The map's grid goes this far beyond the examined region [m]: so far a place is felt."""
+    growing_pitch_m: float = 0.008
+    growing_samples: int = 200
+    """A growing map takes every n-th sample, so that it stays cheap."""
+    growing_period_ns: int = 6 * NS
+    growing_first: int = 40
+    """Samples before the first growing map."""
+
+
+MAP = MapTuning()
 RESENT_PER_STEP = 50
 """Samples of an earlier examination that are published in one step."""
 NOTICED_S = 1.0
@@ -152,11 +163,11 @@ class AssessmentService(Service):
             return  # a scan after the patient moved: samples refer to the first scan, so its shares stay valid
         self._surface = p_A
         self._breath.perceive(p_A, np.asarray(message.breathing, dtype=np.float64))
-        self._coarse = self._grid(GROWING_PITCH)
+        self._coarse = self._grid(MAP.growing_pitch_m)
 
     def _grid(self, pitch: float) -> MapGrid:
         assert self._surface is not None
-        return map_grid(self._surface, self._exam.centre_m, self._exam.region_m, MARGIN, pitch)
+        return map_grid(self._surface, self._exam.centre_m, self._exam.region_m, MAP.margin_m, pitch)
 
     def _state(self, message: Message) -> ContactState:
         p, n = message.surface_point, message.surface_normal
@@ -183,13 +194,13 @@ class AssessmentService(Service):
             self.samples = [sample for sample in self.samples if sample.time < t - NOTICED_S]
 
     def _due(self, t: int) -> bool:
-        grown = len(self.samples) >= max(GROWING_FIRST, self._mapped + 10)
-        return grown and self._coarse is not None and t - self._last_map >= GROWING_EVERY
+        grown = len(self.samples) >= max(MAP.growing_first, self._mapped + 10)
+        return grown and self._coarse is not None and t - self._last_map >= MAP.growing_period_ns
 
     def _grow(self, t: int) -> Outbox:
         assert self._coarse is not None
         self._last_map, self._mapped = t, len(self.samples)
-        every = -(-len(self.samples) // GROWING_SAMPLES)
+        every = -(-len(self.samples) // MAP.growing_samples)
         chosen = self.samples[::every]
         result = growing(chosen, self._coarse, self._reach)
         return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
@@ -198,7 +209,7 @@ class AssessmentService(Service):
         if self._skin is not None:
             self.samples = self._skin.again(self.samples)
         if self._surface is not None:
-            self._final = assess(self.samples, self._grid(PITCH), self._reach, self._exam.false_findings)
+            self._final = assess(self.samples, self._grid(MAP.pitch_m), self._reach, self._exam.false_findings)
         if self._final is None:
             return {"assessment/findings": findings_message(t, [], [])}
         return {
@@ -216,8 +227,8 @@ def sample_message(sample: ForceSample) -> Message:
     """`palpation_msgs/PalpationSample`, stamped with the middle of the measurement."""
     return PalpationSample(
         header=header(round(sample.time * NS), FRAME),
-        position=Point(*map(float, sample.position)),
-        normal=Vector3(*map(float, sample.normal)),
+        position=point_message(sample.position),
+        normal=vector_message(sample.normal),
         depth=sample.depth,
         normal_force=sample.force,
         tangential_speed=float(np.linalg.norm(sample.velocity)),

@@ -194,6 +194,7 @@ def _state(
         stroke=stroke,
         patient_moved=False,
         reason=0,
+        culprit="",
     )
 
 

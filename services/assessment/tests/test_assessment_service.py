@@ -11,7 +11,7 @@ from bench_assessment_scans import FakeInbox, Scan, examine, scan, truth_of
 from palpate.report.evidence import found_of, map_of
 from palpate.report.scoring import Truth, score
 from palpate_assessment.assess import UnassessedReason
-from palpate_assessment.service import GROWING_EVERY, AssessmentService, create
+from palpate_assessment.service import MAP, AssessmentService, create
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import encode
@@ -108,7 +108,7 @@ def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
             stamps.append(t)
         finals += "assessment/findings" in outbox
     assert len(stamps) >= 5
-    assert np.diff(stamps[:-1]).min() >= GROWING_EVERY  # the last map is the final one
+    assert np.diff(stamps[:-1]).min() >= MAP.growing_period_ns  # the last map is the final one
     assert finals == 1
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -23,6 +23,16 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
 
 _NAMES = list(JOINT_NAMES)
+
+
+class Problem(NamedTuple):
+    """Why commanding stops: the topic that causes it, and a text for people."""
+
+    culprit: str
+    text: str
+
+
+NO_PROBLEM: Final = Problem("", "")
 
 
 class ControlService(Service):
@@ -57,8 +67,8 @@ class ControlService(Service):
         self._until = -1
         """Expiry of the last torque [ns]."""
         self._problem = ""
-        self._refused: str | None = None  # error of the newest set-point
-        self._ceased: str | None = None  # why no torque is commanded; None after a valid set-point
+        self._refused: Problem | None = None  # of the newest set-point
+        self._ceased: Problem | None = None  # why no torque is commanded; None after a valid set-point
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -103,12 +113,13 @@ class ControlService(Service):
             return self._command(t, np.zeros(DOF), self._valid)
         frozen = t - measured > self._setpoint_expiry  # repeated, or stamped by a wrong clock
         if self._ceased or frozen or t > self._expires:
-            old = f"joint_states: measured {(t - measured) / MS:.0f} ms ago, limit {self._setpoint_expiry / MS:.0f} ms"
-            expired = f"the last {TOPIC} expired {(t - self._expires) / MS:.0f} ms ago"
+            age, limit = (t - measured) / MS, self._setpoint_expiry / MS
+            old = Problem("joint_states", f"joint_states: measured {age:.0f} ms ago, limit {limit:.0f} ms")
+            expired = Problem(TOPIC, f"the last {TOPIC} expired {(t - self._expires) / MS:.0f} ms ago")
             return self._cease(t, self._ceased or (old if frozen else self._refused or expired))
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
-            return self._repeat_torque(t, f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms")
+            return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
         if joints.name != _NAMES:
             return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
         try:
@@ -147,23 +158,23 @@ class ControlService(Service):
 
     def _refuse(self, t: int, why: str) -> None:
         self._facts["setpoints_rejected"] += 1
-        self._refused = f"{TOPIC} refused: {why}"
-        self._problem = f"at {t} ns: {self._refused}"
+        self._refused = Problem(TOPIC, f"{TOPIC} refused: {why}")
+        self._problem = f"at {t} ns: {self._refused.text}"
 
-    def _repeat_torque(self, t: int, problem: str) -> Outbox:
+    def _repeat_torque(self, t: int, problem: Problem) -> Outbox:
         """Return the last torque until its expiry, then as `_cease`."""
         if t >= self._until:
             return self._cease(t, problem)
         self._facts["ticks_without_joint_states"] += 1
-        self._problem = f"at {t} ns: {problem}"
+        self._problem = f"at {t} ns: {problem.text}"
         return self._command(t, self._torque, duration_message(self._until - t), problem)
 
-    def _cease(self, t: int, problem: str) -> Outbox:
+    def _cease(self, t: int, problem: Problem) -> Outbox:
         """Return an expired command with the reason, so that the driver holds."""
         self._until = -1
         self._ceased = problem
         self._facts["ticks_without_command"] += 1
-        self._problem = f"at {t} ns: {problem}"
+        self._problem = f"at {t} ns: {problem.text}"
         self._controller.reset()
         self._reference.clear()
         self._pending.clear()
@@ -171,11 +182,11 @@ class ControlService(Service):
 
     def _reject_joints(self, t: int, problem: str) -> Outbox:
         self._facts["joint_states_rejected"] += 1
-        return self._cease(t, problem)
+        return self._cease(t, Problem("joint_states", problem))
 
     @staticmethod
-    def _command(t: int, torque: Array, valid_for: Message, problem: str = "") -> Outbox:
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for, problem)}
+    def _command(t: int, torque: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for, problem.text, problem.culprit)}
 
 
 def create(scenario: Scenario) -> ControlService:

@@ -7,9 +7,9 @@ from typing import Final
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import SurfaceCorrection, SurfaceMotion, Vector3
+from palpate_bus.messages import SurfaceCorrection, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import transform_matrix
+from palpate_bus.messages.geometry import transform_matrix, vector_message
 from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox
 from palpate_models.numerics.frames import Array
@@ -40,7 +40,7 @@ def camera_pose(message: Message, frame: str) -> Array | None:
 
 def motion(stamp: int, followed: Followed) -> Message:
     """`palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
-    state, shift = getattr(SurfaceMotion, followed.state.name), Vector3(*map(float, followed.shift))
+    state, shift = getattr(SurfaceMotion, followed.state.name), vector_message(followed.shift)
     return SurfaceMotion(header(stamp, MOTION_FRAME), state, followed.displacement, followed.forecast, followed.sigma, shift)
 
 

@@ -19,7 +19,7 @@ from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND, Periods
-from palpate_planning.reasons import Cause, Reason
+from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import ExamCourse, Stops
@@ -238,7 +238,7 @@ class ExaminationSequence:
                     course.since = now.t
                 elif now.t - course.since >= EXAM.rest_ns:
                     out.trigger, views.asked = True, now.t
-                    self.status.reason, self.status.message = Reason.NONE, f"looking: {frames} frames"
+                    self.status.cause, self.status.message = NO_CAUSE, f"looking: {frames} frames"
             except NoPathError as error:
                 self._look_again(now, out, Cause(Reason.VIEW_UNREACHABLE, f"look posture cannot be reached: {error}"))
         elif isinstance(now.perceived, PerceivedAbdomen):
@@ -247,7 +247,7 @@ class ExaminationSequence:
             self._look_again(now, out, now.perceived.cause)
         elif now.t - views.asked > frames * self._periods.frame + EXAM.perception_timeout_ns:
             text = f"no answer from perception {EXAM.perception_timeout_ns / SECOND:.0f} s after the burst"
-            self._look_again(now, out, Cause(Reason.VIEW_TIMEOUT, text))
+            self._look_again(now, out, Cause(Reason.VIEW_TIMEOUT, text, "perception"))
 
     def _accept_view(self, now: Observation, perceived: PerceivedAbdomen) -> None:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
@@ -272,7 +272,7 @@ class ExaminationSequence:
 
     def _look_again(self, now: Observation, out: ExamStep, cause: Cause) -> None:
         status, exhausted = self.status, self._views.fail()
-        status.reason, status.message = cause
+        status.cause, status.message = cause, cause.text
         status.view_blocked = cause.reason is Reason.VIEW_BLOCKED
         if exhausted:
             self._give_up(now, out, cause._replace(text=f"gave up after {self._views.failed} looks: {cause.text}"))
@@ -363,7 +363,7 @@ class ExaminationSequence:
         status.target_index = self._requested.done if self._known.exam.searched else step.target
         status.targets_skipped = len(self._skipped)
         cause = palpation.failed or palpation.left
-        self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause.reason)
+        self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause)
 
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
         """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
@@ -376,11 +376,11 @@ class ExaminationSequence:
         if more and palpation.moved and rest.moves < EXAM.moves_max:
             rest.moves, rest.wanted, rest.bend = rest.moves + 1, wanted, None
             self._views.restart()
-            course.enter(Phase.LOOK, now.t, "the patient has moved: looking again", Reason.PATIENT_MOVED)
+            course.enter(Phase.LOOK, now.t, "the patient has moved: looking again", MOVED)
         elif more and cause.reason in REPLANNED and rest.replans < EXAM.replans_max:
             rest.replans, rest.wanted = rest.replans + 1, wanted
             rest.bend = max(rest.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
-            course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause.reason)
+            course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause)
         else:
             self._correct(out)
             course.go_home(now, palpation.failed)
@@ -418,7 +418,7 @@ class ExaminationSequence:
             self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}{unplanned}")
         elif now.t - self._course.since > EXAM.findings_timeout_ns:
             text = f"no final findings after {EXAM.findings_timeout_ns / SECOND:.0f} s"
-            self._course.abort(now, Cause(Reason.NO_FINDINGS, text))
+            self._course.abort(now, Cause(Reason.NO_FINDINGS, text, "assessment"))
 
 
 def _stay(now: Observation, out: ExamStep) -> None:

@@ -12,7 +12,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Following, Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.motion.timing import JerkLimitedAxis
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
 from palpate_planning.stroke import Duration
 from palpate_planning.stroke_motion import MOTION
 from palpate_planning.strokes.coverage import Bools
@@ -109,7 +109,7 @@ class WallWatch:
         self.leaps = not (tracked or breath.hidden)
         self.moved = self.moved or breath.moved
         if self.moved:
-            self.ended = Cause(Reason.PATIENT_MOVED, "the patient has moved")
+            self.ended = MOVED
         elif self._not_calm.s > WALL.calm_timeout_s:
             self.ended = Cause(Reason.WALL_NOT_TRACKED, f"the wall could not be tracked for {WALL.calm_timeout_s:g} s")
         elif self._losses >= WALL.contact_losses_max:

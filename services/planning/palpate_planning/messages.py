@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from palpate_bus.messages import ExamState, Path, Point, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion, Vector3
+from palpate_bus.messages import ExamState, Path, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_message, vector
+from palpate_bus.messages.geometry import mesh_arrays, point_message, pose_message, vector_message, vectors
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement
@@ -39,20 +39,21 @@ def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None
         depth_setpoint=status.depth_setpoint,
         depth=0.0 if contact is None else contact.depth,
         normal_force=0.0 if contact is None else contact.force,
-        surface_point=Point(*p.tolist()),
-        surface_normal=Vector3(*n.tolist()),
+        surface_point=point_message(p),
+        surface_normal=vector_message(n),
         end_tick=status.end_tick,
         depth_uncertainty=0.0 if contact is None else contact.wall.sigma,
         wall_displacement=0.0 if contact is None else contact.wall.displacement,
         stroke=status.stroke,
         patient_moved=status.patient_moved,
-        reason=int(status.reason),
+        reason=int(status.cause.reason),
+        culprit=status.cause.culprit,
     )
 
 
 def touch_message(t: int, touched: PublishedTouch) -> Message:
     """Return `palpation_msgs/SkinTouch` of a touch at `t` [ns]."""
-    point = Point(*touched.p_W.tolist())
+    point = point_message(touched.p_W)
     return SkinTouch(
         header(t, "world"), point, touched.stroke, touched.height, touched.sigma, touched.expected, touched.expected_sigma
     )
@@ -73,17 +74,15 @@ def abdomen_of(mesh: Message, targets: Message, X_WA: Array) -> PerceivedAbdomen
     count, lines = len(targets.positions), np.asarray(targets.lines, dtype=np.int64)
     if len(lines) != count:
         raise ValueError(f"perception/targets: {len(lines)} lines for {count} positions")
-    positions = np.array([vector(p) for p in targets.positions])
+    positions = vectors(targets.positions)
     coincident = np.flatnonzero(np.linalg.norm(np.diff(positions, axis=0), axis=1) < COINCIDENT_M)
     if len(coincident):
         raise ValueError(f"perception/targets: {coincident[0]} and {coincident[0] + 1} coincide")
     try:
-        vertices = np.asarray(mesh.vertices, dtype=float).reshape(-1, 3)
-        normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
-        triangles = np.asarray(mesh.triangles, dtype=np.int64).reshape(-1, 3)
+        vertices, normals, triangles, breathing = mesh_arrays(mesh)
         if triangles.max(initial=-1) >= len(vertices):
             raise ValueError(f"triangles of vertex {triangles.max()}, it has {len(vertices)}")
-        surface = PerceivedSurface.from_mesh(vertices, normals, X_WA, np.asarray(mesh.breathing))
+        surface = PerceivedSurface.from_mesh(vertices, normals, X_WA, breathing)
     except ValueError as error:
         raise ValueError(f"perception/surface: {error}") from error
     return PerceivedAbdomen(positions, lines, vertices, triangles, surface)

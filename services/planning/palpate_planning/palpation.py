@@ -272,7 +272,7 @@ class Palpation:
             self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
             if waited.update(True) > TUNING.request_timeout_s:
                 text = f"no further stroke was requested within {TUNING.request_timeout_s:g} s"
-                self._recovery.left = Cause(Reason.NO_REQUEST, text)
+                self._recovery.left = Cause(Reason.NO_REQUEST, text, "search")
             if self._recovery.ending:
                 return False
             if not now.paused and (len(self._segments) > self._number + 1 or not self._more):

@@ -40,13 +40,15 @@ class Reason(IntEnum):
 
 
 class Cause(NamedTuple):
-    """A reason and its text. False if there is none."""
+    """A reason, its text, and the role or topic behind it if one is known. False if there is no reason."""
 
     reason: Reason = Reason.NONE
     text: str = ""
+    culprit: str = ""
 
     def __bool__(self) -> bool:
         return self.reason is not Reason.NONE
 
 
 NO_CAUSE: Final = Cause()
+MOVED: Final = Cause(Reason.PATIENT_MOVED, "the patient has moved")

@@ -47,6 +47,14 @@ NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the examination before there are targets."""
 SEEN = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
 """Topics of perception that move the arm: messages that violate the contract are dropped."""
+CULPRITS = {
+    PalpationTargets.NONE: "perception",
+    PalpationTargets.NO_FRAMES: "camera/depth/image_raw",
+    PalpationTargets.NO_CAMERA: "camera",
+    PalpationTargets.NO_CALIBRATION: "camera/depth/camera_info",
+    PalpationTargets.BAD_FRAMES: "camera/depth/image_raw",
+}
+"""Role or topic at fault if there are no targets for a reason."""
 SEEING = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -154,15 +162,16 @@ class PlanningService(Service):
 
     def _answer(self, targets: Message | None) -> PerceivedAbdomen | PerceptionFailure:
         if targets is None:
-            return PerceptionFailure(Cause(Reason.VIEW_FAILED, "perception/targets: refused"))
+            return PerceptionFailure(Cause(Reason.VIEW_FAILED, "perception/targets: refused", "perception/targets"))
         if not len(targets.positions) or self._mesh is None:
             text = targets.message or "perception found no targets, or no usable surface"
             blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
-            return PerceptionFailure(Cause(Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED, text))
+            reason = Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED
+            return PerceptionFailure(Cause(reason, text, CULPRITS.get(targets.reason, "")))
         try:
             return abdomen_of(self._mesh, targets, self._X_WA)
         except ValueError as error:
-            return PerceptionFailure(Cause(Reason.VIEW_FAILED, str(error)))
+            return PerceptionFailure(Cause(Reason.VIEW_FAILED, str(error), "perception"))
 
     def _motion(self, inbox: Inbox) -> BreathObservation | None:
         """Return the newest motion of the wall, if one arrived and the scenario follows it."""
@@ -187,15 +196,16 @@ class PlanningService(Service):
             return PressRequest(int(message.number), xy, depth, message.reason)
         return None
 
-    def _lost(self, t: int, inbox: Inbox) -> tuple[str, ...]:
-        """Return needed roles that are disconnected, or the supervisor if it is silent for longer than a set-point is valid."""
+    def _lost(self, t: int, inbox: Inbox) -> Cause:
+        """Return the cause if needed roles are disconnected, or the supervisor is silent for longer than a set-point is valid."""
         searching = ("search",) if self._known.exam.searched else ()
         needed = (*(NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED), *searching)
-        gone = tuple([role for role in needed if inbox.lost(role)])
+        gone = [role for role in needed if inbox.lost(role)]
+        culprit = gone[0] if gone else "supervisor/state"
         last = inbox.stamp("supervisor/state")
         if last is not None and t - last > self._supervisor_silence:
-            gone += (f"the supervisor, silent for {(t - last) / MS:.0f} ms",)
-        return gone
+            gone.append(f"the supervisor, silent for {(t - last) / MS:.0f} ms")
+        return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 
 
 def _too_short(message: Message) -> list[str]:
@@ -214,14 +224,14 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
         if request.request == OperatorRequest.STOP:
             return Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), False
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
-        return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {status.reason}"), False
-    if status is not None and status.mode == RobotStatus.MODE_IDLE and status.reason:
-        return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason}"), False
+        return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {status.reason}", status.culprit), False
+    if status is not None and status.mode == RobotStatus.MODE_IDLE and status.cause != RobotStatus.CAUSE_NONE:
+        return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason}", "robot"), False
     if state is None or state.level == SupervisorState.LEVEL_OK:
         return NO_CAUSE, False
     if state.level == SupervisorState.LEVEL_SOFT_STOP:
-        return Cause(Reason.SOFT_STOP, f"soft stop of the supervisor: {state.reason}"), True
-    return Cause(Reason.EMERGENCY_STOP, f"emergency stop of the supervisor: {state.reason}"), False
+        return Cause(Reason.SOFT_STOP, f"soft stop of the supervisor: {state.reason}", state.culprit), True
+    return Cause(Reason.EMERGENCY_STOP, f"emergency stop of the supervisor: {state.reason}", state.culprit), False
 
 
 def _end(requests: tuple[Message, ...]) -> Cause:

@@ -9,7 +9,7 @@ from typing import Final, NamedTuple
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement, SensorReading
-from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import AT_REST
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.plan import PerceivedAbdomen
@@ -78,8 +78,8 @@ class Observation(NamedTuple):
     """True if the stop leaves the arm to planning, which retreats along the normal; else the driver holds."""
     end: Cause = NO_CAUSE
     """Cause for which the examination is to go home and end, if that was just requested."""
-    lost: tuple[str, ...] = ()
-    """Disconnected roles."""
+    lost: Cause = NO_CAUSE
+    """Cause if needed roles are disconnected."""
     request: PressRequest | None = None
     """The request of the search, if it arrived."""
     averaged: Array | None = None
@@ -92,7 +92,7 @@ class ExamStatus:
 
     phase: Phase = Phase.HOME
     message: str = "waiting for the robot"
-    reason: Reason = Reason.NONE
+    cause: Cause = NO_CAUSE
     target_index: int = 0
     target_count: int = 0
     targets_skipped: int = 0

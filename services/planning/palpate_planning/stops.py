@@ -43,10 +43,10 @@ class ExamCourse:
         """The present phase."""
         return self.status.phase
 
-    def enter(self, phase: Phase, t: int, message: str, reason: Reason = Reason.NONE) -> None:
-        """Enter a phase at `t` [ns]."""
+    def enter(self, phase: Phase, t: int, message: str, cause: Cause = NO_CAUSE) -> None:
+        """Enter a phase at `t` [ns]. `message` is for people; of `cause` only the reason and the culprit are used."""
         status = self.status
-        status.phase, status.message, status.reason, self.since = phase, message, reason, t
+        status.phase, status.message, status.cause, self.since = phase, message, cause, t
         if phase in OVER:
             status.end_tick = t + END_AFTER
 
@@ -55,14 +55,14 @@ class ExamCourse:
         assert now.reading is not None
         self.arm.hold(now.reading.q)
         phase = self.interrupted if self.phase is Phase.HELD else self.phase
-        self.enter(Phase.ABORTED, now.t, f"aborted in phase {phase.name}: {cause.text}", cause.reason)
+        self.enter(Phase.ABORTED, now.t, f"aborted in phase {phase.name}: {cause.text}", cause)
 
     def go_home(self, now: Observation, cause: Cause = NO_CAUSE) -> None:
         """Return home from where the arm is; the examination is then aborted if there is a cause."""
         assert now.reading is not None
         self.failure = cause
         self.arm.hold(now.reading.q)
-        self.enter(Phase.RETURN, now.t, f"returning home: {cause.text}" if cause else "returning home", cause.reason)
+        self.enter(Phase.RETURN, now.t, f"returning home: {cause.text}" if cause else "returning home", cause)
 
 
 class Stops:
@@ -90,7 +90,7 @@ class Stops:
             course.interrupted = course.phase
             self._hold(now)
         if now.lost:
-            self._end_after_loss(now, Cause(Reason.SERVICE_LOST, f"lost {', '.join(now.lost)}"))
+            self._end_after_loss(now, now.lost)
         elif now.end:
             self._end_at_home(now, now.end)
 
@@ -105,7 +105,7 @@ class Stops:
         self._soft = self._soft and now.soft
         if now.t - course.since > self._patience_s * SECOND:
             text = f"the stop was not released within {self._patience_s:g} s: {now.stop.text}"
-            course.abort(now, Cause(Reason.NOT_RELEASED, text))
+            course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.culprit))
         elif not self._soft:
             assert now.reading is not None
             course.arm.hold(now.reading.q)
@@ -119,7 +119,7 @@ class Stops:
         course = self._course
         self._soft, self._resuming = now.soft, False
         course.arm.hold(now.reading.q)
-        course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop.reason)
+        course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop)
         if (palpation := self._palpation) is not None:
             palpation.pause()
 
@@ -161,7 +161,7 @@ class Stops:
             return
         palpation.abandon(cause)
         if held and self._soft:
-            course.enter(course.interrupted, now.t, cause.text, cause.reason)
+            course.enter(course.interrupted, now.t, cause.text, cause)
         elif held:
             course.abort(now, cause)
 
@@ -171,7 +171,7 @@ class Stops:
         if palpation is not None:
             palpation.abandon(cause)
             if held and self._soft:
-                course.enter(course.interrupted, now.t, cause.text, cause.reason)
+                course.enter(course.interrupted, now.t, cause.text, cause)
         elif held:
             course.failure, course.interrupted = cause, Phase.RETURN
         else:

@@ -108,7 +108,7 @@ class World:
         self.t = 0
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
-        self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, ()
+        self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, NO_CAUSE
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None

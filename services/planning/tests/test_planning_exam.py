@@ -122,7 +122,7 @@ def test_no_tissue_where_it_should_be_gives_up() -> None:
     world = World(known(region_m=(0.025, 0.0125)), offset=-0.05)
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.NO_TISSUE
+    assert world.exam.status.cause.reason is Reason.NO_TISSUE
 
 
 def test_a_touch_ends_on_very_soft_skin_with_wrong_forecasts() -> None:
@@ -158,7 +158,7 @@ def test_soft_stop_skips_targets_then_gives_up() -> None:
     world.force = lambda depth: 40.0 if depth > 0.001 else 0.0
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.FORCE
+    assert world.exam.status.cause.reason is Reason.FORCE
     assert world.exam.status.targets_skipped >= 3
 
 
@@ -203,7 +203,7 @@ def test_no_target_in_reach_aborts() -> None:
     world = World(known(Robot(base_xy_m=(-0.9, 0.0))))
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.NO_PATH
+    assert world.exam.status.cause.reason is Reason.NO_PATH
 
 
 def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
@@ -212,7 +212,7 @@ def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
     states = []
     while world.exam.status.phase is not Phase.PLAN:
         world.step()
-        states.append((world.exam.status.view_blocked, world.exam.status.reason))
+        states.append((world.exam.status.view_blocked, world.exam.status.cause.reason))
         assert world.t < 30e9
     assert (True, Reason.VIEW_BLOCKED) in states
     assert not world.exam.status.view_blocked
@@ -224,7 +224,7 @@ def test_three_blocked_views_abort() -> None:
     world.answers = [PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "view blocked by the arm"))]
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.VIEW_BLOCKED
+    assert world.exam.status.cause.reason is Reason.VIEW_BLOCKED
     assert world.exam._views.failed == 3
 
 
@@ -232,7 +232,7 @@ def test_without_a_free_scan_posture_the_message_names_the_settings() -> None:
     world = World(known())
     world.exam._views.postures.clear()
     world.run()
-    assert world.exam.status.reason is Reason.VIEW_UNREACHABLE
+    assert world.exam.status.cause.reason is Reason.VIEW_UNREACHABLE
 
 
 def test_the_scan_is_repeated_without_an_answer_then_given_up() -> None:
@@ -242,17 +242,17 @@ def test_the_scan_is_repeated_without_an_answer_then_given_up() -> None:
         world._answer_at = None
         world.step()
         assert world.t < 60e9
-    assert world.exam.status.reason is Reason.VIEW_TIMEOUT
+    assert world.exam.status.cause.reason is Reason.VIEW_TIMEOUT
 
 
 def test_lost_assessment_in_contact_lifts_off() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
-    world.lost = ("assessment",)
+    world.lost = Cause(Reason.SERVICE_LOST, "lost assessment")
     for _ in range(100):
         world.step()
     assert world.pressed == 0.0
-    assert world.exam.status.reason is Reason.SERVICE_LOST
+    assert world.exam.status.cause.reason is Reason.SERVICE_LOST
 
 
 def test_robot_away_from_home_is_brought_there() -> None:

@@ -45,7 +45,7 @@ def test_after_a_release_it_resumes_without_losses(phase: Phase, soft: bool) -> 
     world = stopped_in(phase, soft=soft)
     status = world.exam.status
     assert status.phase is Phase.HELD
-    assert status.reason is Reason.EMERGENCY_STOP
+    assert status.cause.reason is Reason.EMERGENCY_STOP
     assert status.end_tick < 0
     world.stop = NO_CAUSE
     world.run()
@@ -95,7 +95,7 @@ def test_an_end_request_brings_the_arm_home(phase: Phase, stopped: bool) -> None
     world.stop = NO_CAUSE
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.OPERATOR_END
+    assert world.exam.status.cause.reason is Reason.OPERATOR_END
     assert np.abs(world.q - lbr.HOME).max() < 0.02
     assert world.pressed == 0.0
 
@@ -105,7 +105,7 @@ def test_without_a_release_it_ends() -> None:
     world.run()
     status = world.exam.status
     assert status.phase is Phase.ABORTED
-    assert status.reason is Reason.NOT_RELEASED
+    assert status.cause.reason is Reason.NOT_RELEASED
     assert world.t == pytest.approx(status.end_tick - 1_000_000_000 + 10_000_000)
 
 
@@ -138,7 +138,7 @@ def test_an_arm_that_was_pushed_laterally_stops_pressing() -> None:
     world.stop = NO_CAUSE
     assert drawn_sideways(world) < 0.002
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.reason is Reason.ARM_DISPLACED
+    assert world.exam.status.cause.reason is Reason.ARM_DISPLACED
 
 
 @pytest.mark.parametrize("phase", [Phase.SCAN, Phase.RETRACT], ids=lambda phase: phase.name)
@@ -172,9 +172,9 @@ def test_an_arm_that_was_pushed_into_the_tissue_between_strokes_lifts_first() ->
 
 def test_lost_perception_while_held_ends_it() -> None:
     world = stopped_in(Phase.LOOK, soft=True)
-    world.lost = ("perception",)
+    world.lost = Cause(Reason.SERVICE_LOST, "lost perception")
     world.run()
-    assert world.exam.status.reason is Reason.SERVICE_LOST
+    assert world.exam.status.cause.reason is Reason.SERVICE_LOST
 
 
 SMALL = {"region_m": (0.025, 0.0125)}
@@ -277,7 +277,7 @@ def test_a_wall_that_stays_out_is_not_pressed_for_long() -> None:
     world.run(seconds=200.0)
     pressed = [depth > 0.002 for *_, depth, _ in world.rows]
     assert sum(pressed) * 0.01 < 2 * WALL.gate_closed_max_s
-    assert world.exam.status.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
+    assert world.exam.status.cause.reason is Reason.WALL_NOT_TRACKED or world.exam.status.phase is Phase.DONE
 
 
 def test_a_push_while_the_skin_is_only_touched_skips_no_target() -> None:

@@ -39,7 +39,8 @@ def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_AC
     """The robot's status with mean joint positions and F/T reading."""
     force, torque = (Vector3(*map(float, part)) for part in (w[:3], w[3:]))
     zero = np.zeros(7)
-    return RobotStatus(header(t), mode, 0, reason, np.array(q), zero, Wrench(force, torque), zero, 0)
+    cause = RobotStatus.CAUSE_DEVICE if reason else RobotStatus.CAUSE_NONE
+    return RobotStatus(header(t), mode, cause, reason, np.array(q), zero, Wrench(force, torque), zero, 0, "")
 
 
 def sent(outbox: Any) -> dict[str, Any]:
@@ -171,7 +172,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
-        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0)
+        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "")
         inbox.put("supervisor/state", soft, 10_000_000)
     else:
         inbox.gone.add("robot")

@@ -54,6 +54,7 @@ _LIMITS: Final = tuple(
         strict=True,
     )
 )
+_COMMAND: Final = "control/joint_torque"
 _ZERO: Final = np.zeros(7)
 _ZERO.setflags(write=False)
 
@@ -92,6 +93,8 @@ class Command:
     expires: int
     problem: str = ""
     """Text of the commander's reason to stop commanding; for messages only."""
+    culprit: str = ""
+    """Topic that causes the problem."""
 
 
 class Driver:
@@ -102,7 +105,7 @@ class Driver:
         self._force_emergency = force_emergency_n
         self.mode = DriverMode.IDLE
         self.cause = HoldCause.NONE
-        self.reason = ""
+        self.reason = self.culprit = ""
         self.rejected = 0
         self.holds: list[tuple[int, HoldCause, str]] = []
         """All safe holds: time [ns], cause, reason."""
@@ -120,17 +123,17 @@ class Driver:
         """True while a safe hold is latched."""
         return self.mode is DriverMode.SAFE_HOLD
 
-    def hold(self, t: int, cause: HoldCause, reason: str) -> None:
-        """Latches a safe hold at `t` [ns]. The first cause is kept until the release."""
+    def hold(self, t: int, cause: HoldCause, reason: str, culprit: str = "") -> None:
+        """Latches a safe hold at `t` [ns]. The first cause is kept until the release. `culprit`: role or topic at fault."""
         if not self.held:
-            self.mode, self.cause, self.reason = DriverMode.SAFE_HOLD, cause, reason
+            self.mode, self.cause, self.reason, self.culprit = DriverMode.SAFE_HOLD, cause, reason, culprit
             self._brake = TUNING.brake_ticks
             self.holds.append((t, cause, reason))
 
     def release(self, t: int) -> None:
         """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again."""
         if self.mode is DriverMode.SAFE_HOLD:
-            self.mode, self.cause, self.reason = DriverMode.IDLE, HoldCause.NONE, ""
+            self.mode, self.cause, self.reason, self.culprit = DriverMode.IDLE, HoldCause.NONE, "", ""
             self._since = t
             self._before = None
 
@@ -149,7 +152,7 @@ class Driver:
         if self.held:
             return _ZERO
         if lost:
-            self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control is lost")
+            self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control is lost", "control")
         elif not force <= self._force_emergency:  # also for NaN
             limit = self._force_emergency
             self.hold(t, HoldCause.FORCE_LIMIT, f"external force {force:.1f} N at the tool, limit {limit:.1f} N")
@@ -160,7 +163,7 @@ class Driver:
                 self._take(t, command, gravity)
             elif self.mode is DriverMode.ACTIVE:  # not checked, so it must not be applied
                 age = (t - command.stamp) / 1e6
-                self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is {age:.0f} ms old")
+                self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is {age:.0f} ms old", _COMMAND)
         return command.torque if command is not None and self.mode is DriverMode.ACTIVE else _ZERO
 
     def damping(self, v: Array, gravity: Array) -> Array:
@@ -192,7 +195,7 @@ class Driver:
                 late = max(t - expires, 0) / 1e6
                 expired = f"the last command of control expired {late:.0f} ms ago"
                 reason = f"control stopped commanding: {command.problem}" if command.problem else expired
-                self.hold(t, HoldCause.COMMAND_EXPIRED, reason)
+                self.hold(t, HoldCause.COMMAND_EXPIRED, reason, command.culprit or _COMMAND)
             return
         if command is not self._checked:
             self._check(t, command, gravity)
@@ -239,7 +242,7 @@ class Driver:
 
     def _reject(self, t: int, cause: HoldCause, reason: str) -> None:
         self.rejected += 1
-        self.hold(t, cause, reason)
+        self.hold(t, cause, reason, _COMMAND)
 
 
 @compiled

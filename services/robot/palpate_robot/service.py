@@ -133,7 +133,8 @@ class RobotService(Service):
         message = inbox.latest("control/joint_torque")
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
-            self._command = Command(np.array(message.torque), stamp, stamp + nanoseconds(message.valid_for), message.problem)
+            expires = stamp + nanoseconds(message.valid_for)
+            self._command = Command(np.array(message.torque), stamp, expires, message.problem, message.culprit)
             self._command_message = message
         return self._command
 
@@ -151,7 +152,7 @@ class RobotService(Service):
         if self._pressed and received is not None and t - received > _CONTACT_AGE:
             age, limit = (t - received) / 1e6, _CONTACT_AGE / 1e6
             reason = f"no message on sim/contact_wrench for {age:.0f} ms, limit {limit:.0f} ms: tissue is late"
-            self._driver.hold(t, HoldCause.DEVICE, reason)
+            self._driver.hold(t, HoldCause.DEVICE, reason, "sim/contact_wrench")
         f, m = message.wrench.force, message.wrench.torque
         self._pressed = bool(f.x or f.y or f.z or m.x or m.y or m.z)
         if self._pressed:
@@ -191,6 +192,7 @@ class RobotService(Service):
             Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)),
             self._applied,
             driver.rejected,
+            driver.culprit,
         )
 
     def _link_poses(self, stamp: Message) -> Message:

@@ -25,10 +25,11 @@ class StopRequests:
                 self._driver.release(t)
             self._releases = message.releases
             if message.level == SupervisorState.LEVEL_EMERGENCY:
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, f"emergency stop of the supervisor: {message.reason}")
+                reason = f"emergency stop of the supervisor: {message.reason}"
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, reason, message.culprit)
         for message in inbox.new("operator/request"):
             if message.request == OperatorRequest.STOP:
                 self._driver.hold(t, HoldCause.STOP_REQUESTED, f"stopped by the operator: {message.reason}")
             elif message.request not in REQUESTS:
                 reason = f"operator/request: unknown request {message.request} is treated as a stop"
-                self._driver.hold(t, HoldCause.STOP_REQUESTED, reason)
+                self._driver.hold(t, HoldCause.STOP_REQUESTED, reason, "operator/request")

@@ -117,7 +117,7 @@ class Rig:
                 error = self.target - joints.position
                 torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
                 self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it
-                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "")
+                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "", "")
                 self.inbox.messages["control/joint_torque"] = command
             self.outbox = self.driver.step(self.t, self.inbox)
             self.status = self.outbox.get("robot/status", self.status)

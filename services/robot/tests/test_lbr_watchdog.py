@@ -105,7 +105,7 @@ def rig() -> Rig:
 
 def release(rig: Rig) -> None:
     state: Any = SupervisorState(
-        **{**dict.fromkeys(SupervisorState.__dataclass_fields__, 0), "header": header(rig.t), "releases": 1}
+        **{**dict.fromkeys(SupervisorState.__dataclass_fields__, 0), "header": header(rig.t), "releases": 1, "culprit": ""}
     )
     rig.inbox.events["supervisor/state"] = [state]
     rig.tick(20)

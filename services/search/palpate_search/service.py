@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -23,15 +24,24 @@ from palpate_search.presses import Press, Task
 
 FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
-LEAST_UNCERTAINTY_M: Final = 0.0002
-"""Lower bound of the depth SD."""
-REACHED_M: Final = 0.005
-"""A requested place counts as out of reach if no press came nearer than this."""
-OUTLINE_PRESSES: Final = 6
-"""Presses around a lump that was found."""
-ROUNDED_M: Final = 1e-9
-FEWEST: Final = 12
-"""Least number of presses: with fewer the assessment has no result."""
+
+
+@dataclass(frozen=True)
+class SearchTuning:
+    """Numbers of presses, and tolerances."""
+
+    least_uncertainty_m: float = 0.0002
+    """Lower bound of the depth SD."""
+    reached_m: float = 0.005
+    """A requested place counts as out of reach if no press came nearer than this."""
+    outline_presses: int = 6
+    """Presses around a lump that was found."""
+    rounded_m: float = 1e-9
+    fewest_presses: int = 12
+    """Least number of presses: with fewer the assessment has no result."""
+
+
+TUNING = SearchTuning()
 
 
 class SearchService(Service):
@@ -72,7 +82,7 @@ class SearchService(Service):
             self._posterior.add(press)
         if self._asked is not None and not self._felt:
             self._posterior.vain += 1
-        if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < REACHED_M for press in self._felt):
+        if self._asked is not None and not any(np.linalg.norm(press.xy - self._asked) < TUNING.reached_m for press in self._felt):
             self._posterior.refuse(self._asked)
         self._felt.clear()
         while (lump := self._posterior.found) is not None:
@@ -116,7 +126,7 @@ class SearchService(Service):
     def _over(self) -> str:
         """Return the reason for the end; empty while the search continues."""
         posterior, left = self._posterior, self._posterior.left(self._spent_s)
-        if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= FEWEST:
+        if posterior.lump < self._missed and not self._outline and len(posterior.presses) >= TUNING.fewest_presses:
             return f"the probability of a missed lump is {100 * posterior.lump:.1f} %"
         if self._number > self._posterior.task.budget.presses:
             return f"{posterior.task.budget.presses} presses made"
@@ -128,9 +138,11 @@ class SearchService(Service):
 def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
     """Return the place [m] and depth [m] requested by a policy. Raises PluginError outside the allowed range."""
     place = np.asarray(place, dtype=float)
-    if place.shape != (2,) or not np.all((place >= task.low - ROUNDED_M) & (place <= task.high + ROUNDED_M)):  # also rejects NaN
+    if place.shape != (2,) or not np.all(
+        (place >= task.low - TUNING.rounded_m) & (place <= task.high + TUNING.rounded_m)
+    ):  # also rejects NaN
         raise PluginError(f"search.policy: requested place {place} m; allowed: {task.low} to {task.high} m")
-    if not 0 < depth <= task.deepest + ROUNDED_M:
+    if not 0 < depth <= task.deepest + TUNING.rounded_m:
         raise PluginError(f"search.policy: requested depth {depth} m; allowed: above 0, at most {task.deepest} m")
     return place, float(depth)
 
@@ -140,13 +152,13 @@ def outline(lump: Bump, posterior: Posterior) -> list[Array]:
 
     Places outside the region, or already pressed, are omitted.
     """
-    angles = 2 * np.pi * np.arange(OUTLINE_PRESSES) / OUTLINE_PRESSES
+    angles = 2 * np.pi * np.arange(TUNING.outline_presses) / TUNING.outline_presses
     about = np.array((lump.x, lump.y)) + lump.radius * np.column_stack((np.cos(angles), np.sin(angles)))
     places = np.vstack(((lump.x, lump.y), about))
     task, pressed = posterior.task, np.array([press.xy for press in posterior.presses])
     inside = np.all((places >= task.low) & (places <= task.high), axis=1)
     apart = np.linalg.norm(places[:, None] - pressed, axis=2).min(axis=1)
-    return list(places[inside & (apart > REACHED_M)])
+    return list(places[inside & (apart > TUNING.reached_m)])
 
 
 def _press(sample: Message) -> Press:
@@ -157,7 +169,7 @@ def _press(sample: Message) -> Press:
         sample.normal_force,
         nanoseconds(sample.header.stamp) / NS,
         limited=sample.force_limited,
-        depth_uncertainty=max(sample.depth_uncertainty, LEAST_UNCERTAINTY_M),
+        depth_uncertainty=max(sample.depth_uncertainty, TUNING.least_uncertainty_m),
         stroke=int(sample.stroke),
     )
 

@@ -10,12 +10,12 @@ import pytest
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
+from palpate.check.suites.search import LUMP, REQUEST, Play, pressed, suite
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
 from palpate_plugins import PluginError
 from palpate_search.presses import Task
-from palpate_search.service import FEWEST, checked, create
+from palpate_search.service import TUNING, checked, create
 
 
 def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
@@ -32,7 +32,7 @@ def test_it_finds_the_stiff_area_and_ends() -> None:
     requests = [item.message for item in rig.log[REQUEST]]
     assert requests[-1].request == SearchRequest.DONE
     assert requests[-1].lump < Search().missed
-    assert FEWEST < len(requests) < 40
+    assert TUNING.fewest_presses < len(requests) < 40
     places = np.array([(message.place.x, message.place.y) for message in requests[:-1]])
     assert (np.linalg.norm(places - 0.02, axis=1) < 0.025).sum() >= 3
 
@@ -114,5 +114,5 @@ def test_the_report_says_what_it_took() -> None:
     suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
     facts = service.finish()
     assert facts["presses"] == 5
-    assert 4 * PRESS_S <= facts["seconds"] <= 6 * PRESS_S + 0.5
+    assert 4 * LUMP.press_s <= facts["seconds"] <= 6 * LUMP.press_s + 0.5
     assert facts["ended"] == "5 presses made"

@@ -34,12 +34,12 @@ class Stop:
 
 
 class Latch:
-    """Level, cause and reason, kept until a release."""
+    """Level, cause, reason and culprit, kept until a release."""
 
     def __init__(self) -> None:
         self.level = Level.OK
         self.cause = StopCause.NONE
-        self.reason = ""
+        self.reason = self.culprit = ""
         self.releases = 0
         self.refusals = 0
         self.stops: list[Stop] = []
@@ -69,7 +69,7 @@ class Latch:
             began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
             if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
                 reason = f"soft stop did not help within {breach.timeout_ns / 1e6:.0f} ms: {breach.reason}"
-                self._latch(t, Breach(Level.EMERGENCY, StopCause.UNHEEDED, reason))
+                self._latch(t, Breach(Level.EMERGENCY, StopCause.UNHEEDED, reason, culprit=breach.culprit))
 
     def _recovers(self, breach: Breach) -> bool:
         """Return True if `breach` was released and has not grown since."""
@@ -79,7 +79,7 @@ class Latch:
         return breach.level <= released.level and breach.beyond_m <= released.beyond_m + TUNING.further_m
 
     def _latch(self, t: int, breach: Breach) -> None:
-        self.level, self.cause, self.reason = breach.level, breach.cause, breach.reason
+        self.level, self.cause, self.reason, self.culprit = breach.level, breach.cause, breach.reason, breach.culprit
         self._since = t
         self.stops.append(Stop(t, breach.level, breach.cause, breach.reason))
 
@@ -88,10 +88,10 @@ class Latch:
         against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not StopCause.DRIVER]
         if against:
             self.refusals += 1
-            self.reason = f"release refused: {against[0].reason}"
+            self.reason, self.culprit = f"release refused: {against[0].reason}", against[0].culprit
             return standing
         self._recovering = {breach.cause: breach for breach in standing if breach.cause in RECOVERABLE}
-        self.level, self.cause, self.reason = Level.OK, StopCause.NONE, ""
+        self.level, self.cause, self.reason, self.culprit = Level.OK, StopCause.NONE, "", ""
         self.releases += 1
         self._released = t
         return []

@@ -79,7 +79,7 @@ class SupervisorService(Service):
                 release = True
             else:
                 reason = f"operator/request: unknown request {request.request} is treated as a stop"
-                breaches.append(Breach(Level.EMERGENCY, StopCause.INVALID, reason))
+                breaches.append(Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="operator/request"))
         for mesh in inbox.new("perception/surface"):
             breaches += self._take_surface(mesh)
         if inbox.new("robot/status"):
@@ -89,7 +89,7 @@ class SupervisorService(Service):
         latch, tool = self._latch, self._tool
         state = SupervisorState(
             header(t), int(latch.level), int(latch.cause), latch.reason, latch.releases, tool.force, self._depth, tool.speed,
-            latch.refusals,
+            latch.refusals, latch.culprit,
         )  # fmt: skip
         return {"supervisor/state": state}
 
@@ -109,7 +109,10 @@ class SupervisorService(Service):
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
         """Return breaches for lost roles and for watched topics that are too old."""
         lost = [(role, level) for role, level in LOSS_LEVELS if inbox.lost(role)]
-        found = [Breach(level, StopCause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns) for role, level in lost]
+        found = [
+            Breach(level, StopCause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns, culprit=role)
+            for role, level in lost
+        ]
         self._began = t if self._began is None else self._began
         if t - self._began <= TUNING.settle_ns:
             return found
@@ -117,7 +120,7 @@ class SupervisorService(Service):
             received = inbox.stamp(name)
             if received is not None and t - received > self._max_age:
                 reason = f"no message on {name} for {(t - received) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-                found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason))
+                found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason, culprit=name))
         return found
 
     def _take_surface(self, mesh: Any) -> list[Breach]:
@@ -128,14 +131,15 @@ class SupervisorService(Service):
             normals = np.asarray(mesh.normals, dtype=float).reshape(-1, 3)
             self._surface = RestSurface(vertices, normals, self._radius)
         except ValueError as error:
-            return [Breach(Level.SOFT_STOP, StopCause.INVALID, f"perception/surface: {error}")]
+            return [Breach(Level.SOFT_STOP, StopCause.INVALID, f"perception/surface: {error}", culprit="perception/surface")]
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
         values = {"position": status.position, "velocity": status.velocity, "wrench": wrench(status.wrench)}
         for name, value in values.items():
             if not np.isfinite(value).all():
-                return [Breach(Level.EMERGENCY, StopCause.INVALID, f"robot/status: {name} = {value}: must be finite")]
+                reason = f"robot/status: {name} = {value}: must be finite"
+                return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
         self._tool = tool = self._sense.sense(*values.values())
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
@@ -147,9 +151,11 @@ class SupervisorService(Service):
         found = self._watch.judge(tool, depth, stamp, t)
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
-            found.append(Breach(Level.EMERGENCY, StopCause.SILENT, f"robot/status repeats a measurement of age {age}"))
+            reason = f"robot/status repeats a measurement of age {age}"
+            found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
-            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, f"safe hold of the driver: {status.reason}"))
+            reason = f"safe hold of the driver: {status.reason}"
+            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit))
         return found
 
 

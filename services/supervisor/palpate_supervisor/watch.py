@@ -78,6 +78,8 @@ class Breach:
     """Time that a soft stop has to end the breach."""
     beyond_m: float = 0.0
     """Distance beyond the limit of depth or workspace."""
+    culprit: str = ""
+    """Role or topic that is missing or invalid."""
 
 
 class LimitWatch:
@@ -132,11 +134,12 @@ class LimitWatch:
     def _speed(self, speed: float, force: float) -> list[Breach]:
         free = self._limits.speed_mps * TUNING.speed_margin
         if not speed <= free:  # also for NaN
-            return [Breach(Level.EMERGENCY, StopCause.SPEED, f"robot/status: tool speed {speed:.2f} m/s, limit {free:.2f} m/s")]
+            reason = f"robot/status: tool speed {speed:.2f} m/s, limit {free:.2f} m/s"
+            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
         contact = self._limits.contact_speed_mps
         if force > TUNING.contact_n and speed > contact:
             reason = f"robot/status: tool speed {speed:.2f} m/s at {force:.1f} N, limit in contact {contact:.2f} m/s"
-            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason)]
+            return [Breach(Level.EMERGENCY, StopCause.SPEED, reason, culprit="robot/status")]
         return []
 
     def _workspace(self, p_W: Array) -> list[Breach]:

@@ -22,7 +22,7 @@ def status(stamp: int, force: float) -> RobotStatus:
     """The arm stands, with a force that presses the tool up."""
     weight = load_scenario("healthy").robot.tool_mass_kg * GRAVITY
     wrench = Wrench(Vector3(0.0, 0.0, weight + force), Vector3(0.0, 0.0, 0.0))
-    return RobotStatus(header(stamp), 1, 0, "", np.array(lbr.HOME), np.zeros(7), wrench, np.zeros(7), 0)
+    return RobotStatus(header(stamp), 1, 0, "", np.array(lbr.HOME), np.zeros(7), wrench, np.zeros(7), 0, "")
 
 
 def after(service: SupervisorService, t: int, **messages: Any) -> Any:

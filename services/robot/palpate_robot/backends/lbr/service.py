@@ -229,7 +229,7 @@ class LbrService(Service):
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
             expires = stamp + nanoseconds(message.valid_for)
-            self._command = Command(np.array(message.torque), stamp, expires, message.problem)
+            self._command = Command(np.array(message.torque), stamp, expires, message.problem, message.culprit)
             self._command_message = message
         return self._command
 
@@ -241,10 +241,12 @@ class LbrService(Service):
         elif self._arm.received is not None:
             measured = self._arm.received  # no new measurement
         means = self._means
-        reason = driver.reason or self._arm.fault(t) or ""
+        cause, reason, fault = driver.cause, driver.reason, self._arm.fault(t)
+        if not driver.held and fault is not None:
+            cause, reason = HoldCause.DEVICE, fault
         return RobotStatus(
-            header(measured), int(driver.mode), int(driver.cause), reason, means[:7], means[7:14], _wrench(means[14:]),
-            self._applied.copy(), driver.rejected,
+            header(measured), int(driver.mode), int(cause), reason, means[:7], means[7:14], _wrench(means[14:]),
+            self._applied.copy(), driver.rejected, driver.culprit,
         )  # fmt: skip
 
     def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:
