@@ -38,7 +38,7 @@ def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
 
     def supervisor(t: int) -> Any:
         reason = "conformance check" if cause else ""
-        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0, 0)
+        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0, 0, "")
 
     return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero), "supervisor/state": supervisor}
 
@@ -47,7 +47,7 @@ def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> 
     """Return the inputs with a torque command [N m], shape (7,), on every tick."""
     values = np.asarray(torque, dtype=float)
     valid_ns = rig.rules.topics[COMMAND].expiry
-    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "")}
+    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "", "")}
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

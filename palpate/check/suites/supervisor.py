@@ -68,7 +68,7 @@ class PlayedArm:
         force = R_WS.T @ np.array((0.0, 0.0, self.push_N - self.robot.tool_mass_kg * GRAVITY))
         wrench = Wrench(Vector3(*force.tolist()), Vector3(0.0, 0.0, 0.0))
         cause = RobotStatus.CAUSE_COMMAND_EXPIRED if self.reason else RobotStatus.CAUSE_NONE
-        return RobotStatus(header(t), self.mode, cause, self.reason, self.q, self.qd, wrench, np.zeros(7), 0)
+        return RobotStatus(header(t), self.mode, cause, self.reason, self.q, self.qd, wrench, np.zeros(7), 0, "")
 
     def _exam(self, t: int) -> Any:
         return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
