@@ -36,7 +36,7 @@ from research.felt_scans import FIELD_LENGTH_M, ScanErrors, felt_samples
 
 LENGTHS_M: Final = (0.015, 0.05, 0.15)
 NATURAL_SD: Final = 0.2
-"""Standard deviation of the logarithm, between places of one person (docs/persons.md)."""
+"""Standard deviation of the logarithm, between places of one person (docs/reality.md)."""
 LEVEL_N: Final = 2.5
 CONTRASTS: Final = (1.3, 3.0)
 """Felt contrast of the lumps, evenly spread in its logarithm."""

@@ -104,7 +104,7 @@ def test_every_unit_that_fits_is_named_with_the_size_it_gives(tmp_path):
 
 
 def ply(vertices, faces, *, promised=0, comment=""):
-    """An ASCII PLY whose header promises so many faces more than there are."""
+    """An ASCII PLY whose header promises `promised` more faces than there are."""
     header = (
         f"ply\nformat ascii 1.0\n{comment}element vertex {len(vertices)}\nproperty float x\nproperty float y\nproperty float z\n"
     )

@@ -31,11 +31,11 @@ from palpate_errors import RunError
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
 
-_SEEN_FRAMES: Final = ("time", "phase", "depth", "setpoint", "force", "in_contact", "steady", "force_limited")
+_STATE_COLUMNS: Final = ("time", "phase", "depth", "setpoint", "force", "in_contact", "steady", "force_limited")
 
 
 class ExaminationError(RunError):
-    """An examination left no results; has the message of the command line."""
+    """An examination left no results. The text is the last line that the command printed."""
 
 
 class Examination:
@@ -71,7 +71,7 @@ class Examination:
     @cached_property
     def states(self) -> pd.DataFrame:
         """Measurements over time, one row per state: time [s], phase, depth and set-point [m], force [N], flags."""
-        return pd.DataFrame({name: getattr(self._evidence, name) for name in _SEEN_FRAMES})
+        return pd.DataFrame({name: getattr(self._evidence, name) for name in _STATE_COLUMNS})
 
     @cached_property
     def map(self) -> StiffnessMap | None:
@@ -170,15 +170,15 @@ def run(
     """
     chosen = scenario_of(scenario, seed=seed, **settings)
     folder = usual_folder(chosen.name) if out is None else Path(out)
-    with tempfile.TemporaryDirectory(prefix="palpate-run-") as place:
-        file = Path(place) / f"{chosen.name}.yaml"
+    with tempfile.TemporaryDirectory(prefix="palpate-run-") as temporary:
+        file = Path(temporary) / f"{chosen.name}.yaml"
         file.write_text(dump_scenario(chosen), encoding="utf-8")
         flags = {"--overwrite": overwrite, "--quiet": quiet}
         arguments = [str(file), "--out", str(folder), "--composed", "--record", record]
         arguments += [flag for flag, wanted in flags.items() if wanted]
-        status, said = _palpate("run", *arguments, quiet=quiet)
+        status, messages = _palpate("run", *arguments, quiet=quiet)
     if status not in (0, EXIT_FAILED) or not (folder / "report.json").is_file():
-        raise ExaminationError(said[-1] if said else f"{folder}: there are no results (status {status})")
+        raise ExaminationError(messages[-1] if messages else f"{folder}: there are no results (status {status})")
     examination = Examination(folder)
     if examination.failure:
         warnings.warn(f"{folder}: the examination failed: {examination.failure}", stacklevel=2)
@@ -197,14 +197,14 @@ def _palpate(*arguments: str, quiet: bool) -> tuple[int, list[str]]:
         start_new_session=True,  # Ctrl-C reaches it once, from this process
     ) as process:
         assert process.stderr is not None
-        said = []
+        lines = []
         try:
             for line in process.stderr:
-                said.append(line.rstrip())
+                lines.append(line.rstrip())
                 if not quiet:
-                    print(said[-1], file=sys.stderr)
+                    print(lines[-1], file=sys.stderr)
         except KeyboardInterrupt:
             process.send_signal(signal.SIGINT)
             process.communicate()
             raise
-        return process.wait(), said
+        return process.wait(), lines

@@ -34,7 +34,7 @@ REPORT_S: Final = 0.1
 
 
 class Stage(IntEnum):
-    """What the child does with a service."""
+    """Activity of the child with a service."""
 
     LOAD = 0
     STEP = 1
@@ -43,7 +43,7 @@ class Stage(IntEnum):
 
 @dataclass(frozen=True)
 class Place:
-    """Where the child is, in memory that it shares with its parent: number of a role, simulated time [ns], stage."""
+    """Progress of the child, in memory that it shares with its parent: number of a role, simulated time [ns], stage."""
 
     cells: MutableSequence[int]
 
@@ -75,7 +75,7 @@ class Place:
 
     @property
     def stage(self) -> Stage:
-        """What it does."""
+        """Present activity."""
         return Stage(self.cells[2])
 
 
@@ -147,7 +147,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
 
 
 class _Limits:
-    """How long each part may take, and what it means that the child ended in one."""
+    """Time limits of the stages, and the failure of a run whose child ended in one."""
 
     def __init__(self, place: Place, foreign: frozenset[str]) -> None:
         self._place, self._foreign = place, foreign

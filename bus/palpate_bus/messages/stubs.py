@@ -1,6 +1,6 @@
 """Writes `__init__.pyi`, which declares the fields of the message classes for type checkers.
 
-python -m palpate_bus.messages.stubs --write     after a change of a .msg file or of names.py
+python -m palpate_bus.messages.stubs --write     after a change of a .msg file or of typestore.py
 python -m palpate_bus.messages.stubs --check     exits with 1 if the file is out of date; a test runs it
 """
 
@@ -18,7 +18,7 @@ from palpate_bus.messages.typestore import TYPE_NAMES, array_dtype, store
 STUB = Path(__file__).with_name("__init__.pyi")
 
 _HEAD = '''\
-"""Written by `python -m palpate_bus.messages.stubs --write`; change the .msg files or names.py instead."""
+"""Written by `python -m palpate_bus.messages.stubs --write`; change the .msg files or typestore.py instead."""
 
 from dataclasses import dataclass
 from typing import ClassVar

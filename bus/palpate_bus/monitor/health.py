@@ -51,7 +51,7 @@ class TopicHealth:
     bus_rate_hz: float | None
     """Messages per second of bus time."""
     age_ms: float | None
-    """Age of the newest message by its source time (wall clock)."""
+    """Age of the newest message by its source time (wall clock); None before the first."""
     bytes_per_s: float
     missing: int
     """Number of missing sequence numbers."""
@@ -63,7 +63,7 @@ class TopicHealth:
 RECENT_S = 3.0
 """A violation is an error for this time after its last occurrence, then a warning."""
 PREFIX = "palpate/topic/"
-"""Prefix of the topic's name; ROS tools group by path."""
+"""Prefix of a topic's name in `DiagnosticStatus.name`; ROS tools group statuses by path."""
 
 
 def topic_statuses(health: Iterable[TopicHealth], active: Iterable[SeenViolation], now: float) -> list[codec.Message]:
@@ -91,12 +91,12 @@ def _status(row: TopicHealth, found: list[SeenViolation], now: float) -> codec.M
 
 
 def _level(row: TopicHealth, found: list[SeenViolation], now: float) -> tuple[int, str]:
-    """Return level and text."""
+    """Return level and text of the status of a topic with the violations `found`, the newest last."""
     if found:
-        worst = found[-1]
-        if now - worst.last <= RECENT_S:
-            return DiagnosticStatus.ERROR, str(worst.violation)
-        return DiagnosticStatus.WARN, f"was: {worst.violation} ({_how_often(worst)})"
+        newest = found[-1]
+        if now - newest.last <= RECENT_S:
+            return DiagnosticStatus.ERROR, str(newest.violation)
+        return DiagnosticStatus.WARN, f"was: {newest.violation} ({_how_often(newest)})"
     if not row.senders:
         producer = contract().roles.get(row.topic.producer)
         optional = producer is not None and producer.optional

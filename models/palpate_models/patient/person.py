@@ -1,4 +1,7 @@
-"""Random persons: body, wall, anatomy, breathing, lumps and guarding, drawn from statistics of living people."""
+"""Random persons: body, wall, anatomy, breathing, lumps and guarding, drawn from statistics of living people.
+
+Marks of certainty: [V] read in the source, [C] computed from measurements, [M] from memory of the literature, [A] assumed.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,7 @@ from palpate_models.patient.schema import (
 )
 
 GAP_M = (0.002, 0.020)
-"""Gap between the outlines of a pair."""
+"""Range of the gap between the outlines of a pair of lumps, uniform."""
 _TRIES = 50
 
 
@@ -39,10 +42,10 @@ def drawn_lumps(draw: Draw, rng: np.random.Generator) -> tuple[Lesion, ...]:
     count = int(rng.integers(draw.lumps[0], draw.lumps[1] + 1))
     lumps: list[Lesion] = []
     while len(lumps) < count:
-        first = _apart(draw, rng, lumps)
+        first = _separate_lump(draw, rng, lumps)
         lumps.append(first)
         if len(lumps) < count and rng.random() < draw.pairs:
-            lumps.append(_beside(first, _lump(draw, rng, first.centre_m), rng))
+            lumps.append(_moved_beside(first, _lump(draw, rng, first.centre_m), rng))
     return tuple(lumps)
 
 
@@ -56,27 +59,28 @@ def _place(draw: Draw, rng: np.random.Generator) -> tuple[float, float]:
 
 
 def _lump(draw: Draw, rng: np.random.Generator, centre_m: tuple[float, float]) -> Lesion:
-    small = _between(draw.radius_m, rng)
+    small = _log_uniform(draw.radius_m, rng)
     radii = (small, small * float(rng.uniform(*draw.elongation)))
     return Lesion(
         centre_m=centre_m,
         radii_m=radii if rng.random() < 0.5 else radii[::-1],
-        contrast=_between(draw.contrast, rng),
+        contrast=_log_uniform(draw.contrast, rng),
         depth_m=float(rng.uniform(*draw.depth_m)),
     )
 
 
-def _between(limits: Range, rng: np.random.Generator) -> float:
-    """Return a log-uniform number."""
+def _log_uniform(limits: Range, rng: np.random.Generator) -> float:
+    """Return a number from the log-uniform distribution between `limits`."""
     return float(np.clip(np.exp(rng.uniform(*np.log(limits))), *limits))
 
 
-def _apart(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -> Lesion:
+def _separate_lump(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -> Lesion:
     """Return a lump that overlaps no other; if no try succeeds, the one farthest from the others."""
     best, most = _lump(draw, rng, _place(draw, rng)), -np.inf
     for _ in range(_TRIES):
         lump = best.model_copy(update={"centre_m": _place(draw, rng)})
-        gap = min((dist(lump.centre_m, one.centre_m) - max(lump.radii_m) - max(one.radii_m) for one in others), default=np.inf)
+        gaps = (dist(lump.centre_m, other.centre_m) - max(lump.radii_m) - max(other.radii_m) for other in others)
+        gap = min(gaps, default=np.inf)
         if gap > most:
             best, most = lump, gap
         if gap > 0:
@@ -84,8 +88,8 @@ def _apart(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -> Lesion
     return best
 
 
-def _beside(first: Lesion, second: Lesion, rng: np.random.Generator) -> Lesion:
-    """Return the second lump of a pair: in a random direction from the first, a gap away from its outline."""
+def _moved_beside(first: Lesion, second: Lesion, rng: np.random.Generator) -> Lesion:
+    """Return the second lump of a pair, moved in a random direction from the first to a random gap between the outlines."""
     angle = rng.uniform(0, 2 * np.pi)
     away = np.array((np.cos(angle), np.sin(angle)))
     reach = sum(1 / np.hypot(*(away / np.array(lump.radii_m))) for lump in (first, second)) + rng.uniform(*GAP_M)
@@ -122,7 +126,7 @@ def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
     The covariance of the persons' means contains a share of the covariance between places, which is subtracted. A person's wall
     has one length, so the covariance of the other two is conditional on the length.
     """
-    people = [values[person == one] for one in np.unique(person)]
+    people = [values[person == number] for number in np.unique(person)]
     means = np.array([rows.mean(axis=0) for rows in people])
     scatter = [(rows - mean).T @ (rows - mean) for rows, mean in zip(people, means, strict=True)]
     within = np.sum(scatter, axis=0) / (len(values) - len(people))

@@ -1,6 +1,7 @@
-"""The pinhole camera: pixel (u, v) looks along ((u - cx)/fx, (v - cy)/fy, 1) of the optical frame C (x right, y down).
+"""Intrinsics and messages of all backends.
 
-Pixel centres have integer coordinates, as in ROS, so the principal point of a w x h image is ((w - 1)/2, (h - 1)/2).
+Pixel (u, v) looks along ((u - cx)/fx, (v - cy)/fy, 1) of the optical frame C (x right, y down). Pixel centres have integer
+coordinates, as in ROS, so the principal point of a w x h image is ((w - 1)/2, (h - 1)/2).
 """
 
 from __future__ import annotations
@@ -32,7 +33,7 @@ class Pinhole:
 
     @classmethod
     def of(cls, camera: Camera) -> Pinhole:
-        """The intrinsics of a scenario's camera."""
+        """Return the intrinsics of a scenario's camera."""
         focal = camera.focal_px
         return cls(camera.width_px, camera.height_px, focal, focal, (camera.width_px - 1) / 2, (camera.height_px - 1) / 2)
 
@@ -42,14 +43,14 @@ class Pinhole:
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def directions(self) -> Array:
-        """Viewing directions in C with unit z, shape (height, width, 3): a depth times a direction is a point."""
+        """Return viewing directions in C with unit z, shape (height, width, 3): a depth times a direction is a point."""
         directions = np.ones((self.height, self.width, 3))
         directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
         directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, np.newaxis]
         return directions
 
     def every(self, k: int) -> Pinhole:
-        """The camera of every `k`-th pixel: its pixel (i, j) is (k // 2 + k i, k // 2 + k j) of this one."""
+        """Return the camera of every `k`-th pixel: its pixel (i, j) is (k // 2 + k i, k // 2 + k j) of this one."""
         first = k // 2
         size = len(range(first, self.width, k)), len(range(first, self.height, k))
         return Pinhole(*size, self.fx / k, self.fy / k, (self.cx - first) / k, (self.cy - first) / k)
@@ -64,24 +65,24 @@ SMALL_WIDTH_PX: Final = 96
 """About how wide the small image is."""
 
 
-def apart(width: int) -> int:
+def small_spacing(width: int) -> int:
     """Return the pixel spacing k of the small image for a full-size image of that width [px]."""
     return max(round(width / SMALL_WIDTH_PX), 1)
 
 
 def whole(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """The messages of a whole image, [m], shape (height, width), NaN where invalid."""
+    """Return the messages of a full-size image of `depth` [m], shape (height, width), NaN where invalid."""
     return {IMAGE: depth_image(t, depth), INFO: camera_info(t, pinhole)}
 
 
 def small(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """The messages of a small image, likewise; `pinhole` is its own."""
+    """Return the messages of a small image, as `whole`; `pinhole` has the intrinsics of the small image."""
     return {SMALL_IMAGE: depth_image(t, depth), SMALL_INFO: camera_info(t, pinhole)}
 
 
 def every_few(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
     """The messages of the small image of a whole one, [m], shape (height, width), of the camera `pinhole`."""
-    k = apart(pinhole.width)
+    k = small_spacing(pinhole.width)
     return small(t, depth[k // 2 :: k, k // 2 :: k], pinhole.every(k))
 
 

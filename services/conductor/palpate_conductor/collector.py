@@ -121,7 +121,7 @@ class Collected:
 
 
 class CollectedNews:
-    """What a process has collected since it last reported it to another one, which adds it to its copy."""
+    """Data collected by a process since its last report to another one, which adds them to its copy."""
 
     def __init__(self, collected: Collected) -> None:
         self._collected = collected

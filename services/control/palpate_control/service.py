@@ -26,7 +26,7 @@ _NAMES = list(JOINT_NAMES)
 
 
 class Problem(NamedTuple):
-    """Why commanding stops: the topic that causes it, and a text for people."""
+    """Cause of a stop of commands: the topic at fault, and a text for people."""
 
     culprit: str
     text: str

@@ -30,7 +30,7 @@ NO_STIFFNESS: Final = _fixed([0.0] * 7)
 """No torque [N m/rad]; the set-point only keeps the chain of commands alive."""
 _NO_TWIST: Final = _fixed([0.0] * 6)
 _NO_WRENCH: Final = _fixed([0.0] * 6)
-_JOINTSAT_REST: Final = _fixed([0.0] * 7)
+_JOINTS_AT_REST: Final = _fixed([0.0] * 7)
 AT_REST: Final = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,
@@ -40,14 +40,14 @@ AT_REST: Final = Setpoint(
     F_W=_NO_WRENCH,
     stiffness=CARTESIAN_STIFFNESS,
     damping_ratio=DAMPING_RATIO,
-    q=_JOINTSAT_REST,
-    qd=_JOINTSAT_REST,
+    q=_JOINTS_AT_REST,
+    qd=_JOINTS_AT_REST,
     joint_stiffness=JOINT_STIFFNESS,
 )
 """Common fields of both kinds."""
 
 
-def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTSAT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
+def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
     """Return the set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
 
     X_WI, shape (4, 4): pose of the indenter, for other readers of the message; the controller does not use it.
@@ -62,7 +62,7 @@ def cartesian_setpoint(
     q: Array,
     V_WD: Array = _NO_TWIST,
     F_W: Array = _NO_WRENCH,
-    qd: Array = _JOINTSAT_REST,
+    qd: Array = _JOINTS_AT_REST,
 ) -> Setpoint:
     """Return the set-point of contact at `t` [ns]: pose, twist, feed-forward wrench, posture q [rad] in the null space.
 

@@ -322,7 +322,7 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
         force, damping = rng.normal(size=3), np.full(7, 3.0)
         quick.step(torque, force, NOTHING, damping)
         thorough.step(torque, force, NOTHING, damping)
-        free += quick._free > LEAST_CLEARANCE_RAD
+        free += quick._free_travel > LEAST_CLEARANCE_RAD
         touched = touched or thorough.contacts() > 0
         assert quick.contacts() == thorough.contacts()
         np.testing.assert_array_equal(quick.q, thorough.q)
@@ -347,7 +347,7 @@ def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyP
     for k in range(2500):
         torque = plant.gravity_torque() + 4 * np.sin(0.003 * k + np.arange(7.0))
         plant.step(torque, None, NOTHING, np.full(7, 3.0))
-        searched += plant._free <= LEAST_CLEARANCE_RAD
+        searched += plant._free_travel <= LEAST_CLEARANCE_RAD
     assert len(looks) > 2
     assert min(looks) > LEAST_CLEARANCE_RAD
     assert searched == 0

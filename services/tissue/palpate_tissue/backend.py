@@ -15,12 +15,10 @@ from palpate_models.scenario import press
 
 
 class TissueBackend(ABC):
-    """A soft body with a surface of n vertices, pressed by a sphere. All quantities are in the abdomen frame A and in SI
-    units.
-    """
+    """A soft body with a surface of n vertices, pressed by a sphere. Quantities are in the abdomen frame A and in SI units."""
 
     touching: bool = False
-    """True if the sphere holds a vertex after the step."""
+    """True if the sphere touched the surface in the last step."""
     activation: float = 1.0
     """Contraction of guarding muscles, 0 to 1: a in `palpate_models.patient.wall`."""
 
@@ -47,7 +45,7 @@ class TissueBackend(ABC):
         """Resets the body to its undisturbed rest state."""
 
     def in_steps_of(self, dt: float) -> TissueBackend:
-        """Return the same body at rest for steps of about `dt` [s] if the physics allows them, else this one at rest."""
+        """Return this body, at rest, for steps of about `dt` [s] if the physics allows them, else with its own steps."""
         self.settle()
         return self
 
@@ -73,12 +71,12 @@ class TissueBackend(ABC):
     @property
     @abstractmethod
     def contacts(self) -> NDArray[np.intp]:
-        """Return the vertices in contact after the step, shape (k,)."""
+        """Return the indices of the vertices in contact after the step, shape (k,)."""
 
     @property
     @abstractmethod
     def deepest(self) -> tuple[int, float]:
-        """Return the most displaced vertex in contact and its inward displacement [m]. Requires contact."""
+        """Return the index of the most displaced vertex in contact and its inward displacement [m]. Requires contact."""
 
     @property
     @abstractmethod
@@ -91,7 +89,7 @@ class TissueBackend(ABC):
         return self.model.vertices - self.inward[:, None] * self.model.normals
 
     def guard(self, v_A: Array) -> None:
-        """Advances `activation` by a period for a sphere of velocity `v_A` [m/s]. Call it at the end of each step."""
+        """Advances `activation` by a period for a sphere of velocity `v_A` [m/s]. Each `step` ends with it."""
         if self._guarding.voluntary and self.touching:
             vertex, depth = self.deepest
             self.activation = self._guarding.after(self.activation, depth, -float(v_A @ self.model.normals[vertex]))

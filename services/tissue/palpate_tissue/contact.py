@@ -61,9 +61,7 @@ class VertexSearch:
         self._excursion, self._margin = excursion, margin
 
     def around(self, p: list[float], radius: float, deepest: float) -> Near:
-        """Return the vertices that a sphere of `radius` [m] near `p` [m] can touch if the skin is displaced by up to `deepest`
-        [m].
-        """
+        """Return the vertices that a sphere of `radius` [m] near `p` can touch if the skin is displaced by at most `deepest`."""
         ball = math.hypot(radius, max(_REACH_M, deepest + 0.01)) + self._excursion + self._margin
         distance, nearest = self._tree.query(p)
         index = np.sort(np.asarray(self._tree.query_ball_point(p, ball), dtype=np.intp))
@@ -144,8 +142,8 @@ class Push(NamedTuple):
 def shear(bristle: Bristle, velocity: Vector, normal: Vector, load: float, h: float) -> Vector:
     """Return the friction force on the indenter [N] after `h` [s].
 
-    `velocity` [m/s] is that of the indenter's surface relative to the tissue, `normal` a unit vector, `load` the normal force
-    [N].
+    `velocity` [m/s] is that of the indenter's surface relative to the tissue, `normal` a unit vector, `load` [N] the normal
+    force.
     """
     s = add((bristle.stretch[0], bristle.stretch[1], bristle.stretch[2]), scale(h, velocity))
     s = subtract(s, scale(dot(s, normal), normal))

@@ -1,7 +1,7 @@
 """A patient who moves on the table: wraps any tissue service and transforms its messages.
 
-The tissue simulates a body at rest in a world W' that moves with the body: X_WW' = X_WA X_AA' X_AW. Inputs are transformed from W
-to W', outputs from W' to W.
+The tissue simulates a body at rest in a frame V that moves with the body: X_WV = X_WA X_AA' X_AW, A' being the moved A. Inputs
+are transformed from W to V, outputs from V to W.
 """
 
 from __future__ import annotations
@@ -43,11 +43,10 @@ class MovingBody(Service):
         self._motion = motion
         self._X_WA, self._X_AW = X_WA, inverse(X_WA)
         self._X_WV = np.eye(4)
-        """V stands for W', the world that moves with the body."""
         self._v_A, self._w_A = np.zeros(3), np.zeros(3)
         """Twist of the body, see `BodyMotion.twist`."""
         self._evaluated_s = -np.inf
-        self._sent: Mapping[str, Callable[[Any], Message]] = {
+        self._to_world: Mapping[str, Callable[[Any], Message]] = {
             "sim/contact_wrench": self._wrench,
             "sim/surface": self._surface,
             "truth/indentation": self._indentation,
@@ -73,7 +72,7 @@ class MovingBody(Service):
             self._v_A, self._w_A = self._motion.twist(t_s)
             self._evaluated_s = t_s
         for part in self._tissue.parts(t, _ConvertedInbox(inbox, self._seen_from_body)):
-            yield {topic: self._sent[topic](message) if topic in self._sent else message for topic, message in part.items()}
+            yield {topic: self._to_world.get(topic, _unchanged)(message) for topic, message in part.items()}
 
     def finish(self) -> Mapping[str, Any]:
         """Return the tissue's facts, the time of the motion, and the displacement of the body's origin."""
@@ -97,7 +96,7 @@ class MovingBody(Service):
 
     def _surface(self, message: Any) -> Message:
         R, p = self._X_WV[:3, :3], self._X_WV[:3, 3]
-        return replace(message, vertices=_turned(message.vertices, R, p), normals=_turned(message.normals, R))
+        return replace(message, vertices=_transformed(message.vertices, R, p), normals=_transformed(message.normals, R))
 
     def _indentation(self, message: Any) -> Message:
         p_W = self._X_WV[:3, :3] @ vector(message.surface_point) + self._X_WV[:3, 3]
@@ -129,6 +128,10 @@ class _ConvertedInbox:
         return self._inbox.lost(role)
 
 
-def _turned(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
-    """Return n points or vectors, flat, shape (3 n,), rotated by R and translated by p [m]."""
+def _unchanged(message: Message) -> Message:
+    return message
+
+
+def _transformed(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
+    """Return n points or vectors, concatenated, shape (3 n,), rotated by R and translated by p [m]."""
     return np.asarray(values.reshape(-1, 3) @ R.T + p, dtype=np.float32).ravel()

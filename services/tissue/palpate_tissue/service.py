@@ -32,7 +32,7 @@ MOST_MISSED_STEPS = 200
 
 
 class TissueService(Service):
-    """The soft abdomen. The wrench is zero before the first tool state; between two the newest is used."""
+    """The soft abdomen. The wrench is zero before the first tool state. A tick without a new one uses the last."""
 
     role: ClassVar[str] = "tissue"
 
@@ -52,7 +52,7 @@ class TissueService(Service):
         self._R_WA = np.ascontiguousarray(self._X_WA[:3, :3])
         self._R_AW = np.ascontiguousarray(self._R_WA.T)
         self._p_WA = self._X_WA[:3, 3].copy()
-        self._lies = pose_message(self._R_WA, self._p_WA)
+        self._patient_pose = pose_message(self._R_WA, self._p_WA)
         self._transposed_X_AW = np.ascontiguousarray(inverse(self._X_WA)[:3].T)
         """Maps rows of homogeneous world coordinates, points (1) and vectors (0), to rows in A; shape (4, 3)."""
         self._vertices_W = np.ascontiguousarray(apply(self._X_WA, truth.vertices).T)
@@ -64,7 +64,9 @@ class TissueService(Service):
         """Previous tick [ns]; None before the first tool state."""
         self._p_A: Array = np.zeros(3)
         """Indenter centre at that tick [m]."""
-        self._peak_n = self._recent_peak_n = 0.0
+        self._peak_n = 0.0
+        self._period_peak_n = 0.0
+        """Peak force [N] since the last `truth/indentation`."""
         self._contact_steps = 0
         self._onsets = 0
         self._touching = False
@@ -76,7 +78,7 @@ class TissueService(Service):
         surface = SurfaceMesh(
             header(0, "abdomen"), _flat(truth.vertices.T), _flat(truth.normals.T), self._triangles, np.empty(0, np.float32)
         )
-        message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), self._lies)
+        message = PhantomTruth(surface, truth.stiffness.copy(), truth.background.copy(), truth.lesion.copy(), self._patient_pose)
         return {"truth/phantom": message}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -94,9 +96,9 @@ class TissueService(Service):
             outbox["sim/surface"] = self._surface_message(t)
         if t % self._truth_period == 0:
             outbox["truth/indentation"] = self._indentation(t, tool, F_W[:3])
-            self._peak_n, self._recent_peak_n = max(self._peak_n, self._recent_peak_n), 0.0
+            self._peak_n, self._period_peak_n = max(self._peak_n, self._period_peak_n), 0.0
         if t % self._patient_period == 0:
-            outbox["truth/patient"] = PatientTruth(header(t, "world"), self.backend.excursion(t / NS), self._lies)
+            outbox["truth/patient"] = PatientTruth(header(t, "world"), self.backend.excursion(t / NS), self._patient_pose)
         if outbox:
             yield outbox
 
@@ -104,7 +106,7 @@ class TissueService(Service):
         """Return facts about the body and the contact."""
         return {
             **self._facts,
-            "peak_force_n": round(max(self._peak_n, self._recent_peak_n), 4),
+            "peak_force_n": round(max(self._peak_n, self._period_peak_n), 4),
             "contact_steps": self._contact_steps,
             "contact_onsets": self._onsets,
         }
@@ -127,7 +129,7 @@ class TissueService(Service):
         return F_W
 
     def _path(self, t: int, stamp: int, p_A: Array) -> Sequence[tuple[int, Array]]:
-        """Return times [ns] and positions [m] of the steps up to `t` [ns], given the tool at `stamp`; one if nothing is late.
+        """Return times [ns] and positions [m] of the steps to `t` [ns], given the tool at `stamp`; one step if nothing is late.
 
         In wall-clock mode a process that was not scheduled receives a tool that has moved on. One step to that position would be
         a jump, and the dashpots would push with an unreal force.
@@ -145,7 +147,7 @@ class TissueService(Service):
             self._contact_steps += 1
             self._onsets += not self._touching
             x, y, z = F_W[:3].tolist()
-            self._recent_peak_n = max(self._recent_peak_n, sqrt(x * x + y * y + z * z))
+            self._period_peak_n = max(self._period_peak_n, sqrt(x * x + y * y + z * z))
         self._touching = touching
 
     def _surface_message(self, t: int) -> Message:
@@ -166,7 +168,7 @@ class TissueService(Service):
             depth=float(tool.radius) - under.height,
             normal_force=max(normal_force, 0.0),
             tangential_force=hypot(*(f_W - normal_force * n_W).tolist()),
-            peak_force=self._recent_peak_n,
+            peak_force=self._period_peak_n,
             contacts=len(self.backend.contacts),
             surface_point=Point(*p_W.tolist()),
             stiffness=under.stiffness,

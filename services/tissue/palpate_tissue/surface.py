@@ -73,10 +73,10 @@ class SkinSurface:
 
 @compiled
 def nearest_on_triangles(p: Array, corners: Array) -> tuple[Array, Array]:
-    """Return square distances [m^2] of `p` from k triangles, shape (k,), and barycentric coordinates of the nearest points, (k,
-    3).
+    """Return square distances [m^2] of `p` from k triangles and barycentric coordinates of the nearest points.
 
-    The nearest point a + v (b - a) + w (c - a) is the projection of p on the plane if it lies inside, else that on a side.
+    Shapes (k,) and (k, 3). The nearest point a + v (b - a) + w (c - a) is the projection of p on the plane if it lies inside,
+    else that on a side.
     `corners` [m], shape (k, 3, 3), has a, b and c of each triangle as rows. Compiled because numpy would create 200 small arrays.
     """
     squares, weights = np.full(len(corners), np.inf), np.empty((len(corners), 3))

@@ -136,13 +136,13 @@ class _Statistics:
 class KinectNoise:
     """A noisy depth image of a view, from one seeded stream."""
 
-    def __init__(self, focal_px: float, scale: float, rng: np.random.Generator, apart: int = 1) -> None:
+    def __init__(self, focal_px: float, scale: float, rng: np.random.Generator, spacing: int = 1) -> None:
         """`scale` multiplies standard deviations, disparity step and (up to 1) probability of loss; 0: no noise.
 
-        `focal_px` is the sensor's; the pixels of the views are `apart` [px] of it apart. Where this is several, a jittered ray
-        stays on the facet that its pixel's middle shows.
+        `focal_px` is the sensor's; `spacing` is the distance between pixels of a view in pixels of the sensor. If it exceeds 1,
+        a jittered ray stays on the facet seen at the middle of its pixel.
         """
-        self._apart = np.float32(apart)
+        self._spacing = np.float32(spacing)
         self._focal_baseline = np.float32(focal_px * BASELINE_M)
         self._scale = np.float32(scale)
         self._rng = rng
@@ -191,7 +191,7 @@ class KinectNoise:
             theta = np.asarray(np.minimum(theta, GRAZING_RAD[1]), np.float32)  # beyond, all pixels are lost: stay off the pole
             axial = np.zeros(view.w.size, np.float32)
             axial[pixel] = self._scale * axial_sigma(z, theta)
-            lateral = self._scale / self._apart * lateral_sigma(theta)
+            lateral = self._scale / self._spacing * lateral_sigma(theta)
             loss = np.minimum(self._scale, 1) * loss[grazing]
             self._known = _Statistics(view, pixel, u, v, axial, lateral, grazing, loss)
         return self._known

@@ -54,7 +54,7 @@ class Clearance:
         self._stop = stop
 
     def angle(self, q: Array) -> float:
-        """Return the sum of |angles| [rad] that joints at `q` may turn before a stop or box can be reached; may be negative."""
+        """Return the sum of |angles| [rad] that joints may turn from `q` before one can reach a stop or box; may be negative."""
         X_WL = np.array([body.getWorldTransform().matrix() for body in self._bodies])
         ends_W = self._ends @ X_WL.transpose(0, 2, 1)
         ends_B = np.einsum("bij,nkj->bnki", self._X_BW, ends_W)[..., :3]
@@ -67,14 +67,14 @@ class Clearance:
 LEAST_CLEARANCE_RAD: Final = 0.01
 """Clearance below which DART detects collisions: much more than the joints turn in a step."""
 CHECK_EVERY: Final = 20
-"""Steps between clearance checks while it is too small."""
+"""Steps between checks while the clearance is too small."""
 
 
 def _isometry(X: Array) -> Any:
     return dart.math.Isometry3(X)
 
 
-def _along(start: Array, end: Array) -> Array:
+def _pose_along(start: Array, end: Array) -> Array:
     """Return the pose, shape (4, 4), half-way from start to end with z along that direction."""
     z = (end - start) / np.linalg.norm(end - start)
     x = np.cross((0.0, 1.0, 0.0), z) if abs(z[1]) < 0.9 else np.cross((1.0, 0.0, 0.0), z)
@@ -85,7 +85,7 @@ def _along(start: Array, end: Array) -> Array:
     return X
 
 
-def _collide(body: Any, shape: Any, X: Array) -> None:
+def _add_shape(body: Any, shape: Any, X: Array) -> None:
     node = body.createShapeNode(shape)
     node.createCollisionAspect()
     node.createDynamicsAspect()
@@ -108,7 +108,7 @@ def _environment(robot: Robot) -> Any:
     skeleton = dart.dynamics.Skeleton("environment")
     _, body = skeleton.createWeldJointAndBodyNodePair()
     for box in boxes(robot):
-        _collide(body, dart.dynamics.BoxShape(box.size), box.X_WB)
+        _add_shape(body, dart.dynamics.BoxShape(box.size), box.X_WB)
     skeleton.setMobile(False)
     return skeleton
 
@@ -124,7 +124,8 @@ class DartPlant:
             X_PL[:3, 3] = origin + error
             joint.setTransformFromParentBodyNode(_isometry(X_PL))
         self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(7))
-        for joint, stop in zip(self._arm.getJoints()[1:8], lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD, strict=True):
+        stops = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
+        for joint, stop in zip(self._arm.getJoints()[1:8], stops, strict=True):
             joint.setPositionLowerLimit(0, -stop)
             joint.setPositionUpperLimit(0, stop)
             joint.setVelocityLowerLimit(0, -np.inf)  # no physical speed limit: the driver checks it
@@ -138,9 +139,9 @@ class DartPlant:
         self._world = dart.simulation.World()
         self._world.setTimeStep(DT)
         self._world.setGravity([0.0, 0.0, -GRAVITY])
-        awake = self._world.getDeactivationOptions()
-        awake.mEnabled = False  # DART may deactivate bodies slower than 1 cm/s: palpation is
-        self._world.setDeactivationOptions(awake)
+        deactivation = self._world.getDeactivationOptions()
+        deactivation.mEnabled = False  # DART would put bodies slower than 1 cm/s to sleep, and palpation is slower
+        self._world.setDeactivationOptions(deactivation)
         # DART's own detector is exact for capsules and boxes and the cheapest here; FCL has no capsules.
         self._world.getConstraintSolver().setCollisionDetector(dart.collision.DARTCollisionDetector())
         self._world.addSkeleton(self._arm)
@@ -148,14 +149,13 @@ class DartPlant:
         self._links = {link: self._arm.getBodyNode(link) for link in lbr.LINK_NAMES}
         self._sensor = self._links["ft_sensor"]
         self._indenter = self._links["indenter"]
-        stop = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
         self._kinematics = Kinematics(robot, drawn.origin_m)
-        self._clearance = Clearance(self._links, capsules, boxes(robot), stop)
-        self._free = 0.0  # sum of angles [rad] that the joints may turn before a contact is possible
+        self._clearance = Clearance(self._links, capsules, boxes(robot), stops)
+        self._free_travel = 0.0  # sum of angles [rad] that the joints may turn before a contact is possible
         self._check_in = 0  # steps until the next clearance check
         self._viscous = (robot.joint_damping_nms * drawn.damping).tolist()
         self._coulomb = (robot.joint_friction_nm * drawn.friction).tolist()
-        self._known: Array | None = None
+        self._cached_state: Array | None = None
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
@@ -167,21 +167,21 @@ class DartPlant:
         start, end = np.array(capsule.start), np.array(capsule.end)
         length = float(np.linalg.norm(end - start))
         if length > 0:
-            _collide(body, dart.dynamics.CapsuleShape(capsule.radius, length), _along(start, end))
+            _add_shape(body, dart.dynamics.CapsuleShape(capsule.radius, length), _pose_along(start, end))
         else:
             X = np.eye(4)
             X[:3, 3] = start
-            _collide(body, dart.dynamics.SphereShape(capsule.radius), X)
+            _add_shape(body, dart.dynamics.SphereShape(capsule.radius), X)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         self._arm.setPositions(np.asarray(q, dtype=float))
         self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self._known = None
+        self._cached_state = None
         self._arm.setForces(self.gravity_torque())
         self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
-        self._free, self._check_in = 0.0, 0
+        self._free_travel, self._check_in = 0.0, 0
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
@@ -208,18 +208,18 @@ class DartPlant:
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self._known = None
+        self._cached_state = None
 
     def _is_clear(self) -> bool:
         """Return True if no contact is possible during the coming step."""
-        self._free -= sum(map(abs, self.v.tolist())) * DT
-        if self._free > LEAST_CLEARANCE_RAD:
+        self._free_travel -= sum(map(abs, self.v.tolist())) * DT
+        if self._free_travel > LEAST_CLEARANCE_RAD:
             return True
         if self._check_in:
             self._check_in -= 1
             return False
-        self._free = self._clearance.angle(self.q)
-        clear = self._free > LEAST_CLEARANCE_RAD
+        self._free_travel = self._clearance.angle(self.q)
+        clear = self._free_travel > LEAST_CLEARANCE_RAD
         self._check_in = 0 if clear else CHECK_EVERY
         return clear
 
@@ -228,10 +228,10 @@ class DartPlant:
         return self._state()[13:]
 
     def _state(self) -> Array:
-        """Return the cached `Kinematics.state`."""
-        if self._known is None:
-            self._known = self._kinematics.state(self.q, self.v)
-        return self._known
+        """Return `Kinematics.state`, computed once per step."""
+        if self._cached_state is None:
+            self._cached_state = self._kinematics.state(self.q, self.v)
+        return self._cached_state
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy [J]."""
@@ -264,4 +264,4 @@ class DartPlant:
 
     def contacts(self) -> int:
         """Return the number of contact points with table or base in the last step."""
-        return 0 if self._free > LEAST_CLEARANCE_RAD else int(self._world.getLastCollisionResult().getNumContacts())
+        return 0 if self._free_travel > LEAST_CLEARANCE_RAD else int(self._world.getLastCollisionResult().getNumContacts())

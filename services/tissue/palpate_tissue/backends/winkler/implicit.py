@@ -108,8 +108,7 @@ def press(
     activation: float,
     h: float,
 ) -> tuple[bool, Array]:
-    """Step the vertices near a sphere; return True if it touches, and the force [N] and torque about its centre [N m], shape
-    (6,).
+    """Step the vertices near a sphere; return True if it touches, and force [N] and torque [N m] about its centre, shape (6,).
 
     Rows of `motion` (3, 3): position [m], velocity [m/s] and angular velocity [rad/s] of the sphere. `h` is the step [s].
     """

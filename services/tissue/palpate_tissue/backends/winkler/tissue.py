@@ -39,12 +39,12 @@ from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearc
 
 Index = NDArray[np.uint16] | NDArray[np.uint32]
 """Unsigned: numba checks signed indices for negative values, which doubles the cost of the step."""
-_USUAL = 7
+_USUAL_ENTRIES = 7
 """Entries of most matrix rows: a vertex and its six neighbours."""
 
 
 class Membrane(NamedTuple):
-    """The wall: n vertices and b Prony branches, with its matrices for steps of h."""
+    """State and matrices of the wall for the compiled step: n vertices and b Prony branches, steps of h."""
 
     u: Array
     """Displacement along the inward normals [m], shape (n,). Changed in place."""
@@ -127,8 +127,8 @@ def move_freely(wall: Membrane) -> None:
     for i in range(len(u)):
         end = wall.indptr[i + 1]
         total = u[i]
-        if end - begin == _USUAL:  # unrolled by the compiler: 25 % faster
-            for j in range(_USUAL):
+        if end - begin == _USUAL_ENTRIES:  # unrolled by the compiler: 25 % faster
+            for j in range(_USUAL_ENTRIES):
                 total += rate[begin + j] * strain[indices[begin + j]]
         else:
             for j in range(begin, end):
@@ -151,8 +151,7 @@ def stiffen(wall: Membrane) -> None:
 
 @compiled
 def hold(wall: Membrane, patch: Patch, sphere: Sphere, excursion: float) -> tuple[bool, Push]:
-    """Move the vertices under the sphere onto its surface at a breathing `excursion` [m]; return True and the push if there are
-    any.
+    """Move the vertices under the sphere onto its surface at a breathing `excursion` [m]; return if there are any, and the push.
 
     A vertex X with outward normal n moves along it. With d = p - X and s = -d.n it meets the sphere's lower side at w = s + c,
     c^2 = R^2 - |d|^2 + s^2. The frictionless sphere pushes along its own normal there, f (n + (d + s n) / c): f is the component
@@ -231,19 +230,20 @@ class WinklerTissue(TissueBackend):
         self._free = np.flatnonzero(~model.fixed)
         self._search = VertexSearch(model.vertices[self._free], model.normals[self._free], breathing.largest_m, _MARGIN_M)
         self._near: Near | None = None
-        self._patch = self._nothing = self._patch_of(_NONE)
+        self._patch = self._no_patch = self._patch_of(_NONE)
         self._motion: Array = np.zeros((3, 3))
         """Rows: the sphere's centre [m], velocity [m/s] and angular velocity [rad/s]."""
-        self._last: list[float] | None = None
-        self._press(self._nothing, 0.0, np.zeros(6))  # compiles it before the first contact
+        self._previous_centre: list[float] | None = None
+        """The sphere's centre one period ago [m]."""
+        self._advance(self._no_patch, 0.0, np.zeros(6))  # compiles it before the first contact
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
         """See `TissueBackend`. The period has equal sub-steps, in which the sphere moves on a straight line."""
         end = p_A.tolist()
         if not math.isfinite(sum(end)):
             raise ValueError(f"tissue: the indenter's position is not finite: {end}")
-        start = self._last or end  # centre one period ago
-        self._last = end
+        start = self._previous_centre or end
+        self._previous_centre = end
         motion = self._motion
         motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
         wrench = np.zeros(6)
@@ -265,14 +265,14 @@ class WinklerTissue(TissueBackend):
         """See `TissueBackend`."""
         for k in range(1, self.substeps + 1):
             self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
-            self._press(self._nothing, 0.0, np.zeros(6))
+            self._advance(self._no_patch, 0.0, np.zeros(6))
 
     def settle(self) -> None:
         """See `TissueBackend`."""
         self.displacement[:] = self.branches[:] = 0.0
         self.friction.release()
-        self._excursion, self._last = 0.0, None
-        self._near, self._patch = None, self._nothing
+        self._excursion, self._previous_centre = 0.0, None
+        self._near, self._patch = None, self._no_patch
         self.disturbed = self.touching = False
         self.activation = 1.0
 
@@ -288,9 +288,9 @@ class WinklerTissue(TissueBackend):
         self._excursion = excursion
         if self._near is None or not self._near.holds(p, radius):
             self._gather(p, radius)
-        self._press(self._patch, radius, wrench)
+        self._advance(self._patch, radius, wrench)
 
-    def _press(self, patch: Patch, radius: float, wrench: Array) -> None:
+    def _advance(self, patch: Patch, radius: float, wrench: Array) -> None:
         """Runs one explicit step; in contact sets `wrench` (6,) to force [N] and torque [N m] on the sphere."""
         self._wall.activation[0] = self.activation
         touching = step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
