@@ -17,7 +17,7 @@ from typing import Any, Final
 
 from palpate.report.evidence import peak_force
 from palpate.run.forks import Forks
-from palpate.run.group import Groups, apart
+from palpate.run.group import Groups, one_per_process
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.fault_cases import LIMITS, MESSAGE_KINDS, PROCESS_KINDS, CaseOutcome, FaultCase, FaultFinding
@@ -222,7 +222,7 @@ def _placed(case: FaultCase, target: str) -> Groups:
     In lockstep the messages do not depend on it, so only a service with faulty messages needs a process of its own.
     """
     if case.wallclock or case.kind not in MESSAGE_KINDS:
-        return apart(WORKERS)
+        return one_per_process(WORKERS)
     return (target,), tuple(role for role in WORKERS if role != target)
 
 

@@ -26,7 +26,7 @@ import psutil
 
 from palpate.environment import FIXED
 from palpate.report.evidence import peak_force
-from palpate.run.group import apart
+from palpate.run.group import one_per_process
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, measure
@@ -201,7 +201,7 @@ def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...
 
     scenario = load_scenario("clean", SETTINGS)
     files = write_scenario_files(scenario, folder)
-    local = LocalProcesses(apart(roles), folder, files, timing, record="full", secure=secure, forks=forks())
+    local = LocalProcesses(one_per_process(roles), folder, files, timing, record="full", secure=secure, forks=forks())
     session = open_session(local.bus[CONDUCTOR])
     for process in read_processes(compose_file(), roles).values():
         local.start(process)

@@ -6,7 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 from time import perf_counter
 
-from palpate.run.group import Groups, apart
+from palpate.run.group import Groups, one_per_process
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, override_files, read_processes
@@ -46,7 +46,7 @@ def run_distributed(
     absent.check(roles)
     processes = read_processes(compose_file(), roles, override_files())
     started = [process for role, process in processes.items() if role not in absent.roles]
-    groups = groups or apart(roles)
+    groups = groups or one_per_process(roles)
     for process in started:
         _check(process, scenario)
     for role in (role for group in groups if len(group) > 1 for role in group):

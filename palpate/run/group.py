@@ -25,7 +25,7 @@ Groups = tuple[tuple[str, ...], ...]
 """The roles of each process."""
 
 
-def apart(roles: Sequence[str]) -> Groups:
+def one_per_process(roles: Sequence[str]) -> Groups:
     """Return the groups with each role in its own process."""
     return tuple((role,) for role in roles)
 
@@ -41,7 +41,7 @@ def placement(roles: Sequence[str], groups: Sequence[str], processes: int | None
         raise UserError("--group and --processes both say who shares a process: give one of them")
     together = _in_groups(workers, groups) if processes is None else _in_processes(workers, processes)
     placed = [role for group in together for role in group]
-    return (*together, *apart([role for role in roles if role not in placed]))
+    return (*together, *one_per_process([role for role in roles if role not in placed]))
 
 
 def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:

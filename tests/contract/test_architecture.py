@@ -18,7 +18,7 @@ STEPPED = [name for name, role in contract().roles.items() if not role.observer]
 MAY_KNOW_THE_PHANTOM = {"tissue"}
 SHARED_VALUES = {"palpate_bus.setpoint"}
 """Arrays that planning makes and control follows, with their conversion to a message."""
-MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py", "bench.py"}
+MAY_SPEAK_TO_THE_BUS = {"service.py", "messages.py", "inputs.py", "moving.py", "stop_requests.py"}
 NOT_IN_A_STEP = {
     "zenoh",
     "socket",

@@ -13,7 +13,7 @@ import pytest
 
 from palpate.run import composed, processes
 from palpate.run.forks import Forks
-from palpate.run.group import apart
+from palpate.run.group import one_per_process
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, workers, write_scenario_files
 from palpate_bus.contract import contract
@@ -65,7 +65,7 @@ def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[st
     if leak is not None:
         leak(scenario, files)
     forked = Forked()
-    local = LocalProcesses(apart(ROLES), out, files, Timing(), record="full", forks=cast("Forks", forked))
+    local = LocalProcesses(one_per_process(ROLES), out, files, Timing(), record="full", forks=cast("Forks", forked))
     try:
         for process in read_processes(compose_file(), ROLES).values():
             local.start(process)

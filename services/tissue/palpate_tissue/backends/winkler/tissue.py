@@ -17,8 +17,7 @@ The README has the derivation. The FMU's C source has the same equations.
 
 from __future__ import annotations
 
-import math
-from math import sqrt
+from math import isfinite, sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.vectors import add, divide, dot, row, scale, subtract
-from palpate_models.patient import wall
+from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
@@ -240,7 +239,7 @@ class WinklerTissue(TissueBackend):
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
         """See `TissueBackend`. The period has equal sub-steps, in which the sphere moves on a straight line."""
         end = p_A.tolist()
-        if not math.isfinite(sum(end)):
+        if not isfinite(sum(end)):
             raise ValueError(f"tissue: the indenter's position is not finite: {end}")
         start = self._previous_centre or end
         self._previous_centre = end
@@ -339,7 +338,7 @@ class WinklerTissue(TissueBackend):
         model = self.model
         if not (model.stiffening.any() or model.tension.any()):
             return np.empty((3, 0))
-        springs = np.array((model.stiffening**2, wall.straight_from(model.stiffening), model.tension))
+        springs = np.array((model.stiffening**2, wall_law.straight_from(model.stiffening), model.tension))
         springs[:, model.fixed] = 0.0
         return springs
 
@@ -378,5 +377,5 @@ class WinklerTissue(TissueBackend):
                 stored += 0.5 * g * (stretch @ (K @ stretch))
         model = self.model
         muscle = self.activation * model.tension * np.maximum(u, 0.0) ** 2 / 2
-        stored += (model.stiffness * model.areas) @ (wall.stored(u, model.stiffening) + muscle)
+        stored += (model.stiffness * model.areas) @ (wall_law.stored(u, model.stiffening) + muscle)
         return float(stored + self.friction.energy())
