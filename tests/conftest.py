@@ -15,7 +15,7 @@ from examination import GATE, Finished, palpate_run
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_cli.py")
+LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
 

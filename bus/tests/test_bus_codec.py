@@ -21,7 +21,7 @@ TYPES = sorted(
     | {"shape_msgs/msg/SolidPrimitive", "trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/PolygonStamped"}
     | {"std_msgs/msg/Empty", "std_msgs/msg/Int64MultiArray", "rcl_interfaces/msg/ParameterValue"}
 )
-FAST = settings(max_examples=30, suppress_health_check=[HealthCheck.too_slow], deadline=None)
+FAST = settings(max_examples=15, suppress_health_check=[HealthCheck.too_slow], deadline=None)
 
 
 def test_the_fast_topics_have_codecs_of_their_own() -> None:

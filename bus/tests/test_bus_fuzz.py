@@ -15,7 +15,7 @@ from palpate_models.scenario.load import ScenarioError, load_scenario
 
 @pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
 def test_no_input_of_a_small_campaign_breaks_anything(target: FuzzTarget) -> None:
-    done = campaign([target], 150, seed=20, slow_s=math.inf)
+    done = campaign([target], 60, seed=20, slow_s=math.inf)
     assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
 
 

@@ -1,10 +1,11 @@
-"""An operator's keys: read from a terminal of our own alone, and passed on to the conductor."""
+"""Geometry, texts and keys of the dashboard."""
 
 from __future__ import annotations
 
 import json
 import os
 import pty
+import re
 import select
 import signal
 import sys
@@ -14,13 +15,140 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+from dashboard_messages import dome, look
 from test_dashboard_browser import free_ports, start
 
+from palpate_bus.messages import StiffnessMap
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator import HINT, OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
-from palpate_dashboard import replay
+from palpate_dashboard import arrays, palette, replay, text
+from palpate_dashboard.geometry import Carry, VertexNormals, shaded
+from palpate_dashboard.sinks import Live
+from palpate_dashboard.text import truth_page
+from palpate_models.numerics.maps import level_lines
+from palpate_models.patient.breathing import Breathing, BreathingCurve
+from palpate_models.patient.motion import BodyMotion, Motion
+from palpate_models.patient.schema import Phantom
+from palpate_models.scenario.errors import Errors, draw_errors
+from palpate_models.scenario.schema import Scenario
+
+
+def test_normals_of_a_sphere_point_out() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    normals = VertexNormals(sphere.faces, len(sphere.vertices))(sphere.vertices)
+    assert np.einsum("ij,ij->i", normals, sphere.vertices).min() > 0.999
+    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-5)
+
+
+@pytest.mark.parametrize("level", [0.03, 0.05, 0.071])
+def test_level_lines_of_the_distance_are_circles(level: float) -> None:
+    vertices, triangles = dome()
+    distance = np.hypot(vertices[:, 0], vertices[:, 1]).astype(float)
+    segments = level_lines(vertices, triangles, distance, level)
+    radius = np.hypot(segments[..., 0], segments[..., 1])
+    assert radius == pytest.approx(level, abs=1e-3)  # a chord of a 7 mm edge is that far inside
+    steps = np.diff(segments[..., :2], axis=1)[:, 0]
+    assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(2 * np.pi * level, rel=0.02)
+
+
+def test_no_level_no_lines() -> None:
+    vertices, triangles = dome()
+    assert level_lines(vertices, triangles, np.ones(len(vertices)), 2.0).shape == (0, 2, 3)
+
+
+def test_carry_takes_the_nearest_within_reach() -> None:
+    source = np.array([[0.0, 0, 0], [1.0, 0, 0]])
+    target = np.array([[0.1, 0, 0], [0.9, 0, 0], [0.5, 9, 0]])
+    assert Carry(source, target, 0.2)(np.array([7, 8]), -1).tolist() == [7, 8, -1]
+
+
+def test_colours_rise_from_blue_over_pale_to_red() -> None:
+    soft, normal, stiff, beyond = palette.stiffness_colors(np.array([0.4, 1.0, 5.0, 50.0]))
+    assert soft & 0xFF00 > soft >> 24 << 8  # more blue than red
+    assert stiff >> 24 > 4 * (stiff >> 16 & 0xFF)
+    assert min(normal >> 24, normal >> 16 & 0xFF, normal >> 8 & 0xFF) > 200
+    assert beyond == stiff
+    assert normal & 0xFF == 255
+
+
+def test_a_cloud_with_padding_and_invalid_points() -> None:
+    message = look(0)["perception/points"]
+    packed = arrays.cloud(message)
+    assert len(packed) == message.width - 1
+    wide = np.zeros((message.width, 20), dtype=np.uint8)
+    wide[:, 4:16] = np.asarray(message.data).reshape(-1, 12)
+    message.point_step, message.data = 20, wide.ravel()
+    for field in message.fields:
+        field.offset += 4
+    assert np.array_equal(arrays.cloud(message), packed)
+
+
+def test_viewer_setting() -> None:
+    assert Live.parse("") == Live()
+    assert Live.parse("serve") == Live(serve_port=9876)
+    assert Live.parse("serve:9000") == Live(serve_port=9000, serve_at="127.0.0.1")
+    assert Live.parse("serve:0.0.0.0:9000") == Live(serve_port=9000, serve_at="0.0.0.0")
+    assert Live.parse("connect").connect_url == "rerun+http://127.0.0.1:9876/proxy"
+    assert Live.parse("connect:rerun+http://screen:9876/proxy").connect_url == "rerun+http://screen:9876/proxy"
+    for wrong in ("window", "serve:x", "serve:80", "serve:0.0.0.0:80"):
+        with pytest.raises(ValueError, match="PALPATE_VIEWER"):
+            Live.parse(wrong)
+
+
+def test_a_cube_keeps_its_edges_and_a_sphere_none() -> None:
+    trimesh = pytest.importorskip("trimesh")
+    cube = trimesh.creation.box()
+    positions, triangles, normals = shaded(cube.vertices, cube.faces)
+    assert len(positions) == 24
+    faces = np.cross(*(np.diff(positions[triangles], axis=1)[:, i] for i in (0, 1)))
+    for corner in range(3):
+        assert np.einsum("ij,ij->i", faces, normals[triangles[:, corner]]) == pytest.approx(1.0)
+    sphere = trimesh.creation.icosphere(subdivisions=3)
+    positions, triangles, normals = shaded(sphere.vertices, sphere.faces)
+    assert len(positions) == len(sphere.vertices)
+    assert np.einsum("ij,ij->i", normals, positions).min() > 0.999
+
+
+def numbers(scenario: Scenario, row: str) -> list[float]:
+    (line,) = [line for line in truth_page(scenario).splitlines() if line.startswith(f"| {row} |")]
+    return [float(found) for found in re.findall(r"[-+]?\d+\.?\d*", line.removeprefix(f"| {row} |"))]
+
+
+def test_truth_page_states_the_drawn_values() -> None:
+    phantom = Phantom(breathing=Breathing(kind="quiet"), motion=Motion(kind="shift"))
+    scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
+    drawn = draw_errors(scenario.errors, 7)
+    np.testing.assert_allclose(numbers(scenario, "force, bias"), drawn.force.bias[:3], atol=0.006)
+    true = numbers(scenario, "patient, off by [mm]")
+    np.testing.assert_allclose(true, 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
+    np.testing.assert_allclose(numbers(scenario, "tool, true over nominal mass"), drawn.arm.tool_mass, atol=6e-4)
+    assert numbers(scenario, "breathing")[-1] == round(1e3 * BreathingCurve(phantom.breathing, 7).largest_m, 1)
+    moved = numbers(scenario, "motion")
+    motion = BodyMotion(phantom.motion, 7)
+    np.testing.assert_allclose(moved, (motion.at_s, motion.until_s), atol=0.06)
+    np.testing.assert_allclose(numbers(scenario, "moved [mm]"), 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
+
+
+def test_truth_page_depends_on_the_seed_and_is_empty_without_errors() -> None:
+    errors = Errors(level="typical")
+    assert truth_page(Scenario(seed=1, errors=errors)) != truth_page(Scenario(seed=2, errors=errors))
+    still = Phantom(breathing=Breathing(kind="none"))
+    clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
+    for unit in ("mm", "degrees"):
+        assert numbers(clean, f"patient, off by [{unit}]") == [0] * 3
+    assert numbers(clean, "breathing") == numbers(clean, "motion") == []
+
+
+def test_unassessed_places_are_listed_by_reason() -> None:
+    codes = np.array([StiffnessMap.ASSESSED] * 6 + [StiffnessMap.CONTRADICTED] * 3 + [StiffnessMap.YIELDED], dtype=np.uint8)
+    lines = text.unassessed(codes)
+    assert [line.split(" %")[0] for line in lines] == ["not assessed: 30", "not assessed: 10"]
+    assert text.unassessed(codes[:6]) == []
+
 
 KEYS_PROGRAM = """
 import sys, time

@@ -250,7 +250,7 @@ OBSERVED = sorted(topic.name for topic, _ in contract().inputs("dashboard"))
 
 @pytest.mark.parametrize("topic", OBSERVED)
 def test_any_topic_may_be_missing(tmp_path: Path, topic: str) -> None:
-    draw(tmp_path / FILE, run(1.0, Scenario().robot), without=(topic,))
+    draw(tmp_path / FILE, run(0.5, Scenario().robot), without=(topic,))
     assert Recording(tmp_path / FILE).temporal
 
 

@@ -1,12 +1,19 @@
-"""States at 100 Hz to samples."""
+"""Samples from states: averages, the map's grid, depth from the final skin and from measured breathing."""
 
 from __future__ import annotations
+
+from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from palpate_assessment.grid import map_grid
+from palpate_assessment.messages import skin_of
 from palpate_assessment.sampling import LONGEST, TRAVEL, ContactState, ForceSample, Sampler
+from palpate_assessment.seen_breath import BreathingShares, SeenBreath, depth_seen
+from palpate_bus.messages import SurfaceCorrection, SurfaceMesh
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, header
 
 UP = np.array((0.0, 0.0, 1.0))
 
@@ -95,3 +102,116 @@ def test_a_surface_elsewhere_is_refused() -> None:
     far = np.random.Generator(np.random.PCG64(0)).uniform(1.0, 2.0, (100, 3))
     with pytest.raises(ValueError, match="vertices in the examined region"):
         map_grid(far, (0.0, 0.0), (0.2, 0.2), 0.02, 0.005)
+
+
+VERTICES = np.array([(x, 0.0, 0.0) for x in (0.0, 0.05, 0.10)])
+SHARES = np.array((1.0, 0.8, 0.5))
+DEPTH = 0.010
+
+
+def true_breath(t: float) -> float:
+    return 0.004 * np.sin(1.5 * t)
+
+
+def missed(t: float, x: float = 0.0) -> ContactState:
+    """State whose forecast missed the breath altogether: the wall was thought to be at rest."""
+    share = float(np.interp(x, VERTICES[:, 0], SHARES))
+    return ContactState(t, np.array((x, 0.0, 0.0)), UP, DEPTH - share * true_breath(t), 2.0, True, True, followed=0.0)
+
+
+def followed_for(breath: SeenBreath, seconds: float, delay: float = 0.15) -> list[tuple[float, ContactState]]:
+    """States at 100 Hz and images at 10 Hz that come `delay` [s] after their exposure; when each state was settled."""
+    settled = []
+    for k in range(round(seconds * 100)):
+        t = 0.01 * k
+        if k % 10 == round(delay * 100) % 10 and t >= delay:
+            breath.add_image(t - delay, true_breath(t - delay))
+        breath.take(missed(t, 0.05))
+        settled += [(t, one) for one in breath.settled()]
+    return settled
+
+
+def test_depth_is_corrected_by_the_measured_breathing() -> None:
+    breath = SeenBreath()
+    breath.perceive(VERTICES, SHARES)
+    settled = followed_for(breath, 5.0)
+    seen = [one for _, one in settled if one.time > 0.2]
+    assert [one.time for _, one in settled] == sorted(one.time for _, one in settled)
+    assert max(t - one.time for t, one in settled if one.time > 0.2) < 0.26, "an image and its delay"
+    assert np.abs([one.depth - DEPTH for one in seen]).max() < 1e-5
+    assert len(settled) + len(breath.settled(at_once=True)) == 500, "every state comes out once"
+
+
+def test_without_images_nothing_waits_and_nothing_changes() -> None:
+    breath = SeenBreath()
+    breath.perceive(VERTICES, SHARES)
+    for t in (0.00, 0.01, 0.02):
+        breath.take(missed(t))
+        assert [one.time for one in breath.settled()] == [t]
+
+
+def test_a_camera_that_falls_silent_holds_nothing_back_for_longer_than_half_a_second() -> None:
+    breath = SeenBreath()
+    breath.perceive(VERTICES, SHARES)
+    followed_for(breath, 1.0)
+    late = []
+    for k in range(100, 300):
+        breath.take(missed(0.01 * k))
+        late += [(0.01 * k - one.time, one) for one in breath.settled()]
+    assert max(delay for delay, _ in late) <= 0.5 + 1e-9
+    assert late[-1][1].depth == pytest.approx(DEPTH - true_breath(late[-1][1].time)), "as it was reported"
+
+
+def test_depth_is_unchanged_between_distant_images() -> None:
+    time, depth, followed = np.array((0.1, 0.7, 1.3)), np.full(3, DEPTH), np.zeros(3)
+    images = (np.array((0.0, 0.2, 1.2, 1.4)), np.full(4, 0.002))
+    assert depth_seen(time, depth, followed, np.ones(3), images) - DEPTH == pytest.approx((0.002, 0.0, 0.002))
+
+
+def test_shares_are_those_of_the_nearest_vertex() -> None:
+    assert BreathingShares(VERTICES, SHARES)(np.array([(0.04, 0.0, 0.01), (0.2, 0.0, 0.0)])) == pytest.approx((0.8, 0.5))
+    assert BreathingShares(VERTICES, np.empty(0))(VERTICES) == pytest.approx((0.0, 0.0, 0.0))
+
+
+SLOPE = np.array((-0.6, 0.0, 0.8))
+"""Outward normal of a wall that rises by 3 in 4 along x."""
+ASIDE = np.array([(x, y) for x in (-0.1, 0.0, 0.1) for y in (-0.1, 0.0, 0.1)])
+X_AW = np.eye(4)
+X_AW[:3, 3] = (0.0, 0.0, -0.8)
+
+
+def wall() -> Message:
+    """`perception/surface` of a slope, seen at 10 s."""
+    p_W = np.column_stack((ASIDE, 0.8 + 0.75 * ASIDE[:, 0]))
+    normals = np.tile(SLOPE, (len(p_W), 1)).astype(np.float32)
+    return SurfaceMesh(header(10 * NS, "world"), p_W.astype(np.float32).ravel(), normals.ravel(), np.empty(0), np.empty(0))
+
+
+def correction(count: int) -> Message:
+    outward, sigma = np.full(count, 0.002, np.float32), np.full(count, 1e-4, np.float32)
+    return SurfaceCorrection(header(20 * NS, "abdomen"), outward, sigma)
+
+
+def felt(time: float, reported: float, x: float = 0.02) -> ForceSample:
+    """Sample whose skin was assumed `reported` [m] outward of the perceived wall."""
+    position = np.array((x, 0.0, 0.75 * x)) + reported * SLOPE
+    return ForceSample(time, position, SLOPE, np.zeros(3), 0.010, 2.0, 0.01, 1.0, False, 1, 5e-4)
+
+
+def test_depth_counts_from_where_the_skin_was_after_all() -> None:
+    skin = skin_of(wall(), correction(9), X_AW)
+    assert skin is not None
+    again = skin.again([felt(12.0, 0.0015), felt(13.0, 0.0025)])
+    assert [s.depth for s in again] == pytest.approx((0.0105, 0.0095), abs=1e-7)
+    assert [s.depth_uncertainty for s in again] == pytest.approx((1e-4, 1e-4))
+
+
+def test_samples_before_the_scan_or_off_the_surface_are_unchanged() -> None:
+    skin = skin_of(wall(), correction(9), X_AW)
+    assert skin is not None
+    before, other = felt(9.0, 0.0), replace(felt(12.0, 0.0), position=np.array((0.3, 0.0, 0.2)))
+    assert skin.again([before, other]) == [before, other]
+
+
+def test_a_correction_of_another_surface_is_none() -> None:
+    assert skin_of(wall(), correction(8), X_AW) is None

@@ -1,4 +1,4 @@
-"""Steps 1 to 3: deprojection, invalid points, the region of interest, and what hovers above the skin."""
+"""Points from depth images, and the pattern of targets."""
 
 from __future__ import annotations
 
@@ -115,3 +115,15 @@ def test_the_sheet_in_the_region_wins_over_a_larger_one_in_the_margin() -> None:
 def test_no_points_are_no_sheet() -> None:
     empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
     assert len(cloud.main_sheet(empty, np.ones((4, 4)), np.empty(0, bool)).p_W) == 0
+
+
+def test_down_sampling_gives_one_node_a_cell_and_says_which_have_no_points() -> None:
+    x, y = np.linspace(-0.1, 0.1, 5), np.linspace(-0.05, 0.05, 3)
+    rng = np.random.default_rng(0)
+    p = np.column_stack((rng.uniform(-0.12, 0.12, 4000), rng.uniform(-0.08, 0.08, 4000), np.zeros(4000)))
+    hole = np.hypot(p[:, 0] - 0.05, p[:, 1]) < 0.04
+    nodes, known = cloud.downsample(p[~hole], x, y)
+    assert nodes.shape == (15, 2)
+    np.testing.assert_allclose(nodes[:3], [(-0.1, -0.05), (-0.1, 0.0), (-0.1, 0.05)])
+    np.testing.assert_allclose(nodes[~known], [(0.05, 0.0)], atol=1e-12)
+    assert (cloud.supported(p[~hole], nodes, 0.05) == known).all()

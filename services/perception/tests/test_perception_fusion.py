@@ -1,11 +1,16 @@
-"""Fusion of frames: noise, rounding, outliers, invalid pixels, motion."""
+"""Fusion of depth images and visibility of the wall."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
+from palpate_bus.messages import PalpationTargets
+from palpate_models.numerics.frames import apply, inverse, look_at
+from palpate_models.scenario.schema import Exam
+from palpate_perception import cloud, visibility
 from palpate_perception.fusion import DepthFusion, frame_sigma
+from palpate_perception.visibility import Gaps, ViewReason
 
 SHAPE = (40, 50)
 WHOLE = (slice(0, SHAPE[0]), slice(0, SHAPE[1]))
@@ -86,3 +91,94 @@ def test_errors_name_what_is_wrong() -> None:
     fusion = fuse([np.ones(SHAPE, np.float32)])
     with pytest.raises(ValueError, match="previous frames had"):
         fusion.add(np.ones((5, 5), np.float32))
+
+
+K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])
+X_AC = look_at(np.array([0.4, -0.45, 0.92]), np.array([0.0, 0.0, -0.03]))
+X_CA = inverse(X_AC)
+SEEN_SHAPE = (480, 640)
+EXAM = Exam()
+
+
+def flat_depth(z: float = 0.0) -> np.ndarray:
+    """Depth image of the plane z_A = `z`."""
+    direction = cloud.deproject(np.ones(SEEN_SHAPE), K) @ X_AC[:3, :3].T
+    return (z - X_AC[2, 3]) / direction[..., 2]
+
+
+def all_cells() -> np.ndarray:
+    xy, _ = visibility.cells(EXAM)
+    return np.column_stack((xy, np.zeros(len(xy))))
+
+
+def gaps(missing: np.ndarray, depth: np.ndarray) -> Gaps:
+    return visibility.gaps(missing, len(all_cells()), X_CA, K, depth, (0, 0), SEEN_SHAPE)
+
+
+def test_cells_cover_the_region_and_points_fill_them() -> None:
+    xy, (nx, ny) = visibility.cells(Exam(region_m=(0.2, 0.1), centre_m=(0.05, 0.0)))
+    assert (nx, ny) == (20, 10)
+    assert np.ptp(xy[:, 0]) == pytest.approx(0.19)
+    assert xy.mean(axis=0) == pytest.approx([0.05, 0.0])
+    exam = Exam(region_m=(0.2, 0.1), centre_m=(0.05, 0.0))
+    p = np.column_stack((xy, np.zeros(len(xy))))
+    assert visibility.seen(p, exam).all()
+    half = visibility.seen(p[p[:, 0] > 0.05], exam).reshape(nx, ny)
+    assert not half[:10].any()
+    assert half[10:].all()
+    assert not visibility.seen(np.empty((0, 3)), exam).any()
+
+
+def test_no_gap_without_missing_cells() -> None:
+    assert gaps(np.empty((0, 3)), flat_depth()).shares == {}
+
+
+@pytest.mark.parametrize(
+    ("offset", "plane_m", "reason"),
+    [
+        ((0.0, 0.0, 0.0), 0.3, ViewReason.VIEW_BLOCKED),
+        ((0.0, 0.0, -0.06), 0.0, ViewReason.SELF_OCCLUDED),
+        ((0.0, 0.0, 0.0), np.nan, ViewReason.NO_DEPTH),
+        ((0.0, 0.0, 0.0), -0.2, ViewReason.BEYOND_ABDOMEN),
+        ((3.0, 0.0, 0.0), 0.0, ViewReason.OUT_OF_IMAGE),
+        ((0.0, 0.0, 0.0), 0.0, ViewReason.TOO_FEW_POINTS),
+    ],
+)
+def test_reason_of_missing_cells(offset: tuple[float, float, float], plane_m: float, reason: ViewReason) -> None:
+    found = gaps(all_cells() + np.array(offset), flat_depth(plane_m))
+    assert found.reason == reason
+    assert found.shares == {reason: 1.0}
+
+
+def test_obstacle_has_distance_and_share() -> None:
+    found = gaps(all_cells()[:120], flat_depth(0.3))
+    assert found.shares == {ViewReason.VIEW_BLOCKED: pytest.approx(0.3)}
+    assert found.obstacle_m == pytest.approx(0.35, abs=0.05)
+
+
+def test_largest_gap_comes_first_but_a_blocked_view_is_the_reason() -> None:
+    depth = flat_depth()
+    u, _ = cloud.project(apply(X_CA, all_cells()), K)
+    middle = int(np.quantile(u, 0.7))
+    depth[:, :middle] = np.nan
+    depth[:, middle:] = flat_depth(0.3)[:, middle:]
+    found = gaps(all_cells(), depth)
+    assert list(found.shares) == [ViewReason.NO_DEPTH, ViewReason.VIEW_BLOCKED]
+    assert found.reason == ViewReason.VIEW_BLOCKED
+
+
+def test_reasons_are_those_of_the_message() -> None:
+    assert {r.name: r.value for r in ViewReason} == {r.name: getattr(PalpationTargets, r.name) for r in ViewReason}
+
+
+def test_the_rough_guess_follows_the_cloud_and_stays_sane_without_one() -> None:
+    xy, _ = visibility.cells(EXAM)
+
+    def shape(q: np.ndarray) -> np.ndarray:
+        return -0.005 - 1.5 * q[:, 0] ** 2 - 0.5 * q[:, 1] ** 2
+
+    p = np.column_stack((xy, shape(xy)))
+    np.testing.assert_allclose(visibility.quadric(p, xy), shape(xy), atol=2e-3)
+    np.testing.assert_array_equal(visibility.quadric(p[:50], xy), 0)
+    corner = p[(xy[:, 0] > 0.03) & (xy[:, 1] > 0.03)]
+    assert np.abs(visibility.quadric(np.repeat(corner, 5, axis=0), xy) - shape(xy)).max() < 0.05

@@ -33,18 +33,18 @@ def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
     return model, model.createData()
 
 
-@pytest.mark.parametrize("link", lbr.LINK_NAMES)
-def test_forward_kinematics_agrees_with_pinocchio(link: str) -> None:
+def test_forward_kinematics_agrees_with_pinocchio() -> None:
     robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
     plant = DartPlant(robot)
     model, data = _model(robot)
     for q in _postures(20):
         plant.reset(q)
         pin.framesForwardKinematics(model, data, q)
-        p_WL, rotation = plant.link_pose(link)
-        X_WL = data.oMf[model.getFrameId(link)]
-        np.testing.assert_allclose(p_WL, X_WL.translation, atol=1e-9)
-        np.testing.assert_allclose(rotation.to_rotation_matrix(), X_WL.rotation, atol=1e-9)
+        for link in lbr.LINK_NAMES:
+            p_WL, rotation = plant.link_pose(link)
+            X_WL = data.oMf[model.getFrameId(link)]
+            np.testing.assert_allclose(p_WL, X_WL.translation, atol=1e-9, err_msg=link)
+            np.testing.assert_allclose(rotation.to_rotation_matrix(), X_WL.rotation, atol=1e-9, err_msg=link)
 
 
 def test_tool_motion_agrees_with_pinocchio() -> None:
@@ -234,7 +234,7 @@ def _centre_of_mass(robot: Robot) -> np.ndarray:
     return np.asarray(moment / (standoff.mass + sphere.mass))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_static_reading_is_the_tools_weight(seed: int) -> None:
     rng = np.random.default_rng(seed)
     plant = DartPlant(ROBOT, lbr.HOME + rng.uniform(-0.3, 0.3, 7))

@@ -1,20 +1,48 @@
-"""Every policy presses inside the region, as deep as it may, and the same again when it is asked again."""
+"""Policies, the posterior they use, and the service that asks for presses."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.ndimage import correlate
+from scipy.stats import multivariate_normal
 
+from palpate.check.report import ConformanceReport
+from palpate.check.rig import RigSettings, ServiceRig
+from palpate.check.suites.search import LUMP as SUITE_LUMP
+from palpate.check.suites.search import REQUEST, Play, pressed, suite
+from palpate_assessment.calibration import learned
+from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, natural
+from palpate_bus.messages import ExamState, Point, SearchRequest
+from palpate_models.scenario.press import DEPTH_M
+from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
 from palpate_plugins import PluginError
 from palpate_search.choice import policies, policy
 from palpate_search.policies.fixed import latin_hypercube, raster
+from palpate_search.policies.informed import information
 from palpate_search.policies.learned import convolved, ppo
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import (
+    BONE_SD,
+    CONTRAST,
+    DEPTH_ERROR_SCALES,
+    EDGE_M,
+    LEVEL_SD,
+    LUMP_PROBABILITY,
+    NATURAL_SD,
+    OUTSIDE,
+    STROKE_SHARE,
+    SURFACE_SHARE,
+    USUAL_N,
+    VARIATION_SCALES,
+    Posterior,
+)
 from palpate_search.presses import Budget, Press, Task, seconds
+from palpate_search.service import TUNING, checked, create
 
 DECIDED = (0.05, 0.0)
 """Next place of the learned policy after four presses."""
@@ -107,3 +135,195 @@ def test_a_policy_that_cannot_be_used_is_refused(
 
 def test_a_small_region_has_a_place() -> None:
     assert replace(TASK, size=(0.01, 0.01)).places.shape == (1, 2)
+
+
+CENTRED = Task(centre=(0.0, 0.0), size=(0.1, 0.08))
+SOUGHT = Bump(0.02, -0.01, 0.018, EDGE_M)
+
+
+def presses_of(xy: np.ndarray, bump: Bump | None, contrast: float = 2.5, depth: float = 0.010) -> list[Press]:
+    rng = np.random.default_rng(1)
+    shape = np.zeros(len(xy)) if bump is None else bump(xy)
+    force = 4.0 * contrast**shape * (depth / 0.010) ** 1.3 * np.exp(0.02 * rng.standard_normal(len(xy)))
+    return [Press(*map(float, p), depth, float(F), 3.0 * k) for k, (p, F) in enumerate(zip(xy, force, strict=True))]
+
+
+def given(presses: list[Press]) -> Posterior:
+    posterior = Posterior(CENTRED)
+    for one in presses:
+        posterior.add(one)
+    return posterior
+
+
+def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
+    rng = np.random.default_rng(0)
+    xy = rng.uniform(-0.04, 0.04, (7, 2))
+    presses = presses_of(xy, SOUGHT) + presses_of(xy[:2] + 0.003, SOUGHT, depth=0.013)
+    posterior = given(presses)
+    xy = np.array([p.xy for p in presses])
+    depth, force = (np.array([getattr(p, name) for p in presses]) for name in ("depth", "force"))
+    calibration = learned()
+    y = np.log(force) - calibration.exponent * np.log(depth / DEPTH_M) - np.log(USUAL_N)
+    lever, away = calibration.exponent / depth, np.log(depth / DEPTH_M)
+    parts = natural(xy, xy)
+    log_joint = []
+    out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(CENTRED.size) + 1e-9, axis=1)
+    prior = np.where(out, OUTSIDE, 1.0)
+    prior *= LUMP_PROBABILITY / prior.sum()
+    for rough in VARIATION_SCALES:
+        for wrong in DEPTH_ERROR_SCALES:
+            u = wrong * presses[0].depth_uncertainty
+            S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(NATURAL_SD, parts, strict=False))
+            S = S + BONE_SD**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
+            apart = ((xy[:, None] - xy) ** 2).sum(axis=2)
+            S += (SURFACE_SHARE * u) ** 2 * np.outer(lever, lever) * np.exp(-0.5 * apart / SURFACE_M**2)
+            S += np.diag((STROKE_SHARE * u * lever) ** 2 + WHITE_SD**2 + (0.02**2 + TARE_N**2) / force**2)
+            row = [np.log(1 - LUMP_PROBABILITY) + multivariate_normal(np.zeros(len(y)), S).logpdf(y)]
+            for x, y0, radius, p in zip(*posterior.centres.T, posterior.radii, prior, strict=True):
+                b = Bump(x, y0, radius, EDGE_M)(xy)
+                lumpy = multivariate_normal(CONTRAST[0] * b, S + CONTRAST[1] ** 2 * np.outer(b, b))
+                row.append(np.log(p) + lumpy.logpdf(y))
+            log_joint.append(row)
+    joint = np.exp(np.array(log_joint) - np.max(log_joint))
+    joint /= joint.sum()
+    assert posterior.none == pytest.approx(joint[:, 0].sum(), abs=1e-6)
+    np.testing.assert_allclose(posterior.probability, joint[:, 1:].sum(axis=0), atol=1e-6)
+
+
+def test_a_lump_is_located_and_its_absence_becomes_sure() -> None:
+    places = CENTRED.places[::2]
+    there, place = given(presses_of(places, SOUGHT)), np.array((SOUGHT.x, SOUGHT.y))
+    at, probability = there.at
+    assert probability > 0.95
+    assert np.linalg.norm(at - place) < 0.006
+    healthy = given(presses_of(places, None))
+    assert healthy.lump < 0.1 < Posterior(CENTRED).lump
+
+
+def test_others_are_sought_besides_an_accepted_lump() -> None:
+    other = Bump(-0.03, 0.02, 0.014, EDGE_M)
+    places = CENTRED.places
+    both = [
+        Press(a.x, a.y, a.depth, a.force * b.force / 4.0, a.time)
+        for a, b in zip(presses_of(places, SOUGHT), presses_of(places, other), strict=True)
+    ]
+    rest = given(both).accept(SOUGHT)
+    assert rest.lump > 0.9
+    assert np.linalg.norm(rest.at[0] - (other.x, other.y)) < 0.008
+    assert given(presses_of(places, SOUGHT)).accept(SOUGHT).lump < 0.3
+
+
+def test_information_is_the_entropy_that_an_observation_takes_away() -> None:
+    unexplained, contrast, sd2 = np.array([[1.0, 0.2, 0.0], [0.0, 0.0, 0.0]]), np.array((0.7, 0.5, 0.6)), np.full(3, 0.01)
+    p, variance = np.array((0.2, 0.1, 0.1)), np.array((0.02, 0.02))
+    found = information(unexplained, contrast, sd2, p, variance)
+    rng = np.random.default_rng(2)
+    mean = np.append(0.0, contrast * unexplained[0])
+    sd = np.sqrt(np.append(variance[0], variance[0] + sd2 * unexplained[0] ** 2))
+    weight = np.append(1 - p.sum(), p)
+    h = rng.choice(4, size=200_000, p=weight)
+    y = mean[h] + sd[h] * rng.standard_normal(len(h))
+    density = np.exp(-0.5 * ((y[:, None] - mean) / sd) ** 2) / sd
+    expected = np.mean(np.log(density[np.arange(len(h)), h] / (density @ weight)))
+    assert found[0] == pytest.approx(expected, abs=0.02)
+    assert found[1] == 0.0
+
+
+def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
+    """The conformance suite's examination, of a small region."""
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam))
+    rig, report = ServiceRig(create(scenario), RigSettings(scenario)), ConformanceReport("search")
+    suite(rig, report)
+    return rig, report
+
+
+def test_it_finds_the_stiff_area_and_ends() -> None:
+    rig, report = played()
+    assert report.passed
+    requests = [item.message for item in rig.log[REQUEST]]
+    assert requests[-1].request == SearchRequest.DONE
+    assert requests[-1].lump < Search().missed
+    assert TUNING.fewest_presses < len(requests) < 40
+    places = np.array([(message.place.x, message.place.y) for message in requests[:-1]])
+    assert (np.linalg.norm(places - 0.02, axis=1) < 0.025).sum() >= 3
+
+
+def test_it_keeps_to_the_budget_of_presses() -> None:
+    rig, report = played(budget=SearchBudget(presses=5))
+    assert report.passed
+    assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
+    assert "5 presses made" in rig.last(REQUEST).reason
+
+
+def test_it_keeps_to_the_budget_of_time() -> None:
+    rig, _ = played(budget=SearchBudget(seconds=2.0))
+    assert rig.last(REQUEST).request == SearchRequest.DONE
+    assert rig.last(REQUEST).reason == "2 s elapsed"
+
+
+@pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
+def test_no_request_before_palpation(phase: int) -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = phase
+    rig.run(0.3, {"exam/state": play.state})
+    assert not rig.log[REQUEST]
+
+
+def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=12)))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = ExamState.PHASE_RETRACT
+    rig.run(0.3, {"exam/state": play.state})
+    for _ in range(12):
+        asked = rig.last(REQUEST)
+        elsewhere = SimpleNamespace(place=Point(0.04, 0.04, 0.0), depth=asked.depth)
+        rig.send("assessment/samples", pressed(rig.t, elsewhere, np.zeros(2)))
+        play.over = int(asked.number)
+        rig.run(0.3, {"exam/state": play.state})
+    places = [(m.place.x, m.place.y) for m in (item.message for item in rig.log[REQUEST]) if m.request == SearchRequest.PRESS]
+    assert len(set(places)) == len(places) == 12
+
+
+@pytest.mark.parametrize("policy", ["informed", "raster", "random", "latin-hypercube", "expected-improvement"])
+def test_a_press_that_gave_no_sample_is_over_too(policy: str) -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"), search=Search(policy=policy))
+    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
+    play.phase = ExamState.PHASE_RETRACT
+    for _ in range(4):
+        rig.run(0.3, {"exam/state": play.state})
+        play.over = int(rig.last(REQUEST).number)
+    assert len({(item.message.place.x, item.message.place.y) for item in rig.log[REQUEST]}) == 4
+
+
+SQUARE = Task((0.0, 0.0), (0.1, 0.1))
+
+
+@pytest.mark.parametrize(
+    ("place", "depth", "named"),
+    [
+        ((0.14, 0.0), 0.010, "place"),
+        ((float("nan"), 0.0), 0.010, "place"),
+        ((0.0, 0.0, 0.0), 0.010, "place"),
+        ((0.0, 0.0), 10.0, "depth"),
+        ((0.0, 0.0), float("nan"), "depth"),
+        ((0.0, 0.0), 0.0, "depth"),
+    ],
+)
+def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth: float, named: str) -> None:
+    with pytest.raises(PluginError, match=named):
+        checked(np.array(place), depth, SQUARE)
+
+
+def test_the_edge_of_the_region_and_the_greatest_depth_may_be_pressed() -> None:
+    assert checked(SQUARE.high, SQUARE.deepest, SQUARE)[1] == SQUARE.deepest
+
+
+def test_the_report_says_what_it_took() -> None:
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=5)))
+    service = create(scenario)
+    suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
+    facts = service.finish()
+    assert facts["presses"] == 5
+    assert 4 * SUITE_LUMP.press_s <= facts["seconds"] <= 6 * SUITE_LUMP.press_s + 0.5
+    assert facts["ended"] == "5 presses made"

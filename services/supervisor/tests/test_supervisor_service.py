@@ -1,21 +1,296 @@
-"""The supervisor with messages that are invalid."""
+"""Limits that the supervisor watches, its latch, and the service."""
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 import pytest
 
+from palpate_bus.contract import MS
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
-from palpate_models.scenario.load import load_scenario
-from palpate_supervisor.service import TUNING, SupervisorService, create
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Limits
+from palpate_supervisor import latch as latch_module
+from palpate_supervisor import service as service_module
+from palpate_supervisor.latch import Latch
+from palpate_supervisor.service import SupervisorService, create
+from palpate_supervisor.tool import RestSurface, Tool, ToolSense
+from palpate_supervisor.watch import TUNING, Breach, Level, LimitWatch, StopCause
 
-MS = 1_000_000
+KNOWN = exam_input(load_scenario("clean"))
+
+ABOVE = np.array([0.56, 0.0, 1.0])
+
+
+def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    for n in range(20):  # long enough for what needs patience, and without a rate
+        found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS, n * 10 * MS)
+    return found
+
+
+@pytest.mark.parametrize(
+    ("values", "level", "cause"),
+    [
+        ({"force": 26.0}, Level.SOFT_STOP, StopCause.FORCE),
+        ({"force": 41.0}, Level.EMERGENCY, StopCause.FORCE),
+        ({"speed": 0.7}, Level.EMERGENCY, StopCause.SPEED),
+        ({"speed": 0.3, "force": 6.0}, Level.EMERGENCY, StopCause.SPEED),
+        ({"depth": 0.047, "force": 9.0}, Level.SOFT_STOP, StopCause.DEPTH),
+        ({"depth": 0.071, "force": 9.0}, Level.EMERGENCY, StopCause.DEPTH),
+        ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, StopCause.WORKSPACE),
+        ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, StopCause.WORKSPACE),
+    ],
+)
+def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object], level: Level, cause: StopCause) -> None:
+    (breach,) = judge(**values)  # type: ignore[arg-type]
+    assert (breach.level, breach.cause) == (level, cause)
+    assert (breach.beyond_m > 0) == (cause in (StopCause.DEPTH, StopCause.WORKSPACE))
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        {"force": 15.0, "depth": 0.02, "speed": 0.1},
+        {"speed": 0.55, "force": 3.2},
+        {"depth": 0.1},
+        {"p_W": np.array([0.2548758, 0.02, 1.68598239])},
+    ],
+)
+def test_what_an_examination_does_is_no_breach(values: dict[str, object]) -> None:
+    assert judge(**values) == []  # type: ignore[arg-type]
+
+
+def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
+    first = next(f for n, f in enumerate(forces) if watch.judge(Tool(ABOVE, 0.0, f), None, n * 10 * MS, n * 10 * MS))
+    assert 14.0 < first <= 16.0
+
+
+def test_a_hole_in_the_measurements_makes_no_force_rise_faster() -> None:
+    """At 20 N/s, slowly enough for planning; 60 ms are missing, which taken for one period would be 120 N/s."""
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    times = [n * 10 * MS for n in (*range(80), *range(86, 110))]
+    assert not any(watch.judge(Tool(ABOVE, 0.0, 20e-9 * t), None, t, t) for t in times)
+
+
+def test_a_stamp_that_comes_again_is_nothing_to_take_a_rate_from() -> None:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    stamps = [0, 10, 20, 30, 30, 30, 40]
+    assert not any(watch.judge(Tool(ABOVE, 0.0, 0.2 * n), None, t * MS, n * 10 * MS) for n, t in enumerate(stamps))
+
+
+def test_a_force_that_stays_over_the_limit_is_stopped_however_often_its_stamp_comes_again() -> None:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    found = [watch.judge(Tool(ABOVE, 0.0, 30.0), None, 0, n * 10 * MS) for n in range(20)]
+    assert [breach.cause for breach in found[-1]] == [StopCause.FORCE]
+
+
+def test_what_is_no_number_is_a_breach() -> None:
+    assert {breach.cause for breach in judge(speed=np.nan)} == {StopCause.SPEED}
+    assert {breach.cause for breach in judge(force=np.nan)} == {StopCause.FORCE}
+
+
+def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
+    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    for n, force in enumerate((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)):
+        assert watch.judge(Tool(ABOVE, 0.0, float(force)), None, n * 10 * MS, n * 10 * MS) == []
+
+
+def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q = np.array(lbr.HOME)
+    weight = KNOWN.robot.tool_mass_kg * GRAVITY
+    hanging = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])  # tool straight down: +z reads its weight
+    tool = sense.sense(q, np.zeros(7), hanging)
+    assert tool.force == pytest.approx(0.0, abs=0.01)
+    pressed = sense.sense(q, np.zeros(7), hanging - np.array([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]))
+    assert pressed.force == pytest.approx(7.0, abs=0.01)
+
+
+def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q, still, slow = np.array(lbr.HOME), np.zeros(7), np.full(7, 0.05)
+    hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
+    bias = np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.0])
+    for noise in (0.2, -0.2):
+        sense.sense(q, still, hanging + bias + noise)
+    assert sense.sense(q, slow, hanging + bias).force == pytest.approx(0.0, abs=0.01)
+    pressed = hanging + bias - np.array([0.0, 0.0, 9.0, 0.0, 0.0, 0.0])
+    assert sense.sense(q, still, pressed).force == pytest.approx(9.0, abs=0.01), "a tool that has moved may be pressed at rest"
+
+
+def test_a_press_before_the_arm_moves_is_no_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    pressed = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY - 9.0, 0.0, 0.0, 0.0])
+    for _ in range(3):
+        assert sense.sense(np.array(lbr.HOME), np.zeros(7), pressed).force == pytest.approx(9.0, abs=0.01)
+
+
+def test_speed_is_that_of_the_sphere() -> None:
+    sense = ToolSense(KNOWN.robot)
+    q, qd = np.array(lbr.HOME), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2, 0.5])
+    step = 1e-5
+    a, b = (sense.sense(q + s * qd, qd, np.zeros(6)).p_W for s in (-step, step))
+    assert sense.sense(q, qd, np.zeros(6)).speed == pytest.approx(float(np.linalg.norm(b - a)) / (2 * step), rel=1e-4)
+
+
+def test_depth_over_a_dome_is_that_of_geometry() -> None:
+    R, r = 0.25, 0.015
+    x, y = np.meshgrid(np.arange(-0.05, 0.05, 0.005), np.arange(-0.05, 0.05, 0.005))
+    p = np.column_stack((x.ravel(), y.ravel(), np.sqrt(R**2 - x.ravel() ** 2 - y.ravel() ** 2)))
+    surface = RestSurface(p, p / R, r)
+    for direction in ((0.0, 0.0, 1.0), (0.08, -0.05, 1.0), (-0.11, 0.02, 1.0)):
+        n = np.array(direction) / np.linalg.norm(direction)
+        assert surface.depth(n * (R - 0.010 + r)) == pytest.approx(0.010, abs=1e-4)
+
+
+def test_depth_is_that_at_the_nearest_vertex() -> None:
+    rng = np.random.default_rng(2)
+    vertices, normals = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
+    surface = RestSurface(vertices, normals, 0.015)
+    for p in rng.normal(size=(100, 3)):
+        i = int(np.argmin(np.linalg.norm(vertices - p, axis=1)))
+        assert surface.depth(p) == pytest.approx(0.015 - normals[i] @ (p - vertices[i]))
+
+
+@pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
+def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="perceived surface"):
+        RestSurface(bad, bad, 0.015)
+
+
+SOFT = Breach(Level.SOFT_STOP, StopCause.FORCE, "26 N")
+
+EMERGENCY = Breach(Level.EMERGENCY, StopCause.FORCE, "41 N")
+
+DEPTH = Breach(Level.SOFT_STOP, StopCause.DEPTH, "27 mm")
+
+DRIVER = Breach(Level.EMERGENCY, StopCause.DRIVER, "the driver holds")
+
+
+def test_a_stop_stands_when_its_cause_has_gone() -> None:
+    latch = Latch()
+    latch.update(0, [SOFT], False)
+    latch.update(10 * MS, [], False)
+    assert (latch.level, latch.cause, latch.reason) == (Level.SOFT_STOP, StopCause.FORCE, "26 N")
+    latch.update(20 * MS, [], True)
+    assert (latch.level, latch.releases) == (Level.OK, 1)
+
+
+def test_the_worst_counts_and_the_first_of_equals() -> None:
+    latch = Latch()
+    latch.update(0, [SOFT, EMERGENCY], False)
+    assert latch.level is Level.EMERGENCY
+    latch.update(10 * MS, [DRIVER, SOFT], False)
+    assert latch.cause is StopCause.FORCE
+    assert [stop.level for stop in latch.stops] == [Level.EMERGENCY]
+
+
+def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
+    latch = Latch()
+    for t in range(0, TUNING.soft_stop_timeout_ns + 1, 10 * MS):
+        latch.update(t, [SOFT], False)
+    assert latch.level is Level.SOFT_STOP
+    latch.update(TUNING.soft_stop_timeout_ns + 10 * MS, [SOFT], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+    assert "26 N" in latch.reason
+
+
+def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
+    latch = Latch()
+    rising = Breach(Level.SOFT_STOP, StopCause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
+    for t in range(0, TUNING.rising_timeout_ns + 20 * MS, 10 * MS):
+        latch.update(t, [rising], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+
+
+def test_a_soft_stop_that_helps_stays_one() -> None:
+    latch = Latch()
+    latch.update(0, [SOFT], False)
+    for t in range(10 * MS, 2 * TUNING.soft_stop_timeout_ns, 10 * MS):
+        latch.update(t, [], False)
+    assert latch.level is Level.SOFT_STOP
+
+
+def test_a_release_is_refused_while_the_cause_stands() -> None:
+    latch = Latch()
+    latch.update(0, [EMERGENCY], False)
+    latch.update(10 * MS, [EMERGENCY], True)
+    assert latch.level is Level.EMERGENCY
+    assert latch.reason == "release refused: 41 N"
+    latch.update(20 * MS, [], False)
+    assert (latch.level, latch.refusals, latch.releases) == (Level.EMERGENCY, 1, 0)
+    latch.update(30 * MS, [], True)
+    assert (latch.level, latch.refusals, latch.releases) == (Level.OK, 1, 1)
+
+
+def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:
+    latch = Latch()
+    latch.update(0, [DEPTH], False)
+    latch.update(10 * MS, [DEPTH], True)
+    latch.update(20 * MS, [DEPTH], False)
+    assert latch.level is Level.OK
+    latch.update(30 * MS, [], False)
+    latch.update(40 * MS, [DEPTH], False)
+    assert latch.level is Level.SOFT_STOP
+
+
+def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
+    latch = Latch()
+    latch.update(0, [DEPTH], False)
+    latch.update(10 * MS, [DEPTH], True)
+    latch.update(20 * MS, [replace(DEPTH, level=Level.EMERGENCY)], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.DEPTH)
+
+
+def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
+    latch = Latch()
+    for n in range(TUNING.soft_stop_timeout_ns // (10 * MS) + 4):
+        latch.update(n * 10 * MS, [SOFT] if n % 2 == 0 else [], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+
+
+def test_a_soft_stop_of_one_cause_does_not_hide_that_another_is_not_heeded() -> None:
+    latch = Latch()
+    latch.update(0, [Breach(Level.SOFT_STOP, StopCause.OPERATOR, "enough")], False)
+    for t in range(1000 * MS, 1000 * MS + TUNING.soft_stop_timeout_ns + 20 * MS, 10 * MS):
+        latch.update(t, [SOFT], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
+
+
+def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
+    latch = Latch()
+    latch.update(0, [DRIVER], False)
+    latch.update(10 * MS, [DRIVER], True)
+    latch.update(20 * MS, [DRIVER], False)
+    assert latch.level is Level.OK
+    latch.update(10 * MS + latch_module.TUNING.driver_grace_ns, [DRIVER], False)
+    assert latch.cause is StopCause.DRIVER
+
+
+def test_a_release_of_nothing_is_harmless() -> None:
+    latch = Latch()
+    latch.update(0, [], True)
+    assert (latch.level, latch.releases, latch.stops) == (Level.OK, 1, [])
+
+
+def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
+    latch = Latch()
+    outside = Breach(Level.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
+    latch.update(0, [outside], False)
+    latch.update(10 * MS, [outside], True)
+    latch.update(20 * MS, [replace(outside, beyond_m=0.02 + 0.9 * latch_module.TUNING.further_m)], False)
+    assert latch.level is Level.OK
+    latch.update(30 * MS, [replace(outside, beyond_m=0.02 + 1.1 * latch_module.TUNING.further_m)], False)
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.WORKSPACE)
 
 
 def status(stamp: int, force: float) -> RobotStatus:
@@ -53,7 +328,7 @@ def test_what_was_measured_stands_until_it_is_measured_again() -> None:
 def test_a_measurement_that_is_only_repeated_is_silence() -> None:
     service = create(load_scenario("healthy"))
     state = None
-    for t in range(0, TUNING.settle_ns, 10 * MS):
+    for t in range(0, service_module.TUNING.settle_ns, 10 * MS):
         state = after(service, t, robot__status=status(0, 0.0))
     assert (state.level, state.cause) == (SupervisorState.LEVEL_EMERGENCY, SupervisorState.CAUSE_SILENT)
 
@@ -75,7 +350,7 @@ def test_without_the_assessment_planning_has_time_to_retreat() -> None:
     service, state = create(load_scenario("healthy")), None
     inbox = HandInbox()
     inbox.gone.add("assessment")
-    for t in range(0, TUNING.settle_ns, 10 * MS):
+    for t in range(0, service_module.TUNING.settle_ns, 10 * MS):
         state = service.step(t, inbox)["supervisor/state"]
     assert (state.level, state.cause) == (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.CAUSE_LOST)
     state = service.step(5000 * MS, inbox)["supervisor/state"]

@@ -28,13 +28,6 @@ ELASTIC = Stiffness(prony_g=(), prony_tau_s=(), friction=0.0)
 LUMP = Lesion(centre_m=(0.0, 0.0), radii_m=(0.02, 0.02), contrast=5, depth_m=0.01)
 
 
-@pytest.fixture(autouse=True, scope="module")
-def own_cache(tmp_path_factory: pytest.TempPathFactory) -> None:
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 @cache
 def flat(edge_m: float = 0.005, half_m: float = 0.045) -> PhantomModel:
     return flat_phantom(half_m, edge_m)
@@ -226,7 +219,7 @@ def loop(rng: np.random.Generator, steps: int) -> np.ndarray:
     return p
 
 
-@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("seed", range(2))
 def test_no_closed_cycle_yields_work(seed: int) -> None:
     rng = np.random.default_rng(seed)
     tissue = ElasticTissue(flat(), solid((LUMP,)), Stiffness(friction=float(rng.choice((0.0, 0.3)))))
@@ -299,7 +292,7 @@ def slab(edge_m: float = 0.0015, half_m: float = 0.025, thickness_m: float = np.
     return FlatSlab(young_pa=1e4, edge_m=edge_m, half_m=half_m, thickness_m=thickness_m)
 
 
-@pytest.mark.parametrize("depth", [0.002, 0.003, 0.005, 0.007, 0.010])
+@pytest.mark.parametrize("depth", [0.002, 0.005, 0.010])
 @pytest.mark.parametrize("radius", [0.015, 0.020])
 def test_a_paraboloid_meets_hertz_and_a_sphere_sneddon(radius: float, depth: float) -> None:
     for xy in OFFSETS:

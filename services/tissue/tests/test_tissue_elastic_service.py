@@ -19,13 +19,6 @@ from palpate_tissue.backends.elastic.service import create
 COARSE = ("phantom.edge_m=0.012", "phantom.lesions.0.depth_m=0.02", "phantom.lesions.0.radii_m=[0.06, 0.05]")
 
 
-@pytest.fixture(autouse=True, scope="module")
-def own_cache(tmp_path_factory: pytest.TempPathFactory):
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
-        yield
-
-
 class OneTopic:
     """An inbox with the newest tool state."""
 

@@ -53,7 +53,7 @@ def test_force_scales_with_stiffness():
 
 @pytest.mark.parametrize(
     ("radius", "contrast", "reference"),
-    [(0.020, 2, 1.68), (0.020, 4, 2.90), (0.020, 10, 6.27), (0.030, 2, 1.92), (0.030, 4, 3.70), (0.030, 10, 8.91)],
+    [(0.020, 2, 1.68), (0.020, 10, 6.27), (0.030, 4, 3.70)],
 )
 def test_lump_force_ratio(radius, contrast, reference):
     """Design figures at 10 mm for an ideal local field; a field whose shear stiffness follows too reads a little more."""
@@ -95,7 +95,7 @@ def loop(rng, steps, reach=0.03):
     return p
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("seed", range(3))
 def test_no_closed_cycle_yields_work(seed):
     rng = np.random.default_rng(seed)
     lump = Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.02), contrast=10)

@@ -72,7 +72,7 @@ def test_the_fast_way_is_the_slow_one(make: type[TissueBackend]) -> None:
     assert len(set(np.round(slow, 3))) == 3 or make is not winkler
 
 
-@pytest.mark.parametrize(("name", "seed"), [("person", 1), ("obese", 2), ("slim", 3), ("rlq_guarding", 4), ("guarding", 5)])
+@pytest.mark.parametrize(("name", "seed"), [("person", 1), ("obese", 2), ("rlq_guarding", 4)])
 def test_the_fast_way_is_the_slow_one_on_people(name: str, seed: int) -> None:
     """Their walls stiffen, are curved, tense and hold lumps; presses of a sparse grid, limited or not, on the whole wall."""
     words = ["phantom.breathing.kind=none", *(["phantom.draw.lumps=[1, 1]"] if name == "person" else ())]

@@ -1,6 +1,6 @@
 """Cost of recording: time per message and bytes on disk, by compression, for the traffic of an examination in contact.
 
-python services/recorder/tests/bench_recorder.py [SIMULATED SECONDS]
+python -m research.recorder_cost [SIMULATED SECONDS]
 """
 
 from __future__ import annotations
