@@ -70,6 +70,7 @@ def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
 
 
 def main() -> None:
+    """Print the table."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 10.0
     messages = traffic(seconds)
     size = sum(len(payload) for _, payload, _, _ in messages)
