@@ -84,8 +84,12 @@ def whole(tmp_path_factory: pytest.TempPathFactory) -> tuple[Recording, dict[str
     return Recording(path), facts
 
 
-def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+@pytest.fixture(scope="module")
+def recording(whole: tuple[Recording, dict[str, Any]]) -> Recording:
+    return whole[0]
+
+
+def test_everything_is_drawn(recording: Recording) -> None:
     expected = {
         "/world/abdomen", "/world/tool/force", "/world/tool/travelled", "/world/camera/depth", "/world/findings",
         "/world/perception/points", "/world/perception/surface", "/world/perception/targets",
@@ -105,21 +109,18 @@ def test_everything_is_drawn(whole: tuple[Recording, dict[str, Any]]) -> None:
     assert {"/map/mean/legend", "/world/camera"} <= recording.static
 
 
-def test_the_only_timeline_is_simulated_time(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_only_timeline_is_simulated_time(recording: Recording) -> None:
     assert recording.timelines == {TIMELINE}
 
 
-def test_every_link_has_a_shape_and_moves(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_every_link_has_a_shape_and_moves(recording: Recording) -> None:
     for link in lbr.LINK_NAMES[1:]:
         assert f"/world/robot/{link}/shape_0" in recording.static, link
         assert recording.temporal[f"/world/robot/{link}"] > 0.9 * SECONDS * 20, link
     assert recording.temporal["/world/robot/lbr_link_0"] == 1  # the base stands still: written once
 
 
-def test_a_pose_is_where_the_message_had_it(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_a_pose_is_where_the_message_had_it(recording: Recording) -> None:
     messages = dict(run(SECONDS, Scenario().robot))
     drawn = recording.cells("/world/robot/indenter", "Transform3D:translation")
     for time, value in drawn[::40]:
@@ -128,8 +129,7 @@ def test_a_pose_is_where_the_message_had_it(whole: tuple[Recording, dict[str, An
         assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z), abs=1e-6)
 
 
-def test_the_truth_goes_with_the_patient(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_truth_goes_with_the_patient(recording: Recording) -> None:
     messages = dict(run(SECONDS, Scenario().robot))
     breath = recording.cells("/plots/truth/breath", "Scalars:scalars")
     assert len(breath) == SECONDS * 20
@@ -143,8 +143,7 @@ def test_the_truth_goes_with_the_patient(whole: tuple[Recording, dict[str, Any]]
         assert value.as_py()[0] == pytest.approx((p.x, p.y, p.z + sent.excursion), abs=1e-6)
 
 
-def test_curves_have_twenty_points_a_second(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_curves_have_twenty_points_a_second(recording: Recording) -> None:
     rows = recording.cells("/plots/force/measured", "Scalars:scalars")
     assert len(rows) == SECONDS * 20
     times = np.array([time for time, _ in rows])
@@ -152,8 +151,7 @@ def test_curves_have_twenty_points_a_second(whole: tuple[Recording, dict[str, An
     assert len(recording.cells("/plots/torque/joints", "Scalars:scalars")[0][1]) == 7
 
 
-def test_the_abdomen_is_written_only_while_it_changes(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_abdomen_is_written_only_while_it_changes(recording: Recording) -> None:
     rows = recording.cells("/world/abdomen", "Mesh3D:vertex_positions")
     pressed = [time for time, _ in rows if time > 0.1]
     assert min(pressed) > 0.29 * SECONDS
@@ -164,8 +162,7 @@ def test_the_abdomen_is_written_only_while_it_changes(whole: tuple[Recording, di
     assert (still - dented)[:, 2].max() == pytest.approx(0.01, abs=1e-3)
 
 
-def test_the_abdomen_is_coloured_where_it_was_scanned(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_abdomen_is_coloured_where_it_was_scanned(recording: Recording) -> None:
     rows = recording.cells("/world/abdomen", "Mesh3D:vertex_colors")
     assert len(set(rows[0][1].as_py())) == 1  # skin
     assert len(rows) <= SECONDS + 1
@@ -174,22 +171,19 @@ def test_the_abdomen_is_coloured_where_it_was_scanned(whole: tuple[Recording, di
     assert len(set(final)) > 5
 
 
-def test_the_phases_are_written_as_they_change(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_phases_are_written_as_they_change(recording: Recording) -> None:
     states = [(time, value.as_py()[0]) for time, value in recording.cells("/state/phase", "StateChange:state")]
     assert [name for _, name in states] == ["home", "look", "scan"]
     assert states[1][0] == pytest.approx(0.1 * SECONDS, abs=0.06)
 
 
-def test_the_arrow_is_the_force_and_vanishes_with_it(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_arrow_is_the_force_and_vanishes_with_it(recording: Recording) -> None:
     rows = recording.cells("/world/tool/force", "Arrows3D:vectors")
     assert all(0.074 < value.as_py()[0][2] < 0.31 for _, value in rows)  # 30 mm a newton, 2.5 N to 10 N
     assert min(time for time, _ in rows) > 0.29 * SECONDS
 
 
-def test_the_true_outline_is_at_half_contrast(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_true_outline_is_at_half_contrast(recording: Recording) -> None:
     segments = np.array([s for _, v in recording.cells("/map/mean/truth", "LineStrips3D:strips") for s in v.as_py()])
     radius = np.hypot(segments[..., 0] + 0.05, segments[..., 1] + 0.05)
     assert radius == pytest.approx(0.03, abs=2e-3)  # the edge is 3 mm wide, the mesh 6 mm
@@ -203,8 +197,7 @@ def test_it_stays_small(whole: tuple[Recording, dict[str, Any]], tmp_path: Path)
     assert 0 < half["file_bytes"] + growth * (150 - SECONDS / 2) < 60e6
 
 
-def test_the_file_has_the_layout(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_the_file_has_the_layout(recording: Recording) -> None:
     (layout,) = recording.reader.blueprints()
     assert layout.application_id == "palpate"
     origins, kinds = set(), set()
@@ -341,8 +334,7 @@ def test_a_topic_of_another_type_is_refused(tmp_path: Path) -> None:
         list(replay.messages([path]))
 
 
-def test_force_over_depth_holds_every_reading_in_contact_once(whole: tuple[Recording, dict[str, Any]]) -> None:
-    recording, _ = whole
+def test_force_over_depth_holds_every_reading_in_contact_once(recording: Recording) -> None:
     pieces = recording.cells("/force_depth/past", "Points2D:positions")
     points = np.concatenate([np.array(value.as_py()) for _, value in pieces])
     force = dict(recording.cells("/plots/force/measured", "Scalars:scalars"))

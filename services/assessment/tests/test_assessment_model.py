@@ -13,13 +13,18 @@ from palpate_assessment.check import contradicted, pieces
 from palpate_assessment.detection import Candidate, Signs, agreed, matched, strongest
 from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
+from palpate_assessment.sampling import ForceSample
+
+
+def observations(samples: list[ForceSample]) -> Observations:
+    o = observe(samples, learned())
+    assert o is not None
+    return o
 
 
 def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observations:
     wall = natural(seed, sd)
-    o = observe(lines(lambda xy: LEVEL + wall(xy), seed, stroke_m=stroke_m), learned())
-    assert o is not None
-    return o
+    return observations(lines(lambda xy: LEVEL + wall(xy), seed, stroke_m=stroke_m))
 
 
 @pytest.mark.parametrize("stroke_m", [0.0005, 0.0015])
@@ -45,8 +50,7 @@ def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() ->
 
 def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     bump = Bump(0.0, 0.0, 0.02)
-    o = observe(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002), learned())
-    assert o is not None
+    o = observations(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002))
     (log_contrast,), (t,) = matched(Regression(o, learned(), (), usual_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
@@ -55,8 +59,7 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
 @pytest.mark.parametrize("edge", [0.007, 0.013])
 def test_the_edge_with_which_a_lump_is_felt_is_found(edge: float) -> None:
     lump = Bump(0.005, -0.01, 0.02, edge)
-    o = observe(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01), learned())
-    assert o is not None
+    o = observations(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01))
     found, t = strongest(Regression(o, learned(), (), usual_amplitudes(o)))
     assert found is not None
     assert found.edge == pytest.approx(edge, rel=0.2)
@@ -73,8 +76,7 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     lumpy = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.005), 0.015, 1.3), noise=0.005)
     strengths = []
     for samples in (hiccup, lumpy):
-        o = observe(samples, learned())
-        assert o is not None
+        o = observations(samples)
         regression = Regression(o, learned(), (), usual_amplitudes(o))
         (t,) = matched(regression, [bump])[1]
         strengths.append((float(t), agreed(regression, bump, float(t))))
@@ -86,8 +88,7 @@ def test_what_the_first_line_alone_says_of_a_place_beyond_it_is_not_believed() -
     beyond = Bump(0.02, -0.08, 0.008)
     samples = lines(level, noise=0.005)
     first = [s.stroke == 0 and abs(s.position[0] - 0.02) < 0.0155 for s in samples]
-    o = observe([replace(s, force=1.2 * s.force) if spoiled else s for s, spoiled in zip(samples, first, strict=True)], learned())
-    assert o is not None
+    o = observations([replace(s, force=1.2 * s.force) if spoiled else s for s, spoiled in zip(samples, first, strict=True)])
     regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
     (t,) = matched(regression, [beyond])[1]
     assert t > 3
@@ -110,8 +111,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
     steady = lines(lambda xy: LEVEL + wall(xy))
     found = []
     for samples in (steady, [replace(s, force=s.force + float(zeros[s.stroke])) for s in steady]):
-        o = observe(samples, learned())
-        assert o is not None
+        o = observations(samples)
         regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
         found.append((np.exp(regression.log_amplitudes[-2]), regression.field(np.zeros((1, 2)))[1][0]))
     (small, sure), (large, unsure) = found
@@ -127,8 +127,7 @@ def test_every_sample_is_in_one_piece_of_one_stroke() -> None:
 
 
 def test_a_model_that_holds_is_not_contradicted() -> None:
-    o = observe(lines(level), learned())
-    assert o is not None
+    o = observations(lines(level))
     assert not contradicted(Regression(o, learned(), (), usual_amplitudes(o))).any()
 
 

@@ -139,17 +139,6 @@ def test_a_missing_pose_is_reported_with_the_available_ones() -> None:
         RosCameraService(Port(TREE[:1]), wait_s=0.0)
 
 
-def test_a_distorted_image_is_refused_and_said_so() -> None:
-    port = Port()
-    service = RosCameraService(port)
-    port.intrinsics = ros_info(d=0.1)  # the driver was restarted
-    inbox = asked(1)
-    service.step(0, inbox)
-    port.waiting = [ros_image()]
-    assert service.step(100_000_000, inbox) == {}
-    assert "rectified" in str(service.finish()["problem"])
-
-
 def intrinsics(rectified: bool, info: Any) -> Any:
     """Return the intrinsics that the bridge publishes for these. Raises CameraError if it refuses."""
     port = Port()
@@ -181,30 +170,32 @@ def test_without_p_or_without_rectification_k_counts() -> None:
     assert intrinsics(True, unset).k[0] == intrinsics(False, raw).k[0] == 600.0
 
 
-def test_an_image_that_camera_info_is_not_of_is_refused_and_said_so() -> None:
+def larger() -> Any:
+    info = ros_info()
+    info.width, info.height = 6, 4
+    return info
+
+
+@pytest.mark.parametrize(
+    ("info", "frame", "problem"),
+    [
+        (ros_info(d=0.1), FRAME, "rectified"),
+        (larger(), FRAME, "3 x 2, camera_info says 6 x 4"),
+        # Depth that is aligned to colour is in the colour camera's frame.
+        (ros_info(), "camera_color_optical_frame", "set camera.ros.frame=camera_color_optical_frame"),
+    ],
+)
+def test_an_image_that_does_not_fit_is_refused_with_the_reason(info: Any, frame: str, problem: str) -> None:
     port = Port()
-    service = RosCameraService(port)
-    port.intrinsics.width, port.intrinsics.height = 6, 4
-    inbox = asked(1)
+    service, inbox, image = RosCameraService(port), asked(1), ros_image()
+    port.intrinsics = info  # the driver was restarted
     service.step(0, inbox)
-    port.waiting = [ros_image()]
+    image.header.frame_id = frame
+    port.waiting = [image]
     assert service.step(100_000_000, inbox) == {}
     facts = service.finish()
     assert (facts["frames"], facts["frames_rejected"]) == (0, 1)
-    assert facts["problem"] == "depth image is 3 x 2, camera_info says 6 x 4"
-
-
-def test_an_image_of_another_frame_than_the_pose_is_refused_and_said_so() -> None:
-    """Depth that is aligned to colour is in the colour camera's frame."""
-    port = Port()
-    service = RosCameraService(port)
-    inbox = asked(1)
-    service.step(0, inbox)
-    image = ros_image()
-    image.header.frame_id = "camera_color_optical_frame"
-    port.waiting = [image]
-    assert service.step(100_000_000, inbox) == {}
-    assert "set camera.ros.frame=camera_color_optical_frame" in service.finish()["problem"]
+    assert problem in str(facts["problem"])
 
 
 def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:

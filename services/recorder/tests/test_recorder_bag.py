@@ -45,6 +45,11 @@ def surface(t: int) -> bytes:
     return codec.encode(message, "palpation_msgs/msg/SurfaceMesh")
 
 
+@pytest.fixture
+def service(tmp_path: Path) -> RecorderService:
+    return RecorderService(tmp_path / RECORDING)
+
+
 def record(service: RecorderService, milliseconds: int) -> None:
     for i in range(milliseconds):
         service.record(TOPICS["joint_states"], joint_states(i * MS), i * MS, i)
@@ -52,8 +57,7 @@ def record(service: RecorderService, milliseconds: int) -> None:
             service.record(TOPICS["sim/surface"], surface(i * MS), i * MS, i // 50)
 
 
-def test_rosbags_reads_back_every_byte(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_rosbags_reads_back_every_byte(service: RecorderService, tmp_path: Path) -> None:
     record(service, 2500)
     facts = service.finish()
     assert facts["messages"] == 2550
@@ -70,8 +74,7 @@ def test_rosbags_reads_back_every_byte(tmp_path: Path) -> None:
     assert meshes == [(i * MS, surface(i * MS)) for i in range(0, 2500, 50)]
 
 
-def test_a_reader_without_our_definitions_decodes_our_types(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_a_reader_without_our_definitions_decodes_our_types(service: RecorderService, tmp_path: Path) -> None:
     record(service, 60)
     service.finish()
     with AnyReader([tmp_path / RECORDING]) as reader:
@@ -80,8 +83,7 @@ def test_a_reader_without_our_definitions_decodes_our_types(tmp_path: Path) -> N
         assert reader.deserialize(data, connection.msgtype).vertices[0] == pytest.approx(0.05)
 
 
-def test_the_mcap_library_decodes_all_with_the_schemas_in_the_file(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_the_mcap_library_decodes_all_with_the_schemas_in_the_file(service: RecorderService, tmp_path: Path) -> None:
     record(service, 120)
     service.finish()
     with (tmp_path / RECORDING / f"{RECORDING}_0.mcap").open("rb") as stream:
@@ -115,8 +117,7 @@ def kill(service_folder: Path, to: Path, share: float = 1.0) -> Path:
     return to
 
 
-def test_a_crash_loses_at_most_the_last_simulated_second(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_a_crash_loses_at_most_the_last_simulated_second(service: RecorderService, tmp_path: Path) -> None:
     record(service, 3900)
     recovered = recover(kill(tmp_path / RECORDING, tmp_path / "crashed"))
     with Reader(recovered) as reader:
@@ -125,8 +126,7 @@ def test_a_crash_loses_at_most_the_last_simulated_second(tmp_path: Path) -> None
     assert len(stamps) >= 2900
 
 
-def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_a_file_cut_anywhere_is_recovered_up_to_there(service: RecorderService, tmp_path: Path) -> None:
     record(service, 3900)
     service.finish()
     counts = []
@@ -138,8 +138,7 @@ def test_a_file_cut_anywhere_is_recovered_up_to_there(tmp_path: Path) -> None:
     assert 0 < counts[0] < counts[1] < counts[2] < counts[3] == 3978
 
 
-def test_salvage_returns_what_recover_writes(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_salvage_returns_what_recover_writes(service: RecorderService, tmp_path: Path) -> None:
     record(service, 3900)
     crashed = kill(tmp_path / RECORDING, tmp_path / "crashed", 0.7)
     before = sorted(tmp_path.rglob("*"))
@@ -183,25 +182,22 @@ def test_the_file_of_another_writer_is_recovered(tmp_path: Path, as_folder: bool
     assert 0 < recording.counts["tf"] < 300
 
 
-def test_recover_reports_errors(tmp_path: Path) -> None:
+def test_recover_reports_errors(service: RecorderService, tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no recording there"):
         recover(tmp_path)
-    service = RecorderService(tmp_path / RECORDING)
     with pytest.raises(ValueError, match="nothing to recover"):
         recover(kill(tmp_path / RECORDING, tmp_path / "empty"))
     service.finish()
 
 
-def test_gaps_in_the_sequence_are_reported(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_gaps_in_the_sequence_are_reported(service: RecorderService) -> None:
     for sequence in (0, 1, 5, 6):
         service.record(TOPICS["joint_states"], joint_states(0), sequence * MS, sequence)
     assert service.finish()["missing"] == {"/joint_states": 3}
 
 
-def test_memory_stays_bounded_by_the_chunk(tmp_path: Path) -> None:
+def test_memory_stays_bounded_by_the_chunk(service: RecorderService, tmp_path: Path) -> None:
     """Large messages go to disk by size, long before a simulated second is over."""
-    service = RecorderService(tmp_path / RECORDING)
     payload = codec.encode(
         SurfaceMesh(
             header(0),
@@ -278,9 +274,8 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
         recording.check(contract(), ["joint_states"])
 
 
-def test_rerun_opens_the_recording(tmp_path: Path) -> None:
+def test_rerun_opens_the_recording(service: RecorderService, tmp_path: Path) -> None:
     """Its own reader decodes joint states and meshes alike; nothing of ours takes part."""
-    service = RecorderService(tmp_path / RECORDING)
     record(service, 200)
     service.finish()
     out = tmp_path / "opened.rrd"
@@ -297,8 +292,7 @@ def test_rerun_opens_the_recording(tmp_path: Path) -> None:
     assert out.stat().st_size > 10_000
 
 
-def test_an_empty_recording_is_a_valid_bag(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_an_empty_recording_is_a_valid_bag(service: RecorderService, tmp_path: Path) -> None:
     assert service.finish()["messages"] == 0
     with Reader(tmp_path / RECORDING) as reader:
         assert list(reader.messages()) == []
@@ -317,8 +311,7 @@ def test_finish_twice_and_a_new_run_in_the_same_folder(tmp_path: Path) -> None:
     assert metadata["duration"]["nanoseconds"] == 4 * MS
 
 
-def test_an_unknown_topic_is_counted_not_written(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_an_unknown_topic_is_counted_not_written(service: RecorderService) -> None:
     stranger = TOPICS["joint_states"].model_copy(update={"name": "not/ours"})
     service.record(stranger, b"\0\1\0\0", 0, 0)
     facts = service.finish()
@@ -342,8 +335,9 @@ def test_create_reads_the_run_folder(tmp_path: Path, monkeypatch: pytest.MonkeyP
 Usage = namedtuple("Usage", "total used free")
 
 
-def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(
+    service: RecorderService, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     record(service, 1000)
     monkeypatch.setattr(shutil, "disk_usage", lambda _: Usage(0, 0, 9_000_000))
     service.record(TOPICS["joint_states"], joint_states(1000 * MS), 1000 * MS, 1000)
@@ -355,8 +349,7 @@ def test_a_disk_that_fills_up_ends_the_recording_whole_and_not_the_run(tmp_path:
         assert reader.message_count == 1020
 
 
-def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(tmp_path: Path) -> None:
-    service = RecorderService(tmp_path / RECORDING)
+def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(service: RecorderService, tmp_path: Path) -> None:
     record(service, 100)
     shutil.rmtree(tmp_path / RECORDING)
     service.record(TOPICS["joint_states"], joint_states(300 * MS), 300 * MS, 300)
@@ -377,7 +370,7 @@ def small_disk(tmp_path: Path) -> Iterator[Path]:
 
 def test_on_a_small_disk_room_is_left_for_the_report(small_disk: Path) -> None:
     service = RecorderService(small_disk / RECORDING)
-    record(service, 60_000)
+    record(service, 15_000)
     facts = service.finish()
     assert "are left on its disk" in facts["trouble"]
     assert facts["unwritten"] > 0
@@ -392,5 +385,5 @@ def test_a_write_error_ends_the_recording_and_not_the_run(small_disk: Path, monk
     service = RecorderService(small_disk / RECORDING)
     record(service, 10_000)
     (small_disk / "ballast").write_bytes(bytes(shutil.disk_usage(small_disk).free - 100_000))
-    record(service, 60_000)
+    record(service, 15_000)
     assert service.finish()["trouble"].endswith("it cannot be written: No space left on device")

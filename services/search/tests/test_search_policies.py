@@ -261,19 +261,23 @@ def test_it_keeps_to_the_budget_of_time() -> None:
     assert rig.last(REQUEST).reason == "2 s elapsed"
 
 
-@pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
-def test_no_request_before_palpation(phase: int) -> None:
-    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"))
+def playing(phase: int = ExamState.PHASE_RETRACT, search: Search | None = None, **exam: Any) -> tuple[ServiceRig, Play]:
+    """A service and an examination of a small region in this phase."""
+    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam), search=search or Search())
     rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
     play.phase = phase
+    return rig, play
+
+
+@pytest.mark.parametrize("phase", [ExamState.PHASE_HELD, ExamState.PHASE_ASSESS])
+def test_no_request_before_palpation(phase: int) -> None:
+    rig, play = playing(phase)
     rig.run(0.3, {"exam/state": play.state})
     assert not rig.log[REQUEST]
 
 
 def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
-    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=12)))
-    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
-    play.phase = ExamState.PHASE_RETRACT
+    rig, play = playing(budget=SearchBudget(presses=12))
     rig.run(0.3, {"exam/state": play.state})
     for _ in range(12):
         asked = rig.last(REQUEST)
@@ -287,9 +291,7 @@ def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
 
 @pytest.mark.parametrize("policy", ["informed", "raster", "random", "latin-hypercube", "expected-improvement"])
 def test_a_press_that_gave_no_sample_is_over_too(policy: str) -> None:
-    scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search"), search=Search(policy=policy))
-    rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
-    play.phase = ExamState.PHASE_RETRACT
+    rig, play = playing(search=Search(policy=policy))
     for _ in range(4):
         rig.run(0.3, {"exam/state": play.state})
         play.over = int(rig.last(REQUEST).number)

@@ -10,6 +10,7 @@ from palpate_bus.implementations import create_for
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Lesion
 from palpate_models.scenario.load import load_scenario
@@ -17,17 +18,6 @@ from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.service import create
 
 COARSE = ("phantom.edge_m=0.012", "phantom.lesions.0.depth_m=0.02", "phantom.lesions.0.radii_m=[0.06, 0.05]")
-
-
-class OneTopic:
-    """An inbox with the newest tool state."""
-
-    def __init__(self):
-        self.message = None
-
-    def latest(self, topic):
-        assert topic == "sim/tool_state"
-        return self.message
 
 
 def tool_state(t, p, radius=0.015):
@@ -45,9 +35,9 @@ def test_it_publishes_what_the_contract_says_and_presses_back():
     service = create(load_scenario("deep_lesion", COARSE), pitch_m=0.025)
     topics = {topic.name: topic for topic in contract().outputs("tissue")}
     assert set(service.start()) == {name for name, topic in topics.items() if topic.latched}
-    inbox, sent = OneTopic(), {}
+    inbox, sent = HandInbox(), {}
     for k in range(101):
-        inbox.message = tool_state(k * MS, (0.56 - 0.045, -0.045, 0.93 + 0.015 - 1e-4 * k))
+        inbox.messages["sim/tool_state"] = tool_state(k * MS, (0.56 - 0.045, -0.045, 0.93 + 0.015 - 1e-4 * k))
         out = service.step(k * MS, inbox)
         assert set(out) == {name for name, topic in topics.items() if not topic.latched and k % topic.period_ms == 0}
         for name, message in out.items():
@@ -68,9 +58,9 @@ def test_it_publishes_what_the_contract_says_and_presses_back():
 def test_the_wall_of_a_scenario_stiffens_and_is_guarded():
     def force(*settings):
         service = create(load_scenario("deep_lesion", (*COARSE, *settings)), pitch_m=0.025)
-        inbox = OneTopic()
+        inbox = HandInbox()
         for k in range(201):
-            inbox.message = tool_state(k * MS, (0.56 + 0.06, 0.06, 0.93 + 0.015 - 1e-4 * k))
+            inbox.messages["sim/tool_state"] = tool_state(k * MS, (0.56 + 0.06, 0.06, 0.93 + 0.015 - 1e-4 * k))
             out = service.step(k * MS, inbox)
         return out["sim/contact_wrench"].wrench.force.z
 

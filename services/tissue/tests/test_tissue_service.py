@@ -14,6 +14,7 @@ from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.service import Service
+from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.frames import apply, matrix
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.motion import BodyMotion, Motion
@@ -36,37 +37,17 @@ def tool_state(t, p, v=(0.0, 0.0, 0.0), radius=0.015):
     return ToolState(header(t, "world"), pose, Twist(Vector3(*v), Vector3(0.0, 0.0, 0.0)), radius)
 
 
-class OneTopic:
-    """An inbox with the newest tool state."""
-
-    def __init__(self):
-        self.message = None
-
-    def latest(self, topic):
-        assert topic == "sim/tool_state"
-        return self.message
-
-    def new(self, topic):
-        return [] if self.message is None else [self.message]
-
-    def stamp(self, topic):
-        return None
-
-    def lost(self, role):
-        return False
-
-
 def scenario(**phantom):
     still = {"breathing": Breathing(kind="none"), **phantom}
     return Scenario(errors=Errors(level="none"), phantom=Phantom(lesions=(LESION,), **still))
 
 
 def press(service, X_WA, depth=0.008, ticks=60, at=(0.0, 0.0)):
-    inbox, out = OneTopic(), {}
+    inbox, out = HandInbox(), {}
     for k in range(ticks + 1):
         p_A = np.array((*at, 0.015 - depth * min(1, k / 30)))
         p_W = X_WA[:3, :3] @ p_A + X_WA[:3, 3]
-        inbox.message = tool_state(k * MS, p_W.tolist())
+        inbox.messages["sim/tool_state"] = tool_state(k * MS, p_W.tolist())
         out.update(service.step(k * MS, inbox))
     return out
 
@@ -80,9 +61,9 @@ def test_every_output_is_sent_on_its_ticks_encodes_and_lies_in_range():
     topics = {topic.name: topic for topic in contract().outputs("tissue")}
     latched = service.start()
     assert set(latched) == {name for name, topic in topics.items() if topic.latched}
-    inbox = OneTopic()
+    inbox = HandInbox()
     for k in range(101):
-        inbox.message = tool_state(k * MS, (0.56, 0.0, 0.935))
+        inbox.messages["sim/tool_state"] = tool_state(k * MS, (0.56, 0.0, 0.935))
         out = service.step(k * MS, inbox)
         due = {name for name, topic in topics.items() if not topic.latched and k % topic.period_ms == 0}
         assert set(out) == due
@@ -155,7 +136,7 @@ def test_surface_shows_the_dent():
 def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
     breathing = Breathing(kind="quiet", peak_to_peak_m=0.012, depth_cv=0, duration_cv=0)
     service, curve = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0)
-    inbox, tops = OneTopic(), []
+    inbox, tops = HandInbox(), []
     for k in range(0, 4301):
         out = service.step(k * MS, inbox)
         assert not vector(out["sim/contact_wrench"].wrench.force).any()
@@ -168,9 +149,9 @@ def test_without_a_tool_the_abdomen_breathes_and_exerts_nothing():
 
 def test_true_depth_is_counted_from_the_skin_as_the_breath_has_lifted_it():
     breathing = Breathing(kind="quiet", depth_cv=0)
-    service, curve, inbox = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0), OneTopic()
+    service, curve, inbox = create(scenario(breathing=breathing)), BreathingCurve(breathing, 0), HandInbox()
     X_WA = matrix(true_pose(scenario()))
-    inbox.message = tool_state(0, (X_WA @ (0.0, 0.0, 0.045, 1.0))[:3].tolist())  # 30 mm above the skin at rest
+    inbox.messages["sim/tool_state"] = tool_state(0, (X_WA @ (0.0, 0.0, 0.045, 1.0))[:3].tolist())  # 30 mm above the skin at rest
     sent = {k: service.step(k * MS, inbox) for k in range(3000)}
     depths = {k: out["truth/indentation"].depth for k, out in sent.items() if "truth/indentation" in out}
     lifts = np.array([curve.excursion(k / 1000) for k in depths])
@@ -250,10 +231,10 @@ def test_a_process_that_stood_still_moves_the_tool_as_fast_as_it_went() -> None:
 
     peaks = []
     for ticks, heard_at in ((range(101, 201), int), (range(101, 201), lambda _: 200), ([200], int)):
-        service, inbox = create(known), OneTopic()
+        service, inbox = create(known), HandInbox()
         press(service, X_WA, 0.006, 100)
         for t in ticks:
-            inbox.message = tool(heard_at(t), heard_at(t))
+            inbox.messages["sim/tool_state"] = tool(heard_at(t), heard_at(t))
             service.step(t * MS, inbox)
         peaks.append(service.finish()["peak_force_n"])
     assert peaks[1] == pytest.approx(peaks[0], rel=0.02)
@@ -280,13 +261,13 @@ def body_poses(case: Scenario) -> tuple[np.ndarray, np.ndarray]:
 
 def pressed(case: Scenario, X_WA: np.ndarray, make: Callable[[Scenario], Service] = create) -> dict[str, Any]:
     """Return the messages when the indenter presses and slides, along a path in A, on a body that is at X_WA."""
-    service, inbox, out, start = make(case), OneTopic(), {}, AFTER
+    service, inbox, out, start = make(case), HandInbox(), {}, AFTER
     service.start()
     for k in range(start + 151):
         share = np.clip((k - start) / 100, 0, 1)
         p_A, v_A = np.array((-0.03 + 0.02 * share, 0.01, 0.020 - 0.012 * share)), np.array((0.2, 0.0, -0.12)) * (0 < share < 1)
         p_W = apply(X_WA, p_A[None])[0]
-        inbox.message = tool_state(k * MS, p_W.tolist(), (X_WA[:3, :3] @ v_A).tolist()) if k >= start else None
+        inbox.messages["sim/tool_state"] = tool_state(k * MS, p_W.tolist(), (X_WA[:3, :3] @ v_A).tolist()) if k >= start else None
         out.update(service.step(k * MS, inbox))
     return out
 
@@ -337,14 +318,15 @@ def test_an_indenter_that_the_body_takes_along_is_not_rubbed(motion):
     body, X_WA = BodyMotion(case.phantom.motion, case.seed), matrix(true_pose(case))
     p_A, forces = np.array((0.01, 0.02, 0.005)), []
     for moves in (False, True):
-        service, inbox, felt = create(case if moves else moving_scenario(Motion())), OneTopic(), []
+        service, inbox, felt = create(case if moves else moving_scenario(Motion())), HandInbox(), []
         for k in range(300):
             X_WM = X_WA @ body.pose(k / 1000) if moves else X_WA
             v, w = body.twist(k / 1000) if moves else (np.zeros(3), np.zeros(3))
             at = body.pose(k / 1000)[:3, :3] @ p_A + body.pose(k / 1000)[:3, 3]
             v_W = X_WA[:3, :3] @ (v + np.cross(w, at))
-            inbox.message = tool_state(k * MS, apply(X_WM, p_A[None])[0].tolist(), v_W.tolist())
-            inbox.message.twist.angular.x, inbox.message.twist.angular.y, inbox.message.twist.angular.z = X_WA[:3, :3] @ w
+            inbox.messages["sim/tool_state"] = tool_state(k * MS, apply(X_WM, p_A[None])[0].tolist(), v_W.tolist())
+            angular = inbox.messages["sim/tool_state"].twist.angular
+            angular.x, angular.y, angular.z = X_WA[:3, :3] @ w
             out = service.step(k * MS, inbox)
             felt.append(X_WM[:3, :3].T @ vector(out["sim/contact_wrench"].wrench.force))
         forces.append(np.array(felt))
@@ -360,8 +342,8 @@ def test_the_latched_truth_and_all_before_the_motion_are_those_of_a_body_at_rest
     poses = [pose_matrix(service.start()["truth/phantom"].pose) for service in (moving, resting)]
     np.testing.assert_array_equal(*poses)
     X_WA, _ = body_poses(case)
-    inbox = OneTopic()
-    inbox.message = tool_state(0, apply(X_WA, np.array(((0.0, 0.0, 0.010),)))[0].tolist())
+    inbox = HandInbox()
+    inbox.messages["sim/tool_state"] = tool_state(0, apply(X_WA, np.array(((0.0, 0.0, 0.010),)))[0].tolist())
     for k in range(21):
         sent = [service.step(k * MS, inbox)["sim/contact_wrench"].wrench for service in (moving, resting)]
         assert sent[0] == sent[1]
