@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from bench_assessment_scans import FakeInbox, Scan, examine, random_lesion, scan, scenario_with, scored, truth_of
 
 from palpate.report.evidence import found_of, map_of
 from palpate.report.scoring import Truth, score
@@ -19,6 +18,7 @@ from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam, Mode, Scenario
+from research.scans import Scan, StepInbox, examine, random_lesion, scan, scenario_with, scored, truth_of
 
 REGION = (0.11, 0.10)
 Examined = tuple[Any, Any, list[Any]]
@@ -102,7 +102,7 @@ def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
     surface = [small.surface]
     for state in [*small.states, small.states[-1], small.states[-1]]:
         t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        outbox = service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        outbox = service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
         surface = []
         if "assessment/map" in outbox:
             stamps.append(t)
@@ -114,7 +114,7 @@ def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
 
 def test_an_examination_without_samples_ends_with_no_findings(small: Scan) -> None:
     service = create(small.scenario)
-    outbox = service.step(10_000_000, FakeInbox({"exam/state": [small.states[-1]]}))
+    outbox = service.step(10_000_000, StepInbox({"exam/state": [small.states[-1]]}))
     assert outbox["assessment/findings"].final
     assert outbox["assessment/findings"].findings == []
     assert "assessment/map" not in outbox
@@ -126,11 +126,11 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
     surface = [small.surface]
     for state in half:
         t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
         surface = []
     last = small.states[-1]
     aborted = ExamState(**{**vars(last), "phase": ExamState.PHASE_ABORTED})
-    outbox = service.step(60_000_000_000, FakeInbox({"exam/state": [aborted]}))
+    outbox = service.step(60_000_000_000, StepInbox({"exam/state": [aborted]}))
     assert outbox["assessment/findings"].final
     assert 0.2 < outbox["assessment/map"].scanned.mean() < 0.8
 
@@ -138,17 +138,17 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
 def test_what_was_felt_while_a_patient_moved_is_forgotten(small: Scan) -> None:
     service = AssessmentService(exam_input(small.scenario))
     for state in small.states[: len(small.states) // 2]:
-        service.step(nanoseconds(state.header.stamp), FakeInbox({"exam/state": [state], "perception/surface": []}))
+        service.step(nanoseconds(state.header.stamp), StepInbox({"exam/state": [state], "perception/surface": []}))
     before = service.finish()["samples"]
     last = small.states[len(small.states) // 2]
     moved = ExamState(**{**vars(last), "patient_moved": True})
     for _ in range(2):
-        service.step(nanoseconds(last.header.stamp), FakeInbox({"exam/state": [moved]}))
+        service.step(nanoseconds(last.header.stamp), StepInbox({"exam/state": [moved]}))
     after = service.finish()["samples"]
     assert 0 < after < before
     for state in small.states[len(small.states) // 2 :]:
         still = ExamState(**{**vars(state), "patient_moved": True})
-        service.step(nanoseconds(state.header.stamp), FakeInbox({"exam/state": [still]}))
+        service.step(nanoseconds(state.header.stamp), StepInbox({"exam/state": [still]}))
     assert service.finish()["samples"] == after
 
 
@@ -157,7 +157,7 @@ def test_a_surface_in_another_frame_is_refused(small: Scan) -> None:
     wrong = type(small.surface)(**vars(small.surface))
     wrong.header = type(small.surface.header)(small.surface.header.stamp, "camera")
     with pytest.raises(ValueError, match="perception/surface"):
-        service.step(0, FakeInbox({"perception/surface": [wrong]}))
+        service.step(0, StepInbox({"perception/surface": [wrong]}))
 
 
 def test_reasons_have_the_numbers_of_the_message() -> None:
@@ -179,14 +179,14 @@ def test_a_recording_in_one_step_gives_what_the_examination_gave(small: Scan) ->
     ]
     known = exam_input(small.scenario)
     live, later = AssessmentService(known), AssessmentService(known)
-    live.step(first, FakeInbox({"perception/surface": [surface]}))
+    live.step(first, StepInbox({"perception/surface": [surface]}))
     coming = list(motions)
     for state in states:
         t, seen = nanoseconds(state.header.stamp), []
         while coming and nanoseconds(coming[0].header.stamp) + 100_000_000 <= t:
             seen.append(coming.pop(0))
-        live.step(t, FakeInbox({"exam/state": [state], "perception/motion": seen}))
-    later.step(last, FakeInbox({"exam/state": states, "perception/motion": motions, "perception/surface": [surface]}))
+        live.step(t, StepInbox({"exam/state": [state], "perception/motion": seen}))
+    later.step(last, StepInbox({"exam/state": states, "perception/motion": motions, "perception/surface": [surface]}))
     count = len(live.samples)
     assert count > 50
     assert [sample.depth for sample in later.samples[:count]] == [sample.depth for sample in live.samples]

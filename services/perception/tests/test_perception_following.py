@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from bench_perception_following import READY, Patient, Run, run
 
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
@@ -18,6 +17,7 @@ from palpate_perception.breath_filter import BreathFilter, strongest_rate
 from palpate_perception.follower import rises
 from palpate_perception.tracker import jackknife
 from palpate_perception.wall import steady, without_gaps
+from research.following import READY, Patient, Run, run
 
 
 def followed(*settings: str, scenario: str = "healthy", seed: int = 3, seconds: float = 20.0) -> tuple[Run, Patient]:

@@ -1,6 +1,6 @@
 """Error of the followed wall against the truth, with camera, perception and a palpating arm in view; no other service.
 
-Run: `python services/perception/tests/bench_perception_following.py [SECONDS]`; prints the README's table.
+Run: `python -m research.following [SECONDS]`; prints the README's table.
 """
 
 from __future__ import annotations
@@ -51,6 +51,7 @@ class HandedInbox(HandInbox):
     """Without encoding, which is not measured here."""
 
     def put(self, topic: str, message: Any, stamp: int | None = None) -> HandInbox:
+        """Add a message as newest and new."""
         self.messages[topic] = message
         self.events.setdefault(topic, []).append(message)
         return self
@@ -170,6 +171,7 @@ def heights(result: Run, patient: Patient) -> tuple[Array, Array]:
 
 
 def main() -> None:
+    """Print the table."""
     seconds = float(sys.argv[1]) if len(sys.argv) > 1 else 120.0
     wanted = sys.argv[2:] or list(CASES)
     print(

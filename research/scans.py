@@ -1,6 +1,6 @@
 """Scans without a robot: a sphere slid over the real tissue along a snake, with the errors that measuring has.
 
-`python bench_assessment_scans.py [SEEDS]` prints the results of the assessment on many phantoms.
+`python -m research.scans [SEEDS]` prints the results of the assessment on many phantoms.
 """
 
 from __future__ import annotations
@@ -38,16 +38,18 @@ FORCE_SD = 0.03
 """Noise of the force at 100 Hz [N]."""
 
 
-class FakeInbox:
+class StepInbox:
     """Messages of a step, by topic."""
 
     def __init__(self, messages: dict[str, list[Any]]) -> None:
         self._messages = messages
 
     def new(self, topic: str) -> list[Any]:
+        """See `service.Inbox`."""
         return self._messages.get(topic, [])
 
     def latest(self, topic: str) -> Any | None:
+        """See `service.Inbox`."""
         return (self._messages.get(topic) or [None])[-1]
 
 
@@ -206,7 +208,7 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
     surface = [data.surface]
     for state in data.states:
         t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        outbox = service.step(t, FakeInbox({"exam/state": [state], "perception/surface": surface}))
+        outbox = service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
         surface = []
         samples += outbox.get("assessment/samples", [])
         stiffness_map = outbox.get("assessment/map", stiffness_map)

@@ -1,18 +1,14 @@
 """Can a lesion be felt at its depth? Scans without a robot over the elastic body, with the errors that measuring has.
 
-`python bench_elastic_depths.py [DEPTH_MM ...]` prints the results of the assessment for `deep_lesion` with its lesion at
-each depth. It uses the assessment's own bench of scans (services/assessment/tests).
+`python -m research.elastic_depths [DEPTH_MM ...]` prints the results of the assessment for `deep_lesion` with its lesion at
+each depth.
 """
 
 from __future__ import annotations
 
 import sys
-from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).parents[2] / "assessment" / "tests"))
-
-import bench_assessment_scans as scans
 import numpy as np
 
 from palpate_models.patient.phantom import PhantomModel, build_phantom
@@ -20,6 +16,7 @@ from palpate_models.patient.schema import Stiffness
 from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
+from research import scans
 
 DEPTHS_MM = (10, 20, 30, 40)
 
