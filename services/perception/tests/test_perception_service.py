@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any
 
@@ -331,50 +331,44 @@ def test_a_lost_camera_ends_the_burst_with_what_there_is() -> None:
     assert targets.reason == ViewReason.NO_CAMERA
 
 
-def test_frames_that_cannot_be_read_are_answered_in_words() -> None:
-    case = scenario()
-    camera, perception = CameraService(plant_input(case)), create(case)
-    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
-    inbox = HandInbox().receive(camera.start())
-    frame = whole(camera.step(TICK, HandInbox().receive(wake)))
+def unreadable(frame: dict[str, Any]) -> None:
     frame["camera/depth/image_raw"].encoding = "mono8"
-    sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
-    sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
-    (answer,) = [outbox for outbox in sent if outbox]
-    assert answer["perception/targets"].reason == ViewReason.BAD_FRAMES
 
 
-def test_frames_without_the_cameras_pose_are_answered_in_words() -> None:
+def larger_info(frame: dict[str, Any]) -> None:
+    info = frame["camera/depth/camera_info"]
+    info.width, info.height = 2 * info.width, 2 * info.height
+
+
+def larger_image(frame: dict[str, Any]) -> None:
+    info = frame["camera/depth/camera_info"]
+    info.width, info.height = info.width // 2, info.height // 2
+
+
+@pytest.mark.parametrize(
+    ("spoil", "posed", "steps", "reason"),
+    [
+        (unreadable, True, 15, ViewReason.BAD_FRAMES),
+        (lambda frame: None, False, 15, ViewReason.NO_CALIBRATION),
+        (larger_info, True, 3, ViewReason.BAD_FRAMES),  # answered at once: more frames will not help
+        (larger_image, True, 3, ViewReason.BAD_FRAMES),
+    ],
+)
+def test_a_bad_frame_is_answered_with_its_reason(
+    spoil: Callable[[dict[str, Any]], None], posed: bool, steps: int, reason: ViewReason
+) -> None:
     case = scenario()
     camera, perception = CameraService(plant_input(case)), create(case)
-    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 1)}
-    frame = whole(camera.step(TICK, HandInbox().receive(wake)))
-    inbox = HandInbox()
-    sent = [perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 1)}))]
-    sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, 15)]
+    trigger = {"planning/camera_trigger": CameraTrigger(header(0), 1)}
+    frame = whole(camera.step(TICK, HandInbox().receive({"sim/surface": skin(case), **trigger})))
+    spoil(frame)
+    inbox = HandInbox().receive(camera.start() if posed else {})
+    sent = [perception.step(TICK, inbox.receive(trigger))]
+    sent += [perception.step(k * TICK, inbox.receive(frame if k == 2 else {})) for k in range(2, steps)]
     (answer,) = [outbox for outbox in sent if outbox]
-    assert answer["perception/targets"].reason == ViewReason.NO_CALIBRATION
-
-
-@pytest.mark.parametrize("larger", ["info", "image"])
-def test_an_image_that_camera_info_is_not_of_is_answered_in_words(larger: str) -> None:
-    case = scenario()
-    camera, perception = CameraService(plant_input(case)), create(case)
-    wake = {"sim/surface": skin(case), "planning/camera_trigger": CameraTrigger(header(0), 2)}
-    frame = whole(camera.step(TICK, HandInbox().receive(wake)))
-    depth, info = frame["camera/depth/image_raw"], frame["camera/depth/camera_info"]
-    width, height = int(depth.width), int(depth.height)
-    if larger == "info":
-        info.width, info.height = 2 * width, 2 * height
-    else:
-        info.width, info.height = width // 2, height // 2
-    inbox = HandInbox().receive(camera.start())
-    assert perception.step(TICK, inbox.receive({"planning/camera_trigger": CameraTrigger(header(0), 2)})) == {}
-    sent = perception.step(2 * TICK, inbox.receive(frame))
-    assert set(sent) == {"perception/targets"}, "answered at once: more frames will not help"
-    targets = sent["perception/targets"]
-    assert len(targets.positions) == 0
-    assert targets.reason == ViewReason.BAD_FRAMES
+    assert set(answer) == {"perception/targets"}
+    assert len(answer["perception/targets"].positions) == 0
+    assert answer["perception/targets"].reason == reason
 
 
 def test_forecasts_are_at_the_times_that_the_message_says() -> None:
