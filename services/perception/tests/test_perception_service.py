@@ -346,20 +346,20 @@ def larger_image(frame: dict[str, Any]) -> None:
 
 
 @pytest.mark.parametrize(
-    ("spoil", "posed", "steps", "reason"),
+    ("spoil", "posed", "frames", "steps", "reason"),
     [
-        (unreadable, True, 15, ViewReason.BAD_FRAMES),
-        (lambda frame: None, False, 15, ViewReason.NO_CALIBRATION),
-        (larger_info, True, 3, ViewReason.BAD_FRAMES),  # answered at once: more frames will not help
-        (larger_image, True, 3, ViewReason.BAD_FRAMES),
+        (unreadable, True, 1, 15, ViewReason.BAD_FRAMES),
+        (lambda frame: None, False, 1, 15, ViewReason.NO_CALIBRATION),
+        (larger_info, True, 2, 3, ViewReason.BAD_FRAMES),  # answered at once: more frames will not help
+        (larger_image, True, 2, 3, ViewReason.BAD_FRAMES),
     ],
 )
 def test_a_bad_frame_is_answered_with_its_reason(
-    spoil: Callable[[dict[str, Any]], None], posed: bool, steps: int, reason: ViewReason
+    spoil: Callable[[dict[str, Any]], None], posed: bool, frames: int, steps: int, reason: ViewReason
 ) -> None:
     case = scenario()
     camera, perception = CameraService(plant_input(case)), create(case)
-    trigger = {"planning/camera_trigger": CameraTrigger(header(0), 1)}
+    trigger = {"planning/camera_trigger": CameraTrigger(header(0), frames)}
     frame = whole(camera.step(TICK, HandInbox().receive({"sim/surface": skin(case), **trigger})))
     spoil(frame)
     inbox = HandInbox().receive(camera.start() if posed else {})
