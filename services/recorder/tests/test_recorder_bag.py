@@ -182,9 +182,10 @@ def test_the_file_of_another_writer_is_recovered(tmp_path: Path, as_folder: bool
     assert 0 < recording.counts["tf"] < 300
 
 
-def test_recover_reports_errors(service: RecorderService, tmp_path: Path) -> None:
+def test_recover_reports_errors(tmp_path: Path) -> None:
     with pytest.raises(FileNotFoundError, match="no recording there"):
         recover(tmp_path)
+    service = RecorderService(tmp_path / RECORDING)
     with pytest.raises(ValueError, match="nothing to recover"):
         recover(kill(tmp_path / RECORDING, tmp_path / "empty"))
     service.finish()
