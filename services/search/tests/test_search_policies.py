@@ -14,8 +14,7 @@ from scipy.stats import multivariate_normal
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites.search import LUMP as SUITE_LUMP
-from palpate.check.suites.search import REQUEST, Play, pressed, suite
+from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, natural
 from palpate_bus.messages import ExamState, Point, SearchRequest
@@ -327,5 +326,5 @@ def test_the_report_says_what_it_took() -> None:
     suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
     facts = service.finish()
     assert facts["presses"] == 5
-    assert 4 * SUITE_LUMP.press_s <= facts["seconds"] <= 6 * SUITE_LUMP.press_s + 0.5
+    assert 4 * PRESS_S <= facts["seconds"] <= 6 * PRESS_S + 0.5
     assert facts["ended"] == "5 presses made"
