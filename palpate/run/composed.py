@@ -33,7 +33,7 @@ REPORT_S: Final = 0.1
 """Time between two reports of the child."""
 
 
-class Stage(IntEnum):
+class ChildStage(IntEnum):
     """Activity of the child with a service."""
 
     LOAD = 0
@@ -42,19 +42,19 @@ class Stage(IntEnum):
 
 
 @dataclass(frozen=True)
-class Place:
+class ChildPlace:
     """Progress of the child, in memory that it shares with its parent: number of a role, simulated time [ns], stage."""
 
     cells: MutableSequence[int]
 
     @classmethod
-    def shared(cls) -> Place:
+    def shared(cls) -> ChildPlace:
         """Return a place that a forked process shares."""
         place = cls(shared_numbers())
         place.cells[0] = BETWEEN
         return place
 
-    def enter(self, stage: Stage, role: str | None = None) -> None:
+    def enter(self, stage: ChildStage, role: str | None = None) -> None:
         """Set stage and role."""
         self.cells[0] = BETWEEN if role is None else tuple(contract().roles).index(role)
         self.cells[2] = stage
@@ -74,9 +74,9 @@ class Place:
         return self.cells[1]
 
     @property
-    def stage(self) -> Stage:
+    def stage(self) -> ChildStage:
         """Present activity."""
-        return Stage(self.cells[2])
+        return ChildStage(self.cells[2])
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     """Runs all services in one child process. Raises PluginError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
-    place = Place.shared()
+    place = ChildPlace.shared()
     limits = _Limits(place, foreign_roles(scenario))
     collected = Collector().collected
     start = 0.0
@@ -149,13 +149,13 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
 class _Limits:
     """Time limits of the stages, and the failure of a run whose child ended in one."""
 
-    def __init__(self, place: Place, foreign: frozenset[str]) -> None:
+    def __init__(self, place: ChildPlace, foreign: frozenset[str]) -> None:
         self._place, self._foreign = place, foreign
         self._settings, self._patience = Settings.read(), Patience()
 
     def limit_s(self) -> float:
         """Return the limit at the present place [s]."""
-        starts = self._place.stage is Stage.LOAD
+        starts = self._place.stage is ChildStage.LOAD
         if self._place.role in self._foreign:
             return self._settings.start_limit_s if starts else self._settings.step_limit_s
         return self._patience.start if starts else self._patience.hard
@@ -164,17 +164,18 @@ class _Limits:
         """Return the failure of a run whose child ended with `error`."""
         role, stage = self._place.role, self._place.stage
         hangs = isinstance(error, ChildLost) and error.late
-        when = {Stage.LOAD: "at start", Stage.STEP: f"at {self._place.t / NS:.3f} s", Stage.FINISH: "at its end"}[stage]
-        where = " in its step" if role and stage is Stage.STEP else ""
+        step = f"at {self._place.t / NS:.3f} s"
+        when = {ChildStage.LOAD: "at start", ChildStage.STEP: step, ChildStage.FINISH: "at its end"}[stage]
+        where = " in its step" if role and stage is ChildStage.STEP else ""
         text = f"{role or 'the process of all services'} lost {when}: {error}{where}"
         if hangs and role in self._foreign:
-            text += f" ({variable('start_limit_s' if stage is Stage.LOAD else 'step_limit_s')})"
-        codes = {Stage.LOAD: FailureCode.NO_ANSWER if hangs else FailureCode.START_FAILED}
+            text += f" ({variable('start_limit_s' if stage is ChildStage.LOAD else 'step_limit_s')})"
+        codes = {ChildStage.LOAD: FailureCode.NO_ANSWER if hangs else FailureCode.START_FAILED}
         code = codes.get(stage, FailureCode.BLOCKED if hangs else FailureCode.ROLE_LOST)
         return Failure(code, text, () if role is None else (role,))
 
 
-def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: Place, send: Send) -> RunResult:
+def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: ChildPlace, send: Send) -> RunResult:
     """Runs all services in this process. What is collected goes to `send`, as `News`, and not into the result.
 
     The result's `start_time_s` is the time of the first tick by `perf_counter`.
@@ -184,7 +185,7 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: P
     observer_settings = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
 
     def loading(role: str) -> None:
-        place.enter(Stage.LOAD, role)
+        place.enter(ChildStage.LOAD, role)
 
     with given(observer_settings):  # only observers: the name of the results folder may reveal the patient
         observing = load_services(scenario, observers, loading)
@@ -212,7 +213,7 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: P
     interrupted = False
     try:
         run.start()
-        place.enter(Stage.STEP)
+        place.enter(ChildStage.STEP)
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
     except ServiceFailed as error:
@@ -224,14 +225,14 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: P
         failure, last = failure_of(error, run.t), run.t
     wall = perf_counter() - start
     report(measured=True)
-    place.enter(Stage.FINISH)
+    place.enter(ChildStage.FINISH)
     facts = run.finish()
     for recorder in recorders:
         if isinstance(recorder, Service):
-            place.enter(Stage.FINISH, recorder.role)
+            place.enter(ChildStage.FINISH, recorder.role)
             with suppress(Exception) if recorder.role in run.lost else nullcontext():
                 facts[recorder.role] = recorder.finish()
-    place.enter(Stage.FINISH)
+    place.enter(ChildStage.FINISH)
     return RunResult(
         runtime="composed",
         collected=Collected(),

@@ -98,7 +98,8 @@ def test_a_swap_is_an_override_whose_settings_select_the_service(name: str) -> N
         assert chosen is None
         return
     assert name == f"{role}-{chosen}"
-    assert choice(checked(load_scenario("healthy", words)), role) == chosen
+    scenario = load_scenario("healthy", words)
+    assert choice(scenario if chosen == "replay" else checked(scenario), role) == chosen  # the recording is in the container
     assert read_processes(compose_file(), (role,), (file,))[role].command == service.command(role)
     assert document[role]["build"]["args"]["GROUP"] == name
     assert document[role]["image"].endswith(f"-{name}"), "else `up` would use the image of the default service"
@@ -123,7 +124,7 @@ def test_the_end_of_a_process_is_described_by_its_log(tmp_path: Path) -> None:
     log = tmp_path / "tissue.log"
     log.write_text("Traceback (most recent call last):\n  File ...\nMeshError: two holes\n\n")
     assert how(3, log) == "left with status 3: MeshError: two holes"
-    assert how(-9, log) == "killed by signal 9"
+    assert how(-9, log) == "killed by signal 9 (SIGKILL)"
     when = "2026-11-28 13:43:09,099 tissue"
     log.write_text(f"{when} INFO joined\n{when} ERROR services.tissue = fmu: x.fmu: refused:\n- The variable touching\n- and f\n")
     assert how(3, log).endswith("services.tissue = fmu: x.fmu: refused: - The variable touching - and f")

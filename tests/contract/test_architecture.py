@@ -103,7 +103,6 @@ def test_plant_and_controller_share_no_dynamics() -> None:
             assert not {module.partition(".")[0] for module, _ in imports(tree)} & others, path
 
 
-ROOT = Path(__file__).resolve().parents[1]
 FOLDERS = ("benchmarks", "bus", "dashboards", "docs", "fmus", "models", "palpate", "services")
 
 

@@ -20,7 +20,7 @@ MOST: Final = 40
 
 
 @dataclass(frozen=True)
-class Belly:
+class SoftBelly:
     """A belly with one stiff area."""
 
     stiff_radius_m: float = 0.020
@@ -30,7 +30,7 @@ class Belly:
     """Force at 10 mm depth on unremarkable tissue."""
 
 
-BELLY: Final = Belly()
+BELLY: Final = SoftBelly()
 
 
 class Play:

@@ -19,7 +19,7 @@ HIDDEN_M = 0.002
 
 
 @dataclass(frozen=True)
-class BreathTuning:
+class ForecastTuning:
     """Blending of forecasts and estimation of their error."""
 
     stale_ns: int = 500 * MS
@@ -36,7 +36,7 @@ class BreathTuning:
     """Scale on the error estimated from consecutive forecasts, whose errors are correlated (1.0-1.3, tuning seeds)."""
 
 
-TUNING = BreathTuning()
+TUNING = ForecastTuning()
 
 
 class BreathObservation(NamedTuple):
