@@ -74,7 +74,7 @@ class CameraDrift:
 
 
 @dataclass(frozen=True)
-class WatchTuning:
+class FollowerTuning:
     """End of the observation that follows a trigger."""
 
     longest_s: float = 10.0
@@ -86,7 +86,7 @@ class WatchTuning:
     breaths: int = 2
 
 
-WATCH: Final = WatchTuning()
+WATCH: Final = FollowerTuning()
 
 
 class Watch:

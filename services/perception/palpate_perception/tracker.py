@@ -165,7 +165,7 @@ TRACKING: Final = TrackerTuning()
 
 
 @dataclass(frozen=True)
-class MotionTuning:
+class PatientMotionTuning:
     """Tuning of the detection of patient motion."""
 
     memory: float = 0.7
@@ -190,7 +190,7 @@ class MotionTuning:
     """Number of consecutive images that must exceed the threshold."""
 
 
-MOTION: Final = MotionTuning()
+MOTION: Final = PatientMotionTuning()
 
 
 class State(Enum):

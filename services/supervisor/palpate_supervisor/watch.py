@@ -14,7 +14,7 @@ from palpate_supervisor.tool import Tool
 
 
 @dataclass(frozen=True)
-class WatchTuning:
+class SupervisorTuning:
     """Margins and delays of the limit checks."""
 
     lookahead_s: float = 0.1
@@ -40,7 +40,7 @@ class WatchTuning:
     """Force that is certainly contact: tool inertia causes 1.4 N at 4 m/s^2, and a sensor that warms up drifts by 2 N."""
 
 
-TUNING = WatchTuning()
+TUNING = SupervisorTuning()
 
 
 class Level(IntEnum):
