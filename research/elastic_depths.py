@@ -11,6 +11,8 @@ from typing import Any
 
 import numpy as np
 
+from palpate.report.evidence import found_of, map_of
+from palpate.report.scoring import score
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Stiffness
 from palpate_models.scenario.load import load_scenario
@@ -30,11 +32,10 @@ def measure(depth_mm: float, seed: int = 0, settings: tuple[str, ...] = ()) -> d
     def tissue(_: PhantomModel, stiffness: Stiffness) -> ElasticTissue:
         return ElasticTissue(model, body, stiffness)
 
-    scans.Tissue = tissue  # type: ignore[misc, assignment]
-    data, truth = scans.scan(scenario), scans.truth_of(scenario)
+    data, truth = scans.scan(scenario, tissue_of=tissue), scans.truth_of(scenario)
     stiffness_map, findings, _ = scans.examine(data)
-    found = scans.found_of(findings.findings)
-    s = scans.score(found, scans.map_of(stiffness_map), truth)
+    found = found_of(findings.findings)
+    s = score(found, map_of(stiffness_map), truth)
     lesion = np.asarray(scenario.phantom.lesions[0].centre_m)
     return {
         "depth_mm": depth_mm,

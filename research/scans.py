@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from typing import Any
 
@@ -24,11 +24,12 @@ from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.field import gaussian_field
-from palpate_models.patient.phantom import build_phantom
-from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_models.scenario.load import exam_input, true_pose
 from palpate_models.scenario.schema import Mode, Scenario
-from palpate_tissue.backends.winkler.tissue import WinklerTissue as Tissue
+from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 SURFACE_SD, SURFACE_LENGTH = 0.0001, 0.012
 """Error of the perceived surface [m] and its correlation length: perception's own figures."""
@@ -51,6 +52,14 @@ class StepInbox:
     def latest(self, topic: str) -> Any | None:
         """See `service.Inbox`."""
         return (self._messages.get(topic) or [None])[-1]
+
+    def stamp(self, topic: str) -> int | None:
+        """See `service.Inbox`; nothing is stamped."""
+        return None
+
+    def lost(self, role: str) -> bool:
+        """See `service.Inbox`; nothing is lost."""
+        return False
 
 
 @dataclass(frozen=True)
@@ -80,8 +89,8 @@ def snake(region: tuple[float, float], spacing: float, speed: float, dt: float) 
     t = 0.0
     for i, y in enumerate(np.linspace(-0.5 * height, 0.5 * height, lines)):
         n = round(width / speed / dt)
-        x = np.linspace(-0.5 * width, 0.5 * width, n) * (1 if i % 2 == 0 else -1)
-        yield t + dt * np.arange(n), np.column_stack((x, np.full(n, y)))
+        x: Array = np.linspace(-0.5 * width, 0.5 * width, n, dtype=np.float64) * (1 if i % 2 == 0 else -1)
+        yield t + dt * np.arange(n, dtype=np.float64), np.column_stack((x, np.full(n, y)))
         t += n * dt + 0.6
 
 
@@ -92,16 +101,21 @@ def points(region: tuple[float, float], spacing: float, dt: float) -> Iterator[t
     t, n = 0.0, round(0.8 / dt)
     for i, y in enumerate(ys):
         for x in xs if i % 2 == 0 else xs[::-1]:
-            yield t + dt * np.arange(n), np.tile((float(x), float(y)), (n, 1))
+            yield t + dt * np.arange(n, dtype=np.float64), np.tile(np.array((float(x), float(y))), (n, 1))
             t += n * dt + 0.6
 
 
-def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | None = None) -> Scan:
-    """Slides the indenter over a scenario's phantom at the examination's depth; `errors` scales all that is wrong."""
+def scan(
+    scenario: Scenario,
+    errors: float = 1.0,
+    region: tuple[float, float] | None = None,
+    tissue_of: Callable[[PhantomModel, Stiffness], TissueBackend] = WinklerTissue,
+) -> Scan:
+    """Return the states of an indenter that slides over a phantom at the examination's depth; `errors` scales all errors."""
     exam, robot = scenario.exam, scenario.robot
     X_WA = matrix(true_pose(scenario))
     model = build_phantom(scenario.phantom, scenario.seed)
-    tissue = Tissue(model, scenario.phantom.stiffness)
+    tissue = tissue_of(model, scenario.phantom.stiffness)
     rng = np.random.Generator(np.random.PCG64(scenario.seed + 1000))
     near = (np.abs(model.vertices[:, :2]) < 0.15).all(axis=1) & (model.normals[:, 2] > 0.2)
     height = CloughTocher2DInterpolator(model.vertices[near, :2], model.vertices[near, 2])
@@ -151,9 +165,9 @@ def scan(scenario: Scenario, errors: float = 1.0, region: tuple[float, float] | 
             F, _ = tissue.step(float(t), centre[k], velocity[k], robot.indenter_radius_m)
             force[k] = F @ n[k]
         for k in range(9, len(times), 10):
-            F = float(force[k - 9 : k + 1].mean()) + errors * FORCE_SD * float(rng.standard_normal())
+            felt = float(force[k - 9 : k + 1].mean()) + errors * FORCE_SD * float(rng.standard_normal())
             steady = bool(times[k] - times[0] > 0.4)
-            states.append(_state(times[k], p[k], n[k], float(measured[k]), F, steady, X_WA, stroke))
+            states.append(_state(times[k], p[k], n[k], float(measured[k]), felt, steady, X_WA, stroke))
         for k in range(600):
             tissue.step(float(times[-1] + tissue.dt * k), p[-1] + n[-1] * 0.1, zero, robot.indenter_radius_m)
         states.append(_state(times[-1] + 0.05, p[-1], n[-1], -0.08, 0.0, False, X_WA, stroke))
@@ -240,7 +254,7 @@ def main(seeds: int) -> None:
     rlq = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)
     right = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.03, 0.03), contrast=4.0)
     left = Lesion(centre_m=(0.055, 0.055), radii_m=(0.025, 0.025), contrast=3.5)
-    kinds = {
+    kinds: dict[str, Callable[[int], tuple[Lesion, ...]]] = {
         "healthy": lambda seed: (),
         "rlq": lambda seed: (rlq,),
         "two": lambda seed: (right, left),
