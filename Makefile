@@ -57,7 +57,7 @@ install: $(VENV)/.installed
 # A full installation includes the libraries of the default examination.
 $(VENV)/.examines: pyproject.toml constraints.txt $(wildcard $(VENV)/.installed)
 	@test -e $(VENV)/.installed || { $(MAKE) --no-print-directory venv && \
-	echo "installing the libraries of an examination, about 1.5 GB; for the dashboard: $(BIN)/pip install -c constraints.txt -e '.[dashboard]'" && \
+	echo "installing the libraries of an examination, about 1.5 GB; for the dashboard: $(BIN)/pip install 'palpate[dashboard]'" && \
 	$(PIP) -e '.[run]'; }
 	@touch $@
 

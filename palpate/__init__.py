@@ -16,6 +16,8 @@ from importlib import import_module
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
+from palpate_plugins import needs
+
 if TYPE_CHECKING:
     from palpate.interface.assessment import Assessment, StiffnessMap, assess
     from palpate.interface.examination import Examination, run
@@ -67,7 +69,7 @@ def __getattr__(name: str) -> Any:
         if (error.name or "palpate").startswith("palpate"):
             raise
         raise ModuleNotFoundError(
-            f"palpate.{name} needs the module {error.name}: pip install 'palpate[library]'", name=error.name
+            f"palpate.{name} {needs((str(error.name),), 'study' if name == 'study' else 'library')}", name=error.name
         ) from error
     globals()[name] = value
     return value

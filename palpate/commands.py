@@ -9,6 +9,7 @@ from __future__ import annotations
 import ast
 import shutil
 import sys
+from collections.abc import Sequence
 from importlib import import_module
 from importlib.metadata import version
 from importlib.util import find_spec
@@ -20,6 +21,7 @@ import typer
 
 from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, reserve_output, say
 from palpate_errors import UserError
+from palpate_plugins import missing_libraries, needs
 
 HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
 GROUPS = {
@@ -74,7 +76,8 @@ EXTRAS = {
     "faults": "bench",
     "fuzz": "bench",
 }
-"""Extra with the libraries of a command that `palpate[run]` does not install."""
+"""Extra with the libraries of a command that the extra `run` does not install."""
+HELP_OPTIONS = ["-h", "--help"]
 MARGIN = 1
 """Columns that Typer leaves free on each side of the help."""
 INDENT = "  "
@@ -87,6 +90,7 @@ def main() -> None:
     if "--json" in sys.argv:
         reserve_output()
     try:
+        _check_libraries(name)
         app_for(name)(prog_name="palpate")
     except BrokenPipeError:
         sys.exit(EXIT_TROUBLE)
@@ -110,7 +114,7 @@ def app_for(name: str, columns: int | None = None) -> typer.Typer:
         no_args_is_help=True,
         rich_markup_mode="rich",
         pretty_exceptions_show_locals=False,
-        context_settings={"help_option_names": ["-h", "--help"]},
+        context_settings={"help_option_names": HELP_OPTIONS},
     )
     if name in COMMANDS:
         _add(app, name, columns or shutil.get_terminal_size().columns)
@@ -176,8 +180,18 @@ def _exit_for_missing(name: str, error: ModuleNotFoundError) -> NoReturn:
     """Exits if a library is not installed. Raises the error again for a missing module of Palpate."""
     if (error.name or "palpate").startswith("palpate"):
         raise error
-    extra = EXTRAS.get(name, "run")
-    print(f"palpate: the command {name} needs the module {error.name}; pip install 'palpate[{extra}]'", file=sys.stderr)
+    _refuse_without((str(error.name),), name)
+
+
+def _check_libraries(name: str) -> None:
+    """Exits if a library of the command's extra is not installed, before anything is measured. Its help needs none."""
+    helps = len(sys.argv) == 2 or not {*HELP_OPTIONS}.isdisjoint(sys.argv)
+    if name in EXTRAS and not helps and (missing := missing_libraries(EXTRAS[name])):
+        _refuse_without(missing, name)
+
+
+def _refuse_without(missing: Sequence[str], name: str) -> NoReturn:
+    print(f"palpate: the command {name} {needs(missing, EXTRAS.get(name, 'run'))}", file=sys.stderr)
     sys.exit(EXIT_BAD_INPUT)
 
 

@@ -41,23 +41,26 @@ def bench(
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
+    from palpate.report.platforms import fingerprint
     from palpate.run.inputs import usable
 
     screen, console = Console(stderr=True), Console(width=max(WIDTH, Console().width))
     chosen = usable(scenario, settings)
-    with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
-        figures = measure(chosen, display, only or GROUPS, out)
-    for table in tables(figures):
-        console.print(table)
-    console.print(f"{platform.platform()}, written to {out}", highlight=False)
-
-
-def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out: Path) -> dict[str, Any]:
-    """Return the figures of the chosen groups; `out` is written after each, so that an interrupted call leaves a part."""
-    from palpate.report.files import write_text
-    from palpate.report.platforms import fingerprint
-
     figures: dict[str, Any] = {"platform": fingerprint(), "parts": {}, "runs": {}}
+    try:
+        with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
+            measure(chosen, display, only or GROUPS, out, figures)
+    finally:  # an error or Ctrl-C keeps what was measured
+        for table in tables(figures):
+            console.print(table)
+        if out.is_file():
+            console.print(f"{platform.platform()}, written to {out}", highlight=False)
+
+
+def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out: Path, figures: dict[str, Any]) -> None:
+    """Adds the figures of the chosen groups; writes `out` after each."""
+    from palpate.report.files import write_text
+
     cases: list[tuple[str, str, Callable[[], dict[str, Any]]]] = []
     if "parts" in groups:
         cases += [("parts", name, part) for name, part in PARTS.items()]
@@ -67,7 +70,6 @@ def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out
         display.show(done, len(cases), name)
         figures[group][name] = case()
         write_text(out, json.dumps(figures, indent=2))
-    return figures
 
 
 def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:

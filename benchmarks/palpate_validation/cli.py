@@ -58,12 +58,12 @@ def validate(
         refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
     sections = []
     wanted = [name for name in SECTIONS if not only or name in only]
-    with CaseDisplay(console, False, "sections") as display:
-        for number, name in enumerate(wanted):
-            display.show(number, len(wanted), f"measuring {name}")
-            sections.append(run_section(name))
     try:
-        write(sections, out)
+        with CaseDisplay(console, False, "sections") as display:
+            for number, name in enumerate(wanted):
+                display.show(number, len(wanted), f"measuring {name}")
+                sections.append(run_section(name))
+                write(sections, out)  # an error or Ctrl-C in a later section keeps these
         if docs is not None:
             write_page(sections, docs, docs.parent / "images" / "validation")
     except OSError as error:

@@ -43,7 +43,7 @@ def failures(sections: Sequence[PageSection]) -> list[Check]:
 
 
 def write(sections: Sequence[PageSection], out: Path) -> None:
-    """Write validate.json and a PNG per section with a figure to the folder `out`, which is created if needed."""
+    """Write validate.json, and the PNG of the last section if it has a figure, to the folder `out`, made if needed."""
     out.mkdir(parents=True, exist_ok=True)
     facts = {
         section.name: {
@@ -59,9 +59,9 @@ def write(sections: Sequence[PageSection], out: Path) -> None:
         for section in sections
     }  # fmt: skip
     (out / "validate.json").write_text(json.dumps(_plain(facts), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-    for section in sections:
-        if section.draw is not None:
-            write_figure(section.draw, out / f"{section.name}.png", section.size_in)
+    last = sections[-1]
+    if last.draw is not None:
+        write_figure(last.draw, out / f"{last.name}.png", last.size_in)
 
 
 def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> None:

@@ -8,12 +8,13 @@ from __future__ import annotations
 import ast
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from importlib import import_module
+from functools import cache
+from importlib import import_module, metadata
 from importlib.machinery import PathFinder
-from importlib.metadata import EntryPoint, PackageNotFoundError, distribution, entry_points
+from importlib.metadata import EntryPoint, PackageNotFoundError, entry_points
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
@@ -67,12 +68,13 @@ class PluginKind:
             raise self._error(choice, self.expected(choice))
 
     def check_libraries(self, choice: str) -> None:
-        """Check that the libraries of an installed plug-in can be imported."""
+        """Check that the libraries of an installed plug-in are there. Imports nothing."""
         if is_file(choice) or choice in self.builtin:
             return
         point = self.entry_point(choice)
-        if not all(map(_installed, _requirements(point, self._extra(point)))):
-            self._load_installed(point)  # another distribution may provide the library, so the import decides
+        extra = self._extra(point)
+        if point.dist is not None and extra is not None and (missing := missing_libraries(extra, point.dist.name)):
+            raise self._error(choice, needs(missing, extra))
 
     def foreign(self, choice: str) -> bool:
         """True for a user's file and for a plug-in of another distribution."""
@@ -102,8 +104,8 @@ class PluginKind:
         """Return the PluginError for an exception of the function, with the last line of its file that took part."""
         if isinstance(error, ModuleNotFoundError):
             extra = None if is_file(choice) or choice in self.builtin else self._extra(self.entry_point(choice))
-            remedy = f"; pip install 'palpate[{extra}]'" if extra else ""
-            return self._error(choice, f"the module {error.name} is not installed{remedy}")
+            missing = f"the module {error.name} is not installed"
+            return self._error(choice, needs((str(error.name),), extra) if extra else missing)
         path = Path(choice).resolve()
         lines = [frame.lineno for frame in extract_tb(error.__traceback__) if Path(frame.filename) == path]
         where = f"line {lines[-1]}: " if lines else ""
@@ -155,18 +157,33 @@ class PluginKind:
         return function
 
 
-def _requirements(point: EntryPoint, extra: str | None) -> list[str]:
-    """Return the distributions that an extra names itself."""
-    pattern = re.compile(rf"([\w.-]+).*extra == ['\"]{re.escape(extra or '')}['\"]")
-    lines = [] if point.dist is None or extra is None else point.dist.requires or []
-    return [found[1] for line in lines if (found := pattern.match(line))]
+IMPORTED = {"open3d-cpu": "open3d", "pillow": "PIL", "pin": "pinocchio", "rerun-sdk": "rerun", "scikit-learn": "sklearn"}
+"""Modules of distributions, where the name differs by more than a dash: another distribution may provide the module."""
+
+
+def needs(missing: Sequence[str], extra: str) -> str:
+    """Return that libraries are missing, and how they are installed, as text."""
+    return f"needs {', '.join(missing)}, not installed: pip install '{DISTRIBUTION}[{extra}]'"
+
+
+@cache
+def missing_libraries(extra: str, of: str = DISTRIBUTION) -> tuple[str, ...]:
+    """Return the distributions of an extra, with those of extras that it includes, that are not installed. Imports nothing."""
+    pattern = re.compile(rf"([\w.-]+)(?:\[([\w,-]+)\])?.*extra == ['\"]{re.escape(extra)}['\"]")
+    missing = []
+    for found in filter(None, map(pattern.match, metadata.requires(of) or ())):
+        if found[1] == of:
+            missing += [name for inner in found[2].split(",") for name in missing_libraries(inner, of)]
+        elif not _installed(found[1]):
+            missing.append(found[1])
+    return tuple(dict.fromkeys(missing))
 
 
 def _installed(name: str) -> bool:
     try:
-        distribution(name)
+        metadata.distribution(name)
     except PackageNotFoundError:
-        return False
+        return find_spec(IMPORTED.get(name, name.replace("-", "_"))) is not None
     return True
 
 

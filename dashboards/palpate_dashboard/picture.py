@@ -24,6 +24,7 @@ from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live, address
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
+from palpate_plugins import needs
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable")
 ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist", "--no-sandbox")
@@ -67,7 +68,7 @@ def page_at(port: int, width: int, height: int) -> Iterator[Page]:
     try:
         from playwright.sync_api import Error, sync_playwright  # noqa: PLC0415
     except ImportError as error:
-        raise NoPicture("playwright is not installed: pip install playwright") from error
+        raise NoPicture(f"a picture {needs(('playwright',), 'dashboard')}") from error
     with sync_playwright() as driver:
         browser = driver.chromium.launch(executable_path=chromium, args=list(ARGUMENTS))
         page = browser.new_page(viewport={"width": width, "height": height}, color_scheme="light")

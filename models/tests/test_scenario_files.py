@@ -313,6 +313,8 @@ def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:
         ("HEAD\ndef scan(exam, surface):\n    return Scan([np.zeros((3, 3))])", r"line 0 has the shape \(3, 3\)"),
         ("HEAD\ndef scan(exam, surface):\n    return Scan([np.array([(0.9, 0.0)])])", r"800 mm outside of exam\.region_m"),
         ("HEAD\ndef scan(exam, surface):\n    return Scan([])", "0 targets, want 1 to"),
+        ("HEAD\ndef scan(exam, surface):\n    return Scan([np.zeros((2, 2))])", "targets 0 and 1 of line 0 are both at"),
+        ("HEAD\ndef scan(exam, surface):\n    return Scan([np.zeros((1, 2))] * 2, joined=True)", "targets 0 and 1 are both at"),
     ],
 )
 def test_an_invalid_pattern_file_is_reported_with_its_line(tmp_path: Path, text: str | None, said: str) -> None:

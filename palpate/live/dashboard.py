@@ -19,6 +19,7 @@ from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, T
 
 from palpate.live.bus import ChosenRun
 from palpate_errors import UserError
+from palpate_plugins import needs
 
 if TYPE_CHECKING:
     from palpate_bus.runs.announcement import Run
@@ -169,5 +170,5 @@ def _rerun(*words: str) -> list[str]:
     """Return the command line of rerun's own viewer."""
     found = find_spec("rerun_cli")
     if found is None or found.origin is None:
-        raise UserError("rerun's own command is not installed: pip install rerun-sdk")
+        raise UserError(f"rerun's own command {needs(('rerun-sdk',), 'dashboard')}")
     return [str(Path(found.origin).with_name("rerun.exe" if os.name == "nt" else "rerun")), *words]

@@ -17,6 +17,7 @@ from palpate_models.scenario.load import HIDDEN, did_you_mean, dump_scenario, vi
 from palpate_models.scenario.schema import Scenario, Services
 from palpate_plugins import PluginError, is_file
 from palpate_search.choice import POLICY, policy
+from palpate_search.service import try_policy
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}
 WORKERS = tuple(name for name, role in _ROLES.items() if not (role.observer or role.optional))
@@ -72,6 +73,8 @@ def checked(scenario: Scenario) -> Scenario:
             continue
         try:
             implementations.check(role, name)
+            if role not in OBSERVERS:  # a run without the dashboard's libraries has no dashboard
+                implementations.check_libraries(role, name)
         except PluginError as error:
             raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(name):
@@ -82,7 +85,7 @@ def checked(scenario: Scenario) -> Scenario:
     search = scenario.search
     if scenario.exam.searched:
         try:
-            _check_policy(search.policy)
+            _check_policy(scenario)
         except PluginError as error:
             raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(search.policy):
@@ -90,16 +93,14 @@ def checked(scenario: Scenario) -> Scenario:
     return scenario.model_copy(update={"services": Services.model_validate(services), "search": search})
 
 
-def _check_policy(name: str) -> None:
-    """Raises PluginError for a policy that cannot be loaded."""
-
-    def load() -> None:
+def _check_policy(scenario: Scenario) -> None:
+    """Raises PluginError for a policy that cannot be loaded, or a user's whose first press is not usable."""
+    name = scenario.search.policy
+    if not POLICY.foreign(name):
         policy(name)
-
-    if POLICY.foreign(name):
-        guarded(f"search.policy = {name!r}", load, Settings.read().start_limit_s, PluginError)
-    else:
-        load()
+        return
+    part = f"search.policy = {name!r}"
+    guarded(part, lambda: try_policy(scenario), Settings.read().start_limit_s, PluginError)
 
 
 def foreign_roles(scenario: Scenario) -> frozenset[str]:

@@ -85,12 +85,12 @@ def test_a_command_that_lacks_its_libraries_names_the_extra(
     monkeypatch.setattr(commands, "import_module", absent)
     with pytest.raises(SystemExit):
         app_for("fmu")
-    assert "the command fmu needs the module fmpy; pip install 'palpate[fmu]'" in "".join(capsys.readouterr())
+    assert "the command fmu needs fmpy, not installed: pip install 'palpate[fmu]'" in "".join(capsys.readouterr())
 
 
 def test_a_run_without_the_libraries_of_the_dashboard_has_no_dashboard(monkeypatch: pytest.MonkeyPatch) -> None:
     def lacking(role: str, choice: str) -> None:
-        raise PluginError(f"services.{role} = {choice!r}: the module rerun is not installed; pip install 'palpate[dashboard]'")
+        raise PluginError(f"services.{role} = {choice!r}: needs rerun-sdk, not installed: pip install 'palpate[dashboard]'")
 
     options = RunOptions(composed=True)
     assert examine._observers(load_scenario("clean"), options) == ("dashboard", "recorder")

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from importlib.metadata import PackageNotFoundError
 from pathlib import Path
 
 import pytest
@@ -71,6 +70,7 @@ def test_a_file_without_a_service_is_refused(tmp_path: Path, text: str | None, s
     [
         ("1 / 0\ndef create(scenario): ...", "line 1: ZeroDivisionError"),
         ("import math\ndef create(scenario):\n    return math.nosuch", "line 3: AttributeError"),
+        ("def create(scenario):\n    return 5", r"create\(\) returned 5, want a palpate_bus\.service\.Service"),
     ],
 )
 def test_an_error_in_a_file_is_reported_with_its_line(tmp_path: Path, text: str, said: str) -> None:
@@ -114,18 +114,17 @@ def test_a_service_of_another_role_is_refused() -> None:
 
 
 def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
-    def absent(name: str) -> None:
-        raise PackageNotFoundError(name)
-
     def fails(_: object) -> None:
         raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
 
     check_libraries("robot", "mujoco")
-    monkeypatch.setattr(palpate_plugins, "distribution", absent)
+    palpate_plugins.missing_libraries.cache_clear()
+    monkeypatch.setattr(palpate_plugins, "_installed", lambda name: name != "mujoco")
     monkeypatch.setattr("importlib.metadata.EntryPoint.load", fails)
     check("robot", "mujoco")
-    said = r"services\.robot = 'mujoco': the module mujoco is not installed; pip install 'palpate\[mujoco\]'"
+    said = r"services\.robot = 'mujoco': needs mujoco, not installed: pip install 'palpate\[mujoco\]'"
     with pytest.raises(PluginError, match=said):
         check_libraries("robot", "mujoco")
     with pytest.raises(PluginError, match=said):
         create_for("robot", "mujoco")
+    palpate_plugins.missing_libraries.cache_clear()

@@ -19,6 +19,8 @@ LARGEST: Final = 20_000
 """Maximum number of targets, which already take hours."""
 OUTSIDE_M: Final = 0.001
 """Tolerance of targets outside of the examined region."""
+APART_M: Final = 1e-4
+"""Least distance of consecutive targets of a stroke."""
 
 
 @dataclass(frozen=True)
@@ -62,6 +64,15 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
     off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
     if off.max() > OUTSIDE_M:
         raise PluginError(f"exam.pattern = {exam.pattern!r}: targets lie up to {1e3 * off.max():.0f} mm outside of exam.region_m")
+    for k, stroke in enumerate([scan.targets] if scan.joined else lines):
+        steps = np.linalg.norm(np.diff(stroke, axis=0), axis=1)
+        if len(steps) and steps.min() < APART_M:
+            i = int(steps.argmin())
+            where = "" if scan.joined else f" of line {k}"
+            raise PluginError(
+                f"exam.pattern = {exam.pattern!r}: targets {i} and {i + 1}{where} are both at {stroke[i].round(4).tolist()} m; "
+                f"consecutive targets must be {1e3 * APART_M:g} mm apart"
+            )
     return scan
 
 

@@ -18,9 +18,9 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
-from palpate_search.choice import policy
+from palpate_search.choice import Policy, policy
 from palpate_search.posterior import Posterior
-from palpate_search.presses import Press, Task
+from palpate_search.presses import Budget, Press, Task
 
 FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
@@ -111,7 +111,7 @@ class SearchService(Service):
         elif self._outline:
             place, depth = self._outline.pop(0), posterior.task.depth
         else:
-            place, depth = checked(*self._policy(posterior, posterior.left(self._spent_s)), posterior.task)
+            place, depth = next_press(self._policy, posterior, posterior.left(self._spent_s))
         self._asked = np.asarray(place, dtype=float)
         return SearchRequest(
             header(t, FRAME),
@@ -133,6 +133,22 @@ class SearchService(Service):
         if left.seconds <= 0:
             return f"{posterior.task.budget.seconds:g} s elapsed"
         return ""
+
+
+def try_policy(scenario: Scenario) -> None:
+    """Ask the scenario's policy for a first press. Raises PluginError if that is not usable."""
+    posterior = Posterior(Task.of(exam_input(scenario)))
+    next_press(policy(scenario.search.policy), posterior, posterior.left(0.0))
+
+
+def next_press(chosen: Policy, posterior: Posterior, left: Budget) -> tuple[Array, float]:
+    """Return the place [m] and depth [m] that a policy requests. Raises PluginError unless it is a press in the allowed range."""
+    asked: Any = chosen(posterior, left)
+    try:
+        place, depth = asked
+        return checked(np.asarray(place, dtype=float), float(depth), posterior.task)
+    except (TypeError, ValueError) as error:
+        raise PluginError(f"search.policy: returned {asked!r}, want (place, depth): (x, y) [m] and a number [m]") from error
 
 
 def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:

@@ -41,7 +41,7 @@ from palpate_search.posterior import (
     Posterior,
 )
 from palpate_search.presses import Budget, Press, Task, seconds
-from palpate_search.service import TUNING, checked, create
+from palpate_search.service import TUNING, checked, create, next_press
 
 DECIDED = (0.05, 0.0)
 """Next place of the learned policy after four presses."""
@@ -314,6 +314,13 @@ SQUARE = Task((0.0, 0.0), (0.1, 0.1))
 def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth: float, named: str) -> None:
     with pytest.raises(PluginError, match=named):
         checked(np.array(place), depth, SQUARE)
+
+
+@pytest.mark.parametrize("returned", [None, 5, (1,), ((0.0, 0.0), "deep"), (("a", "b"), 0.01)])
+def test_what_is_not_a_press_is_refused(returned: Any) -> None:
+    posterior = Posterior(TASK)
+    with pytest.raises(PluginError, match=r"search\.policy: returned .*, want \(place, depth\)"):
+        next_press(lambda *_: returned, posterior, posterior.left(0.0))
 
 
 def test_the_edge_of_the_region_and_the_greatest_depth_may_be_pressed() -> None:
