@@ -93,6 +93,7 @@ class _Watch:
     target: str
     finding: FaultFinding
     since: float = 0.0
+    """Wall time of the injection [s], from `monotonic`."""
     phase_since: int | None = None
     """Simulated time [ns] at which the phase of the fault began."""
     before: Sequence[Sign] = ()
@@ -102,7 +103,10 @@ class _Watch:
     """Outcome, if it is known before the run ends."""
 
     def on_progress(self, progress: RunProgress) -> None:
-        """Called every 20 ms of wall time (`palpate_conductor.conductor.TUNING`)."""
+        """Inject the fault, collect signs and end the case; called every 20 ms of wall time.
+
+        The period is in `palpate_conductor.conductor.TUNING`. Raises CaseOver once the outcome is known.
+        """
         if self.finding.injected_s is None:
             self._inject(progress)
             return
@@ -121,7 +125,7 @@ class _Watch:
                 child.kill()
 
     def _end(self, exam: Any | None) -> tuple[CaseOutcome, str] | None:
-        """Return the outcome and its text as soon as they are known, before the return home."""
+        """Return the outcome and its text, known before the arm has returned home; None until then."""
         if exam is None:
             return None
         if exam.phase == ExamState.PHASE_DONE:
@@ -132,6 +136,7 @@ class _Watch:
         return (CaseOutcome.CONTINUED, "the scan was finished") if scanned and self.target != AFTER_SCAN else None
 
     def _inject(self, progress: RunProgress) -> None:
+        """Signal the process at fault if the examination is in the phase and at the time of the case."""
         exam = progress.collected.exam
         if exam is None:
             return
@@ -227,7 +232,7 @@ def _placed(case: FaultCase, target: str) -> Groups:
 
 
 def _fault(case: FaultCase) -> InjectedFault | None:
-    """Return the fault of the process's transport; None if a signal is the fault."""
+    """Return the fault that the process's transport injects on SIGUSR1; None for a signal that is the fault itself."""
     if case.kind in ("kill", "freeze"):
         return None
     if case.kind == "jump":
@@ -266,7 +271,7 @@ def _conclude(finding: FaultFinding, watch: _Watch, result: RunResult) -> None:
 
 
 def set_peaks(finding: FaultFinding, forces: Sequence[tuple[int, float]], split: float) -> None:
-    """Enter the peak forces [N] before and after `split` [ns], from pairs of time [ns] and force."""
+    """Enter the peak forces [N] before and after the time `split` [ns], from pairs of time [ns] and force [N]."""
     finding.peak_force_before_n = round(max((force for t, force in forces if t < split), default=0.0), 2)
     after = [force for t, force in forces if t >= split]
     finding.peak_force_n = round(max(after), 2) if after else None

@@ -20,38 +20,45 @@ from palpate_models.patient.person import drawn
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom, Stiffness
 from palpate_models.patient.tension import pressed_force
+from palpate_models.scenario.press import DEPTH_M
 
 PITCH_M: Final = 0.004
+"""Spacing of the grid."""
 HALF_M: Final = 0.148
-"""Half the side of the square that is computed."""
+"""Half the side of the square that is computed, about the origin of A."""
+_RADIUS_M: Final = 0.015
+"""Radius of the indenter."""
 CONTACT_M: Final = 0.009
-"""Radius of the contact of a sphere of 15 mm at 10 mm depth [C, of the foundation's obstacle problem]."""
+"""Radius of its contact at the depth of the standard press, from the obstacle problem of the foundation [C]."""
 POWER: Final = 0.8
-"""Exponent of the power mean over the footprint: the wall yields next to a stiff place [C, transients]."""
+"""Exponent of the power mean over the footprint: the wall yields next to a stiff place [C]."""
+_TENSION_GAIN: Final = 0.4
+"""Increase of the force by muscle tension, relative to tension over k_w."""
 _TABLE: Final = np.linspace(0.0, 600.0, 25)
+"""Stiffening [1/m] at which the force is computed; linear between."""
 
 
 @dataclass(frozen=True)
 class FeltPatient:
-    """Force of the standard press on a square grid about the umbilicus, n x n places."""
+    """Force of the standard press on a square grid about the umbilicus, the origin of A, with n x n places."""
 
     force: Array
-    """[N], shape (n, n), rows along y."""
+    """[N], shape (n, n): row by y, column by x, both ascending."""
     healthy: Array
     """The force without lumps [N], shape (n, n)."""
 
     def force_at(self, xy: Array) -> Array:
-        """Return the force [N] at places [m], shape (m, 2) -> (m,)."""
+        """Return the force [N] at places in A's xy plane [m], shape (m, 2) -> (m,)."""
         return np.asarray(map_coordinates(self.force, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
 
     def excess_at(self, xy: Array) -> Array:
-        """Return the logarithm of the felt contrast of all lumps at places [m], shape (m, 2) -> (m,)."""
+        """Return the log of the force with lumps over that without, at places in A's xy plane [m], shape (m, 2) -> (m,)."""
         excess = np.log(self.force / self.healthy)
         return np.asarray(map_coordinates(excess, ((xy + HALF_M) / PITCH_M).T[::-1], order=1))
 
 
 def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
-    """Return the person of a seed with the lumps of the phantom."""
+    """Return the person of a seed with the lumps of the phantom. Raises MeshError as `build_phantom` does."""
     phantom = drawn(phantom, seed)
     model = build_phantom(phantom, seed)
     axis = np.arange(-HALF_M, HALF_M + 1e-9, PITCH_M)
@@ -60,7 +67,7 @@ def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
     xy = np.stack(np.meshgrid(axis, axis), axis=-1)
 
     def felt(modulus: Array) -> Array:
-        force = force_at_10_mm(replace(model, stiffness=modulus), phantom.stiffness) * (1 + 0.4 * model.tension)
+        force = force_at_10_mm(replace(model, stiffness=modulus), phantom.stiffness) * (1 + _TENSION_GAIN * model.tension)
         raster = np.nan_to_num(
             LinearNDInterpolator(model.vertices[front, :2], np.log(force[front]))(xy), nan=float(np.log(np.median(force[front])))
         )
@@ -71,7 +78,9 @@ def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
 
 
 def _footprint(length: float) -> Array:
-    """Return the sensitivity of the force to the modulus about the indenter, on the grid, summing to 1.
+    """Return the sensitivity of the force to the modulus about the indenter, on the grid, square; its sum is 1.
+
+    `length`: decay length l of the foundation [m].
 
     By the envelope theorem dF = dk_w (u phi + l^2 grad u . grad phi) with the influence phi = K0(r / l) / K0(a / l)
     beyond the contact.
@@ -81,14 +90,14 @@ def _footprint(length: float) -> Array:
     r = np.hypot(*np.meshgrid(axis, axis))
     a = CONTACT_M
     beyond = np.maximum(r, a) / length
-    edge = 0.010 - 0.015 + np.sqrt(0.015**2 - a**2)
+    edge = DEPTH_M - _RADIUS_M + np.sqrt(_RADIUS_M**2 - a**2)
     outside = edge * (k0(beyond) ** 2 + k1(beyond) ** 2) / k0(a / length) ** 2
-    inside = 0.010 - 0.015 + np.sqrt(0.015**2 - np.minimum(r, a) ** 2)
+    inside = DEPTH_M - _RADIUS_M + np.sqrt(_RADIUS_M**2 - np.minimum(r, a) ** 2)
     footprint = gaussian_filter(np.where(r < a, inside, outside), 0.5)
     return np.asarray(footprint / footprint.sum())
 
 
 def force_at_10_mm(model: PhantomModel, wall: Stiffness) -> Array:
-    """Return the force [N] of a 10 mm press on a flat wall with the stiffness and stiffening of each vertex, shape (n,)."""
+    """Return the force [N] at 10 mm depth on a flat uniform wall with stiffness and stiffening of each vertex, shape (n,)."""
     unit = [pressed_force(wall.model_copy(update={"stiffening_per_m": beta}), 0.0) for beta in _TABLE.tolist()]
     return model.stiffness / wall.k_w_n_per_m3 * np.interp(model.stiffening, _TABLE, unit)

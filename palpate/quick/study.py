@@ -39,11 +39,11 @@ from palpate_models.scenario.schema import Scenario
 
 APART_S: Final = 3.0
 """Measurements further apart in time share only the error of the surface."""
-_LONGEST: Final = 100
+_LAGS: Final = 100
 """Number of lags of the covariances in time, of PERIOD_S each."""
 _PAIRS: Final = 400_000
 """Number of pairs of measurements per run for the covariance in space."""
-_HALF: Final = 1.678
+_HALF_VALUE: Final = 1.678
 """(1 + x) exp(-x) is one half here."""
 _HEADER: Final = """\
 # Errors of whole examinations, by setting of the errors and kind of breathing; fields: palpate/quick/errors.py.
@@ -61,19 +61,19 @@ class Trace:
     stroke: NDArray[np.int64]
     """Index of the stroke, shape (n,)."""
     time: Array
-    """[s], shape (n,)."""
+    """Simulated time [s], shape (n,)."""
     place: Array
-    """Estimated position, xy of A as registered, from the centre of the region [m], shape (n, 2)."""
+    """Estimated position from the centre of the region, xy in the registered frame A [m], shape (n, 2)."""
     aside: Array
-    """True less estimated position [m], xy, shape (n, 2)."""
-    wrong: Array
-    """Measured depth, as finally corrected, less true depth [m], shape (n,)."""
+    """True minus estimated position, xy in A [m], shape (n, 2)."""
+    depth_error: Array
+    """Measured depth, as finally corrected, minus true depth [m], shape (n,)."""
     uncertainty: Array
-    """Its reported standard deviation [m], shape (n,)."""
-    unseen: Array
-    """Displacement of the skin by breathing, less its mean [m], shape (n,)."""
+    """Reported standard deviation of the measured depth [m], shape (n,)."""
+    breathing: Array
+    """Outward displacement of the skin by breathing minus its mean [m], shape (n,)."""
     regulation: Array
-    """Measured depth less set-point [m], shape (n,)."""
+    """Measured depth minus set-point [m], shape (n,)."""
 
 
 def runs_in(folders: Sequence[Path]) -> list[Path]:
@@ -110,9 +110,9 @@ def trace_of(folder: Path) -> Trace:
         time=time,
         place=touched.believed[:, :2] - scenario.exam.centre_m,
         aside=(off_W @ X_WA[:3, :3])[:, :2],
-        wrong=evidence.depth_known[there] - true_depth,
+        depth_error=evidence.depth_known[there] - true_depth,
         uncertainty=evidence.uncertainty[there],
-        unseen=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
+        breathing=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
         regulation=evidence.depth[there] - evidence.setpoint[there],
     )
 
@@ -125,16 +125,16 @@ def _began(time: Array, phase: NDArray[np.uint8]) -> float:
 
 
 def loop_of(traces: Sequence[Trace]) -> LoopErrors:
-    """Return the distributions of the errors in examinations of one setting."""
+    """Return the distributions of the errors in examinations of one setting. Raises ValueError for errors of a user's own."""
     fitted = [_fit(trace) for trace in traces]
     surface = np.array([[found.offset_m, *found.tilt, found.followed] for found, _ in fitted])
     rests = [rest for _, rest in fitted]
     field_m, field_length_m = _field(traces, rests)
     variance = float(np.mean([rest.var() for rest in rests]))
-    in_time = _in_time([t.time for t in traces], rests)
-    travelled = 0.5 * traces[0].scenario.exam.speed_mps * PERIOD_S * np.arange(len(in_time))
-    wander = in_time - field_m**2 * np.exp(-0.5 * (travelled / field_length_m) ** 2)
-    regulated = _in_time([t.time for t in traces], [t.regulation for t in traces])
+    covariance = _covariance_by_lag([t.time for t in traces], rests)
+    travelled = 0.5 * traces[0].scenario.exam.speed_mps * PERIOD_S * np.arange(len(covariance))
+    wander = covariance - field_m**2 * np.exp(-0.5 * (travelled / field_length_m) ** 2)
+    regulated = _covariance_by_lag([t.time for t in traces], [t.regulation for t in traces])
     breathes = traces[0].scenario.phantom.breathing.kind != "none"
     return LoopErrors(
         **setting_of(traces[0].scenario),  # type: ignore[arg-type]  # a user-defined setting is refused there
@@ -149,9 +149,9 @@ def loop_of(traces: Sequence[Trace]) -> LoopErrors:
         field_length_m=field_length_m,
         followed=_normal(surface[:, 3]) if breathes else Normal(),
         wander_m=_round(np.sqrt(max(variance - field_m**2, 0.0))),
-        wander_s=_time(wander),
+        wander_s=_time_constant(wander),
         regulation_m=_round(np.sqrt(np.mean([np.mean(trace.regulation**2) for trace in traces]))),
-        regulation_s=_time(regulated),
+        regulation_s=_time_constant(regulated),
     )
 
 
@@ -162,9 +162,9 @@ def drawn_of(trace: Trace) -> Drawn:
 
 def _fit(trace: Trace) -> tuple[Drawn, Array]:
     """Return the constant errors of an examination, and the remaining errors of its depths [m], shape (n,)."""
-    columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.unseen))
-    coefficients: Array = np.asarray(np.linalg.lstsq(columns, trace.wrong, rcond=None)[0], dtype=np.float64)
-    rest = trace.wrong - columns @ coefficients
+    columns = np.column_stack((np.ones(len(trace.time)), trace.place, -trace.breathing))
+    coefficients: Array = np.asarray(np.linalg.lstsq(columns, trace.depth_error, rcond=None)[0], dtype=np.float64)
+    rest = trace.depth_error - columns @ coefficients
     count = np.bincount(trace.stroke)
     zeros: Array = np.bincount(trace.stroke, rest) / count
     offset, tilt, unseen = float(coefficients[0]), coefficients[1:3], float(coefficients[3])
@@ -172,7 +172,10 @@ def _fit(trace: Trace) -> tuple[Drawn, Array]:
 
 
 def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, float]:
-    """Return SD and correlation length [m] of the error shared by measurements that are close in space but not in time."""
+    """Return SD [m] and correlation length [m] of the error that measurements close in space, but not in time, share.
+
+    `rests`: remaining depth errors of each trace, from `_fit` [m], shape (n,).
+    """
     products, distances = [], []
     for number, (trace, rest) in enumerate(zip(traces, rests, strict=True)):
         rng = np.random.Generator(np.random.PCG64(number))
@@ -199,36 +202,40 @@ def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, floa
     return _round(np.sqrt(variance * largest)), _round(length)
 
 
-def _in_time(times: Sequence[Array], values: Sequence[Array]) -> Array:
-    """Return the mean covariance in time by lag, shape (_LONGEST,)."""
-    total, count = np.zeros(_LONGEST), np.zeros(_LONGEST)
+def _covariance_by_lag(times: Sequence[Array], values: Sequence[Array]) -> Array:
+    """Return the mean covariance in time by lag [m^2], shape (_LAGS,), of `values` [m] at `times` [s]."""
+    total, count = np.zeros(_LAGS), np.zeros(_LAGS)
     for time, value in zip(times, values, strict=True):
         tick = np.round(time / PERIOD_S).astype(np.int64)
-        for lag in range(_LONGEST):
+        for lag in range(_LAGS):
             together = tick[lag:] - tick[: len(tick) - lag] == lag
             total[lag] += float((value[lag:] * value[: len(value) - lag])[together].sum())
             count[lag] += int(together.sum())
     return np.asarray(total / np.maximum(count, 1))
 
 
-def _time(covariance: Array) -> float:
+def _time_constant(covariance: Array) -> float:
     """Return T [s] of the covariance (1 + t / T) exp(-t / T) with the same half-value time."""
     below = np.flatnonzero(covariance < 0.5 * covariance[0])
     lag = int(below[0]) if len(below) else len(covariance)
-    return _round(max(lag, 1) * PERIOD_S / _HALF)
+    return _round(max(lag, 1) * PERIOD_S / _HALF_VALUE)
 
 
 def _normal(values: Array) -> Normal:
+    """Return mean and sample standard deviation of the values, shape (n,)."""
     return Normal(mean=_round(values.mean()), sd=_round(values.std(ddof=1)) if len(values) > 1 else 0.0)
 
 
 def _round(value: Any) -> float:
-    """Round to three digits."""
+    """Round to three significant digits."""
     return float(f"{float(value):.3g}")
 
 
 def examine(number: int, level: str, breathing: str, out: Path, settings: Sequence[str], workers: int) -> list[Path]:
-    """Run whole examinations of persons, every second one with a lump; return their folders. Existing runs are kept."""
+    """Run whole examinations of persons of seeds 0 to `number` - 1, odd ones with a lump; return their folders.
+
+    Existing runs are kept. Raises CalledProcessError if a run fails.
+    """
 
     def one(seed: int) -> Path:
         folder = out / f"{level}-{breathing}-{seed}"

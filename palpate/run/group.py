@@ -31,10 +31,10 @@ def one_per_process(roles: Sequence[str]) -> Groups:
 
 
 def placement(roles: Sequence[str], groups: Sequence[str], processes: int | None) -> Groups:
-    """Return the roles of each process: first those of the `groups` ("robot,tissue"), or of the `processes`; then one for each
-    other role, observers too.
+    """Return the roles of each process.
 
-    Raises UserError.
+    The first processes have the `groups` ("robot,tissue"), or there are `processes` of them for all services but observers. Each
+    other role, observers included, has a process of its own. Raises UserError.
     """
     workers = [role for role in roles if not contract().roles[role].observer]
     if groups and processes is not None:
@@ -45,6 +45,7 @@ def placement(roles: Sequence[str], groups: Sequence[str], processes: int | None
 
 
 def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
+    """Return the roles of each group. Raises UserError for a role that is unknown, an observer, or in two groups."""
     together = tuple(tuple(word.strip() for word in text.split(",")) for text in groups)
     placed: list[str] = []
     for group, text in zip(together, groups, strict=True):
@@ -59,7 +60,10 @@ def _in_groups(workers: Sequence[str], groups: Sequence[str]) -> Groups:
 
 
 def _in_processes(workers: Sequence[str], number: int) -> Groups:
-    """Return the workers by period, split first where it changes, to separate the fast loop, then from the slow end."""
+    """Return the workers, sorted by period, in `number` processes. Raises UserError for a number out of range.
+
+    They are split first where the period changes, which separates the 1 kHz loop, then from the slow end.
+    """
     if not 1 <= number <= len(workers):
         raise UserError(f"--processes {number}: this run has {len(workers)} services to place; allowed are 1 to {len(workers)}")
     period = {role: contract().roles[role].period for role in workers}
@@ -77,11 +81,13 @@ class GroupMember(NamedTuple):
     """A service of a shared process."""
 
     words: tuple[str, ...]
+    """Arguments after `python -m palpate.service ROLE`."""
     environment: Mapping[str, str]
+    """Environment variables of this service alone."""
 
 
 def group_command(file: Path, hosted: Mapping[str, GroupMember]) -> tuple[str, ...]:
-    """Writes the file of a group and returns the command of its process."""
+    """Write the file of a group, and return the command of its process. Raises OSError."""
     file.write_text(json.dumps({role: member._asdict() for role, member in hosted.items()}), encoding="utf-8")
     return ("python", "-m", "palpate.run.group", str(file))
 
@@ -102,7 +108,7 @@ def _hosted(role: str, member: GroupMember) -> Hosted:
 
 
 def main(arguments: Sequence[str]) -> None:
-    """Runs the group to its end and leaves with status 0, or 3 when the run failed or was aborted."""
+    """Run the group to its end, and exit with status 0, or 3 if the run failed or was aborted."""
     hosted = group_members(Path(arguments[0]))
     host(lambda: [_hosted(role, member) for role, member in hosted.items()], "+".join(hosted))
 

@@ -1,11 +1,10 @@
-"""Role perception: the suite sends depth frames of a belly of known shape, and then none."""
+"""Conformance of perception: the suite sends depth frames of a belly of known shape, and then none."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from palpate.check import shapes
 from palpate.check.report import ConformanceReport
@@ -14,15 +13,12 @@ from palpate.check.suites.camera import FRAME
 from palpate_bus.messages import (
     CameraInfo,
     CameraTrigger,
-    Image,
-    Quaternion,
     RegionOfInterest,
     SurfaceMotion,
     TFMessage,
-    Transform,
     TransformStamped,
-    Vector3,
 )
+from palpate_bus.messages.geometry import depth_message, transform_message
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array, apply, inverse, look_at
 from palpate_models.scenario.load import exam_input
@@ -32,13 +28,17 @@ SMALL_IMAGE, SMALL_INFO, MOTION = "camera/follow/depth", "camera/follow/camera_i
 SURFACE, TARGETS = "perception/surface", "perception/targets"
 FRAMES = 4
 SIZE = (480, 640)
+"""Height and width of the full image [px]."""
 FOCAL = 525.0
+"""[px]."""
 FLOOR_M = -0.12
+"""z of the floor in A."""
 ANSWER_S = 10.0
+"""Simulated time limit for the answer to a trigger."""
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks silence without a trigger, the surface of a known belly, and the answer without frames."""
+    """Check silence without a trigger, the surface of a known belly, and the answer without frames."""
     known = exam_input(rig.settings.scenario)
     X_WA = np.array(known.X_WA)
     camera = rig.settings.scenario.camera
@@ -74,6 +74,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _answer(rig: Rig, feed: Feed) -> bool:
+    """Return True if targets arrive within ANSWER_S."""
     waited = 0.0
     while not rig.log[TARGETS] and waited < ANSWER_S:
         rig.run(0.5, feed)
@@ -82,9 +83,9 @@ def _answer(rig: Rig, feed: Feed) -> bool:
 
 
 def _following(rig: Rig, depth: Array, K: Array, report: ConformanceReport) -> None:
-    """Checks that it reports the motion of the wall from images with every eighth pixel."""
-    few = np.diag((1 / 8, 1 / 8, 1.0)) @ K
-    shown = rig.run(1.0, _frames(np.ascontiguousarray(depth[::8, ::8]), few, SMALL_IMAGE, SMALL_INFO))[MOTION]
+    """Check that it reports the motion of the wall from images with every eighth pixel."""
+    K_small = np.diag((1 / 8, 1 / 8, 1.0)) @ K
+    shown = rig.run(1.0, _frames(np.ascontiguousarray(depth[::8, ::8]), K_small, SMALL_IMAGE, SMALL_INFO))[MOTION]
     if report.expect("reports the motion of the wall from small images", bool(shown), MOTION, "so" if shown else "nothing"):
         count = SurfaceMotion.FORECASTS
         sizes = {len(received.message.forecast) for received in shown}
@@ -92,13 +93,12 @@ def _following(rig: Rig, depth: Array, K: Array, report: ConformanceReport) -> N
 
 
 def _tf(X_WC: Array) -> Any:
-    x, y, z, w = map(float, Rotation.from_matrix(X_WC[:3, :3]).as_quat())
-    pose = Transform(Vector3(*map(float, X_WC[:3, 3])), Quaternion(x, y, z, w))
-    return TFMessage([TransformStamped(header(0, "world"), FRAME, pose)])
+    """Return the `tf2_msgs/TFMessage` of the camera's pose, shape (4, 4)."""
+    return TFMessage([TransformStamped(header(0, "world"), FRAME, transform_message(X_WC))])
 
 
 def _frames(depth: Array, K: Array, image: str = IMAGE, info: str = INFO) -> Feed:
-    data = np.ascontiguousarray(depth, "<f4").view(np.uint8).reshape(-1)
+    """Return the feed of a depth image [m] and its intrinsics, shape (3, 3)."""
     P = np.hstack((K, np.zeros((3, 1)))).ravel()
     whole = RegionOfInterest(0, 0, 0, 0, False)
     height, width = depth.shape
@@ -106,11 +106,12 @@ def _frames(depth: Array, K: Array, image: str = IMAGE, info: str = INFO) -> Fee
         info: lambda t: CameraInfo(
             header(t, FRAME), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole
         ),
-        image: lambda t: Image(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data),
+        image: lambda t: depth_message(header(t, FRAME), depth),
     }
 
 
 def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
+    """Check place, normals and triangles of the perceived surface."""
     message = rig.last(SURFACE)
     if not report.expect(
         "perceives a surface", message is not None, "perception/surface", "there" if message is not None else "none"
@@ -131,6 +132,7 @@ def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
 
 
 def _targets(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
+    """Check number, place and fused frames of the targets."""
     message = rig.last(TARGETS)
     p_W = np.array([(p.x, p.y, p.z) for p in message.positions]).reshape(-1, 3)
     sizes = {len(p_W), len(message.normals), len(message.lines)}

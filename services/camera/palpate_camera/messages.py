@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_bus.messages import CameraInfo, RegionOfInterest
-from palpate_bus.messages import Image as ImageMessage
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import depth_message
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Camera
@@ -39,11 +39,11 @@ class Pinhole:
 
     @property
     def matrix(self) -> Array:
-        """K, shape (3, 3), in pixels."""
+        """K [px], shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
     def directions(self) -> Array:
-        """Return viewing directions in C with unit z, shape (height, width, 3): a depth times a direction is a point."""
+        """Return viewing directions in C with unit z, shape (height, width, 3): depth times direction is the point in C."""
         directions = np.ones((self.height, self.width, 3))
         directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
         directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, np.newaxis]
@@ -62,26 +62,26 @@ INFO: Final = "camera/depth/camera_info"
 SMALL_IMAGE: Final = "camera/follow/depth"
 SMALL_INFO: Final = "camera/follow/camera_info"
 SMALL_WIDTH_PX: Final = 96
-"""About how wide the small image is."""
+"""Approximate width of the small image."""
 
 
 def small_spacing(width: int) -> int:
-    """Return the pixel spacing k of the small image for a full-size image of that width [px]."""
+    """Return the spacing k [px] of the small image's pixels in a full-size image of that width [px]."""
     return max(round(width / SMALL_WIDTH_PX), 1)
 
 
 def whole(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """Return the messages of a full-size image of `depth` [m], shape (height, width), NaN where invalid."""
-    return {IMAGE: depth_image(t, depth), INFO: camera_info(t, pinhole)}
+    """Return the messages by topic of a whole image at `t` [ns]; `depth` [m], shape (height, width), NaN where invalid."""
+    return {IMAGE: depth_message(header(t, FRAME), depth), INFO: camera_info(t, pinhole)}
 
 
 def small(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """Return the messages of a small image, as `whole`; `pinhole` has the intrinsics of the small image."""
-    return {SMALL_IMAGE: depth_image(t, depth), SMALL_INFO: camera_info(t, pinhole)}
+    """Return the messages by topic of a small image, as `whole`; `pinhole` is that of the small image."""
+    return {SMALL_IMAGE: depth_message(header(t, FRAME), depth), SMALL_INFO: camera_info(t, pinhole)}
 
 
-def every_few(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """The messages of the small image of a whole one, [m], shape (height, width), of the camera `pinhole`."""
+def small_of(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
+    """Return the messages by topic of the small image of a whole one; arguments as of `whole`."""
     k = small_spacing(pinhole.width)
     return small(t, depth[k // 2 :: k, k // 2 :: k], pinhole.every(k))
 
@@ -92,15 +92,8 @@ def pinhole_of(info: Message) -> Pinhole:
     return Pinhole(int(info.width), int(info.height), *(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
 
 
-def depth_image(t: int, image: NDArray[np.float32]) -> Message:
-    """`sensor_msgs/Image` of encoding 32FC1 [m], little-endian, NaN where invalid."""
-    height, width = image.shape
-    data = np.ascontiguousarray(image, "<f4").view(np.uint8).reshape(-1)
-    return ImageMessage(header(t, FRAME), height, width, "32FC1", 0, 4 * width, data)
-
-
 def camera_info(t: int, pinhole: Pinhole) -> Message:
-    """`sensor_msgs/CameraInfo` without distortion."""
+    """Return the `sensor_msgs/CameraInfo`, without distortion, at `t` [ns]."""
     K = pinhole.matrix
     P = np.hstack((K, np.zeros((3, 1)))).ravel()
     size, whole = (pinhole.height, pinhole.width), RegionOfInterest(0, 0, 0, 0, False)

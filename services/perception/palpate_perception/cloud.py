@@ -28,7 +28,7 @@ class CloudTuning:
     table_clearance_m: float = 0.02
     """Distance from the table's top within which points belong to the table."""
     jump: float = 0.015
-    """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth: 16 mm at 1.1 m,
+    """Neighbouring pixels belong to one sheet if their depths differ by less than this part of the depth [1]: 16 mm at 1.1 m,
     more than a surface seen at 75 deg and less than from the arm to the skin."""
 
 
@@ -40,11 +40,11 @@ class Intrinsics:
     """Intrinsics and pose from camera_info and tf_static."""
 
     K: Array
-    """Shape (3, 3), in pixels."""
+    """[px], shape (3, 3)."""
     X_WC: Array
     """Calibrated pose of the optical frame in world, shape (4, 4)."""
     shape: tuple[int, int]
-    """Height and width of the full image."""
+    """Height and width of the full image [px]."""
 
     def same(self, other: Intrinsics) -> bool:
         """True if the other has the same intrinsics and pose."""
@@ -169,10 +169,17 @@ Index = NDArray[np.intp]
 
 
 def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Step 4: one point for each node of the lattice, as a voxel grid of the lattice's spacing does.
+    """Return the nodes of a lattice and the mask of those with data, as a voxel grid of the lattice's spacing does.
 
-    Returns the nodes' xy [m], shape (len(x) * len(y), 2), lines first, and whether a point of the cloud `p` (in A,
-    shape (n, 3)) lies in a node's cell. The nodes themselves, not the cells' centroids, keep spacing and ends exact.
+    The nodes themselves, not the centroids of the points in their cells, keep spacing and ends exact.
+
+    Args:
+        p: points in A [m], shape (n, 3).
+        x: coordinates of the lattice's nodes along x [m], evenly spaced, shape (nx,).
+        y: the same along y, shape (ny,).
+
+    Returns:
+        xy of the nodes [m], shape (nx * ny, 2), y fastest, and whether a node's cell has a point, shape (nx * ny,).
     """
     i, j = (_nearest(s, coordinate) for s, coordinate in ((x, p[:, 0]), (y, p[:, 1])))
     inside = (i >= 0) & (j >= 0)
@@ -183,16 +190,16 @@ def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
-    """Return the mask of targets, shape (m,), whose cell contains a point of the cloud `p` (in A, shape (n, 3)).
+    """Step 4: return the mask of targets whose cell has a point, shape (m,).
 
-    `xy`: targets in A [m], shape (m, 2); their cells are squares of the side `spacing` [m].
+    `p`: points in A [m], shape (n, 3); `xy`: targets in A [m], shape (m, 2); cells are squares of the side `spacing` [m].
     """
     distance, _ = cKDTree(p[:, :2]).query(xy, p=np.inf, distance_upper_bound=spacing / 2)
     return np.isfinite(distance)
 
 
 def _nearest(station: Array, coordinate: Array) -> Index:
-    """Index of the nearest station, -1 for what is further than half a step."""
+    """Return the index of the nearest station; -1 if it is further than half a step."""
     step = station[1] - station[0] if len(station) > 1 else np.inf
     i = np.clip(np.rint((coordinate - station[0]) / step), 0, len(station) - 1).astype(np.intp)
     return np.where(np.abs(coordinate - station[i]) <= step / 2, i, -1)

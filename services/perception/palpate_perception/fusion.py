@@ -42,11 +42,12 @@ class DepthFusion:
     """Collects the frames of a burst, cropped to `window` (rows, columns)."""
 
     def __init__(self, window: tuple[slice, slice]) -> None:
+        """`window`: rows and columns of the full image, as of `cloud.window`."""
         self.window = window
         self._frames: list[Image] = []
 
     def add(self, depth: Image) -> None:
-        """Add a frame [m], shape (height, width), NaN where invalid. Raises ValueError if its size differs."""
+        """Add a full frame [m], shape (height, width), NaN where invalid. Raises ValueError if its size differs."""
         cut = np.array(depth[self.window], np.float32)
         if self._frames and cut.shape != self._frames[0].shape:
             raise ValueError(f"depth frame: window of shape {cut.shape}; previous frames had {self._frames[0].shape}")
@@ -60,7 +61,7 @@ class DepthFusion:
     def level(self, displacements: Array, per_metre: Image) -> None:
         """Remove breathing from the frames, in which the wall was displaced by `displacements` [m], shape (frames,).
 
-        `per_metre`: change of depth per displacement, of the window's shape.
+        `per_metre`: change of depth per outward displacement [1], of the window's shape.
         """
         self._frames = [frame - np.float32(d) * per_metre for frame, d in zip(self._frames, displacements, strict=True)]
 

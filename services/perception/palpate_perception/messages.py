@@ -22,7 +22,7 @@ MOTION_FRAME: Final = contract().topics["perception/motion"].frame or ""
 
 
 def intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
-    """The camera of an image, by the newest camera_info on `topic` and tf_static; None until both have come."""
+    """Return intrinsics and pose for an image, from the newest camera_info on `topic` and tf_static; None until both arrived."""
     info, pose = inbox.latest(topic), inbox.latest("tf_static")
     X_WC = None if pose is None else camera_pose(pose, image.header.frame_id)
     if info is None or X_WC is None:
@@ -31,7 +31,10 @@ def intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
 
 
 def camera_pose(message: Message, frame: str) -> Array | None:
-    """X_WC, shape (4, 4), of an optical frame from tf_static; None when it is not in there."""
+    """Return X_WC, shape (4, 4), of the optical frame `frame` from tf_static; None if tf_static lacks it.
+
+    Raises ValueError for a quaternion that is not of unit length.
+    """
     for item in message.transforms:
         if item.child_frame_id == frame and item.header.frame_id == FRAME:
             return transform_matrix(item.transform)
@@ -39,11 +42,11 @@ def camera_pose(message: Message, frame: str) -> Array | None:
 
 
 def motion(stamp: int, followed: Followed) -> Message:
-    """`palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
+    """Return the `palpation_msgs/SurfaceMotion` of an image exposed at the time `stamp` [ns]."""
     state, shift = getattr(SurfaceMotion, followed.state.name), vector_message(followed.shift)
     return SurfaceMotion(header(stamp, MOTION_FRAME), state, followed.displacement, followed.forecast, followed.sigma, shift)
 
 
 def correction(t: int, outward: Array) -> Message:
-    """`palpation_msgs/SurfaceCorrection` at the time `t` [ns]: how far outward [m] the wall lies at each vertex, shape (n,)."""
+    """Return the `palpation_msgs/SurfaceCorrection` at `t` [ns]: outward offset of the wall [m] at each vertex, shape (n,)."""
     return SurfaceCorrection(header(t, MOTION_FRAME), outward.astype(np.float32), np.empty(0, np.float32))

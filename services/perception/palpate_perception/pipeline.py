@@ -69,7 +69,7 @@ class PerceivedMesh:
     triangles: NDArray[np.uint32]
     """Triangles, counter-clockwise seen from outside, shape (m, 3)."""
     lifts: Array
-    """Breathing mode, shape (n,); zero if unknown."""
+    """Breathing mode: displacement relative to the point that moves most [1], shape (n,); zero if unknown."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,9 +120,9 @@ class Pipeline:
         depth = np.asarray(fused.depth, np.float64)
 
         organised = cloud.deproject(depth, camera.K, origin)
-        points = cloud.to_world(organised, np.asarray(fused.sigma, np.float64), camera.X_WC)  # 1
-        points = cloud.remove_invalid(points)  # 2
-        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + CROP.table_clearance_m)  # 3
+        points = cloud.to_world(organised, np.asarray(fused.sigma, np.float64), camera.X_WC)  # step 1
+        points = cloud.remove_invalid(points)  # step 2
+        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + CROP.table_clearance_m)  # step 3
         points = cloud.main_sheet(points, depth, self._region.holds(apply(self._X_AW, points.p_W)))
         p_A = apply(self._X_AW, points.p_W)
 
@@ -141,8 +141,8 @@ class Pipeline:
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
-        nodes = scan.targets + shift  # 5
-        known = cloud.supported(p_A, nodes, self._exam.spacing_m)  # 4
+        nodes = scan.targets + shift  # step 5: the pattern gives places and their order
+        known = cloud.supported(p_A, nodes, self._exam.spacing_m)  # step 4: of those places, the ones with data
         p_W, n_W = self._on(field, nodes)
         targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
 

@@ -60,17 +60,17 @@ def touch_message(t: int, touched: PublishedTouch) -> Message:
 
 
 def correction_message(t: int, outward: Array, sigma: Array) -> Message:
-    """Return `palpation_msgs/SurfaceCorrection` at `t` [ns] of the vertices of the perceived surface [m], shape (n,) each."""
+    """Return the `palpation_msgs/SurfaceCorrection` at `t` [ns]: outward offset and its SD [m] at each vertex, shapes (n,)."""
     return SurfaceCorrection(header(t, "abdomen"), outward.astype(np.float32), sigma.astype(np.float32))
 
 
 def path_message(t: int, poses_WI: Array) -> Message:
-    """Return `nav_msgs/Path` of indenter poses, shape (n, 4, 4)."""
+    """Return the `nav_msgs/Path` at `t` [ns] of indenter poses X_WI, shape (n, 4, 4)."""
     return Path(header(t, "world"), [PoseStamped(header(t, "world"), pose_message(X[:3, :3], X[:3, 3])) for X in poses_WI])
 
 
 def abdomen_of(mesh: Message, targets: Message, X_WA: Array) -> PerceivedAbdomen:
-    """Return the targets on the perceived surface. Raises ValueError if the messages cannot be used."""
+    """Return surface and targets of perception; `X_WA`, shape (4, 4). Raises ValueError if the messages cannot be used."""
     count, lines = len(targets.positions), np.asarray(targets.lines, dtype=np.int64)
     if len(lines) != count:
         raise ValueError(f"perception/targets: {len(lines)} lines for {count} positions")

@@ -5,18 +5,20 @@ from __future__ import annotations
 from typing import Final, NamedTuple
 
 MS: Final = 1_000_000
+"""A millisecond [ns]."""
 SECOND: Final = 1_000 * MS
+"""A second [ns]."""
 
 
 class Periods(NamedTuple):
     """Periods of the contract [ns]."""
 
     step: int
-    """Between two steps of planning."""
+    """Time between two steps of planning."""
     frame: int
-    """Between two frames of the camera."""
+    """Time between two frames of the camera."""
 
     @property
     def step_s(self) -> float:
-        """Between two steps of planning [s]."""
+        """Time between two steps of planning [s]."""
         return self.step / SECOND

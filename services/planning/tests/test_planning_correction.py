@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from palpate_planning.wall.wall import PRIOR, HeightMeasurement, SurfaceCorrection
+from palpate_planning.wall.wall import PRIOR, HeightMeasurement, TouchCorrection
 
 PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
 BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
@@ -17,13 +17,13 @@ def tilted(xy: np.ndarray) -> np.ndarray:
 
 
 def test_without_touches_the_correction_is_zero_and_uncertain() -> None:
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     assert correction.height(np.zeros(2)) == 0.0
     assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(PRIOR.offset_m, PRIOR.field_m))
 
 
 def test_offset_and_tilt_are_found_in_between() -> None:
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     for place in PLACES:
         correction.touch(HeightMeasurement(place, float(tilted(place)), 2e-4))
     for place in BETWEEN:
@@ -33,7 +33,7 @@ def test_offset_and_tilt_are_found_in_between() -> None:
 
 
 def test_touches_at_one_place_are_averaged() -> None:
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     for height in (0.0042, 0.0038):
         correction.touch(HeightMeasurement(np.zeros(2), height, 5e-4))
     assert correction.height(np.zeros(2)) == pytest.approx(0.004, abs=2e-5)
@@ -49,7 +49,7 @@ def test_errors_agree_with_the_reported_sd() -> None:
     scores = []
     for _ in range(50):
         truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
-        correction = SurfaceCorrection()
+        correction = TouchCorrection()
         for place, height in zip(PLACES, truth, strict=False):
             correction.touch(HeightMeasurement(place, float(height + 4e-4 * rng.standard_normal()), 4e-4))
         scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
@@ -61,7 +61,7 @@ def test_touches_determine_the_roughness_of_the_error(rough_m: float, most_m: fl
     """After 25 touches a smooth error is known to within the error of a touch, a rough one is not."""
     rng = np.random.default_rng(5)
     places = np.array([(x, y) for x in np.linspace(-0.09, 0.09, 5) for y in np.linspace(-0.09, 0.09, 5)])
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     for place in places:
         height = tilted(place) + rough_m * rng.standard_normal() + 2e-4 * rng.standard_normal()
         correction.touch(HeightMeasurement(place, float(height), 2.5e-4))
@@ -70,7 +70,7 @@ def test_touches_determine_the_roughness_of_the_error(rough_m: float, most_m: fl
 
 
 def test_the_latest_touch_can_be_revised() -> None:
-    revised, right = SurfaceCorrection(), SurfaceCorrection()
+    revised, right = TouchCorrection(), TouchCorrection()
     for correction in (revised, right):
         correction.touch(HeightMeasurement(PLACES[0], 0.004, 4e-4))
     revised.touch(HeightMeasurement(PLACES[1], 0.006, 9e-4))
@@ -81,7 +81,7 @@ def test_the_latest_touch_can_be_revised() -> None:
 
 
 def test_a_new_scan_keeps_offset_and_tilt_learned_from_touches() -> None:
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     for place in PLACES:
         correction.touch(HeightMeasurement(place, float(tilted(place)), 3e-4))
     before = correction.sigma(PLACES[0])
@@ -97,7 +97,7 @@ def test_a_better_surface_needs_a_smaller_correction() -> None:
     bent = rng.multivariate_normal(
         np.zeros(len(PLACES)), (2 * PRIOR.field_m) ** 2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
     )
-    correction = SurfaceCorrection()
+    correction = TouchCorrection()
     for place, field in zip(PLACES, bent, strict=True):
         correction.touch(HeightMeasurement(place, float(tilted(place) + field), 2e-4))
     better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
@@ -109,7 +109,7 @@ def test_a_better_surface_needs_a_smaller_correction() -> None:
 
 def test_successive_touches_share_the_error_of_the_breath() -> None:
     """Nine touches within three seconds leave the error of the breath in the offset; within three minutes they average it."""
-    hasty, slow = SurfaceCorrection(), SurfaceCorrection()
+    hasty, slow = TouchCorrection(), TouchCorrection()
     for number, place in enumerate(PLACES):
         hasty.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number / 3.0))
         slow.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number * 20.0))

@@ -2,8 +2,8 @@
 
     python -m palpate_recorder.recover DIR/recording_mcap
 
-writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken files, an index and `metadata.yaml`. It takes the
-recordings of other writers too, as a folder or as one MCAP file, and keeps their topics of ROS 2.
+writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken files, an index and `metadata.yaml`. It accepts
+recordings of other programs too, as a folder or a single MCAP file, and keeps their ROS 2 topics.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ class Salvaged(Recording):
     """The complete chunks of a truncated recording, in memory."""
 
     held: tuple[RecordedMessage, ...] = ()
-    """In order of their stamps."""
+    """Messages in order of their stamps."""
 
     def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
         """See `Recording.messages`."""
@@ -52,7 +52,10 @@ class Salvaged(Recording):
 
 
 def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
-    """Return the complete chunks of some topics of the recording `folder`. Raises as `recover`."""
+    """Return the messages of some topics in the complete chunks of the recording `folder`.
+
+    Raises FileNotFoundError if there is no recording, ValueError if none of the topics is in a complete chunk.
+    """
     broken, wanted = _Broken(folder), frozenset(f"/{topic}" for topic in topics)
     held = [
         RecordedMessage(record.log_time, channel.topic[1:], record.data, record.sequence)
@@ -80,20 +83,20 @@ class _Broken:
     """The files of a truncated recording, oldest first, and their channels."""
 
     def __init__(self, path: Path) -> None:
-        """Raises FileNotFoundError if there is no file."""
+        """`path`: a folder or a file. Raises FileNotFoundError if there is no file."""
         self.files = [path] if path.is_file() else sorted(path.glob("*.mcap"), key=_number)
         if not self.files:
             raise FileNotFoundError(f"{path}: no recording there; give an .mcap file, or the folder that holds it")
         self._channels: dict[str, Channel] = {}
 
     def found(self) -> dict[str, Channel]:
-        """Return the channels of ROS 2 that `messages` came upon, by topic. Raises ValueError if there are none."""
+        """Return the ROS 2 channels read so far, by topic: iterate over `messages` first. Raises ValueError if there are none."""
         if not self._channels:
             raise ValueError(f"{self.files[0]}: broken before the end of its first chunk, nothing to recover")
         return self._channels
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
-        """Yield the complete messages of ROS 2 with their channels."""
+        """Yield the complete ROS 2 messages with their channels, in file order."""
         for file in self.files:
             schemas: dict[int, Schema] = {}
             channels: dict[int, Channel] = {}

@@ -21,7 +21,7 @@ class CubicPieces(NamedTuple):
     """A piecewise cubic curve y(s) in m dimensions, in the format of scipy's `CubicSpline`."""
 
     knots: Array
-    """[s], shape (n,)."""
+    """Values of s, ascending, shape (n,)."""
     coefficients: Array
     """Coefficients of (s - knot)^3, (s - knot)^2, s - knot and 1 between the knots, shape (4, n - 1, m)."""
 
@@ -39,7 +39,7 @@ class BicubicSpline(NamedTuple):
 
 @compiled
 def cubic_at(curve: CubicPieces, s: float) -> tuple[Array, Array]:
-    """Return the value y and derivative dy/ds at `s`, shapes (m,)."""
+    """Return the value y and its derivative dy/ds at `s`, shapes (m,)."""
     knots, c = curve
     i = min(max(int(np.searchsorted(knots, s, side="right")) - 1, 0), len(knots) - 2)
     u = s - knots[i]
@@ -178,12 +178,12 @@ class PerceivedSurface:
         return float(np.median(np.abs(self._field(p_A[:, :2])[:, 0] - p_A[:, 2])))
 
     def at(self, xy_A: Array) -> tuple[Array, Array]:
-        """Return surface points [m] and outward unit normals at xy_A, shape (n, 2): two arrays in world, shape (n, 3)."""
+        """Return surface points [m] and outward unit normals in world at xy_A [m], shape (n, 2): two arrays, shape (n, 3)."""
         p_A, n_A = self.in_A(xy_A)
         return apply(self._X_WA, p_A), n_A @ self._X_WA[:3, :3].T
 
     def in_A(self, xy_A: Array) -> tuple[Array, Array]:
-        """Return the same in frame A."""
+        """Return points [m] and outward unit normals in A at xy_A [m], shape (n, 2): two arrays, shape (n, 3)."""
         values = self._field(xy_A)
         n_A = np.column_stack((-values[:, 1], -values[:, 2], np.ones(len(values))))
         return np.column_stack((xy_A, values[:, 0])), n_A / np.linalg.norm(n_A, axis=1, keepdims=True)
@@ -193,11 +193,11 @@ class PerceivedSurface:
         return np.asarray(((p_W - self._X_WA[:3, 3]) @ self._X_WA[:3, :3])[:2])
 
     def breathing(self, xy_A: Array) -> float:
-        """Return the breathing displacement at a position, shape (2,), relative to the point that moves most [1]."""
+        """Return the breathing displacement at xy_A [m], shape (2,), relative to that of the point that moves most [1]."""
         return 0.0 if self._mode is None else float(bicubic_at(self._mode.spline, xy_A[0], xy_A[1])[0])
 
     def nearest(self, c_W: Array) -> Foot:
-        """Return the foot of the perpendicular from c_W, shape (3,).
+        """Return the foot of the perpendicular from the point c_W [m], shape (3,), usually the centre of the indenter.
 
         Fixed-point iteration: move the foot by the tangential part of the gap to c. The error shrinks by the ratio of distance to
         radius of curvature, about 0.03 per iteration in contact. The result is approximate far away (0.2 m and more).
@@ -207,7 +207,7 @@ class PerceivedSurface:
 
 @compiled
 def foot(field: BicubicSpline, X_WA: Array, c_W: Array) -> tuple[Array, Array, float, Array]:
-    """Return `PerceivedSurface.nearest` for the given spline and pose."""
+    """Return the fields of `Foot` for `PerceivedSurface.nearest`, from the surface's spline and pose."""
     R_WA, p_WA = X_WA[:3, :3].copy(), X_WA[:3, 3]
     c_A = (c_W - p_WA) @ R_WA
     xy_A = c_A[:2]

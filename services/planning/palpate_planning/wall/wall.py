@@ -4,7 +4,7 @@ At a position x in A's xy plane the wall is outward of the perceived surface by
 
     c(x) + m(x) w(t)
 
-with the correction c (`SurfaceCorrection`), the breathing mode m (`perception/surface`) and the displacement w where m is 1
+with the correction c (`TouchCorrection`), the breathing mode m (`perception/surface`) and the displacement w where m is 1
 (`breath`). The correction is a Gaussian process. Camera and arm agree to centimetres, but the error is smooth: an offset, a tilt,
 and a bending field of the camera (parameters of `CorrectionPrior`),
 
@@ -79,7 +79,7 @@ class HeightMeasurement(NamedTuple):
     """Time [s]."""
 
 
-class SurfaceCorrection:
+class TouchCorrection:
     """The outward correction c(x) [m] and its SD. Positions are in A's xy plane [m]."""
 
     def __init__(self, expected_roughness: float = 1.0) -> None:
@@ -118,9 +118,9 @@ class SurfaceCorrection:
         fits = (_fit(float(a), self._expected, self._places, heights, errors) for a in ROUGHNESSES)
         self._fit = max(fits, key=lambda fit: fit.log_probability)
 
-    def averaged(self, outward: Callable[[Array], Array]) -> SurfaceCorrection:
+    def averaged(self, outward: Callable[[Array], Array]) -> TouchCorrection:
         """Return the correction, from the same touches, of a better surface, `outward` [m] of this one at positions (n, 2)."""
-        better = SurfaceCorrection(PRIOR.mean_image_roughness)
+        better = TouchCorrection(PRIOR.mean_image_roughness)
         less = outward(self._places)
         better._touches = tuple(t._replace(height=t.height - h) for t, h in zip(self._touches, less.tolist(), strict=True))
         better._blurred = self._blurred
@@ -215,7 +215,7 @@ class Wall:
     def __init__(self, perceived: PerceivedSurface, breath: Breath) -> None:
         """Start without correction."""
         self.perceived, self.breath = perceived, breath
-        self.correction = SurfaceCorrection()
+        self.correction = TouchCorrection()
         self.shift_A = np.zeros(2)
         """Shift of the body along the table since the first scan of the surface, in A [m], shape (2,)."""
         self._first = perceived

@@ -30,12 +30,12 @@ WORLD: Final = "world"
 
 
 class ReplayedCamera(Service):
-    """Shows what a camera saw before."""
+    """Publishes the images of a recording."""
 
     role: ClassVar[str] = "camera"
 
     def __init__(self, recording: Recording) -> None:
-        """Reads and checks the frames, about 1 MB each. Raises RecordingError without a usable frame of a known pose."""
+        """Read and check the frames, about 1 MB each. Raises RecordingError without a usable frame whose camera pose is known."""
         rules = contract()
         recorded: dict[str, list[RecordedMessage]] = {topic: [] for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, POSE)}
         recording.check(rules, recorded)
@@ -61,11 +61,11 @@ class ReplayedCamera(Service):
         self._shown = self._ticks = 0
 
     def start(self) -> Outbox:
-        """The recorded pose of the optical frame in world, latched."""
+        """Return the recorded pose X_WC of the optical frame in world, latched."""
         return {POSE: TFMessage([TransformStamped(header(0, WORLD), FRAME, self._pose)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """The next small image, and the next whole one while a burst lasts; a new trigger replaces the burst under way."""
+        """Return the next small image, and during a burst the next whole one. A new trigger replaces the present burst."""
         for trigger in inbox.new("planning/camera_trigger"):
             self._wanted = int(trigger.frames)
         outbox = self._next_small(t)
@@ -77,7 +77,7 @@ class ReplayedCamera(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Return the number of frames played, and of different ones."""
+        """Return the recording, the numbers of frames played and recorded, and the transforms left out."""
         return {
             "recording": str(self._path),
             "frames": self._shown,
@@ -88,28 +88,30 @@ class ReplayedCamera(Service):
     def _next_small(self, t: int) -> dict[str, Message]:
         if self._small:
             return messages.small(t, *self._small[self._ticks % len(self._small)])
-        return messages.every_few(t, *self._frames[self._ticks % len(self._frames)])
+        return messages.small_of(t, *self._frames[self._ticks % len(self._frames)])
 
 
 class _Logged(NamedTuple):
-    """A recorded message and when its recorder received it [ns]."""
+    """A decoded message."""
 
     time: int
+    """Log time of the recording [ns]."""
     message: Message
 
     @property
     def stamp(self) -> int:
-        """Time of its header [ns]."""
+        """Stamp in the header [ns]."""
         return nanoseconds(self.message.header.stamp)
 
 
 def _decoded(recorded: Sequence[RecordedMessage], kind: str) -> Iterator[_Logged]:
-    """Decode messages; one that was recorded twice counts once. Raises CodecError."""
+    """Decode messages of the type `kind`; of equal payloads only one is kept. Raises CodecError."""
     once = {message.payload: message for message in recorded}
     return (_Logged(message.stamp, decode(message.payload, kind)) for message in once.values())
 
 
 def _nearest(infos: Sequence[_Logged], time: int) -> _Logged:
+    """Return the message logged nearest to `time` [ns]."""
     return min(infos, key=lambda info: abs(info.time - time))
 
 
@@ -123,7 +125,7 @@ def _pairs(images: Sequence[_Logged], infos: Sequence[_Logged]) -> Iterator[tupl
 
 
 def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str, frame: str) -> list[Frame]:
-    """Return the images of a pair of topics with their intrinsics; none without both. Raises CameraError, CodecError."""
+    """Return the images of a pair of topics with their intrinsics; none if one topic is empty. Raises CameraError, CodecError."""
     types = contract().topics
     images, infos = (list(_decoded(recorded[topic], types[topic].type)) for topic in (image, info))
     source = CameraInput(
@@ -143,7 +145,7 @@ def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str
 
 
 def create(scenario: Scenario) -> ReplayedCamera:
-    """The camera of `camera.recording`. Raises RecordingError."""
+    """Return the camera that plays `camera.recording`. Raises RecordingError."""
     path = scenario.camera.recording
     if path is None:
         raise RecordingError("services.camera: replay needs camera.recording: a run's folder, a rosbag2 folder or an .mcap file")

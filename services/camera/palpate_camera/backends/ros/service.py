@@ -34,22 +34,22 @@ class CameraPort(ABC):
 
     @abstractmethod
     def images(self) -> list[Any]:
-        """sensor_msgs/Image since last time, oldest first."""
+        """Return the sensor_msgs/Image received since the last call, oldest first."""
 
     @abstractmethod
     def info(self) -> Any | None:
-        """The newest sensor_msgs/CameraInfo."""
+        """Return the newest sensor_msgs/CameraInfo; None before the first."""
 
     @abstractmethod
     def transforms(self) -> list[Any]:
-        """geometry_msgs/TransformStamped of tf_static since last time."""
+        """Return the geometry_msgs/TransformStamped of tf_static received since the last call."""
 
 
 class ZenohCamera(CameraPort):
-    """Over zenoh, as rmw_zenoh does."""
+    """Subscribes over zenoh, as rmw_zenoh does."""
 
     def __init__(self, ros: RosCamera) -> None:
-        """Joins the ROS side. Raises BusConfigError."""
+        """Join the ROS side. Raises BusConfigError."""
         self._node = RosNode("palpate_camera", ros.domain, BusOptions(router=ros.router))
         image, info = ros.image.strip("/"), ros.info.strip("/")
         self.rectified = "rect" in image.rpartition("/")[2]  # image_proc's names: image_rect, image_rect_raw
@@ -59,16 +59,16 @@ class ZenohCamera(CameraPort):
         self._info: Any | None = None
 
     def images(self) -> list[Any]:
-        """Images since last time."""
+        """See `CameraPort.images`."""
         return self._images.take()
 
     def info(self) -> Any | None:
-        """The newest intrinsics."""
+        """See `CameraPort.info`."""
         self._info = self._infos.newest() or self._info
         return self._info
 
     def transforms(self) -> list[Any]:
-        """Static transforms since last time."""
+        """See `CameraPort.transforms`."""
         return [item for message in self._tf.take() for item in message.transforms]
 
 
@@ -85,9 +85,9 @@ class RosCameraService(Service):
         wait_s: float = POSE_WAIT_S,
         now: Callable[[], int] = time_ns,
     ) -> None:
-        """Waits for the camera's pose and first image; `now` is ROS's clock [ns].
+        """Wait for the camera's pose, up to `wait_s` [s], and its first image; `now` returns the time of ROS [ns].
 
-        Raises CameraError naming the frames that are known when the pose does not come, or the first image if it cannot be used.
+        Raises CameraError without a pose, naming the known frames, or if the first image cannot be used.
         """
         self._port, self._now = port, now
         self._input = CameraInput(
@@ -103,16 +103,16 @@ class RosCameraService(Service):
         _check_first(port, self._input, min(wait_s, FRAME_WAIT_S))
         self._wanted = self._asked = 0
         self._stamp = 0
-        """When the newest image was taken, by the driver's clock [ns]; 0: none, or the driver does not say."""
+        """Header stamp of the newest image, by the driver's clock [ns]; 0 without an image or a stamp."""
         self._facts = {"bursts": 0, "frames": 0, "frames_rejected": 0, "frames_repeated": 0}
         self._problem = ""
 
     def start(self) -> Outbox:
-        """The calibrated pose of the optical frame in world, latched."""
+        """Return the calibrated pose X_WC of the optical frame in world, latched."""
         return {"tf_static": TFMessage([TransformStamped(header(0, "world"), FRAME, self._pose)])}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """The newest frame's small image, and the whole one while a burst lasts, but not what came before its trigger."""
+        """Return the newest frame's small image; during a burst also the whole one, if it was exposed after the trigger."""
         images, info = self._port.images(), self._port.info()
         triggers = list(inbox.new("planning/camera_trigger"))
         if triggers:
@@ -135,7 +135,7 @@ class RosCameraService(Service):
             self._problem = str(error)
             return {}
         exposed = self._exposed(t, stamp)
-        outbox = messages.every_few(exposed, depth, pinhole)
+        outbox = messages.small_of(exposed, depth, pinhole)
         if self._wanted and not triggers and exposed >= self._asked:
             self._wanted -= 1
             self._facts["frames"] += 1
@@ -143,7 +143,7 @@ class RosCameraService(Service):
         return outbox
 
     def _exposed(self, t: int, stamp: int) -> int:
-        """Return the exposure [ns] of an image of ROS time `stamp` in the time of the run (now `t`); `t` if it is unknown."""
+        """Return the time of exposure [ns] in the run's time, now `t`, of an image with ROS time `stamp`; `t` if unknown."""
         age = self._now() - stamp
         return max(t - age, 0) if 0 <= age <= OLDEST_NS else t
 
@@ -153,6 +153,7 @@ class RosCameraService(Service):
 
 
 def _await_pose(port: CameraPort, transforms: StaticTransforms, frame: str, world: str, wait_s: float) -> Transform:
+    """Return the pose of `frame` in `world` within `wait_s` [s]. Raises CameraError."""
     begin = monotonic()
     while True:
         transforms.add(port.transforms())
@@ -162,7 +163,7 @@ def _await_pose(port: CameraPort, transforms: StaticTransforms, frame: str, worl
 
 
 def _check_first(port: CameraPort, source: CameraInput, wait_s: float) -> None:
-    """Raises CameraError if the first image that comes within a time cannot be used."""
+    """Check the first image within `wait_s` [s]. Raises CameraError if it cannot be used."""
     begin = monotonic()
     images: list[Any] = []
     while True:
@@ -177,7 +178,7 @@ def _check_first(port: CameraPort, source: CameraInput, wait_s: float) -> None:
 
 
 def create(scenario: Scenario) -> RosCameraService:
-    """The camera that the scenario's `camera.ros` names. Raises CameraError."""
+    """Return the camera named by `camera.ros`. Raises CameraError (also in lockstep) and BusConfigError."""
     if Settings.read().runtime != "wallclock":
         raise CameraError("services.camera = ros takes a real camera, which does not wait: run with --wallclock")
     ros = scenario.camera.ros

@@ -9,5 +9,5 @@ from palpate_robot.service import RobotService
 
 
 def create(scenario: Scenario) -> RobotService:
-    """Return the robot of a scenario; it uses the plant input only."""
+    """Return the robot of a scenario; it has the plant input only, so nothing of the patient."""
     return RobotService(plant_input(scenario), MujocoPlant)
