@@ -102,11 +102,12 @@ def _frames(depth: Array, K: Array, image: str = IMAGE, info: str = INFO) -> Fee
     P = np.hstack((K, np.zeros((3, 1)))).ravel()
     whole = RegionOfInterest(0, 0, 0, 0, False)
     height, width = depth.shape
+    pixels = depth.astype(np.float32)
     return {
         info: lambda t: CameraInfo(
             header(t, FRAME), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole
         ),
-        image: lambda t: depth_message(header(t, FRAME), depth),
+        image: lambda t: depth_message(header(t, FRAME), pixels),
     }
 
 
