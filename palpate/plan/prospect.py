@@ -107,8 +107,9 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     axes.tricontour(x, y, z, levels=10, colors=CONTOURS, linewidths=0.8)
     axes.plot([], [], color=CONTOURS, linewidth=0.8, label="equal height of the skin")
     used = np.array([i not in planned.skipped for i in range(len(planned.scan.targets))])
-    for stroke in planned.strokes:
-        axes.plot(*(stroke.T * MM), color="#7a8c94", linewidth=1.2, zorder=2)
+    for k, stroke in enumerate(planned.strokes):
+        label = "stroke, which may leave the region where it turns" if k == 0 else None
+        axes.plot(*(stroke.T * MM), color="#7a8c94", linewidth=1.2, zorder=2, label=label)
     order = np.flatnonzero(used)
     targets = planned.scan.targets * MM
     dots = axes.scatter(targets[used, 0], targets[used, 1], c=order, cmap="viridis", s=22, zorder=3)

@@ -211,6 +211,7 @@ def draw_map(
     _draw_force(figure, grid, drawing, samples)
     _draw_stiffness(figure, grid, drawing)
     figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=INK)
+    figure.supxlabel("white in the maps: not assessed", fontsize=_SMALL, color=QUIET)
     figure.savefig(path, metadata={"Title": title, "Comment": f"run {run}"})
 
 

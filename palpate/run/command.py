@@ -43,7 +43,8 @@ def run(options: RunOptions) -> None:
 
       palpate run --group robot,tissue,control      the 1 kHz loop in one process, all others in one each; the same run hash
 
-    The exit status is 0 when the examination was completed, 2 when it was not started, 3 when it failed or was interrupted.
+    The exit status is 0 when the examination was completed, 2 when it was not started, 3 when it failed or was interrupted,
+    130 when it was interrupted before it began.
     """
     from palpate.run.inputs import usable
     from palpate_errors import UserError

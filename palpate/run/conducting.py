@@ -31,6 +31,8 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     chosen = load_scenario(str(out / "scenario.yaml"))
     if chosen.services.tissue == NONE and not wallclock:
         raise UserError(NEEDS_WALLCLOCK)
+    if (out / "report.json").is_file():
+        raise UserError(f"--out {out}: it holds the results of a run; `palpate prepare --out {out}` moves them away")
     session = open_session()
     roles = (*workers(chosen), *observers)
     with results_first():

@@ -139,10 +139,11 @@ class RunWatchdog:
 
         Follows who-waits-for-whom from the slowest waiting service to one that does not wait, or around a cycle.
         """
+        computing = self.silent(roles, INTERRUPTED_S)  # what they waited for before their step is past
         waiting = {
             role: self._producers[p.waiting_for]
             for role, p in self.progress.items()
-            if role in roles and self._producers.get(p.waiting_for) in roles
+            if role in roles and self._producers.get(p.waiting_for) in roles and role not in computing
         }
         if all(self.progress[role].waiting_for == "grant" for role in roles):
             return "conductor", "all services wait for a grant of the conductor: planning or the recorder is behind"

@@ -191,6 +191,16 @@ def test_a_cycle_is_named_as_one() -> None:
     assert "cycle" in text
 
 
+def test_a_service_that_computes_is_the_culprit_and_not_part_of_a_cycle() -> None:
+    w = watchdog()
+    w.report("planning", 2, "sim/contact_wrench")
+    w.report("tissue", 1, "exam/state")
+    w.progress["tissue"].reported -= 1.0  # it reports while it waits, not in its step
+    role, text = w.culprit(ROLES)
+    assert role == "tissue"
+    assert "cycle" not in text
+
+
 def test_one_service_that_waits_for_a_grant_does_not_make_the_conductor_the_culprit() -> None:
     w = watchdog()
     w.report("robot", 1, "grant")
