@@ -130,7 +130,7 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     axes.set_aspect("equal")
     axes.set_xlabel("x, to the patient's left [mm]")
     axes.set_ylabel("y, to the head [mm]")
-    axes.legend(loc="upper right", fontsize=9)
+    figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     exam = scenario.exam
     if exam.searched:
         how = f"search, at most {exam.budget.presses} presses, at most"
