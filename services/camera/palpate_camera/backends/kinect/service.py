@@ -111,7 +111,7 @@ def surface_mesh(message: Message) -> Mesh:
     if message.header.frame_id != "world":
         raise ValueError(f"sim/surface: header.frame_id = {message.header.frame_id!r}, want 'world'")
     vertices = np.asarray(message.vertices, np.float64).reshape(-1, 3)
-    triangles = np.array(message.triangles, np.uint32).reshape(-1, 3)  # copied: numba compiles anew for read-only arrays
+    triangles = np.array(message.triangles, np.uint32).reshape(-1, 3)  # copied: numba compiles again for read-only arrays
     return Mesh(vertices, triangles)
 
 
