@@ -155,7 +155,8 @@ def _view(recording: Path, port: int, native: bool, show: bool, console: Console
     if show:
         webbrowser.open(address(port))
     ports = ("--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(port + 1))
-    server = subprocess.Popen([*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT])
+    words = [*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT]
+    server = subprocess.Popen(words, env={"RUST_LOG": "warn", **os.environ})  # its notices would bury the address
     try:
         status = server.wait()
     finally:
