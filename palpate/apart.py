@@ -66,14 +66,15 @@ class TimeLimit:
         """`place`: where the child is; `limit_s`: how long it may be there [s]."""
         self._place, self._limit_s = place, limit_s
         self._last = place()
-        self._there_s, self._checked = 0.0, monotonic()
+        self.there_s, self._checked = 0.0, monotonic()
+        """Time for which the child has been at its present place."""
 
     def check(self) -> None:
         """Raises ChildLost when the child is late. Call it every `POLL_S`."""
         now, place = monotonic(), self._place()
-        self._there_s = self._there_s + min(now - self._checked, 2 * POLL_S) if place == self._last else 0.0
+        self.there_s = self.there_s + min(now - self._checked, 2 * POLL_S) if place == self._last else 0.0
         self._last, self._checked = place, now
-        if self._there_s > self._limit_s():
+        if self.there_s > self._limit_s():
             raise ChildLost(f"did not return within {self._limit_s():g} s", late=True)
 
 

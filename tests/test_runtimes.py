@@ -235,9 +235,11 @@ def test_the_first_diagnostics_include_services_that_joined_late(monkeypatch: py
 def test_a_service_that_does_not_answer_is_named() -> None:
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
         session = open_session(mesh(("conductor",), Path(folder))["conductor"])
-        conductor = Conductor(session, contract(), 0, ("robot",), Collector(), Patience(start=0.5))
+        conductor = Conductor(session, contract(), 0, ("robot",), Collector(), Patience(start=0.5, quiet=0.1))
+        shown: list[str] = []
         with pytest.raises(RunFailed) as failed:
-            conductor.run()
+            conductor.run(tell=lambda c: shown.extend(c.outcome.trouble))
+        assert [text for text in shown if "robot" in text], "while it is awaited"
         assert (failed.value.failure.code, failed.value.failure.roles) == (FailureCode.NO_ANSWER, ("robot",))
         close_session(session)
 
@@ -255,7 +257,7 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
         conductor = Conductor(session, contract(), 0, ("recorder",), Collector())
         report = ("recorder", SimpleNamespace(state=ServiceReport.FINISHED), {})
         monkeypatch.setattr(conductor, "_receive_reports", lambda: [report] if gone else [])
-        conductor._end(exited)
+        conductor._end(exited, lambda _: None)
         assert conductor.outcome.trouble == []
         assert conductor.outcome.reports.keys() == {"recorder"}
     finally:

@@ -17,7 +17,7 @@ import yaml
 import zenoh
 from rich.console import Console
 
-from palpate.console import bandwidth, print_json, print_line, table, wide_console
+from palpate.console import bandwidth, print_json, print_line, say, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import Topic, contract
@@ -27,6 +27,8 @@ from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
 
 REPORT_PERIOD_S = 1.0
+SILENT_S = 5.0
+"""A topic without a message for this time is announced."""
 BANDWIDTH_PERIODS = 5
 """Bandwidth is the mean over this many report periods."""
 SPACING_MESSAGES = 10_000
@@ -169,6 +171,7 @@ class TopicReader:
 
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
+        self.name = topic.name
         self.invalid = 0
         """Messages without a valid attachment."""
         key = topic_key(topic, domain)
@@ -264,11 +267,17 @@ def _unknown(name: str) -> NoBus:
 
 
 def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
-    """Yields messages until the time is over."""
-    end = None if seconds is None else monotonic() + seconds
+    """Yields messages until the time is over. Says once that none arrives."""
+    begin = monotonic()
+    end, silent = None if seconds is None else begin + seconds, True
     while end is None or monotonic() < end:
         if (received := reader.get(0.1)) is not None:
+            silent = False
             yield received
+        elif silent and monotonic() - begin > SILENT_S:
+            silent = False
+            limit = "until Ctrl-C" if seconds is None else f"{seconds:g} s at most"
+            say(f"no message on {reader.name} for {SILENT_S:g} s; waiting {limit}")
 
 
 def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Received]]:

@@ -29,6 +29,8 @@ LOOK_NS = NS
 """The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
 LONGEST_NS = 7 * 86400 * NS
 """Longest recording that is played [ns]; a longer one has stamps of two clocks."""
+GAP_NS = 5 * NS
+"""A longer time without a message is announced [ns]."""
 CLOCK = "clock"
 CLOCK_PERIOD_NS = 10 * MS
 
@@ -107,12 +109,18 @@ class Player:
             if acting and not self._drive:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
-    def play(self, start: int = 0, until: int | None = None, progress: Callable[[int], None] = lambda _: None) -> None:
+    def play(
+        self,
+        start: int = 0,
+        until: int | None = None,
+        progress: Callable[[int], None] = lambda _: None,
+        gap: Callable[[float], None] = lambda _: None,
+    ) -> None:
         """Plays from `start` to `until` [ns after the origin].
 
         It begins with the last earlier message of each topic that is not periodic.
 
-        Calls `progress` with the stamp of each message [ns].
+        Calls `progress` with the stamp of each message [ns], and `gap` with the time [s] until the next one if that is long.
 
         Raises UserError if a service appears that sends a topic that is played, or would act on it.
         """
@@ -125,6 +133,8 @@ class Player:
         epoch = 0
         for message in self._recording.messages(self.topics, start, until):
             epoch = epoch or monotonic_ns()  # after the first chunk is unpacked
+            if (silent := (message.stamp - self.origin - self.now) / self._rate) > GAP_NS:
+                gap(silent / NS)
             while self._own_clock and self._next_clock <= message.stamp:
                 self._wait(epoch + round((self._next_clock - start) / self._rate))
                 self._tick()
@@ -149,15 +159,16 @@ class Player:
         self._next_clock += CLOCK_PERIOD_NS
 
     def _wait(self, due: int) -> None:
-        now = monotonic_ns()
-        if now - self._looked > LOOK_NS:
-            self._looked = now
-            self._look()
-        left = due - now
-        if left > 0:
-            sleep(left / NS)
-        else:
-            self.lag_ms = max(self.lag_ms, -left / 1e6)
+        left = due - monotonic_ns()
+        self.lag_ms = max(self.lag_ms, -left / 1e6)
+        while True:
+            now = monotonic_ns()
+            if now - self._looked > LOOK_NS:
+                self._looked = now
+                self._look()
+            if now >= due:
+                return
+            sleep(min(due - now, LOOK_NS) / NS)
 
     def hold(self) -> None:
         """Stays on the bus, for late joiners of latched topics, until interrupted."""
@@ -220,7 +231,7 @@ def play(
             raise UserError(f"--from {start / NS:g}: {file} ends at {last / NS:.3f} s")
         try:
             with TimeLeft("playing", start, last if end is None else min(end, last)) as bar:
-                player.play(start, end, bar.reach)
+                player.play(start, end, bar.reach, lambda s: console.print(f"no message for the next {s:.0f} s", highlight=False))
             if not player.sent:
                 raise RunError(f"{file}: played no message: it has none in the part that was chosen")
             console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, at most {player.lag_ms:.1f} ms late")

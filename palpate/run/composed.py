@@ -112,6 +112,12 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     limits = _Limits(place, foreign_roles(scenario))
     collected = Collector().collected
     start = 0.0
+    waits: list[str] = []
+    trouble: list[str] = []
+    """Messages for the user so far: those of the child and of its waits."""
+
+    def show(t: int) -> None:
+        tell(RunProgress(t, t / NS / max(perf_counter() - start, 1e-9), collected, tuple(trouble)))
 
     def receive(news: News) -> None:
         nonlocal start
@@ -119,12 +125,20 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         collect(collected, news.collected)
         if news.measured:
             all_is_measured()
-        tell(RunProgress(news.t, news.t / NS / max(perf_counter() - start, 1e-9), collected, news.trouble))
+        trouble.extend(news.trouble[len(trouble) - len(waits) :])
+        show(news.t)
+
+    limit = TimeLimit(place.now, limits.limit_s)
+
+    def check() -> None:
+        if limit.there_s > limits.patience.quiet and (text := limits.wait_text()) not in waits:
+            waits.append(text)
+            trouble.append(text)
+            show(place.t)
+        limit.check()
 
     try:
-        result = run_apart(
-            lambda send: run_here(scenario, out, observers, place, send), receive, TimeLimit(place.now, limits.limit_s).check
-        )
+        result = run_apart(lambda send: run_here(scenario, out, observers, place, send), receive, check)
     except UserError:
         raise
     except Exception as error:  # the report needs what was measured
@@ -151,14 +165,24 @@ class _Limits:
 
     def __init__(self, place: ChildPlace, foreign: frozenset[str]) -> None:
         self._place, self._foreign = place, foreign
-        self._settings, self._patience = Settings.read(), Patience()
+        self._settings, self.patience = Settings.read(), Patience()
 
     def limit_s(self) -> float:
         """Return the limit at the present place [s]."""
         starts = self._place.stage is ChildStage.LOAD
         if self._place.role in self._foreign:
             return self._settings.start_limit_s if starts else self._settings.step_limit_s
-        return self._patience.start if starts else self._patience.hard
+        return self.patience.start if starts else self.patience.hard
+
+    def wait_text(self) -> str:
+        """Return a text for a child that stays at its present place."""
+        role = self._place.role or "the process of all services"
+        doing = {
+            Stage.LOAD: f"still starting {role}; a first run compiles, which takes a minute or more",
+            Stage.STEP: f"waiting for {role} to finish its step at {self._place.t / NS:.3f} s",
+            Stage.FINISH: f"waiting for {role} to finish its files",
+        }
+        return f"{doing[self._place.stage]} ({self.limit_s():g} s at most)"
 
     def failure(self, error: RunError) -> Failure:
         """Return the failure of a run whose child ended with `error`."""

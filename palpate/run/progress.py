@@ -73,7 +73,7 @@ class Narration:
             return None  # the first descent after the touches ends them; the scan begins at depth
         else:
             sentence = self._touching_text() if name == "touch" else self._scanning_text(state)
-        now = (name, int(state.reason), "" if in_stroke else str(state.message))
+        now = (name, int(state.reason), state.target_index if in_stroke else str(state.message))
         if now == self._last:
             return None
         self._last = now

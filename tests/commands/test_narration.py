@@ -6,6 +6,7 @@ import os
 import pty
 import sys
 import time
+from dataclasses import replace
 from types import SimpleNamespace
 from typing import Any
 
@@ -51,6 +52,17 @@ def narrated(states: list[Any], narration: Narration | None = None) -> list[tupl
 def test_touches_and_scan_are_narrated_once_each() -> None:
     names = [name for name, _ in narrated([*examination(), state(Phase.RETURN, "returning home", 9)])]
     assert names == ["approach", "touch", "scan", "return"]
+
+
+def test_a_wait_is_printed_once_at_each_target() -> None:
+    narration = Narration(EXAM)
+    narrated(examination(), narration)
+    waits, rests = (
+        state(Phase.INDENT, "waiting for it", 9, Reason.WAITS_FOR_WALL),
+        state(Phase.INDENT, StrokeStage.REST.value, 9),
+    )
+    later = [replace(s, target_index=20) for s in (rests, waits, rests, waits)]
+    assert [text for _, text in narrated([rests, waits, rests, waits, *later], narration)] == ["waiting for it"] * 2
 
 
 def test_the_part_counts_the_touches_and_then_is_the_scan() -> None:

@@ -169,6 +169,14 @@ class ExamState:
     REASON_SERVICE_LOST: ClassVar[int]
     REASON_OTHER_PATIENT: ClassVar[int]
     REASON_NO_FINDINGS: ClassVar[int]
+    REASON_WAITS_FOR_WALL: ClassVar[int]
+    REASON_WAITS_FOR_BREATH: ClassVar[int]
+    REASON_WAITS_FOR_ARM: ClassVar[int]
+    REASON_WAITS_FOR_REQUEST: ClassVar[int]
+    REASON_WAITS_FOR_ROBOT: ClassVar[int]
+    REASON_WAITS_FOR_PLAN: ClassVar[int]
+    REASON_WAITS_FOR_PERCEPTION: ClassVar[int]
+    REASON_WAITS_FOR_FINDINGS: ClassVar[int]
     header: Header
     phase: int
     message: str

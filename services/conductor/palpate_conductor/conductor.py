@@ -23,7 +23,7 @@ from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
-from palpate_conductor.grants import Grants
+from palpate_conductor.grants import EXAM_SILENT_S, Grants
 from palpate_conductor.handover import Slots
 from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorRequestServer
@@ -161,7 +161,7 @@ class Conductor:
 
     def _run(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> RunOutcome:
         try:
-            self._handshake(exited)
+            self._handshake(exited, tell)
         except KeyboardInterrupt:
             self.outcome.interrupted = True
             self.abort("interrupted")
@@ -173,7 +173,7 @@ class Conductor:
         try:
             self._conduct(exited, tell)
             self.outcome.wall_time_s = monotonic() - self._started_at
-            self._end(exited)
+            self._end(exited, tell)
             tell(self)
         except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report needs what was measured, whatever ended the run
             self.outcome.interrupted = isinstance(error, KeyboardInterrupt)
@@ -193,7 +193,7 @@ class Conductor:
         self._observed.drain_and_step(last=True)
         return self.outcome
 
-    def _handshake(self, exited: Callable[[], Mapping[str, str]]) -> None:
+    def _handshake(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Send hellos until every service has answered and has a sender on every input."""
         missing_inputs: dict[str, list[str]] = {}
         begin = own_answered = monotonic()
@@ -219,14 +219,17 @@ class Conductor:
                 raise RunFailed(FailureCode.START_FAILED, f"{', '.join(roles)} exited at start: {how}", *roles)
             if not own_roles <= missing_inputs.keys():
                 own_answered = monotonic()
-                if not warned and own_answered - begin > self._patience.quiet_start:
-                    late = ", ".join(sorted(own_roles - missing_inputs.keys()))
-                    self._notify(f"still starting: {late}; a first run compiles, which takes a minute or more")
-                    warned = True
             joining = bool(self._patience.absent) and own_roles <= missing_inputs.keys()
             since, limit_s = (own_answered, self._patience.join) if joining else (begin, self._patience.start)
             if not joining and own_roles - missing_inputs.keys() <= self._patience.foreign:
                 limit_s = min(limit_s, self._patience.foreign_start)
+            if not warned and monotonic() - begin > self._patience.quiet:
+                self._notify(
+                    f"still starting, {limit_s:.0f} s at most: {self._unready(missing_inputs)}; "
+                    "a first run compiles, which takes a minute or more"
+                )
+                tell(self)
+                warned = True
             if monotonic() - since > limit_s:
                 raise self._start_timeout(missing_inputs, limit_s)
         self._contract.poll(force=True)  # so that the first diagnostics include the service that joined last
@@ -234,9 +237,14 @@ class Conductor:
     def _start_timeout(self, missing_inputs: Mapping[str, list[str]], limit_s: float) -> RunFailed:
         self.abort("start timed out")
         silent = [role for role in self._roles if role not in missing_inputs]
+        return RunFailed(FailureCode.NO_ANSWER, f"not ready after {limit_s:.0f} s: {self._unready(missing_inputs)}", *silent)
+
+    def _unready(self, missing_inputs: Mapping[str, list[str]]) -> str:
+        """Return a text for the services that have not answered or have an input without a sender."""
+        silent = [role for role in self._roles if role not in missing_inputs]
         texts = [f"no answer from {', '.join(silent)}"] if silent else []
         texts += [f"{role} receives nothing on {', '.join(keys)}" for role, keys in missing_inputs.items() if keys]
-        return RunFailed(FailureCode.NO_ANSWER, f"not ready after {limit_s:.0f} s: {'; '.join(texts)}", *silent)
+        return "; ".join(texts)
 
     def _not_in_run(self, name: str) -> bool:
         """True if `name` is a topic whose producer has no part in this run."""
@@ -292,6 +300,11 @@ class Conductor:
     def _extend_grant(self) -> None:
         if self.grants.paused:
             self.watchdog.restart()
+            self._notify_once([f"paused by an operator: waiting for palpate resume, {self._patience.pause:g} s at most"])
+            if self.grants.paused_s > self._patience.pause:
+                raise RunFailed(FailureCode.STOPPED, f"paused for {self._patience.pause:g} s without palpate resume")
+        if self.grants.exam_silent_s > self._patience.quiet:
+            self._notify_once([f"waiting for exam/state of planning, {EXAM_SILENT_S:g} s at most"])
         collected = self._collector.collected
         records = "recorder" in self._observers and "recorder" not in self.outcome.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
@@ -314,7 +327,8 @@ class Conductor:
             role, text = self.watchdog.culprit(roles)
             raise RunFailed(FailureCode.BLOCKED, f"{role} blocks the run for {stalled:.0f} s: {text}", role)
         if stalled > self._patience.soft and not self._warned:
-            log.warning("no tick for %.0f s, still waiting: %s", stalled, self.watchdog.culprit(roles)[1])
+            limit = f"{self._patience.hard:.0f} s at most"
+            self._notify(f"no tick for {stalled:.0f} s, waiting {limit}: {self.watchdog.culprit(roles)[1]}")
         self._warned = stalled > self._patience.soft
 
     # -- lost services
@@ -401,10 +415,10 @@ class Conductor:
         self.outcome.reports[role] = detail
         self.outcome.digests.update(detail.get("digests", {}))
 
-    def _end(self, exited: Callable[[], Mapping[str, str]]) -> None:
+    def _end(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Let the observers take in what is left and close their files."""
         waiting = set(self._observers) - self.outcome.lost.keys()
-        begin = monotonic()
+        begin, warned = monotonic(), False
         self._send(RunControl.END)
         while waiting and monotonic() - begin < TUNING.observers_finish_s:
             self._heartbeat.loop_turned()
@@ -419,6 +433,11 @@ class Conductor:
             for role in waiting & ended.keys():
                 self._notify(f"{role} exited while closing: {ended[role]}")
             waiting -= ended.keys()
+            if waiting and not warned and monotonic() - begin > self._patience.quiet:
+                limit = f"{TUNING.observers_finish_s:.0f} s at most"
+                self._notify(f"waiting for {', '.join(sorted(waiting))} to close the files, {limit}")
+                tell(self)
+                warned = True
         for role in waiting:
             self._notify(f"{role} did not finish within {TUNING.observers_finish_s:.0f} s")
 
@@ -446,7 +465,7 @@ def conduct(
     def report(c: Conductor) -> None:
         wall = max(c.elapsed_s, 1e-9)
         t = max(collector.collected.exam_time, 0)
-        tell(RunProgress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble), c.request))
+        tell(RunProgress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble), c.request if c.elapsed_s else None))
 
     try:
         with rare_collections():

@@ -40,13 +40,13 @@ class Grants:
         self.last = False
         """True if the run ends there."""
         self.paused = False
-        self._at = self._paced_since = self._exam_at = 0.0
+        self._at = self._paced_since = self._exam_at = self._paused_at = 0.0
         self._paced_from = 0
         self._exam = NEVER
 
     def begin(self) -> None:
         """Send the first grant."""
-        self._paced_since = monotonic()
+        self._paced_since = self._exam_at = monotonic()
         self.grant(time_ns() + WALLCLOCK_LEAD if self._wallclock else WINDOW - MS)
 
     def grant(self, tick: int, last: bool = False) -> None:
@@ -93,9 +93,19 @@ class Grants:
         self._repeat()
         if exam != self._exam:
             self._exam, self._exam_at = exam, monotonic()
-        elif not self.last and self._exam_at and monotonic() - self._exam_at > EXAM_SILENT_S:
-            text = f"planning has sent nothing on exam/state since {exam / NS:.3f} s, for {EXAM_SILENT_S:.0f} s"
+        elif self.exam_silent_s > EXAM_SILENT_S:
+            text = f"planning has sent nothing on exam/state since {max(exam, 0) / NS:.3f} s, for {EXAM_SILENT_S:.0f} s"
             raise RunFailed(FailureCode.EXAM_SILENT, text, "planning", topics=("exam/state",))
+
+    @property
+    def exam_silent_s(self) -> float:
+        """Time without a new exam state in wall-clock mode [s]; 0 in lockstep, where time then stands still, and at the end."""
+        return 0.0 if self.last or not self._wallclock else monotonic() - self._exam_at
+
+    @property
+    def paused_s(self) -> float:
+        """Time for which the run has been paused [s]; a step begins it again."""
+        return monotonic() - self._paused_at if self.paused else 0.0
 
     def _repeat(self) -> None:
         """Send the newest grant again every `REGRANT_S`, for services that join late and as a sign of life."""
@@ -114,6 +124,7 @@ class Grants:
         if request not in TIME_REQUESTS:
             raise UserError(f"{request}: want one of {', '.join(TIME_REQUESTS)}")
         if request == "pause":
+            self._paused_at = self._paused_at if self.paused else monotonic()
             self.paused = True
         elif not self.paused:
             raise UserError("the run is not paused")
@@ -124,5 +135,6 @@ class Grants:
         elif not 0 < ms <= WINDOW // MS:
             raise UserError(f"step of {ms} ms: allowed are 1 to {WINDOW // MS} ms")
         else:
+            self._paused_at = monotonic()
             self.grant(self.horizon + ms * MS)
         return f"pauses at {(self.horizon + MS) / NS:.3f} s"

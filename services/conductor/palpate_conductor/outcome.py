@@ -52,10 +52,10 @@ class Patience:
 
     start: float = 300.0
     """Until every service answers on every edge; the first run after an installation compiles."""
-    quiet_start: float = 15.0
-    """Until the services that have not answered yet are listed, once."""
+    quiet: float = 5.0
+    """Until a wait is explained on the console: for services that start, a pause, or files that are written."""
     soft: float = 5.0
-    """Without a finished tick: a warning names the blocking service."""
+    """Without a finished tick: a message names the blocking service."""
     hard: float = 120.0
     """Without a finished tick: the run ends."""
     foreign: frozenset[str] = frozenset()
@@ -68,6 +68,8 @@ class Patience:
     """Until the service of a stopped process counts as lost."""
     asleep: float = 15.0
     """The same for a process that sleeps and uses no processor time; longer than zenoh blocks a sender on a reader that left."""
+    pause: float = 3600.0
+    """Until a run that an operator has paused ends."""
     absent: tuple[str, ...] = ()
     """Roles that the user starts."""
     join: float = 300.0

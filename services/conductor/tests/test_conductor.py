@@ -5,8 +5,10 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
+import tempfile
 import tracemalloc
 from collections.abc import Callable
+from time import sleep
 from types import SimpleNamespace
 from typing import Any
 
@@ -16,14 +18,16 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import IndentationTruth, Point, SupervisorState, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.failure import FailureCode
+from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
-from palpate_conductor import heartbeat
-from palpate_conductor.collector import KeptMessages
+from palpate_conductor import grants, heartbeat
+from palpate_conductor.collector import Collector, KeptMessages
+from palpate_conductor.conductor import Conductor
 from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, failure_of
+from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of
 from palpate_conductor.watchdog import FreezeWatch, RunWatchdog
 from palpate_errors import UserError
 
@@ -60,6 +64,38 @@ def test_kept_messages_take_less_than_a_quarter_of_the_memory() -> None:
 
     decoded: list[Any] = []
     assert taken(KeptMessages(TOPIC).extend) < taken(decoded.extend) / 4
+
+
+def test_a_pause_has_a_bound_and_is_named() -> None:
+    with tempfile.TemporaryDirectory(prefix="pause-") as folder:
+        session = open_session(BusOptions(listen=(f"unixsock-stream/{folder}/conductor",)))
+        try:
+            conductor = Conductor(session, contract(), 0, ("control",), Collector(), Patience(pause=0.3))
+            conductor.grants.begin()
+            conductor.grants.pace("pause", 0)
+            conductor._extend_grant()
+            assert any("palpate resume" in text for text in conductor.outcome.trouble)
+            sleep(0.2)
+            conductor.grants.pace("pause", 0)  # counts on
+            sleep(0.2)
+            with pytest.raises(RunFailed) as failed:
+                conductor._extend_grant()
+            assert failed.value.failure.code is FailureCode.STOPPED
+            conductor.grants.pace("resume", 0)
+            conductor._extend_grant()
+        finally:
+            close_session(session)
+
+
+def test_a_planning_that_never_sends_a_state_is_awaited_for_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(grants, "EXAM_SILENT_S", 0.1)
+    awaited = grants.Grants(lambda tick, last: None, Timing(wallclock=True))
+    awaited.begin()
+    awaited.extend(NEVER, None, None)
+    sleep(0.2)
+    with pytest.raises(RunFailed) as failed:
+        awaited.extend(NEVER, None, None)
+    assert failed.value.failure.code is FailureCode.EXAM_SILENT
 
 
 # -- heartbeat and frozen processes

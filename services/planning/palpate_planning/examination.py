@@ -21,13 +21,14 @@ from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
-from palpate_planning.status import PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
 from palpate_planning.strokes.requests import PLANNING_TIME, PressPlanner, PressRequest
 from palpate_planning.strokes.segments import Segment
+from palpate_planning.waits import FOR_FINDINGS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT
 from palpate_planning.wall.wall import Wall, plane
 
 
@@ -167,6 +168,8 @@ class ExaminationSequence:
         self._planning: BackgroundTask[ExamPlan] | None = None
         self._skipped: dict[int, Cause] = {}
         self._started = False
+        self._began: int | None = None
+        """Time of the first step [ns]."""
         self._averaged: Array | None = None
         """Height of the wall above the surface's vertices in the mean of the images since the view [m]."""
         self._phases: dict[Phase, Callable[[Observation, ExamStep], Setpoint | None]] = {
@@ -194,13 +197,16 @@ class ExaminationSequence:
         """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
         course, status = self._course, self.status
         course.rate = self._restart.step(now.t)
+        self._began = now.t if self._began is None else self._began
         if now.reading is None:
             q = np.array(lbr.HOME)
+            self._await_robot(now.t, self._began)
             return ExamStep(None, setpoint=joint_setpoint(now.t, self._kinematics.pose(q), q, stiffness=NO_STIFFNESS))
         if not self._started:
             self._started = True
             course.arm.hold(now.reading.q)
-            course.enter(Phase.HOME, now.t, "going home")
+            if status.phase not in OVER:
+                course.enter(Phase.HOME, now.t, "going home")
         if now.averaged is not None:
             self._averaged = now.averaged
         self._requested.receive(now.request)
@@ -213,7 +219,30 @@ class ExaminationSequence:
         step = ExamStep(course.contact)
         phase = self._phases.get(status.phase, _stay)
         step.setpoint = phase(now, step) or course.arm.step(now.t, course.rate)
+        self._await_plan(now.t)
         return step
+
+    # --- waits --------------------------------------------------------------------------------------------------------
+
+    def _await_robot(self, t: int, began: int) -> None:
+        """Report that the robot is awaited since `began` [ns], and abort after a time."""
+        status, waited_s = self.status, (t - began) / SECOND
+        if status.phase in OVER or waited_s < WAIT.reported_s:
+            return
+        status.cause, status.message = FOR_ROBOT.cause, FOR_ROBOT.cause.text
+        if waited_s > WAIT.limit_s:
+            self._course.enter(Phase.ABORTED, t, f"aborted before the robot was ready: {FOR_ROBOT.end.text}", FOR_ROBOT.end)
+
+    def _await_plan(self, t: int) -> None:
+        """Report that the motion planner is awaited: in wall-clock mode it may take long."""
+        status, task = self.status, self._planning if self.status.phase is Phase.PLAN else None
+        since = self._course.arm.planning_since if task is None else task.begun
+        if status.phase in OVER:
+            return
+        if since is not None and t - since >= WAIT.reported_s * SECOND:
+            status.cause, status.message = FOR_PLAN.cause, FOR_PLAN.cause.text
+        elif status.cause.reason is FOR_PLAN.cause.reason:
+            status.cause, status.message = NO_CAUSE, "moving"
 
     # --- before contact -----------------------------------------------------------------------------------------------
 
@@ -238,7 +267,10 @@ class ExaminationSequence:
                     course.since = now.t
                 elif now.t - course.since >= EXAM.rest_ns:
                     out.trigger, views.asked = True, now.t
-                    self.status.cause, self.status.message = NO_CAUSE, f"looking: {frames} frames"
+                    self.status.cause, self.status.message = (
+                        FOR_PERCEPTION,
+                        f"looking: {frames} frames, which perception evaluates",
+                    )
             except NoPathError as error:
                 self._look_again(now, out, Cause(Reason.VIEW_UNREACHABLE, f"look posture cannot be reached: {error}"))
         elif isinstance(now.perceived, PerceivedAbdomen):
@@ -314,6 +346,9 @@ class ExaminationSequence:
             course.arm.start(plan.approach)
             self.status.targets_skipped = len(self._skipped)
             course.enter(Phase.APPROACH, now.t, plan.skipped_text() or "approaching the first target")
+        elif self._planning.late(now.t):
+            self._planning = None
+            self._give_up(now, out, FOR_PLAN.end)
 
     def _approach(self, now: Observation, out: ExamStep) -> Setpoint | None:
         course, known = self._course, self._known
@@ -362,7 +397,7 @@ class ExaminationSequence:
         status.steady, status.force_limited, status.depth_setpoint = step.steady, step.limited, step.depth_setpoint
         status.target_index = self._requested.done if self._known.exam.searched else step.target
         status.targets_skipped = len(self._skipped)
-        cause = palpation.failed or palpation.left
+        cause = palpation.failed or palpation.left or palpation.waits
         self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause)
 
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
@@ -384,6 +419,8 @@ class ExaminationSequence:
         else:
             self._correct(out)
             course.go_home(now, palpation.failed)
+            if cause and not palpation.failed:
+                self.status.cause, self.status.message = cause, f"returning home: {cause.text}"
 
     def _correct(self, out: ExamStep) -> None:
         """Publish the final surface correction, unless the patient moved."""
@@ -409,7 +446,7 @@ class ExaminationSequence:
         if course.failure:
             course.abort(now, course.failure)
         else:
-            course.enter(Phase.ASSESS, now.t, "waiting for the findings")
+            course.enter(Phase.ASSESS, now.t, FOR_FINDINGS.text, FOR_FINDINGS)
 
     def _assess(self, now: Observation, out: ExamStep) -> None:
         if now.findings_final:

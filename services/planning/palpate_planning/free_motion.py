@@ -16,10 +16,12 @@ import numpy as np
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import JointTrajectory
-from palpate_planning.periods import MS
+from palpate_planning.periods import MS, SECOND
 from palpate_planning.setpoints import joint_setpoint
 from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
+from palpate_planning.waits import FOR_PLAN, WAIT
 
 T = TypeVar("T")
 
@@ -31,13 +33,17 @@ class BackgroundTask(Generic[T]):
     """A task on the worker: started at `t` [ns], used at `t + duration`. `work` must share no state with the steps."""
 
     def __init__(self, t: int, duration: int, work: Callable[[], T], *, lockstep: bool = True) -> None:
-        self._due = t + duration
+        self.begun, self._due = t, t + duration
         self._lockstep = lockstep
         self._future: Future[T] = WORKER.submit(work)
 
     def due(self, t: int) -> bool:
         """Return True if the result is to be used at `t` [ns]."""
         return t >= self._due and (self._lockstep or self._future.done())
+
+    def late(self, t: int) -> bool:
+        """Return True if the result is not awaited any longer at `t` [ns]."""
+        return t - self._due > WAIT.limit_s * SECOND
 
     def result(self) -> T:
         """Return the result, or raise the exception of the work; waits for it."""
@@ -125,7 +131,14 @@ class FreeMotion:
         elif self._task.due(t):
             task, self._task = self._task, None
             self._follower.start(task.result())
+        elif self._task.late(t):
+            raise NoPathError(FOR_PLAN.end.text)
         return False
+
+    @property
+    def planning_since(self) -> int | None:
+        """Since when a motion is being planned [ns], if one is."""
+        return None if self._task is None else self._task.begun
 
     def step(self, t: int, rate: float) -> Setpoint:
         """Return the set-point at `t` [ns]; see `TrajectoryFollower.step`."""

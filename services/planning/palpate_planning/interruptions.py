@@ -27,8 +27,6 @@ class WallTuning:
 
     calm_s: float = 1.0
     """After a cough or a deep breath the skin is left alone until the wall has been tracked for this time."""
-    calm_timeout_s: float = 60.0
-    """The strokes end if the wall cannot be tracked for this time."""
     hidden_timeout_s: float = 5.0
     """The arm leaves if it hides the wall for this time; a deep breath or a cough, which also hides it, is shorter."""
     contact_lost_s: float = 0.3
@@ -68,8 +66,7 @@ class WallWatch:
     def __init__(self, breath: Breath, following: Following, period_s: float) -> None:
         self._breath, self._gated = breath, following is Following.GATE
         self._tracked = Duration(period_s, WALL.calm_s)
-        self._not_calm, self._contact_lost = Duration(period_s), Duration(period_s)
-        self._occluded, self._gate_closed = Duration(period_s), Duration(period_s)
+        self._contact_lost, self._occluded, self._gate_closed = Duration(period_s), Duration(period_s), Duration(period_s)
         self._losses = 0
         self.spoiled = False
         """True if present samples are invalid: the indenter has to lift off."""
@@ -99,7 +96,6 @@ class WallWatch:
         tracked = breath.calm(t)
         calm = self._gate_closed.update(not self.open) <= WALL.gate_closed_max_s and tracked
         self._tracked.update(calm)
-        self._not_calm.update(not self.calm)
         self._occluded.update(breath.hidden and not tracked and not on_free_motion)
         lost = self._contact_lost.update(contact_lost) > WALL.contact_lost_s
         if lost:
@@ -110,8 +106,6 @@ class WallWatch:
         self.moved = self.moved or breath.moved
         if self.moved:
             self.ended = MOVED
-        elif self._not_calm.s > WALL.calm_timeout_s:
-            self.ended = Cause(Reason.WALL_NOT_TRACKED, f"the wall could not be tracked for {WALL.calm_timeout_s:g} s")
         elif self._losses >= WALL.contact_losses_max:
             self.ended = Cause(Reason.CONTACT_LOST, f"contact was lost {self._losses} times")
 

@@ -18,7 +18,6 @@ from palpate_planning.stroke import (
     PUSHING,
     STROKE,
     Descent,
-    Duration,
     Stages,
     StrokeInput,
     StrokeStage,
@@ -32,6 +31,7 @@ from palpate_planning.stroke import (
 )
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.segments import SEGMENTS, STRETCHED, Segment
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_REQUEST, FOR_WALL, StrokeWaits, Wait
 from palpate_planning.wall.wall import PublishedTouch, Wall
 
 
@@ -39,8 +39,6 @@ from palpate_planning.wall.wall import PublishedTouch, Wall
 class PalpationTuning:
     """Tuning of repeated and requested strokes."""
 
-    request_timeout_s: float = 60.0
-    """The arm waits this long to be asked for the next stroke."""
     unnoticed_m: float = 0.03
     """Path length discarded before detected patient motion [m]; detection takes about 1 s."""
     repeat_m: float = 0.010
@@ -112,6 +110,7 @@ class Palpation:
         self._descent = Descent(self._motion, exam.depth_m, strokes)
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
         self._recovery = Recovery(exam, limits, period_s)
+        self._waits, self._strokes_before = StrokeWaits(period_s), strokes
         self.ahead: frozenset[int] = frozenset()
         """The targets that are left when the strokes end early."""
         self.bend_needed = 0.0
@@ -139,6 +138,11 @@ class Palpation:
     def left(self) -> Cause:
         """Cause of an early end without failure."""
         return self._recovery.left
+
+    @property
+    def waits(self) -> Cause:
+        """What the arm waits for, once it has waited for some seconds."""
+        return self._waits.reported
 
     @property
     def moved(self) -> bool:
@@ -226,6 +230,7 @@ class Palpation:
         self._check_force(contact)
         self._check_elbow(contact)
         self._check_wall(t, contact)
+        self._check_waits()
         self.stage = self._stages.send(
             StrokeInput(
                 t,
@@ -238,6 +243,8 @@ class Palpation:
                 rate=rate,
             )
         )
+        if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and motion.segment.touch):
+            self._waits.reach(self._number, motion.along.position, at_depth=not motion.segment.touch)
         in_contact = contact.touching and self.stage is not StrokeStage.LIFT
         motion.regulate(contact, in_contact=in_contact, pushing=self.stage in PUSHING)
         return self._report(t, contact, rate)
@@ -266,13 +273,9 @@ class Palpation:
 
     def _wait(self) -> Stages[bool]:
         """Wait above the skin; return True if a further segment follows."""
-        waited = Duration(self._motion.period_s)
         while True:
             now = yield StrokeStage.WAIT
             self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
-            if waited.update(True) > TUNING.request_timeout_s:
-                text = f"no further stroke was requested within {TUNING.request_timeout_s:g} s"
-                self._recovery.left = Cause(Reason.NO_REQUEST, text, "search")
             if self._recovery.ending:
                 return False
             if not now.paused and (len(self._segments) > self._number + 1 or not self._more):
@@ -365,6 +368,31 @@ class Palpation:
             self._interrupt()
         elif self._watch.leaps:
             self._rise()
+
+    def _check_waits(self) -> None:
+        """End strokes that wait for too long: without failure if tissue has been measured."""
+        end = self._waits.step(self._awaited())
+        if not end:
+            return
+        if end.reason is Reason.NO_REQUEST:
+            self._recovery.left = end
+        elif end.reason is Reason.ARM_DISPLACED or not (self._waits.pressed or self._strokes_before):
+            self.abandon(end)
+        else:
+            self.leave(end)
+
+    def _awaited(self) -> Wait | None:
+        """Return what the arm waits for. A pause is not counted here: its stop has a bound."""
+        stage, open_gate = self.stage, self._watch.open
+        if self._recovery.paused or self._recovery.ending:
+            return None
+        if stage is StrokeStage.WAIT:
+            return FOR_REQUEST
+        if stage in (StrokeStage.REST, StrokeStage.LIFT) and not self._watch.calm:
+            return FOR_WALL if open_gate else FOR_BREATH
+        if stage in (StrokeStage.REST, StrokeStage.LIFT, StrokeStage.TRANSFER) and self._recovery.displacement is not None:
+            return FOR_ARM
+        return FOR_BREATH if stage in (StrokeStage.SLIDE, StrokeStage.HOLD) and not open_gate else None
 
     def _rise(self) -> None:
         """Lift from low above the skin to where a sudden motion of the wall does not reach."""

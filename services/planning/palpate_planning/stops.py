@@ -73,11 +73,15 @@ class Stops:
     """
 
     def __init__(self, course: ExamCourse, patience_s: float) -> None:
-        """A stop that is not released within `patience_s` ends the examination."""
+        """An examination that is stopped for `patience_s` at one place, once or several times, ends."""
         self._course = course
         self._patience_s = patience_s
         self._soft = False
         """True if planning has moved the arm since the stop began."""
+        self._place: tuple[int, Phase | None] = (0, None)
+        """Where the examination was stopped last: target, and phase outside of the strokes."""
+        self._stopped_ns = self._counted = 0
+        """Time for which it was stopped there, and the time up to which that counts."""
         self._resuming = False
         """True if the stop was released and the arm returns to where it was."""
 
@@ -97,13 +101,15 @@ class Stops:
     def step(self, now: Observation) -> Setpoint | None:
         """Advance a held examination; return None where the arm's free motion or rest gives the set-point."""
         course = self._course
+        passed, self._counted = now.t - self._counted, now.t
         if not now.stop:
             self._resume(now)
             return None
         if self._resuming:
             self._hold(now)
         self._soft = self._soft and now.soft
-        if now.t - course.since > self._patience_s * SECOND:
+        self._stopped_ns += passed
+        if self._stopped_ns > self._patience_s * SECOND:
             text = f"the stop was not released within {self._patience_s:g} s: {now.stop.text}"
             course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.culprit))
         elif not self._soft:
@@ -118,6 +124,9 @@ class Stops:
         assert now.reading is not None
         course = self._course
         self._soft, self._resuming = now.soft, False
+        place = (course.status.target_index, None if course.interrupted in PALPATING else course.interrupted)
+        self._stopped_ns = self._stopped_ns if place == self._place else 0  # a stop that returns at once waits no longer for it
+        self._place, self._counted = place, now.t
         course.arm.hold(now.reading.q)
         course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop)
         if (palpation := self._palpation) is not None:

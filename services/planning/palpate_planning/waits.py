@@ -1,0 +1,108 @@
+"""Waits of the examination: for what, from when on they are reported, and when they end."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final, NamedTuple
+
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+
+
+@dataclass(frozen=True)
+class WaitTuning:
+    """Time limits of the waits."""
+
+    reported_s: float = 5.0
+    """A wait that lasts this long is the reason in `exam/state`."""
+    limit_s: float = 60.0
+    """Longest wait: all of it counts, however often it was interrupted, until the strokes make progress."""
+    progress_m: float = 0.005
+    """A slide that advances by this path length makes progress."""
+
+
+WAIT: Final = WaitTuning()
+
+
+class Wait(NamedTuple):
+    """What is awaited, and the cause of an end if it does not come."""
+
+    cause: Cause
+    end: Cause
+
+
+def _wait(reason: Reason, text: str, end: Reason, why: str, culprit: str = "") -> Wait:
+    limit = f"{WAIT.limit_s:g} s"
+    return Wait(Cause(reason, f"{text}, {limit} at most", culprit), Cause(end, f"{why} ({limit} of waiting)", culprit))
+
+
+FOR_WALL: Final = _wait(
+    Reason.WAITS_FOR_WALL,
+    "waiting above the skin: the wall is not tracked",
+    Reason.WALL_NOT_TRACKED,
+    "the wall could not be tracked",
+)
+FOR_BREATH: Final = _wait(
+    Reason.WAITS_FOR_BREATH,
+    "waiting for the end of expiration: the breath's gate is closed",
+    Reason.WALL_NOT_TRACKED,
+    "the breath did not reach the end of expiration for long enough",
+)
+FOR_ARM: Final = _wait(
+    Reason.WAITS_FOR_ARM,
+    "waiting for the arm, which was pushed aside, to return to its path",
+    Reason.ARM_DISPLACED,
+    "the arm did not return to its path",
+)
+FOR_REQUEST: Final = _wait(
+    Reason.WAITS_FOR_REQUEST,
+    "waiting above the skin: the search has not requested the next press",
+    Reason.NO_REQUEST,
+    "the search did not request a press that can be carried out",
+    "search",
+)
+FOR_ROBOT: Final = _wait(
+    Reason.WAITS_FOR_ROBOT,
+    "waiting for the robot: no usable robot/status",
+    Reason.ROBOT_NOT_READY,
+    "no usable robot/status",
+    "robot/status",
+)
+FOR_PLAN: Final = _wait(
+    Reason.WAITS_FOR_PLAN,
+    "waiting for the motion planner",
+    Reason.NO_PATH,
+    "the motion planner did not finish",
+)
+FOR_PERCEPTION: Final = Cause(Reason.WAITS_FOR_PERCEPTION, "waiting for the surface and the targets", "perception")
+FOR_FINDINGS: Final = Cause(Reason.WAITS_FOR_FINDINGS, "waiting for the findings", "assessment")
+
+
+class StrokeWaits:
+    """Counts the time in which the arm waits since the strokes last made progress."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._waited_s: dict[Wait, float] = {}
+        self._segment, self._position = -1, 0.0
+        """The furthest place reached: number of the segment and path length [m]."""
+        self.pressed = False
+        """True if a stroke has reached its depth."""
+        self.reported = NO_CAUSE
+        """The present wait, once the arm has waited for long enough to say so."""
+
+    def reach(self, segment: int, position: float, *, at_depth: bool) -> None:
+        """A stroke touches the skin or slides; it makes progress if it was not as far before."""
+        self.pressed = self.pressed or at_depth
+        if segment > self._segment or position >= self._position + WAIT.progress_m:
+            self._segment, self._position = segment, position
+            self._waited_s.clear()
+
+    def step(self, wait: Wait | None) -> Cause:
+        """Count a period that waits for `wait`, if anything; return why the strokes end, if they do."""
+        self.reported = NO_CAUSE
+        if wait is None:
+            return NO_CAUSE
+        waited_s = self._waited_s[wait] = self._waited_s.get(wait, 0.0) + self._period_s
+        if sum(self._waited_s.values()) >= WAIT.reported_s:
+            self.reported = wait.cause
+        return wait.end if waited_s > WAIT.limit_s else NO_CAUSE

@@ -1,0 +1,178 @@
+"""Tests of the waits: each says for what within some seconds, and ends within a bound that counts all of it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from planning_fakes import BASE, PERIODS, World, known
+
+from palpate_models.scenario.schema import ExamInput
+from palpate_planning import waits
+from palpate_planning.examination import ExaminationSequence
+from palpate_planning.free_motion import BackgroundTask
+from palpate_planning.periods import SECOND
+from palpate_planning.reasons import NO_CAUSE, Cause, Reason
+from palpate_planning.status import OVER, Observation, Phase
+from palpate_planning.stroke import StrokeStage
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_WALL, WAIT, StrokeWaits
+
+SMALL = {"region_m": (0.025, 0.0125)}
+STILL_RAD = 1e-6
+
+
+class Watched(World):
+    """A closed loop that fails where the arm rests for longer than a wait may without a reason."""
+
+    def __init__(self, settings: ExamInput, excursion: Callable[[float], float] | None = None) -> None:
+        super().__init__(settings, excursion=excursion)
+        self.reasons: dict[Reason, float] = {}
+        """First time of each reason [s]."""
+        self._q_rest, self._since = self.q, 0
+
+    def watch(self, each: Callable[[float], None] = lambda t: None, seconds: float = 300.0) -> None:
+        """Run to the end; `each` sets the inputs at a time [s]."""
+        while self.exam.status.end_tick < 0:
+            assert self.t < seconds * SECOND, f"waits without end: {self.exam.status}"
+            each(self.t / SECOND)
+            self.step()
+            reason = self.exam.status.cause.reason
+            self.reasons.setdefault(reason, self.t / SECOND)
+            if np.abs(self.q - self._q_rest).max() > STILL_RAD or reason is not Reason.NONE:
+                self._q_rest, self._since = self.q, self.t
+            assert self.t - self._since < (WAIT.reported_s + 1.0) * SECOND, f"waits without a reason: {self.exam.status}"
+
+
+def reached(world: World, stage: StrokeStage, stroke: int) -> float:
+    """Run to a stage of a stroke; return the time [s]."""
+    status = world.exam.status
+    world.run(lambda: status.stroke >= stroke and status.message == stage.value)
+    return world.t / SECOND
+
+
+@pytest.fixture
+def limit_s(monkeypatch: pytest.MonkeyPatch) -> float:
+    """Make the waits of strokes end early, to save time; return the limit."""
+    short = replace(WAIT, limit_s=20.0)
+    monkeypatch.setattr(waits, "WAIT", short)
+    return short.limit_s
+
+
+@pytest.mark.parametrize(("calm_s", "every_s"), [(0.7, 1.9), (1.2, 10.0), (2.0, 10.0)])
+def test_a_wall_that_is_calm_for_a_moment_ends_within_the_bound(calm_s: float, every_s: float, limit_s: float) -> None:
+    world = Watched(known(**SMALL), excursion=lambda t: 0.0)
+    began = reached(world, StrokeStage.REST, 0)
+
+    def flicker(t: float) -> None:
+        world.calm = (t - began) % every_s >= every_s - calm_s
+
+    world.watch(flicker)
+    assert world.exam.status.cause.reason is Reason.WALL_NOT_TRACKED, world.exam.status.message
+    assert world.exam.status.phase is Phase.ABORTED, "no tissue was measured"
+    assert world.reasons[Reason.WAITS_FOR_WALL] - began < WAIT.reported_s + 2.0
+    assert world.t / SECOND - began < limit_s * (1.0 + calm_s / (every_s - calm_s)) + 15.0
+
+
+@pytest.mark.usefixtures("limit_s")
+def test_what_was_measured_is_assessed_where_the_wall_is_lost_later() -> None:
+    world = Watched(known(**SMALL), excursion=lambda t: 0.0)
+    reached(world, StrokeStage.SLIDE, 2)
+    for _ in range(100):
+        world.step()
+    world.calm = False
+    world.watch()
+    assert Reason.WAITS_FOR_WALL in world.reasons
+    assert Reason.WALL_NOT_TRACKED in world.reasons
+    assert world.exam.status.phase is Phase.DONE
+    assert world.exam.status.targets_skipped > 0
+
+
+@pytest.mark.usefixtures("limit_s")
+def test_a_breath_that_stays_in_is_named() -> None:
+    lost = 1e9
+    world = Watched(known(breathing="gate", **SMALL), excursion=lambda t: 0.0 if t < lost else 0.004)
+    lost = reached(world, StrokeStage.SLIDE, 2)
+    world.watch()
+    assert world.reasons[Reason.WAITS_FOR_BREATH] - lost < WAIT.reported_s + 1.0
+    assert world.exam.status.phase in OVER
+
+
+def test_a_search_without_requests_ends_the_strokes(limit_s: float) -> None:
+    world = Watched(known(pattern="search", **SMALL))
+    began = reached(world, StrokeStage.WAIT, 1)
+    world.watch()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.reasons[Reason.WAITS_FOR_REQUEST] - began < WAIT.reported_s + 0.1
+    assert Reason.NO_REQUEST in world.reasons
+    assert world.t / SECOND - began < limit_s + 15.0
+
+
+def test_a_silent_perception_is_named_at_once() -> None:
+    world = Watched(known(**SMALL))
+
+    def silence(_: float) -> None:
+        world._answer_at = None
+
+    world.watch(silence)
+    assert Reason.WAITS_FOR_PERCEPTION in world.reasons
+    assert world.exam.status.cause.reason is Reason.VIEW_TIMEOUT
+
+
+def test_the_findings_are_named() -> None:
+    world = Watched(known(**SMALL))
+    world.watch()
+    assert Reason.WAITS_FOR_FINDINGS in world.reasons
+    assert world.exam.status.phase is Phase.DONE
+
+
+def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:
+    exam = ExaminationSequence(known(BASE, **SMALL), PERIODS)
+    reasons = {}
+    for k in range(round(2 * WAIT.limit_s)):
+        exam.step(Observation(7 * SECOND + k * SECOND, None))
+        reasons[k] = exam.status.cause.reason
+    assert reasons[4] is Reason.NONE
+    assert reasons[5] is Reason.WAITS_FOR_ROBOT
+    assert exam.status.phase is Phase.ABORTED
+    assert exam.status.cause.reason is Reason.ROBOT_NOT_READY
+    assert exam.status.end_tick < (7 + WAIT.limit_s + 3) * SECOND
+
+
+@pytest.mark.parametrize("phase", [Phase.HOME, Phase.SCAN], ids=lambda phase: phase.name)
+def test_a_stop_that_returns_again_and_again_ends_the_examination(phase: Phase) -> None:
+    settings = known(**SMALL)
+    world = Watched(settings)
+    world.q = world.q + np.array([0.2, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    world.run(lambda: world.exam.status.phase is phase)
+    patience_s, began = settings.limits.release_patience_s, world.t / SECOND
+
+    def flicker(t: float) -> None:
+        released = (t - began) % (0.4 * patience_s) < 0.02
+        world.stop = NO_CAUSE if released else Cause(Reason.ROBOT_HOLD, "hold", "robot")
+
+    world.watch(flicker, seconds=began + 2 * patience_s)
+    assert world.exam.status.cause.reason is Reason.NOT_RELEASED
+    assert world.t / SECOND - began < 1.1 * patience_s
+
+
+def test_a_slow_planner_is_not_awaited_for_ever() -> None:
+    task = BackgroundTask(0, SECOND, lambda: None, lockstep=False)
+    assert not task.late(SECOND + round(WAIT.limit_s * SECOND))
+    assert task.late(2 * SECOND + round(WAIT.limit_s * SECOND))
+
+
+def test_only_progress_begins_the_count_again() -> None:
+    counted, ends = StrokeWaits(1.0), []
+    counted.reach(1, 0.0, at_depth=True)
+    for k in range(200):
+        counted.reach(1, 0.9 * WAIT.progress_m * (k % 2), at_depth=True)
+        counted.step(None)
+        end = counted.step((FOR_WALL, FOR_ARM, FOR_BREATH)[k % 3])
+        assert bool(counted.reported) == (k + 1 >= WAIT.reported_s)
+        if end:
+            ends.append(k)
+    assert ends[0] == 3 * WAIT.limit_s
+    counted.reach(1, WAIT.progress_m, at_depth=True)
+    assert not counted.step(FOR_WALL)
