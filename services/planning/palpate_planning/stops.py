@@ -79,7 +79,7 @@ class Stops:
         self._soft = False
         """True if planning has moved the arm since the stop began."""
         self._place: tuple[int, Phase | None] = (0, None)
-        """Where the examination was stopped last: target, and phase outside of the strokes."""
+        """Where the examination was stopped last: number of the stroke, and the phase outside of strokes."""
         self._stopped_ns = self._counted = 0
         """Time for which it was stopped there, and the time up to which that counts."""
         self._resuming = False
@@ -110,7 +110,7 @@ class Stops:
         self._soft = self._soft and now.soft
         self._stopped_ns += passed
         if self._stopped_ns > self._patience_s * SECOND:
-            text = f"the stop was not released within {self._patience_s:g} s: {now.stop.text}"
+            text = f"the stop was not released within {self._patience_s:g} s of waiting: {now.stop.text}"
             course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.culprit))
         elif not self._soft:
             assert now.reading is not None
@@ -124,8 +124,8 @@ class Stops:
         assert now.reading is not None
         course = self._course
         self._soft, self._resuming = now.soft, False
-        place = (course.status.target_index, None if course.interrupted in PALPATING else course.interrupted)
-        self._stopped_ns = self._stopped_ns if place == self._place else 0  # a stop that returns at once waits no longer for it
+        place = (course.status.stroke, None if course.interrupted in PALPATING else course.interrupted)
+        self._stopped_ns = self._stopped_ns if place == self._place else 0
         self._place, self._counted = place, now.t
         course.arm.hold(now.reading.q)
         course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop)
