@@ -40,6 +40,8 @@ class LinkTimes:
     """Time without a message after which the conductor is lost before the run starts, or if it has no heartbeat."""
     awaited_s: float = 120.0
     """As `silent_s`, before the first message: containers on a busy machine start tens of seconds apart."""
+    quiet_s: float = 5.0
+    """Part of it after which the wait is said."""
     lockstep_silent_s: float = 3.0
     """As `silent_s`, in lockstep, where time does not advance without grants."""
     longest_poll_s: float = 0.1
@@ -90,6 +92,8 @@ class ConductorLink:
         self._polled = self._checked = self._lost_at = monotonic()
         self._missed = False
         """True if the conductor's token was missing at the last check."""
+        self._waits = False
+        """True if it has been said that the conductor is awaited."""
         self._pid = 0
         """The conductor's process id if we can inspect that process; else 0."""
         self.lost = ""
@@ -142,6 +146,9 @@ class ConductorLink:
             self._on_heartbeat(beat.payload)
             return
         self._silent_s += since
+        if self._silent_s > TIMES.quiet_s and self._patience_s == TIMES.awaited_s and not self._waits:
+            self._waits = True
+            log.warning("waiting for the conductor, %g s at most", TIMES.awaited_s)
         if self.lost or now - self._checked < TIMES.token_gone_s:
             return
         self._checked = now
