@@ -79,7 +79,7 @@ class Stops:
         self._soft = False
         """True if planning has moved the arm since the stop began."""
         self._place: tuple[int, Phase | None] = (0, None)
-        """Where the examination was stopped last: number of the stroke, and the phase outside of strokes."""
+        """Place of the latest stop: number of the stroke, and the phase outside of strokes."""
         self._stopped_ns = self._counted = 0
         """Time for which it was stopped there, and the time up to which that counts."""
         self._resuming = False

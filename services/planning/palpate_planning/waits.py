@@ -24,7 +24,7 @@ WAIT: Final = WaitTuning()
 
 
 class Wait(NamedTuple):
-    """What is awaited, and the cause of an end if it does not come."""
+    """A wait that is reported as a cause, and the cause of the end after it."""
 
     cause: Cause
     end: Cause
