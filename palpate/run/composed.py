@@ -178,9 +178,9 @@ class _Limits:
         """Return a text for a child that stays at its present place."""
         role = self._place.role or "the process of all services"
         doing = {
-            Stage.LOAD: f"still starting {role}; a first run compiles, which takes a minute or more",
-            Stage.STEP: f"waiting for {role} to finish its step at {self._place.t / NS:.3f} s",
-            Stage.FINISH: f"waiting for {role} to finish its files",
+            ChildStage.LOAD: f"still starting {role}; a first run compiles, which takes a minute or more",
+            ChildStage.STEP: f"waiting for {role} to finish its step at {self._place.t / NS:.3f} s",
+            ChildStage.FINISH: f"waiting for {role} to finish its files",
         }
         return f"{doing[self._place.stage]} ({self.limit_s():g} s at most)"
 

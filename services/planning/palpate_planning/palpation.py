@@ -141,7 +141,7 @@ class Palpation:
 
     @property
     def waits(self) -> Cause:
-        """What the arm waits for, once it has waited for some seconds."""
+        """The present wait as a cause, once it has lasted for some seconds."""
         return self._waits.reported
 
     @property
