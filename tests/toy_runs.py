@@ -59,7 +59,8 @@ def run_toys(
         router: if given, all processes are clients of it
     """
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
-        bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=("robot", "control", "tissue"))
+        loop = tuple(group[0] for group in groups if {"robot", "control", "tissue"}.issuperset(group))
+        bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=loop)
         if router:
             bus = dict.fromkeys(bus, BusOptions(mode="client", router=router))
         session = open_session(bus["conductor"])
