@@ -126,7 +126,8 @@ def test_ids_depend_on_what_is_in_a_file_and_not_on_where_it_is(tmp_path: Path, 
     for folder, text in (("a", "1"), ("b", "1"), ("c", "2")):
         path = tmp_path / folder / "mine.py"
         path.parent.mkdir()
-        path.write_text(f"def create(scenario): return {text}\nscan = next_press = create\n")
+        policy = f"def next_press(posterior, budget): return (0.0, 0.0), 0.00{text}"
+        path.write_text(f"def create(scenario): return {text}\nscan = create\n{policy}\n")
         settings = {"exam.pattern": "search"} if field == "search.policy" else {}
         found.append(cases_of(study(methods={"m": {"settings": {**settings, field: str(path)}}}))[0].case_id)
     assert found[0] == found[1] != found[2]

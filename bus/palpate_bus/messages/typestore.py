@@ -59,6 +59,10 @@ def _load_store() -> Any:
     for name, text in palpation_definitions().items():
         types.update(get_types_from_msg(text, name))
     store.register(types)
+    for name in types:  # rosbags replaces the classes' module at each registration: pickle would not find them there
+        kind = store.types[name]
+        kind.__module__ = __name__
+        globals()[kind.__name__] = kind
     return store
 
 
