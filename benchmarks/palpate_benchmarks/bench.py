@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 GROUPS = ("parts", "runs")
 WIDTH = 160
-"""Columns of the tables where the terminal has fewer, or the output is not a terminal."""
+"""Least width of the tables [characters], also where the output is not a terminal."""
 
 
 def bench(
@@ -58,7 +58,7 @@ def bench(
 
 
 def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out: Path, figures: dict[str, Any]) -> None:
-    """Adds the figures of the chosen groups; writes `out` after each."""
+    """Measure the cases of the chosen groups into `figures`; write `out` after each."""
     from palpate.report.files import write_text
 
     cases: list[tuple[str, str, Callable[[], dict[str, Any]]]] = []
@@ -73,7 +73,7 @@ def measure(scenario: Scenario, display: CaseDisplay, groups: Sequence[str], out
 
 
 def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:
-    """Return the ways to run the scenario: composed; distributed, with the 1 kHz loop in one process, and with observers."""
+    """Return a function for each way to run the scenario: composed or distributed, by processes and observers."""
     from palpate.run.composed import run_composed
     from palpate.run.distributed import run_distributed
     from palpate.run.group import placement
@@ -83,10 +83,10 @@ def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:
 
     def distributed(observers: tuple[str, ...], together: Sequence[str]) -> Callable[[], dict[str, Any]]:
         groups = placement((*workers(scenario), *observers), together, None)
-        return lambda: _figures(lambda out: run_distributed(scenario, out, lambda _: None, observers, groups=groups))
+        return lambda: _run_figures(lambda out: run_distributed(scenario, out, lambda _: None, observers, groups=groups))
 
     return {
-        "composed": lambda: _figures(lambda out: run_composed(scenario, out, lambda _: None, ())),
+        "composed": lambda: _run_figures(lambda out: run_composed(scenario, out, lambda _: None, ())),
         "distributed": distributed((), ()),
         "1 kHz loop in one process": distributed((), loop),
         "distributed, recorder and viewer": distributed(OBSERVERS, ()),
@@ -94,7 +94,7 @@ def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:
     }
 
 
-def _figures(run: Callable[[Path], RunResult]) -> dict[str, Any]:
+def _run_figures(run: Callable[[Path], RunResult]) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(prefix="palpate-bench-") as folder:
         result = run(Path(folder))
     if result.interrupted:

@@ -40,7 +40,7 @@ from palpate_planning.stroke import (
 )
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.coverage import strokes, transfer
-from palpate_planning.strokes.path import Ints, SurfacePath, lay
+from palpate_planning.strokes.path import Ints, SurfacePath, frames_along
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
 from palpate_planning.wall.surface import Foot, PerceivedSurface
@@ -210,7 +210,7 @@ class QuickExamination:
         return self._loop.uncertainty_m
 
     def _lay(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> SkinPath:
-        s, p, n, R = lay(self._believed, xy, _DOWN)
+        s, p, n, R = frames_along(self._believed, xy, _DOWN)
         visited: Ints = np.zeros(len(targets), dtype=np.int64) if visits is None else visits
         path = SurfacePath(s, p, n, R, np.zeros((len(s), 7)), targets, visited)
         count = max(1, round(path.length / _DENSE_M))

@@ -9,7 +9,7 @@ import tempfile
 from collections import deque
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final
@@ -46,7 +46,7 @@ from palpate_models.scenario.load import exam_input, seen, view_of
 from palpate_models.scenario.schema import Scenario
 
 FOLDER: Final = "resumed"
-"""Within the folder of the run that is continued."""
+"""Name of a continuation's folder, in the folder of the run that it continues."""
 RUNTIME: Final = "recovered"
 
 
@@ -61,7 +61,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
     run = interrupted_run(folder)
     note = ""
-    checkpoint, earlier = _before(folder.resolve())
+    checkpoint, earlier = _continued(folder.resolve())
     collected, recording = run.collected, run.recording
     if collected.findings is None or not collected.findings.final:
         try:
@@ -90,16 +90,15 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
 
 
 def _assess(run: InterruptedRun) -> None:
-    """Runs the assessment to its end on the recorded examination."""
+    """Run the assessment on the recorded examination, as if it had been aborted where the recording ends."""
     scenario, recording, collected = run.scenario, run.recording, run.collected
     exam = collected.exam
     if exam is None:
         return
     rules, row = contract(), contract().topics["exam/state"]
     end = tick_after(recording.last, "assessment")
-    exam.phase, phase = ExamState.PHASE_ABORTED, exam.phase
-    over = RecordedMessage(end, row.name, codec.encode(exam, row.type), len(collected.exam_states) + 1)
-    exam.phase = phase
+    aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
+    over = RecordedMessage(end, row.name, aborted, len(collected.exam_states) + 1)
     service = create("assessment", scenario.services.assessment, seen(scenario, view_of("assessment")))
     received = chain(inputs(recording, "assessment"), [over])
     for sent in rerun(service, rules, received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
@@ -124,7 +123,7 @@ class Resumption:
     def summary(self) -> str:
         """Text for the user: the run, its samples, its remaining targets."""
         left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
-        return f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples are there{left}"
+        return f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples recorded{left}"
 
 
 def resumption(folder: Path) -> Resumption:
@@ -146,7 +145,7 @@ def resumption(folder: Path) -> Resumption:
 
 
 def _holds_run(folder: Path) -> bool:
-    """Return True if a folder has a run that is not one killed at its start. Raises EvidenceError if it is still active."""
+    """Return True if a folder has a run with a recording. Raises EvidenceError if it is still active."""
     if not (folder / "scenario.yaml").is_file():
         return False
     try:
@@ -155,7 +154,7 @@ def _holds_run(folder: Path) -> bool:
         return False
 
 
-def _before(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
+def _continued(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
     """Return checkpoint and messages of the runs that the one in `folder` continued; None and () if it continued none."""
     if folder.name != FOLDER or not (folder.parent / "scenario.yaml").is_file():
         return None, ()
@@ -165,7 +164,7 @@ def _before(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
 
 @contextmanager
 def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
-    """Passes a checkpoint to services created within it, by a neutral path: the results folder may name the patient."""
+    """Pass a checkpoint to services created in this context, as a temporary file: the results folder may name the patient."""
     if checkpoint is None:
         yield
         return
@@ -188,12 +187,13 @@ def _reached(runs: list[InterruptedRun]) -> Checkpoint:
     """Return the checkpoint at the end of a sequence of runs, each of which continued its predecessor."""
     reached: Checkpoint | None = None
     for run in runs:
-        reached = _after(run, reached)
+        reached = _extended(run, reached)
     assert reached is not None
     return reached
 
 
-def _after(run: InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+def _extended(run: InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+    """Return the checkpoint at the end of a run that continued from `earlier`: its samples, remaining targets and surface."""
     known, c = exam_input(run.scenario), run.collected
     assessment = AssessmentService(known, earlier)
     if c.surface is not None:
@@ -210,11 +210,11 @@ def _after(run: InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
         surface = apply(X_AW, points(c.surface))
         targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
         wanted = range(len(targets)) if earlier is None else earlier.wanted(targets, run.scenario.exam.spacing_m)
-        left = targets[[i for i in sorted(wanted) if i >= _latest(c.exam_states)]]
+        left = targets[[i for i in sorted(wanted) if i >= _latest_steady_target(c.exam_states)]]
     strokes = max((int(state.stroke) for state in c.exam_states), default=0)
     return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)
 
 
-def _latest(exam_states: Iterable[Any]) -> int:
-    """Return the latest target with steady contact; it is palpated again, since its stroke continues from there."""
+def _latest_steady_target(exam_states: Iterable[Any]) -> int:
+    """Return the index of the latest target with steady contact. The continuation palpates it again: its stroke starts there."""
     return max((int(state.target_index) for state in exam_states if state.steady), default=0)

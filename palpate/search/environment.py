@@ -27,7 +27,7 @@ from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import SearchCase, case
 from palpate_models.numerics.frames import Array
 from palpate_search.posterior import LAYERS, Posterior, maps, shape
-from palpate_search.presses import Budget, Task, seconds
+from palpate_search.presses import Budget, Task, press_duration
 
 ID: Final = "Palpate/Search-v0"
 TIME_COST: Final = 0.01
@@ -85,7 +85,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         before, here = self._entropy(), self._posterior.here
         felt = self._hand.press(xy, float(depth))
         self._posterior.add(felt)
-        reward = before - self._entropy() - TIME_COST * float(seconds(here, xy))
+        reward = before - self._entropy() - TIME_COST * float(press_duration(here, xy))
         self._history[self._count] = (*(2 * share - 1), np.log(felt.force / 5.0), 1.0)
         self._count += 1
         over = self._count == self._presses

@@ -19,7 +19,7 @@ from palpate_models.numerics.seeds import generator
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
-from palpate_search.presses import Press, Task, seconds
+from palpate_search.presses import Press, Task, press_duration
 
 DESCENT_MPS: Final = 0.030
 HOLD_S: Final = 0.3
@@ -61,7 +61,7 @@ class _Timed:
             raise ValueError(f"place = {xy.tolist()} m: want one within {self.task.low.tolist()} to {self.task.high.tolist()} m")
         if not 0 < depth <= self.task.deepest + 1e-9:
             raise ValueError(f"depth = {depth} m: want more than 0 and at most {self.task.deepest} m")
-        duration = float(seconds(self._here, xy))
+        duration = float(press_duration(self._here, xy))
         self.spent += duration
         self._here, self._strokes = xy, self._strokes + 1
         return duration

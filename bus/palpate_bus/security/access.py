@@ -54,12 +54,12 @@ class _Rules:
         """Allow `who` to send on `keys`, or to receive from them.
 
         For the router, a message sent by a member is an ingress and a received one an egress; for subscriptions and queries it
-        is the reverse.
+        is the reverse. `messages`: the kinds that pass from sender to receiver, and those that pass back. `what` names the rule.
         """
         if not keys:
             return
-        to, of = ("ingress", "egress") if sends else ("egress", "ingress")
-        for flow, kinds in ((to, messages[0]), (of, messages[1])):
+        forward, reverse = ("ingress", "egress") if sends else ("egress", "ingress")
+        for flow, kinds in ((forward, messages[0]), (reverse, messages[1])):
             name = f"{who} {what} {flow}"
             rule = {"id": name, "permission": "allow", "flows": [flow], "messages": kinds, "key_exprs": list(keys)}
             self.rules.append(rule)
@@ -71,7 +71,7 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
 
     `by`: the attribute that identifies a member in zenoh, `cert_common_names` or `usernames`.
     """
-    made = _Rules()
+    access = _Rules()
     presence = (_TOKEN, _WATCH)
     data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher has a token below its key
     for role in rules.roles:
@@ -79,23 +79,23 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
         sends += [key for row in rules.internal.values() for key in _internal_sent(row, role)]
         gets = [key for topic, _ in rules.inputs(role) for key in _keys(topic.name)]
         gets += [key for row in rules.internal.values() for key in _internal_got(row, role)]
-        made.allow(role, "sends", sends, True, data)
-        made.allow(role, "gets", gets, False, data)
-        made.allow(role, "lives", _tokens(role), True, presence)
+        access.allow(role, "sends", sends, True, data)
+        access.allow(role, "gets", gets, False, data)
+        access.allow(role, "lives", _tokens(role), True, presence)
     shown = public(rules)
-    made.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
+    access.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
-        made.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
-    made.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
-    made.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
+        access.allow(guest, "gets", [key for name in (*shown, *_VIEWED) for key in _keys(name)], False, data)
+    access.allow("conductor", "serves", [OPERATOR_REQUESTS], True, data)
+    access.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
     for member in (*rules.roles, VIEWER, OPERATOR):
-        made.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
+        access.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
     return {
         "enabled": True,
         "default_permission": "deny",
-        "rules": made.rules,
-        "subjects": [{"id": member, by: [member]} for member in made.policies],
-        "policies": [{"rules": names, "subjects": [member]} for member, names in made.policies.items()],
+        "rules": access.rules,
+        "subjects": [{"id": member, by: [member]} for member in access.policies],
+        "policies": [{"rules": names, "subjects": [member]} for member, names in access.policies.items()],
     }
 
 

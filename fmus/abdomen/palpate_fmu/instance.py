@@ -18,7 +18,7 @@ import logging
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import chdir
+from contextlib import chdir, suppress
 from functools import cache
 from math import isfinite, nan
 from pathlib import Path
@@ -47,12 +47,12 @@ _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
     "Boolean": ("Boolean", "Boolean", np.bool_),
 }
 """By the type of a variable: its functions in FMI 3.0 and 2.0, and its NumPy type (FMI 2.0's integers are of 32 bits)."""
-_FINDINGS = 5
-"""Findings of the validator that are logged."""
+_LOGGED_FINDINGS = 5
+"""Largest number of the validator's findings that are logged."""
 _WARNING, _DISCARD, _FATAL = 1, 2, 4
 _STATUS = ("OK", "Warning", "Discard", "Error", "Fatal", "Pending")
 _LAST_SUCCESSFUL_TIME_2, _TERMINATED_2 = 2, 3
-"""FMI 2.0's fmi2StatusKind for the time that a discarded step reached, and for the wish to end the simulation."""
+"""FMI 2.0's fmi2StatusKind for the time that a discarded step reached, and for its request to end the simulation."""
 _FLAGS = (
     ("eventHandlingNeeded", "the FMU asks for an event, which a host without event mode does not handle"),
     ("terminateSimulation", "the FMU asks to end the simulation"),
@@ -81,7 +81,7 @@ def _take_messages() -> str:
 
 @cache
 def _callbacks_2() -> Any:
-    """FMI 2.0's callbacks, one set for all instances: FMPy expands messages with one logger per process."""
+    """Return FMI 2.0's callbacks, one set for all instances: FMPy formats messages with one logger per process."""
     from fmpy import calloc, fmi2, free  # noqa: PLC0415
     from fmpy.logging import addLoggerProxy  # noqa: PLC0415
 
@@ -89,15 +89,13 @@ def _callbacks_2() -> Any:
     callbacks.logger = fmi2.fmi2CallbackLoggerTYPE(_keep_message)
     callbacks.allocateMemory = fmi2.fmi2CallbackAllocateMemoryTYPE(calloc)
     callbacks.freeMemory = fmi2.fmi2CallbackFreeMemoryTYPE(free)
-    try:
+    with suppress(OSError, AttributeError):  # without it, messages are shown as format strings
         addLoggerProxy(ctypes.byref(callbacks))
-    except (OSError, AttributeError):
-        return callbacks  # a platform without it shows messages as their formats
     return callbacks
 
 
 def _instantiate(folder: str, description: Any) -> Any:
-    """An instance by FMPy."""
+    """Return FMPy's instance of an unpacked FMU."""
     from fmpy import fmi2, fmi3  # noqa: PLC0415
 
     older = description.fmiVersion == "2.0"
@@ -115,7 +113,7 @@ def _instantiate(folder: str, description: Any) -> Any:
 
 
 class Port:
-    """Variables of one type that are read or written together. `port[name]` is a view of the values, of the variable's shape."""
+    """Variables of one type that are read or written together. `port[name]` is a view of one variable's value, in its shape."""
 
     def __init__(self, members: Sequence[FmuVariable], dtype: type[np.generic], call: Callable[..., None], version: int) -> None:
         self.values: NDArray[Any] = np.zeros(sum(v.size for v in members), dtype=dtype)
@@ -166,12 +164,12 @@ class FmuInstance:
         self._fmu: Any = None
         self._fatal = False
         self.warnings = 0
-        """Calls that the FMU answered with a warning."""
+        """Number of calls that returned a warning."""
         self.description, findings = read_description(self.path)
-        for finding in findings[:_FINDINGS]:
+        for finding in findings[:_LOGGED_FINDINGS]:
             log.warning("%s: %s (finding of a validator; the FMU is used)", self.path.name, finding)
-        if len(findings) > _FINDINGS:
-            log.warning("%s: %d findings more, see palpate fmu info", self.path.name, len(findings) - _FINDINGS)
+        if len(findings) > _LOGGED_FINDINGS:
+            log.warning("%s: %d findings more, see palpate fmu info", self.path.name, len(findings) - _LOGGED_FINDINGS)
         if self.description.coSimulation is None:
             raise FmuError(f"{path}: an FMU without co-simulation")
         self.version = 2 if self.description.fmiVersion == "2.0" else 3
@@ -206,8 +204,8 @@ class FmuInstance:
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
         self.close()
 
-    def _answered(self, status: int, what: str, more: str = "") -> None:
-        """Process a status that is not OK: count a warning, raise FmuError for all others. `more` is added to its text."""
+    def _check_status(self, status: int, what: str, more: str = "") -> None:
+        """Handle a status other than OK: count a warning, raise FmuError for all others; `more` is appended to its text."""
         said = _take_messages() or "no message"
         if status == _WARNING:
             self.warnings += 1
@@ -219,7 +217,7 @@ class FmuInstance:
         raise FmuError(f"{self.path.name}: {what}: {name}{more}: {said}")
 
     def _function(self, name: str) -> Callable[..., int]:
-        """A function of the library itself: FMPy's wrappers cost several microseconds a call."""
+        """Return a function of the FMU's library, without FMPy's wrapper, which costs several microseconds a call."""
         function: Callable[..., int] = getattr(self._fmu.dll, f"fmi{self.version}{name}")
         return function
 
@@ -269,17 +267,17 @@ class FmuInstance:
             raise FmuError(f"{self.path.name}: {', '.join(names)}: of type {kind}; want {', '.join(_TYPES)}")
         dtype = np.int32 if self.version == 2 and suffix in ("Integer", "Boolean") else dtype
         functions = {verb: self._function(f"{verb}{suffix}") for verb in ("Get", "Set")}
-        component, answered = self._component, self._answered
+        component, check_status = self._component, self._check_status
 
         def call(verb: str, arguments: tuple[Any, ...]) -> None:
             status = functions[verb](component, *arguments)
             if status:
-                answered(status, f"{verb.lower()} {', '.join(names)}")
+                check_status(status, f"{verb.lower()} {', '.join(names)}")
 
         return Port(members, dtype, call, self.version)
 
     def get(self, name: str) -> NDArray[Any]:
-        """The value of a variable, of its shape."""
+        """Return the value of a variable, in the variable's shape."""
         port = self.port([name])
         port.pull()
         return port[name].copy()
@@ -300,7 +298,7 @@ class FmuInstance:
         status = self._do_step(t_s, dt_s)
         if status:
             reached = self._reached_text() if status == _DISCARD else ""
-            self._answered(status, f"step from {t_s:g} s by {dt_s:g} s", reached)
+            self._check_status(status, f"step from {t_s:g} s by {dt_s:g} s", reached)
         for flag, (name, meaning) in zip(self._flags, _FLAGS, strict=False):
             if not flag.value or (name == "earlyReturn" and self._reached.value >= t_s + dt_s * (1 - TIME_TOLERANCE)):
                 continue
@@ -309,7 +307,7 @@ class FmuInstance:
             raise FmuError(f"{self.path.name}: step from {t_s:g} s by {dt_s:g} s: {meaning} ({name}){reached}: {said}")
 
     def _reached_text(self) -> str:
-        """Return how far a step came that did not succeed, as text; empty if the FMU does not give it."""
+        """Return the time that a failed step reached, as text; empty if the FMU does not report it."""
         reached, ended = ctypes.c_double(nan), ctypes.c_int(0)
         if self.version == 3:
             reached = self._reached

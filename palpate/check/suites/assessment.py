@@ -171,7 +171,9 @@ def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
         }
         report.expect("one value per vertex", sizes == {n}, n, sorted(sizes))
         ordered = bool(np.all(last.lower <= last.apparent)) and bool(np.all(last.apparent <= last.upper))
-        report.expect("bands include their value", ordered, "lower <= apparent <= upper", "so" if ordered else "not so")
+        report.expect(
+            "bands include their value", ordered, "lower <= apparent <= upper", "as expected" if ordered else "not as expected"
+        )
         scanned, member = np.asarray(last.scanned, dtype=bool), np.asarray(last.finding) >= 0
         rest = float(np.median(last.apparent[scanned & ~member]))
         near = 0.5 * BELLY.force_n < rest < 2 * BELLY.force_n

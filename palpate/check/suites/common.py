@@ -14,9 +14,9 @@ from palpate_bus.contract.conformance import Checker
 RATE_TOLERANCE = 0.2
 """Largest relative error of a live implementation's rate, over the whole check."""
 STAMP_TOLERANCE_MS = 100.0
-"""Tolerance in addition to the slack."""
-LOST = 0.05
-"""Share of a live implementation's messages that may be lost in transport."""
+"""Largest median difference of stamps from the check's clock, in addition to the slack."""
+MAX_LOST_SHARE = 0.05
+"""Largest share of a live implementation's messages that may be lost in transport."""
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
@@ -47,7 +47,7 @@ def _values(topic: Topic, received: list[ReceivedMessage], report: ConformanceRe
     checker = Checker(topic)
     faults = [fault for item in received for fault in checker(item.message)]
     wanted = "frame, ranges and finite numbers as in its row"
-    got = f"{len(received)} messages, all so"
+    got = f"{len(received)} messages, all valid"
     if faults:
         first = faults[0]
         got = f"{len(faults)} faults, first: {first.field} is {first.got}, allowed {first.expected}"
@@ -76,7 +76,10 @@ def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: Con
         return
     back = [(a, b) for (_, a), (_, b) in pairwise(stamps) if b < a]
     report.expect(
-        f"{topic.name}: stamps rise", not back, "never backwards", f"{back[0][1]} after {back[0][0]} ns" if back else "so"
+        f"{topic.name}: stamps rise",
+        not back,
+        "never backwards",
+        f"{back[0][1]} after {back[0][0]} ns" if back else "as expected",
     )
     if rig.live:
         off = np.median([(t - stamp) / MS for t, stamp in stamps])
@@ -86,12 +89,14 @@ def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: Con
         )
     else:
         wrong = [(t, stamp) for t, stamp in stamps if t != stamp]
-        report.expect(f"{topic.name}: stamps", not wrong, "the tick", f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else "so")
+        report.expect(
+            f"{topic.name}: stamps", not wrong, "the tick", f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else "as expected"
+        )
 
 
 def _sequence(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     steps = np.diff([item.sequence for item in received])
     jumps = int(np.sum(steps != 1))
-    ok = bool(np.all(steps > 0)) and jumps <= (LOST * len(steps) if rig.live else 0)
+    ok = bool(np.all(steps > 0)) and jumps <= (MAX_LOST_SHARE * len(steps) if rig.live else 0)
     got = f"{jumps} jumps among {len(received)}" if jumps else "without a gap"
     report.expect(f"{topic.name}: sequence", ok, "numbered 1, 2, 3, ... in the attachment", got)

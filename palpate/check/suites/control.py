@@ -170,7 +170,9 @@ def _garbage(rig: Rig, report: ConformanceReport) -> None:
     nothing = np.full(7, np.nan)
     received = rig.run(0.2, feed(joint_target(nothing, 100.0)))[TORQUE]
     finite = all(np.all(np.isfinite(item.message.torque)) for item in received)
-    report.expect("a set-point that is not a number makes no such torque", finite, "finite torques", "so" if finite else "NaN")
+    report.expect(
+        "a set-point that is not a number makes no such torque", finite, "finite torques", "as expected" if finite else "NaN"
+    )
     still = float(np.max(np.abs(np.asarray(received[-1].message.torque) - before))) if received else np.inf
     calm = still < 1.0 or _ceased(received)
     report.expect(

@@ -55,7 +55,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
     answered = _answer(rig, feed)
     if not report.expect(
-        "answers a burst", answered, f"perception/targets within {ANSWER_S:.0f} s", "so" if answered else "nothing"
+        "answers a burst", answered, f"perception/targets within {ANSWER_S:.0f} s", "as expected" if answered else "nothing"
     ):
         return
     report.section("surface")
@@ -86,7 +86,9 @@ def _following(rig: Rig, depth: Array, K: Array, report: ConformanceReport) -> N
     """Check that it reports the motion of the wall from images with every eighth pixel."""
     K_small = np.diag((1 / 8, 1 / 8, 1.0)) @ K
     shown = rig.run(1.0, _frames(np.ascontiguousarray(depth[::8, ::8]), K_small, SMALL_IMAGE, SMALL_INFO))[MOTION]
-    if report.expect("reports the motion of the wall from small images", bool(shown), MOTION, "so" if shown else "nothing"):
+    if report.expect(
+        "reports the motion of the wall from small images", bool(shown), MOTION, "as expected" if shown else "nothing"
+    ):
         count = SurfaceMotion.FORECASTS
         sizes = {len(received.message.forecast) for received in shown}
         report.expect("with its forecast", sizes == {count}, f"{count} values", sorted(sizes))
@@ -129,7 +131,12 @@ def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     tilt = float(np.quantile(angle[near], 0.95)) if near.any() else np.inf
     report.expect("with outward normals", tilt < 10, "95 % within 10 degrees", f"{tilt:.1f} degrees")
     inside = int(np.max(message.triangles, initial=0)) < len(p_A)
-    report.expect("triangles index its vertices", inside, "indices below the number of vertices", "so" if inside else "not so")
+    report.expect(
+        "triangles index its vertices",
+        inside,
+        "indices below the number of vertices",
+        "as expected" if inside else "not as expected",
+    )
 
 
 def _targets(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:

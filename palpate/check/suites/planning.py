@@ -130,4 +130,4 @@ def _phases(received: list[ReceivedMessage], report: ConformanceReport) -> None:
     ok = phases == sorted(phases) and phases[-1] <= ExamState.PHASE_PLAN
     report.expect("phases follow their order", ok, "HOME, LOOK, PLAN", phases)
     undecided = all(item.message.end_tick < 0 for item in received)
-    report.expect("no end is announced yet", undecided, "end_tick -1", "so" if undecided else "decided")
+    report.expect("no end is announced yet", undecided, "end_tick -1", "as expected" if undecided else "decided")

@@ -117,7 +117,7 @@ def _description(rig: Rig, report: ConformanceReport) -> None:
         "robot_description is a URDF of the arm and tool",
         "<robot" in text and not missing,
         "all joints, link indenter",
-        "so" if not missing else f"without {', '.join(missing)}",
+        "as expected" if not missing else f"without {', '.join(missing)}",
     )
 
 

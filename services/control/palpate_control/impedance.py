@@ -126,7 +126,7 @@ class ImpedanceController:
         """Return the unlimited torque of mode CARTESIAN [N m], shape (7,)."""
         model, (R_WD, x) = self.model, reference.motion
         model.update(q, qd)
-        if self._outdated(reference.setpoint):
+        if self._design_due(reference.setpoint):
             setpoint = reference.setpoint  # copied: arrays of messages are read-only, a different type for numba
             requested = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
             inertia, friction = model.inertia(q), model.viscous_friction
@@ -141,7 +141,7 @@ class ImpedanceController:
         """Return the unlimited torque of mode JOINT [N m], shape (7,)."""
         model, motion = self.model, reference.motion
         model.update_gravity(q)
-        if self._outdated(reference.setpoint):
+        if self._design_due(reference.setpoint):
             self._joint_gains = joint_gains(
                 reference.setpoint.joint_stiffness, model.inertia(q), model.viscous_friction, self._dead_time
             )
@@ -150,8 +150,8 @@ class ImpedanceController:
         inertial = model.inverse_dynamics(q, qd, motion.qdd) - model.gravity
         return impedance + inertial + friction_torque(motion.qd, model.viscous_friction, model.coulomb_friction)
 
-    def _outdated(self, setpoint: Setpoint) -> bool:
-        """Return True if the gains for `setpoint` must be designed now."""
+    def _design_due(self, setpoint: Setpoint) -> bool:
+        """Return True if gains must be designed at this tick; called once a tick, since it counts ticks since the last design."""
         if setpoint is self._designed_for and self._design_age < TUNING.design_ticks:
             self._design_age += 1
             return False

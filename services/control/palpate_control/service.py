@@ -26,7 +26,7 @@ _NAMES = list(JOINT_NAMES)
 
 
 class Problem(NamedTuple):
-    """Cause of a stop of commands: the topic at fault, and a text for people."""
+    """Fault of an input: the topic at fault, and a text for the user."""
 
     culprit: str
     text: str
@@ -54,21 +54,21 @@ class ControlService(Service):
         self._reference = Extrapolator(topics[TOPIC].period)
         self._setpoint_expiry = topics[TOPIC].expiry
         self._joint_states_age = topics["joint_states"].max_age
-        self._validity = topics["control/joint_torque"].expiry
-        self._valid = duration_message(self._validity)
-        self._expired = duration_message(0)
-        self._expires: int | None = None
+        self._torque_expiry = topics["control/joint_torque"].expiry
+        self._full_validity = duration_message(self._torque_expiry)
+        self._no_validity = duration_message(0)
+        self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
         self._facts = dict.fromkeys(
             ("setpoints", "setpoints_rejected", "joint_states_rejected", "ticks_without_joint_states", "ticks_without_command"), 0
         )
         self._peak = np.zeros(DOF)
         self._torque = np.zeros(DOF)
-        self._until = -1
+        self._torque_expires = -1
         """Expiry of the last torque [ns]."""
         self._problem = ""
         self._refused: Problem | None = None  # of the newest set-point
-        self._ceased: Problem | None = None  # why no torque is commanded; None after a valid set-point
+        self._stop_reason: Problem | None = None  # None after a valid set-point
         self._warm_up()
 
     def _warm_up(self) -> None:
@@ -89,7 +89,7 @@ class ControlService(Service):
                     rest,
                     rest,
                     np.ones(DOF),
-                    self._valid,
+                    self._full_validity,
                 )
                 guide.accept(Setpoint.from_message(codec.decode(codec.encode(message, kind), kind)), stamp)
                 self._controller.torque(np.array(HOME), rest, guide.at(stamp))
@@ -109,14 +109,14 @@ class ControlService(Service):
             self._accept(message, t)
         while self._pending and self._pending[0].stamp <= followed:
             self._reference.accept(self._pending.popleft(), followed)
-        if self._expires is None or joints is None:
-            return self._command(t, np.zeros(DOF), self._valid)
+        if self._setpoint_expires is None or joints is None:
+            return self._command(t, np.zeros(DOF), self._full_validity)
         frozen = t - measured > self._setpoint_expiry  # repeated, or stamped by a wrong clock
-        if self._ceased or frozen or t > self._expires:
+        if self._stop_reason or frozen or t > self._setpoint_expires:
             age, limit = (t - measured) / MS, self._setpoint_expiry / MS
             old = Problem("joint_states", f"joint_states: measured {age:.0f} ms ago, limit {limit:.0f} ms")
-            expired = Problem(TOPIC, f"the last {TOPIC} expired {(t - self._expires) / MS:.0f} ms ago")
-            return self._cease(t, self._ceased or (old if frozen else self._refused or expired))
+            expired = Problem(TOPIC, f"the last {TOPIC} expired {(t - self._setpoint_expires) / MS:.0f} ms ago")
+            return self._stop_commands(t, self._stop_reason or (old if frozen else self._refused or expired))
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
@@ -128,15 +128,15 @@ class ControlService(Service):
         except ValueError as error:
             return self._reject_joints(t, str(error))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
-        self._torque, self._until = torque, t + self._validity
-        return self._command(t, torque, self._valid)
+        self._torque, self._torque_expires = torque, t + self._torque_expiry
+        return self._command(t, torque, self._full_validity)
 
     def finish(self) -> Mapping[str, Any]:
         """Return counts of set-points and rejections, the last problem, and the largest torque per joint [N m]."""
         return {**self._facts, "problem": self._problem, "peak_torque_nm": [round(float(x), 3) for x in self._peak]}
 
     def _accept(self, message: Message, t: int) -> None:
-        """Checks a set-point and queues it until the arm was measured at its stamp; the first one is applied at once."""
+        """Check a set-point and queue it until joint states as late as its stamp arrive; the first one is applied at once."""
         try:
             setpoint = Setpoint.from_message(message)
         except ValueError as error:
@@ -148,13 +148,13 @@ class ControlService(Service):
             return
         while self._pending and self._pending[-1].stamp >= setpoint.stamp:
             self._pending.pop()  # planning's clock was set back: the newest message counts
-        self._refused = self._ceased = None
+        self._refused = self._stop_reason = None
         self._facts["setpoints"] += 1
         if self._reference.current is None and not self._pending:
             self._reference.accept(setpoint, t)
         else:
             self._pending.append(setpoint)
-        self._expires = min(setpoint.stamp, t) + min(nanoseconds(message.valid_for), self._setpoint_expiry)
+        self._setpoint_expires = min(setpoint.stamp, t) + min(nanoseconds(message.valid_for), self._setpoint_expiry)
 
     def _refuse(self, t: int, why: str) -> None:
         self._facts["setpoints_rejected"] += 1
@@ -162,27 +162,27 @@ class ControlService(Service):
         self._problem = f"at {t} ns: {self._refused.text}"
 
     def _repeat_torque(self, t: int, problem: Problem) -> Outbox:
-        """Return the last torque until its expiry, then as `_cease`."""
-        if t >= self._until:
-            return self._cease(t, problem)
+        """Return the last torque until its expiry, then as `_stop_commands`."""
+        if t >= self._torque_expires:
+            return self._stop_commands(t, problem)
         self._facts["ticks_without_joint_states"] += 1
         self._problem = f"at {t} ns: {problem.text}"
-        return self._command(t, self._torque, duration_message(self._until - t), problem)
+        return self._command(t, self._torque, duration_message(self._torque_expires - t), problem)
 
-    def _cease(self, t: int, problem: Problem) -> Outbox:
-        """Return an expired command with the reason, so that the driver holds."""
-        self._until = -1
-        self._ceased = problem
+    def _stop_commands(self, t: int, problem: Problem) -> Outbox:
+        """Return an expired command with the reason, so that the driver enters its safe hold."""
+        self._torque_expires = -1
+        self._stop_reason = problem
         self._facts["ticks_without_command"] += 1
         self._problem = f"at {t} ns: {problem.text}"
         self._controller.reset()
         self._reference.clear()
         self._pending.clear()
-        return self._command(t, np.zeros(DOF), self._expired, problem)
+        return self._command(t, np.zeros(DOF), self._no_validity, problem)
 
     def _reject_joints(self, t: int, problem: str) -> Outbox:
         self._facts["joint_states_rejected"] += 1
-        return self._cease(t, Problem("joint_states", problem))
+        return self._stop_commands(t, Problem("joint_states", problem))
 
     @staticmethod
     def _command(t: int, torque: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:

@@ -43,9 +43,9 @@ from palpate_planning.wall.breath import BreathObservation
 
 NEEDED = ("robot", "assessment", "supervisor", "conductor")
 """Roles whose loss ends the examination in any phase. Without the conductor no operator could stop it."""
-NEEDED_TO_SEE = (*NEEDED, "camera", "perception")
+NEEDED_BEFORE_TARGETS = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the examination before there are targets."""
-SEEN = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
+PERCEPTION_TOPICS = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
 """Topics of perception that move the arm: messages that violate the contract are dropped."""
 CULPRITS = {
     PalpationTargets.NONE: "perception",
@@ -54,8 +54,8 @@ CULPRITS = {
     PalpationTargets.NO_CALIBRATION: "camera/depth/camera_info",
     PalpationTargets.BAD_FRAMES: "camera/depth/image_raw",
 }
-"""Role or topic at fault if there are no targets for a reason."""
-SEEING = frozenset({Phase.HOME, Phase.LOOK})
+"""Role or topic at fault, by the reason why perception has no targets."""
+BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
 
@@ -73,12 +73,12 @@ class PlanningService(Service):
         self._exam = ExaminationSequence(
             known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep
         )
-        self._supervisor_silence = contract().topics["planning/setpoint"].expiry
+        self._max_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._peak_force = 0.0
         self._unreadable = self._refused = 0
-        self._checks = {topic: Checker(contract().topics[topic]) for topic in SEEN}
+        self._checks = {topic: Checker(contract().topics[topic]) for topic in PERCEPTION_TOPICS}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Advance one planning period: read the measurements, step the examination, write set-point and state."""
@@ -179,7 +179,7 @@ class PlanningService(Service):
         return received[-1] if received and self._known.exam.breathing is not Following.IGNORE else None
 
     def _averaged(self, inbox: Inbox) -> Array | None:
-        """Return the height of the wall in the mean of all images, if it arrived and belongs to the present surface."""
+        """Return the height of the wall averaged over all images, if it arrived and belongs to the present surface."""
         for message in self._valid(inbox, "perception/correction"):
             if message is not None and self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
                 return np.asarray(message.outward, dtype=float)
@@ -199,26 +199,26 @@ class PlanningService(Service):
     def _lost(self, t: int, inbox: Inbox) -> Cause:
         """Return the cause if needed roles are disconnected, or the supervisor is silent for longer than a set-point is valid."""
         searching = ("search",) if self._known.exam.searched else ()
-        needed = (*(NEEDED_TO_SEE if self._exam.status.phase in SEEING else NEEDED), *searching)
+        needed = (*(NEEDED_BEFORE_TARGETS if self._exam.status.phase in BEFORE_TARGETS else NEEDED), *searching)
         gone = [role for role in needed if inbox.lost(role)]
         culprit = gone[0] if gone else "supervisor/state"
         last = inbox.stamp("supervisor/state")
-        if last is not None and t - last > self._supervisor_silence:
+        if last is not None and t - last > self._max_silence:
             gone.append(f"the supervisor, silent for {(t - last) / MS:.0f} ms")
         return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 
 
 def _too_short(message: Message) -> list[str]:
-    """Return what is wrong with the lengths of a message of perception, which the contract does not specify."""
+    """Return an error if an array of a perception message is too short: the contract has no lengths."""
     if isinstance(message, SurfaceMotion) and len(message.forecast) < SurfaceMotion.FORECASTS:
         return [f"forecast has {len(message.forecast)} values, want {SurfaceMotion.FORECASTS}"]
     return []
 
 
 def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...]) -> tuple[Cause, bool]:
-    """Return why the arm must rest, if it must; and True if planning is to retreat (else the driver holds).
+    """Return the cause of a stop, if any, and True for a soft stop, after which planning retreats (else the driver holds).
 
-    `status` is the robot's newest, `state` the supervisor's.
+    `status` is the latest `robot/status`, `state` the latest `supervisor/state`.
     """
     for request in requests:
         if request.request == OperatorRequest.STOP:

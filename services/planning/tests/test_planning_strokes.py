@@ -14,7 +14,7 @@ from palpate_models.scenario.schema import Mode
 from palpate_planning.interruptions import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
 from palpate_planning.strokes.coverage import TUNING, strokes, touches, transfer
-from palpate_planning.strokes.path import SurfacePath, angular_velocity, centre, frame, lay, least_twist, pose
+from palpate_planning.strokes.path import SurfacePath, angular_velocity, centre, frame, frames_along, least_twist, pose
 from palpate_planning.wall.surface import PerceivedSurface
 
 SPACING = 0.0125
@@ -190,7 +190,7 @@ def dome_path(samples: int) -> SurfacePath:
     xy = np.column_stack((np.linspace(-0.05, 0.05, samples), np.full(samples, 0.01))) if samples > 1 else np.zeros((1, 2))
     x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-0.1, 0.1, 0.01))
     vertices = np.column_stack((x.ravel(), y.ravel(), -(x.ravel() ** 2) / 0.5 - y.ravel() ** 2))
-    s, p, n, R = lay(PerceivedSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
+    s, p, n, R = frames_along(PerceivedSurface.from_mesh(vertices, None, np.eye(4)), xy, DOWN)
     q = np.outer(1.0 + s, np.arange(1.0, 8.0)) ** 2
     visits = np.array([0, samples // 2, samples - 1]) if samples > 1 else np.zeros(1, int)
     return SurfacePath(s, p, n, R, q, np.array([7, 3, 5])[: len(visits)], visits)

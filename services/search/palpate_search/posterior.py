@@ -25,7 +25,7 @@ from palpate_assessment.calibration import learned
 from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
-from palpate_search.presses import PRESS_S, SHALLOWEST_M, Budget, Press, Task, seconds
+from palpate_search.presses import LEAST_MEASURED_M, PRESS_S, Budget, Press, Task, press_duration
 
 RADII_M: Final = (0.014, 0.022, 0.030)
 """Palpable radii of the lump hypotheses."""
@@ -181,7 +181,7 @@ class Posterior:
     def add(self, felt: Press) -> None:
         """Updates the posterior with a press."""
         calibration = learned()
-        depth, force = max(felt.depth, SHALLOWEST_M), max(felt.force, 0.1)
+        depth, force = max(felt.depth, LEAST_MEASURED_M), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
         xy, n = felt.xy[None], len(self.presses)
@@ -292,6 +292,6 @@ def maps(posterior: Posterior) -> Array:
     layers = np.empty((LAYERS, len(mean)))
     layers[0] = np.log(posterior.by_place * len(mean) + 0.01) / np.log(len(mean))
     layers[1], layers[2] = mean - mean.mean(), np.sqrt(variance)
-    layers[3] = seconds(posterior.here, posterior.task.places) - PRESS_S
+    layers[3] = press_duration(posterior.here, posterior.task.places) - PRESS_S
     layers[4], layers[5] = posterior.lump, left
     return layers.reshape(LAYERS, *shape(posterior))

@@ -14,12 +14,12 @@ PLACES_M = 0.010
 """Spacing of candidate places."""
 BORDER_M = 0.010
 """Least distance of presses from the region's edge: reach and surface are known only inside."""
-SHALLOWEST_M = 0.002
-"""Lower bound of a measured depth, which may be zero."""
-SHALLOWER = 0.6
-"""Shallowest press over the nominal depth."""
-DEEPER = 1.4
-"""Deepest press over the nominal depth."""
+LEAST_MEASURED_M = 0.002
+"""Least measured depth that methods use: a measured depth may be zero, and its logarithm is taken."""
+SHALLOWEST_RATIO = 0.6
+"""Depth of the shallowest press, as a multiple of the nominal depth."""
+DEEPEST_RATIO = 1.4
+"""Depth of the deepest press, as a multiple of the nominal depth."""
 TRAVEL_MPS = 0.12
 """Mean speed between presses."""
 PRESS_S = 3.2
@@ -39,11 +39,11 @@ class Press:
     force: float
     """Normal force at that depth [N]."""
     time: float
-    """[s]"""
+    """Time of the measurement [s]."""
     noise_n: float = 0.02
     """Standard error of the force [N]."""
     limited: bool = False
-    """True if depth yielded to the force limit."""
+    """True if the force limit stopped the press before its depth."""
     depth_uncertainty: float = 0.001
     """Reported SD of the depth [m]."""
     stroke: int = 0
@@ -74,9 +74,9 @@ class Task:
     depth: float = 0.010
     """Nominal depth of a press [m]."""
     deepest: float = 0.014
-    """[m]"""
+    """Greatest depth of a press [m]."""
     force: float = 15.0
-    """Depth yields at this force [N]."""
+    """Force limit of a press [N]."""
     depth_uncertainty: float = 0.001
     """Expected SD of the depth before the first press [m]."""
     budget: Budget = Budget(100, 600.0)
@@ -87,13 +87,13 @@ class Task:
     @property
     def shallowest(self) -> float:
         """Least depth of a press [m]."""
-        return SHALLOWER * self.depth
+        return SHALLOWEST_RATIO * self.depth
 
     @classmethod
     def of(cls, known: ExamInput) -> Task:
         """Return the task of an examination."""
         exam, limits = known.exam, known.limits
-        deepest = min(DEEPER * exam.depth_m, limits.depth_m)
+        deepest = min(DEEPEST_RATIO * exam.depth_m, limits.depth_m)
         budget = Budget(exam.budget.presses, exam.budget.seconds)
         return cls(exam.centre_m, exam.region_m, exam.depth_m, deepest, limits.force_working_n, budget=budget, seed=exam.seed)
 
@@ -122,7 +122,7 @@ class Task:
         return np.linspace(low, high, max(round((high - low) / PLACES_M), 0) + 1)
 
 
-def seconds(begin: Array | None, end: Array) -> Array:
-    """Return the duration [s] of a press at `end`, shape (2,) or (k, 2), coming from `begin`: shape () or (k,)."""
+def press_duration(begin: Array | None, end: Array) -> Array:
+    """Return the duration [s], shape () or (k,), of a press at `end` [m], shape (2,) or (k, 2), with the way from `begin` [m]."""
     hop = np.linalg.norm(end - (end if begin is None else begin), axis=-1)
     return np.asarray(PRESS_S + hop / TRAVEL_MPS)

@@ -40,7 +40,7 @@ from palpate_search.posterior import (
     VARIATION_SCALES,
     Posterior,
 )
-from palpate_search.presses import Budget, Press, Task, seconds
+from palpate_search.presses import Budget, Press, Task, press_duration
 from palpate_search.service import TUNING, checked, create, next_press
 
 DECIDED = (0.05, 0.0)
@@ -102,7 +102,7 @@ def test_the_learned_policy_decides_as_its_weights_do() -> None:
 def test_ours_counts_the_way() -> None:
     slow = np.array(presses("informed", 10))
     assert np.median(np.linalg.norm(np.diff(slow[:, :2], axis=0), axis=1)) < 0.08
-    assert seconds(np.zeros(2), np.array((0.12, 0.0))) > seconds(np.zeros(2), np.zeros(2))
+    assert press_duration(np.zeros(2), np.array((0.12, 0.0))) > press_duration(np.zeros(2), np.zeros(2))
 
 
 def test_a_policy_of_a_file(tmp_path: Path) -> None:

@@ -182,8 +182,12 @@ def _orientation(y: Array) -> Array:
     return frame(-n / np.sqrt(n @ n), y[6:9])
 
 
-def lay(surface: PerceivedSurface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
-    """Project a curve in A's xy plane onto the surface: s (k,), p and n (k, 3) in world, R (k, 3, 3) by least twist."""
+def frames_along(surface: PerceivedSurface, xy: Array, R_ref: Array) -> tuple[Array, Array, Array, Array]:
+    """Project a curve in A's xy plane, shape (k, 2), onto the surface; return path length, points, normals and rotations.
+
+    Path length `s` [m], shape (k,); points `p` [m] and outward normals `n` in world, shape (k, 3); rotations `R` by least twist,
+    shape (k, 3, 3).
+    """
     p, n = surface.at(xy)
     s = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(p, axis=0), axis=1))))
     return s, p, n, least_twist(-n, R_ref)

@@ -129,8 +129,8 @@ class ExamPlanner:
             usable = np.array([i not in skipped and (wanted is None or i in wanted) for i in range(len(xy))], dtype=bool)
             scan = [] if exam.searched else strokes(xy, perceived.lines, usable, joined, exam.mode, exam.spacing_m, breaks)
             pieces = scan if bend and scan else touches(xy, usable) + scan
-            layout = segments.lay(pieces)
-            if not layout.troubled:
+            layout = segments.layout(pieces)
+            if not layout.infeasible:
                 break
             breaks |= layout.breaks
             skipped |= layout.dropped

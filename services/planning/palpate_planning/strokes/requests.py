@@ -57,7 +57,7 @@ class PressPlanner:
         places = [(request.xy, int(nearest[0])), *((self._targets[target], int(target)) for target in nearest)]
         for place, target in places:
             stroke = Stroke(place[None], np.array([target]), np.zeros(1, dtype=np.int64))
-            planned = self._segments.after(self._last, stroke, request.depth_m)
+            planned = self._segments.press_after(self._last, stroke, request.depth_m)
             if planned:
                 self._last = stroke
                 return planned

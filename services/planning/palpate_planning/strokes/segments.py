@@ -15,7 +15,7 @@ from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.strokes.coverage import Stroke, transfer
-from palpate_planning.strokes.path import SurfacePath, centre, lay, least_twist, pose
+from palpate_planning.strokes.path import SurfacePath, centre, frames_along, least_twist, pose
 from palpate_planning.wall.surface import PerceivedSurface
 
 
@@ -27,7 +27,7 @@ class SegmentTuning:
     """Height of the sphere's deepest point above the surface before, between and after strokes: twice the usual error of the
     perceived surface (`wall.wall`)."""
     posture_every: int = 4
-    """Inverse kinematics is solved at every fourth sample of a stroke, postures in between are interpolated."""
+    """Inverse kinematics is solved at every n-th sample of a stroke; the postures between them are interpolated."""
 
 
 SEGMENTS = SegmentTuning()
@@ -36,18 +36,18 @@ REACH = Cause(Reason.OUT_OF_REACH, "out of the arm's reach")
 STRETCHED = Cause(Reason.ARM_STRETCHED, "within reach of a stretched arm only")
 
 Place = tuple[float, float]
-Troubles = list[tuple[int, Cause]]
+Infeasible = list[tuple[int, Cause]]
 """Samples of a path that the arm cannot take, with the cause."""
 
 
 @dataclass(frozen=True, slots=True)
 class Segment:
-    """A part of the examination."""
+    """One stroke, or the path from one stroke to the next."""
 
     path: SurfacePath
-    """On the surface; only its ends count for a free motion."""
+    """Path on the surface; a free motion uses only its ends."""
     contact: bool
-    """True at depth; else above the surface, between strokes."""
+    """True for a stroke; False for a path above the surface between strokes."""
     touch: bool = False
     """True if the skin is only touched, not pressed."""
     depth_m: float | None = None
@@ -67,8 +67,8 @@ class Layout:
     """Targets to skip, with the cause."""
 
     @property
-    def troubled(self) -> bool:
-        """True if it cannot be carried out."""
+    def infeasible(self) -> bool:
+        """True if the arm cannot carry it out."""
         return bool(self.breaks or self.dropped)
 
 
@@ -100,19 +100,19 @@ class SegmentPlanner:
         """
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
         self._postures, self._radius, self._depth, self._bend, self._free_motion = postures, radius, depth, bend, free_motion
-        self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Troubles]] = {}
+        self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Infeasible]] = {}
         self._hovers: dict[Place, Array | None] = {}
         self._paths: dict[tuple[Place, Place], tuple[Segment | None, Cause]] = {}
         self._R_ref = np.eye(3)
 
-    def lay(self, pieces: list[Stroke]) -> Layout:
-        """Return strokes and the paths between them. Repeated calls reuse what has not changed."""
+    def layout(self, pieces: list[Stroke]) -> Layout:
+        """Return the strokes and the paths between them. Strokes and paths planned by earlier calls are reused."""
         layout = Layout()
         if pieces and not self._strokes:
             self._R_ref = self._kinematics.pose(self._postures[pieces[0].targets[0]])[:3, :3]
         for k, piece in enumerate(pieces):
-            path, troubles = self._stroke(piece)
-            for sample, why in troubles:
+            path, infeasible = self._stroke(piece)
+            for sample, why in infeasible:
                 after = int(np.searchsorted(piece.visits, sample, side="right")) - 1
                 target = int(piece.targets[after])
                 if sample == piece.visits[after]:
@@ -122,7 +122,7 @@ class SegmentPlanner:
             for end in (0, -1):
                 if self.hover(piece, end) is None:
                     layout.dropped[int(piece.targets[end])] = REACH._replace(text=f"the posture above it is {REACH.text}")
-            if k and not layout.troubled:
+            if k and not layout.infeasible:
                 segment, why = self._path_to_next(pieces[k - 1], piece)
                 if segment is None:
                     layout.dropped[int(piece.targets[0])] = why._replace(text=f"no path to it: {why.text}")
@@ -131,13 +131,13 @@ class SegmentPlanner:
             layout.segments.append(Segment(path, contact=True, touch=piece.touch))
         return layout
 
-    def after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
+    def press_after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
         """Return a press to `depth` [m] and the path to it from the end of the previous stroke; empty if impossible."""
-        path, troubles = self._path_of(press, depth)
-        if troubles or self.hover(press, 0) is None:
+        path, infeasible = self._path_of(press, depth)
+        if infeasible or self.hover(press, 0) is None:
             return ()
-        way, _ = self._path_to_next(before, press)
-        return () if way is None else (way, Segment(path, contact=True, depth_m=depth))
+        transit, _ = self._path_to_next(before, press)
+        return () if transit is None else (transit, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
         """Return the posture above the first (0) or last (-1) target [rad], shape (7,); None if out of reach or in collision."""
@@ -151,7 +151,7 @@ class SegmentPlanner:
             self._hovers[place] = solution.q if good else None
         return self._hovers[place]
 
-    def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Troubles]:
+    def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Infeasible]:
         key = tuple(int(i) for i in piece.targets)
         if key not in self._strokes:
             self._strokes[key] = self._path_of(piece, self._depth)
@@ -162,12 +162,12 @@ class SegmentPlanner:
         key = (_place(before, -1), _place(after, 0))
         if key not in self._paths:
             xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
-            path, troubles = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -SEGMENTS.hover_m)
+            path, infeasible = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -SEGMENTS.hover_m)
             start, goal = self.hover(before, -1), self.hover(after, 0)
-            if not troubles:
+            if not infeasible:
                 self._paths[key] = (Segment(path, contact=False), NO_CAUSE)
             elif start is None or goal is None:
-                self._paths[key] = (None, troubles[0][1])
+                self._paths[key] = (None, infeasible[0][1])
             else:
                 try:
                     self._paths[key] = (Segment(path, contact=False, free=self._free_motion(start, goal)), NO_CAUSE)
@@ -175,30 +175,30 @@ class SegmentPlanner:
                     self._paths[key] = (None, Cause(Reason.NO_PATH, str(error)))
         return self._paths[key]
 
-    def _path_of(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Troubles]:
-        """Return a stroke with postures at `depth`, near those of its targets; and samples that the arm cannot take."""
-        s, p, n, R = lay(self._surface, stroke.xy, self._R_ref)
+    def _path_of(self, stroke: Stroke, depth: float) -> tuple[SurfacePath, Infeasible]:
+        """Return a stroke with postures at `depth` [m] near those of its targets, and the samples that the arm cannot take."""
+        s, p, n, R = frames_along(self._surface, stroke.xy, self._R_ref)
         centres = centre(p, n, self._radius, depth)
         known = self._postures[stroke.targets]
         near = np.column_stack([np.interp(s, s[stroke.visits], known[:, j]) for j in range(7)])
         solved = np.unique(np.concatenate((np.arange(0, len(s), SEGMENTS.posture_every), stroke.visits, [len(s) - 1])))
         q = np.empty((len(solved), 7))
-        troubles: Troubles = []
+        infeasible: Infeasible = []
         for row, i in enumerate(solved):
             solution = self._kinematics.solve(pose(R[i], centres[i]), near[i], near[i])
             q[row] = solution.q
             if not solution.ok:
-                troubles.append((int(i), REACH))
+                infeasible.append((int(i), REACH))
             elif stretched(solution.q, self._bend):
-                troubles.append((int(i), STRETCHED))
+                infeasible.append((int(i), STRETCHED))
             elif not self._scene.free(solution.q):
-                troubles.append((int(i), collision(self._scene, solution.q)))
+                infeasible.append((int(i), collision(self._scene, solution.q)))
         between = np.asarray(CubicSpline(s[solved], q, bc_type="natural")(s)) if len(solved) > 1 else q
-        return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), troubles
+        return SurfacePath(s, p, n, R, between, stroke.targets, stroke.visits), infeasible
 
 
 def collision(scene: CollisionScene, q: Array) -> Cause:
-    """Return what the arm collides with at q [rad], shape (7,)."""
+    """Return the cause that names what the arm collides with at `q` [rad], shape (7,)."""
     return Cause(Reason.COLLISION, f"the arm would collide: {', '.join(scene.collisions(q))}")
 
 

@@ -21,7 +21,7 @@ from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
-from palpate_search.presses import Budget, seconds
+from palpate_search.presses import Budget, press_duration
 
 _BINS = 64
 _BIN = 0.25
@@ -103,7 +103,7 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     mean, variance = posterior.field()
     contrast, contrast_variance = posterior.contrast()
     unexplained, probability = posterior.unexplained(), posterior.probability
-    duration = seconds(posterior.here, task.places)
+    duration = press_duration(posterior.here, task.places)
     exponent, spread = calibration.exponent, calibration.exponent_sd
 
     def rate(some: NDArray[np.intp], depth: float) -> Array:

@@ -31,12 +31,12 @@ from palpate_tissue.moving import carried
 
 _log = logging.getLogger("palpate.tissue")
 
-MOST_STEPS = 1000
-"""Largest number of steps that an FMU of fixed step size catches up in one call."""
+MAX_CATCH_UP_STEPS = 1000
+"""Largest number of missed steps that an FMU of fixed step size makes up in one tick."""
 
 
 class FmuService(Service):
-    """Hosts an FMU in a role. Each tick advances the FMU by a period, or by several that were missed, with the newest inputs.
+    """Hosts an FMU in a role. Each tick advances it with the latest inputs, by one period and by any that were missed.
 
     The first step, at tick 0, begins at the FMU's start time.
     """
@@ -55,7 +55,7 @@ class FmuService(Service):
         self._period = rules.roles[table.role].period
         self._time = -self._period
         self._fmu = FmuInstance(fmu_file, table.start_s, table.parameters)
-        self._ahead = round(self._fmu.start_s * NS) + self._period
+        self._fmu_offset = round(self._fmu.start_s * NS) + self._period
         """Time of the FMU minus that of the run [ns]."""
         try:
             self._wiring = Wiring(table, self._fmu, rules, frames, scenario or {})
@@ -63,7 +63,7 @@ class FmuService(Service):
             self._fmu.close()  # removes the unpacked files
             raise
         self._latched = tuple(output for output in self._wiring.outputs if output.topic.latched)
-        self._running = tuple(output for output in self._wiring.outputs if not output.topic.latched)
+        self._periodic = tuple(output for output in self._wiring.outputs if not output.topic.latched)
         simulation = self._fmu.description.coSimulation
         self._variable_step = bool(getattr(simulation, "canHandleVariableCommunicationStepSize", False))
         self._steps = 0
@@ -81,30 +81,30 @@ class FmuService(Service):
                 source.write(message)
         self._advance(t)
         outbox: dict[str, Message | list[Message]] = {}
-        for output in self._running:
+        for output in self._periodic:
             if t % output.topic.period == 0:
                 outbox[output.topic.name] = output.message(t)
         return outbox
 
     def _advance(self, t: int) -> None:
-        behind, rest = divmod(t - self._time, self._period)
+        behind, remainder = divmod(t - self._time, self._period)
         if behind == 1 or (self._variable_step and t > self._time):
             self._step(self._time, t - self._time)
         else:
-            if behind > MOST_STEPS:
-                raise RunError(f"the FMU is {behind} periods behind, at most {MOST_STEPS} can be caught up")
-            if rest:
+            if behind > MAX_CATCH_UP_STEPS:
+                raise RunError(f"the FMU is {behind} periods behind, at most {MAX_CATCH_UP_STEPS} can be caught up")
+            if remainder:
                 raise RunError(f"the FMU takes steps of {self._period / NS} s only and cannot step to {t / NS} s")
             for k in range(behind):
                 self._step(self._time + k * self._period, self._period)
         self._time = t
 
     def _step(self, begin: int, duration: int) -> None:
-        self._fmu.step((begin + self._ahead) / NS, duration / NS)
+        self._fmu.step((begin + self._fmu_offset) / NS, duration / NS)
         self._steps += 1
 
     def finish(self) -> Mapping[str, Any]:
-        """Return facts about the FMU, and free it."""
+        """Return the FMU's name, version and counts, and free it."""
         description = self._fmu.description
         facts = {
             "fmu": self._fmu.path.name,
@@ -127,7 +127,7 @@ def host(role: str, *arguments: Any, **options: Any) -> FmuService:
 
 
 def packaged_map(name: str) -> FmuMap:
-    """Return a map of this package."""
+    """Return the map `name` that this package provides."""
     with resources.as_file(resources.files("palpate_tissue.backends.fmu").joinpath("maps", f"{name}.yaml")) as path:
         return load_map(path)
 
@@ -161,7 +161,8 @@ def create(scenario: Scenario) -> Service:
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
     """Return a service with an FMU in the role of its map, by default the tissue. Raises MapError, FmuError.
 
-    For the tissue the frame `abdomen` is the patient's true frame; for other roles, whose scenario has it, the registered one.
+    The frame `abdomen` is `true_pose(scenario)`: the patient's true frame where the scenario has its seed and errors, which is
+    the case for tissue, robot and camera.
     """
     table = table or packaged_map("tissue_fmi2" if read_description(fmu_file)[0].fmiVersion == "2.0" else "tissue")
     X_WA = matrix(true_pose(scenario))
