@@ -10,7 +10,7 @@ from typing import Any, Final
 
 import pytest
 
-from palpate.run.composed import run_composed
+from palpate.run.composed import ChildPlace, run_here
 from palpate_bus.messages.codec import Message
 from palpate_bus.runtime.lockstep import OutputPort, Sent
 from palpate_models.scenario.load import load_scenario
@@ -41,7 +41,7 @@ def examined(folder: Path, text: str | None) -> tuple[dict[str, str], Counter[st
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(OutputPort, "pack", changed)
-        result = run_composed(load_scenario("clean", SMALL), folder, lambda _: None, observers=())
+        result = run_here(load_scenario("clean", SMALL), folder, (), ChildPlace.shared(), lambda _: None)
     assert result.failure is None
     return {topic: digest.hexdigest() for topic, digest in digests.items()}, +texts
 

@@ -7,9 +7,10 @@ depend on the speed of the machine. In wall-clock mode the result is used when i
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
@@ -25,8 +26,23 @@ from palpate_planning.waits import FOR_PLAN, WAIT
 
 T = TypeVar("T")
 
-WORKER = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
-"""The only worker of the process: CasADi and OMPL are not thread-safe. A dropped task runs to its end."""
+
+class Worker:
+    """The only planning thread of a process: CasADi and OMPL are not thread-safe. A dropped task runs to its end."""
+
+    def __init__(self) -> None:
+        self._start()
+        os.register_at_fork(after_in_child=self._start)  # a forked child has none of its parent's threads
+
+    def _start(self) -> None:
+        self._pool = ThreadPoolExecutor(max_workers=1, thread_name_prefix="planning")
+
+    def submit(self, work: Callable[..., T], *arguments: Any) -> Future[T]:
+        """Return the future result of `work`."""
+        return self._pool.submit(work, *arguments)
+
+
+WORKER = Worker()
 
 
 class BackgroundTask(Generic[T]):

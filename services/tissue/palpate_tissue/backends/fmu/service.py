@@ -161,11 +161,10 @@ def create(scenario: Scenario) -> Service:
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:
     """Return a service with an FMU in the role of its map, by default the tissue. Raises MapError, FmuError.
 
-    The frame `abdomen` is `true_pose(scenario)`: the patient's true frame where the scenario has its seed and errors, which is
-    the case for tissue, robot and camera.
+    The frame `abdomen` is the patient's true one for the tissue, and the registered one for any other role.
     """
     table = table or packaged_map("tissue_fmi2" if read_description(fmu_file)[0].fmiVersion == "2.0" else "tissue")
-    X_WA = matrix(true_pose(scenario))
+    X_WA = matrix(true_pose(scenario) if table.role == "tissue" else scenario.exam.pose)
     frames = {"world": np.eye(4), "abdomen": X_WA}
     known: dict[str, Any] = {"X_WA.position": X_WA[:3, 3], "X_WA.orientation": Rotation.from_matrix(X_WA[:3, :3]).as_quat()}
     if table.role == "tissue":
