@@ -42,7 +42,7 @@ LINK = re.compile(r"(?<!!)\[([^\]]*)\]\(([^)\s#]+)(#[^)]*)?\)")
 
 
 def gather(into: Path) -> None:
-    """Fills the folder `into`, which is deleted first."""
+    """Fill the folder `into`, which is deleted first."""
     shutil.rmtree(into, ignore_errors=True)
     listed = subprocess.run(
         ["git", "ls-files", "-co", "--exclude-standard"], cwd=ROOT, capture_output=True, text=True, check=True
@@ -71,7 +71,7 @@ def generated() -> dict[Path, str]:
 
 
 def execute(notebook: Path, into: Path) -> None:
-    """Executes a notebook and writes it into the folder as a page with its pictures. Raises CellExecutionError."""
+    """Execute a notebook and write it into the folder as a page with its pictures. Raises CellExecutionError."""
     cells = jupytext.read(ROOT / notebook)
     with tempfile.TemporaryDirectory(prefix="palpate-notebook-") as folder:
         try:
@@ -88,7 +88,7 @@ def execute(notebook: Path, into: Path) -> None:
 
 
 def title(text: str) -> str:
-    """The first heading of a page, up to a colon or comma."""
+    """Return the first heading of a page, up to a colon or comma."""
     heading = next(line for line in text.splitlines() if line.startswith("# "))
     return re.split("[:,]", heading.removeprefix("# "))[0]
 

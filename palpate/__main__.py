@@ -21,7 +21,7 @@ TERMINALS = [number for number in (0, 1, 2) if os.isatty(number)]
 
 
 def main() -> None:
-    """Runs the command in an environment that makes its runs repeatable."""
+    """Run the command in an environment that makes its runs repeatable."""
     if any(os.environ.get(name) != value for name, value in FIXED.items()):
         signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})  # until the interpreter is up again
         os.execve(sys.executable, [sys.executable, "-m", "palpate", *sys.argv[1:]], {**os.environ, **FIXED})

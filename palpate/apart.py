@@ -70,7 +70,7 @@ class TimeLimit:
         """Time for which the child has been at its present place."""
 
     def check(self) -> None:
-        """Raises ChildLost when the child is late. Call it every `POLL_S`."""
+        """Raise ChildLost when the child is late. Call it every `POLL_S`."""
         now, place = monotonic(), self._place()
         self.there_s = self.there_s + min(now - self._checked, 2 * POLL_S) if place == self._last else 0.0
         self._last, self._checked = place, now

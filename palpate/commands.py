@@ -85,7 +85,7 @@ COMMANDS = {name: where for group in GROUPS.values() for name, where in group.it
 
 
 def main() -> None:
-    """Runs the command of `sys.argv`."""
+    """Run the command of `sys.argv`."""
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if "--json" in sys.argv:
         reserve_output()
@@ -177,14 +177,14 @@ def _examples(examples: list[str], columns: int) -> str:
 
 
 def _exit_for_missing(name: str, error: ModuleNotFoundError) -> NoReturn:
-    """Exits if a library is not installed. Raises the error again for a missing module of Palpate."""
+    """Exit if a library is not installed. Raises the error again for a missing module of Palpate."""
     if (error.name or "palpate").startswith("palpate"):
         raise error
     _refuse_without((str(error.name),), name)
 
 
 def _check_libraries(name: str) -> None:
-    """Exits if a library of the command's extra is not installed, before anything is measured. Its help needs none."""
+    """Exit if a library of the command's extra is not installed, before anything is measured. Its help needs none."""
     helps = len(sys.argv) == 2 or not {*HELP_OPTIONS}.isdisjoint(sys.argv)
     if name in EXTRAS and not helps and (missing := missing_libraries(EXTRAS[name])):
         _refuse_without(missing, name)

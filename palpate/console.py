@@ -49,7 +49,7 @@ class CommandGroup(TyperGroup):
     """The commands. Every exception that Palpate raises on purpose becomes one line and an exit status here."""
 
     def invoke(self, ctx: Any) -> Any:
-        """Runs the chosen command."""
+        """Run the chosen command."""
         try:
             return super().invoke(ctx)
         except UserError as error:
@@ -63,18 +63,18 @@ class CommandGroup(TyperGroup):
 
 
 def say(why: object) -> None:
-    """Prints a message to standard error, without markup."""
+    """Print a message to standard error, without markup."""
     SteadyConsole(stderr=True).print(f"[bold red]palpate:[/] {escape(str(why))}", highlight=False, soft_wrap=True)
 
 
 def refuse(why: object) -> NoReturn:
-    """Prints a message and exits with the status of bad input."""
+    """Print a message and exits with the status of bad input."""
     say(why)
     raise typer.Exit(EXIT_BAD_INPUT) from None
 
 
 def fail(why: object) -> NoReturn:
-    """Prints a message and exits with the status of a failure after the start."""
+    """Print a message and exits with the status of a failure after the start."""
     say(why)
     raise typer.Exit(EXIT_FAILED) from None
 
@@ -140,12 +140,12 @@ def reserve_output() -> None:
 
 
 def print_json(value: Any) -> None:
-    """Prints one JSON document to standard output."""
+    """Print one JSON document to standard output."""
     print(json.dumps(value, indent=2), file=_DOCUMENT, flush=True)
 
 
 def print_line(value: Any) -> None:
-    """Prints one line of JSON, for streams."""
+    """Print one line of JSON, for streams."""
     print(json.dumps(value), file=_DOCUMENT, flush=True)
 
 
@@ -186,7 +186,7 @@ class CaseDisplay(Progress):
         self._task = self.add_task(unit, total=None, last="")
 
     def show(self, done: int, total: int, last: str) -> None:
-        """Shows the number of finished cases and the name of the last one."""
+        """Show the number of finished cases and the name of the last one."""
         self.update(self._task, completed=done, total=total, last=last)
         if self._lines and done:
             self.console.print(f"{done} of {total}  {last}", highlight=False)
@@ -203,11 +203,11 @@ class TimeLeft(Progress):
         self._shown = self.add_task(description, total=end - begin)
 
     def reach(self, where: float) -> None:
-        """Sets the position. Cheap: the bar is drawn ten times per second only."""
+        """Set the position. Cheap: the bar is drawn ten times per second only."""
         self._reached = where
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """Updates the bar; rich calls this at each refresh."""
+        """Update the bar; rich calls this at each refresh."""
         if self.task_ids:  # rich draws before the task exists, too
             self.update(self._shown, completed=self._reached - self._begin)
         yield from super().get_renderables()

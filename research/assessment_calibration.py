@@ -111,7 +111,7 @@ def weigh(seed: int) -> WeighedPatient:
 
 
 def real(candidate: Candidate, known: Truth) -> bool:
-    """True if a lump of felt contrast FELT or more is within a candidate's radius."""
+    """Return True if a lump of felt contrast FELT or more is within a candidate's radius."""
     bump, sign = candidate.bump, np.sign(candidate.log_contrast)
     angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
     ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
@@ -120,7 +120,7 @@ def real(candidate: Candidate, known: Truth) -> bool:
 
 
 def fitted(cases: list[WeighedPatient], calibration: Calibration) -> Calibration:
-    """The calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail.
+    """Return the calibration with probabilities and operating point of the cases: logistic regression, and an exponential tail.
 
     The regression is of a lump against all else, the tail of what is reported, with muscles among what else it may be.
     """

@@ -75,7 +75,7 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 
 
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
-    """The base placement with the least cost over the scenario's region. Raises RuntimeError if no start converges."""
+    """Return the base placement with the least cost over the scenario's region. Raises RuntimeError if no start converges."""
     contact = scan_targets(scenario, spacing, BORDER_M)
     raised = scan_targets(scenario, spacing, BORDER_M, RAISED_M)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))

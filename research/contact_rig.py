@@ -72,7 +72,7 @@ class DelayedInbox:
         self._inbox: Inbox | None = None
 
     def advance(self, t: int, inbox: Inbox, scripted: Mapping[str, Message]) -> None:
-        """Takes what has been sent and hands on what has arrived by `t` [ns]."""
+        """Take what has been sent and hands on what has arrived by `t` [ns]."""
         self._inbox = inbox
         self._new = {topic: [message] for topic, message in scripted.items()}
         for topic, message in scripted.items():
@@ -97,7 +97,7 @@ class DelayedInbox:
         return self._inbox
 
     def latest(self, topic: str) -> Message | None:
-        """The newest message that has arrived."""
+        """Return the newest message that has arrived."""
         if self._mine(topic):
             return self._latest[topic][1] if topic in self._latest else None
         return self._real.latest(topic)
@@ -113,7 +113,7 @@ class DelayedInbox:
         return self._real.stamp(topic)
 
     def lost(self, role: str) -> bool:
-        """True if the service of that role is lost."""
+        """Return True if the service of that role is lost."""
         return self._real.lost(role)
 
 
@@ -130,7 +130,7 @@ class Delayed(Service):
         self._script = script
 
     def start(self) -> Outbox:
-        """The inner service's latched messages."""
+        """Return the inner service's latched messages."""
         return self._inner.start()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -142,7 +142,7 @@ class Delayed(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """The inner service's facts."""
+        """Return the inner service's facts."""
         return self._inner.finish()
 
 
@@ -169,7 +169,7 @@ class Delays:
     seed: int = 0
 
     def on(self, *topics: str) -> dict[str, BusDelay]:
-        """The delays among `topics`, each with a random stream of its own."""
+        """Return the delays among `topics`, each with a random stream of its own."""
         return {
             topic: BusDelay(self.delay_s, self.jitter_s, 100 * self.seed + EVENTS.index(topic))
             for topic in topics
@@ -221,7 +221,7 @@ def scenario(contrast: float) -> Scenario:
 
 @cache
 def _tissue(contrast: float) -> Service:
-    """A tissue that has not been touched; a run takes a copy of it."""
+    """Return a tissue that has not been touched; a run takes a copy of it."""
     return create_tissue(scenario(contrast))
 
 

@@ -202,7 +202,7 @@ def measure(depths: Array = DEPTHS_M) -> Bodies:
 
 
 def section(bodies: Bodies | None = None, depths: Array = DEPTHS_M) -> PageSection:
-    """The comparison with its bounds."""
+    """Return the comparison with its bounds."""
     bodies = bodies or measure(depths)
     exact = sliding_vertices(BOX, depths)
 

@@ -89,7 +89,7 @@ def where_met(folder: Path) -> list[Met]:
 
 
 def met_by(began: Mapping[int, float], truth: Array) -> list[Met]:
-    """The same of descents that began at times [s]; `truth` has rows of time, depth, force and place [m], shape (n, 6)."""
+    """Return the same of descents that began at times [s]; `truth` has rows of time, depth, force and place [m], shape (n, 6)."""
     time, depth, force = truth.T[:3]
     met = []
     for stroke, begin in began.items():
@@ -112,7 +112,7 @@ def contact_summary(met: Sequence[Met]) -> str:
 
 
 def row(name: str, depths: Depths) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     between, within = (1e3 * x for x in depths.by_stroke())
     wrong, reported = (1e3 * float(np.sqrt(np.mean(x**2))) for x in (depths.error, depths.sigma))
     strokes = len(np.unique(depths.stroke))
@@ -136,7 +136,7 @@ def draw(figure: Figure, reported: Sequence[tuple[str, Depths]]) -> None:
 
 
 def main() -> None:
-    """Prints a table of the runs, and draws them."""
+    """Print a table of the runs, and draw them."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path)
     parser.add_argument("--picture", type=Path)

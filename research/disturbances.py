@@ -117,7 +117,7 @@ def _with_rectus(patient: FeltPatient) -> FeltPatient:
 
 
 def line(row: Disturbance, seeds: range, region: float = REGION_M) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     results = [examined(row, seed, region) for seed in seeds]
     ill = sum(findings > 0 for findings, _ in results)
     held = 100 * np.array([part for _, part in results])
@@ -127,7 +127,7 @@ def line(row: Disturbance, seeds: range, region: float = REGION_M) -> str:
 
 
 def main() -> None:
-    """Prints the table, row by row."""
+    """Print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--patients", type=int, default=30)
     parser.add_argument("--first-seed", type=int, default=1000)

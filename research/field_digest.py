@@ -30,7 +30,7 @@ NOT_HASHED: Final = ("record_chunks", "diagnostics", "clock")
 
 
 def update(digest: Any, value: Any, kind: str = "") -> None:
-    """Adds the numbers of `value`, field by field; skips strings and `ADDED` fields."""
+    """Add the numbers of `value`, field by field; skips strings and `ADDED` fields."""
     if isinstance(value, str):
         return
     if dataclasses.is_dataclass(value):
@@ -77,7 +77,7 @@ def digests(folder: Path) -> dict[str, str]:
 
 
 def main() -> None:
-    """Prints the digest of each topic, and of all topics."""
+    """Print the digest of each topic, and of all topics."""
     found = digests(Path(sys.argv[1]))
     whole = hashlib.sha256("".join(f"{k} {v}\n" for k, v in found.items()).encode()).hexdigest()
     for topic, digest in found.items():

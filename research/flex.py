@@ -74,7 +74,7 @@ class FlexBlock:
         return int(self.model.nflexvert)
 
     def press(self, depth: float) -> tuple[float, float]:
-        """Moves to `depth` [m], holds, and returns the force [N] and the cost of a held step, fastest tenth [us]."""
+        """Move to `depth` [m], hold, and return the force [N] and the cost of a held step, fastest tenth [us]."""
         while self.depth < depth:
             self.depth = min(self.depth + SPEED_MPS * DT, depth)
             self._step()
@@ -143,7 +143,7 @@ def measure() -> FlexCurves:
 
 
 def section(curves: FlexCurves | None = None) -> PageSection:
-    """The comparison with its bounds."""
+    """Return the comparison with its bounds."""
     c = curves or measure()
     checks = (
         Check("flex over Hertz at 10 mm", c.flex[-1] / c.hertz[-1], "", 0.75, 1.25, "Hertz, R = 30 mm"),

@@ -63,7 +63,7 @@ class Weighed:
 
 
 def cases() -> list[Case]:
-    """The tuning patients."""
+    """Return the tuning patients."""
     found = cases_of(load_study("guarding"), Request(split="tune"))
     others = cases_of(load_study("operating-point"), Request(split="tune"))
     return [*found, *(case for case in others if case.number < FIRST)]
@@ -114,7 +114,7 @@ def fitted(rows: list[Weighed]) -> Array:
 
 
 def evaluate(rows: list[Weighed], calibration: Calibration, false_findings: float = 0.02) -> None:
-    """Prints what the weights change among the patients that they are fitted to."""
+    """Print what the weights change among the patients that they are fitted to."""
     muscle = calibration.muscle(np.array([row.signs for row in rows]))
     muscle[[row.softer for row in rows]] = -np.inf
     before = np.array([row.logit for row in rows])

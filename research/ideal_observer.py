@@ -67,7 +67,7 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
 
 
 def ideal(o: Observations, length: float) -> float:
-    """The ideal observer's greatest |t| of a scan."""
+    """Return the ideal observer's greatest |t| of a scan."""
     apart, lever = cdist(o.xy, o.xy, "sqeuclidean"), np.outer(o.per_metre, o.per_metre)
     S = fixed(replace(o, depth_uncertainty=np.zeros(len(o.y))), learned())
     S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
@@ -84,7 +84,7 @@ def ideal(o: Observations, length: float) -> float:
 
 
 def ours(o: Observations) -> float:
-    """The assessment's greatest logit of a scan; -20 where it weighs nothing."""
+    """Return the assessment's greatest logit of a scan; -20 where it weighs nothing."""
     calibration = learned()
     _, candidates = detect(o, calibration)
     return float(calibration.logit(np.array([c.features for c in candidates])).max()) if candidates else -20.0
@@ -100,7 +100,7 @@ def auc(scores: Array, diseased: NDArray[np.bool_]) -> tuple[float, float]:
 
 
 def row(scores: Array, contrasts: Array) -> list[str]:
-    """An observer's AUC, and how many lumps of each class it finds, of patients with these felt contrasts (n,)."""
+    """Return an observer's AUC, and how many lumps of each class it finds, of patients with these felt contrasts (n,)."""
     area, error = auc(scores, contrasts > 1)
     threshold = np.quantile(scores[contrasts == 1], 1 - FALSE_ALARMS)
     words = [f"{area:.2f} ({max(area - 1.96 * error, 0):.2f} to {min(area + 1.96 * error, 1):.2f})"]

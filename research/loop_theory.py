@@ -79,7 +79,7 @@ class LinearLoop:
         return z, robot @ control, robot @ (along * normal[:, None, None] + across * self.shear)
 
     def stable(self, control_ms: int, contact_ms: int) -> bool:
-        """True if stable with these delays [ms] of each message of the control and of the contact path."""
+        """Return True if stable with these delays [ms] of each message of the control and of the contact path."""
         z, control, tissue = self._contour
         late = z[:, None, None]
         d = np.linalg.det(np.eye(7) + control * late ** (-2 * control_ms) + tissue * late ** (-2 * contact_ms))

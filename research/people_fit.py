@@ -72,7 +72,7 @@ def fit(measured: Array, simulated: Simulated) -> tuple[WallParameters, float, f
 
 
 def tension_of() -> Callable[[float], float]:
-    """The tension that multiplies the force of the median person's wall at 10 mm by a ratio."""
+    """Return the tension that multiplies the force of the median person's wall at 10 mm by a ratio."""
     at = round(PRESS.ratio_at_m / PRESS.spacing_m)
     force = np.array([press(MEDIAN, tension, PRESS.ratio_at_m)[at] for tension in track(TENSIONS.tolist(), "tensions")])
     return lambda ratio: float(np.interp(ratio, force / force[0], TENSIONS))
@@ -93,7 +93,7 @@ def fits() -> dict[tuple[str, str], Fit]:
 
 
 def write(found: dict[tuple[str, str], Fit], path: Path) -> None:
-    """Writes `fitted.csv`."""
+    """Write `fitted.csv`."""
     with path.open("w", encoding="ascii", newline="") as file:
         out = csv.writer(file, lineterminator="\n")
         out.writerow(COLUMNS)

@@ -77,7 +77,7 @@ class Compared:
 
 
 def figures_of(report: Report, found: Map, felt: Felt, touched: Touched) -> Tier:
-    """The figures of a case."""
+    """Return the figures of a case."""
     true = felt.force(touched.places(found.vertices[:, :2]))
     known = found.scanned & np.isfinite(true)
     off = np.log(found.apparent[known] / true[known])
@@ -129,7 +129,7 @@ def compare(quick: Sequence[Tier], whole: Sequence[Tier]) -> list[Compared]:
 
 
 def draw(figure: Figure, quick: Sequence[Tier], whole: Sequence[Tier], rows: Sequence[Compared]) -> None:
-    """Maps against each other, and the differences with their intervals over their margins."""
+    """Map against each other, and the differences with their intervals over their margins."""
     left, right = figure.subplots(1, 2)
     for k, (q, w) in enumerate(zip(quick, whole, strict=True)):
         both = np.flatnonzero(q.scanned & w.scanned)

@@ -64,7 +64,7 @@ BENT_M: Final = 0.0005
 
 
 def read(folder: Path) -> tuple[Scenario, Collected, Known]:
-    """The recorded run in a folder, and the truth of it. Raises RecordingError, ScenarioError."""
+    """Return the recorded run in a folder, and the truth of it. Raises RecordingError, ScenarioError."""
     scenario = load_scenario(str(folder / "scenario.yaml"))
     collected = collect(open_recording(folder / RECORDING))
     return scenario, collected, truth_of_run(scenario, collected)
@@ -90,7 +90,7 @@ def again(scenario: Scenario, collected: Collected, known: Known, row: str) -> S
 
 
 def line(name: str, scores: Sequence[Scores]) -> str:
-    """A row of the table."""
+    """Return a row of the table."""
     healthy = [s for s in scores if s.matched + s.missed + s.not_palpable == 0]
     lumps = sum(s.matched + s.missed for s in scores)
     matched = [f.ratio_held for s in scores for f in s.findings if f.ratio_held is not None and f.lump is not None]
@@ -129,7 +129,7 @@ def _mean(shares: Sequence[float | None]) -> str:
 
 
 def main() -> None:
-    """Prints the table, row by row."""
+    """Print the table, row by row."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folders", nargs="+", type=Path, metavar="RUN", help="folder of a run with --record normal or full")
     parser.add_argument("--row", action="append", choices=list(ROWS), help="may be repeated; without it the run as it is")

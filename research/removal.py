@@ -55,7 +55,7 @@ INTERVAL = {"tissue's step": 6}
 
 @contextmanager
 def _interpreted(modules: Sequence[str]) -> Iterator[None]:
-    """Runs the compiled functions of `modules` as Python."""
+    """Run the compiled functions of `modules` as Python."""
     changed: list[tuple[dict[str, Any], str, Any]] = []
     for name in [name for name in sys.modules if name.startswith("palpate_")]:
         names = vars(sys.modules[name])
@@ -73,7 +73,7 @@ def _interpreted(modules: Sequence[str]) -> Iterator[None]:
 
 @contextmanager
 def _by_rosbags(run: Composed, kind: str) -> Iterator[None]:
-    """Encodes and decodes the messages of one type with rosbags."""
+    """Encode and decodes the messages of one type with rosbags."""
     ports = [port for stepper in run.steppers.values() for port in stepper.ports.values() if port.topic.type == kind]
     buffers = [buffer for stepper in run.steppers.values() for buffer in stepper.buffers.values() if buffer.topic.type == kind]
     for port in ports:
@@ -90,7 +90,7 @@ def _by_rosbags(run: Composed, kind: str) -> Iterator[None]:
 
 
 def measure(scenario: Scenario) -> dict[str, list[float]]:
-    """The time of slots without each thing as a multiple of the time of those around them, over one examination."""
+    """Return the time of slots without each thing as a multiple of the time of those around them, over one examination."""
     tree = FrameTree(exam_input(scenario))
     run = Composed([*load_services(scenario, WORKERS), collector := Collector(tree=tree)])
     removals: dict[str, Callable[[], Any]] = {name: partial(_interpreted, modules) for name, modules in MODULES.items()}
@@ -134,7 +134,7 @@ def table(runs: Sequence[dict[str, list[float]]]) -> Table:
 
 
 def _mid_mean(values: np.ndarray[Any, np.dtype[np.float64]]) -> float:
-    """The mean of the middle half: a slot in which the garbage collector or a rare topic was busy says nothing."""
+    """Return the mean of the middle half: a slot in which the garbage collector or a rare topic was busy says nothing."""
     quarter = len(values) // 4
     return float(np.sort(values)[quarter : len(values) - quarter].mean())
 

@@ -231,18 +231,18 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
 
 
 def scored(data: Scan) -> Scores:
-    """The scores of the service on a scan."""
+    """Return the scores of the service on a scan."""
     stiffness_map, findings, _ = examine(data)
     return score(found_of(findings.findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
 
 
 def scenario_with(lesions: tuple[Lesion, ...], seed: int) -> Scenario:
-    """A scenario of the default abdomen with given lesions."""
+    """Return a scenario of the default abdomen with given lesions."""
     return Scenario(seed=seed, phantom=Phantom(lesions=lesions))
 
 
 def random_lesion(seed: int) -> Lesion:
-    """A lesion anywhere in the examined region, of 20 to 40 mm radius and contrast 2.5 to 5."""
+    """Return a lesion anywhere in the examined region, of 20 to 40 mm radius and contrast 2.5 to 5."""
     rng = np.random.Generator(np.random.PCG64(seed))
     radii = rng.uniform(0.02, 0.04, 2)
     x, y = rng.uniform(-0.1 + radii.max(), 0.1 - radii.max(), 2)
@@ -250,7 +250,7 @@ def random_lesion(seed: int) -> Lesion:
 
 
 def main(seeds: int) -> None:
-    """Prints a row a scan, and the means of each kind."""
+    """Print a row a scan, and the means of each kind."""
     rlq = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.035, 0.030), contrast=4.0)
     right = Lesion(centre_m=(-0.055, -0.055), radii_m=(0.03, 0.03), contrast=4.0)
     left = Lesion(centre_m=(0.055, 0.055), radii_m=(0.025, 0.025), contrast=3.5)

@@ -43,7 +43,7 @@ class SkinError:
 
 
 def read(folder: Path) -> SkinError:
-    """The skin of a recorded run. Raises RecordingError, and KeyError where no correction was sent."""
+    """Return the skin of a recorded run. Raises RecordingError, and KeyError where no correction was sent."""
     scenario, newest = load_scenario(str(folder / "scenario.yaml")), dict[str, Message]()
     for message in open_recording(folder).messages((SURFACE, IMAGES, ALL)):
         newest[message.topic] = codec.decode(message.payload, contract().topics[message.topic].type)
@@ -86,7 +86,7 @@ def draw(figure: Figure, skin: SkinError) -> None:
 
 
 def main() -> None:
-    """Prints how large each part is, and draws the maps."""
+    """Print how large each part is, and draw the maps."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("--picture", type=Path)

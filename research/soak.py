@@ -87,7 +87,7 @@ class Soak:
             self.add(sample)
 
     def add(self, sample: ProcessSample) -> None:
-        """Adds a sample."""
+        """Add a sample."""
         peak = self.peaks.setdefault(sample.role, {}).setdefault(sample.number, Peak(sample.at_s))
         peak.rss_mb, peak.descriptors = max(peak.rss_mb, sample.rss_mb), max(peak.descriptors, sample.descriptors)
 
@@ -96,7 +96,7 @@ class Soak:
         return [_growth(role, list(peaks.values())) for role, peaks in self.peaks.items()]
 
     def write(self, folder: Path) -> None:
-        """Writes soak.json."""
+        """Write soak.json."""
         write_text(folder / GROWTHS, json.dumps([asdict(growth) for growth in self.growths()], indent=1) + "\n")
 
 
@@ -189,7 +189,7 @@ def growth_table(growths: list[Growth]) -> str:
 
 
 def draw(soaks: dict[str, list[ProcessSample]], path: Path) -> None:
-    """Writes a PNG: for each soak, by its name, the most memory and open files of every role in each examination, and its memory
+    """Write a PNG: for each soak, by its name, the most memory and open files of every role in each examination, and its memory
     in the course of the examination in the middle.
     """
     figure = Figure(figsize=(11.0, 3.2 * len(soaks)), layout="constrained")
@@ -224,7 +224,7 @@ def main(
     folders: Annotated[list[Path], typer.Argument(help="Folders of soaks; their names are those in the figure.")],
     out: Annotated[Path, typer.Option(help="Where the figure goes.")] = Path("soak.png"),
 ) -> None:
-    """Prints how the memory of each role grows from examination to examination, and draws it."""
+    """Print how the memory of each role grows from examination to examination, and draw it."""
     try:
         growths = {folder.name: read_growths(folder) for folder in folders}
         soaks = {folder.name: _ended(read_samples(folder), growths[folder.name]) for folder in folders}

@@ -66,7 +66,7 @@ def margin_ms(contrast: float, topics: tuple[str, ...], stiffness: float = STIFF
 
 
 def measure() -> Stability:
-    """The sweeps, and margins of each path for each contrast."""
+    """Return the sweeps, and margins of each path for each contrast."""
     delay = {c: [press(c, STIFFNESS_NPM, Delays(EVENTS, ms * 1e-3)) for ms in DELAYS_MS] for c in CONTRASTS}
     jitter = {c: [press(c, STIFFNESS_NPM, Delays(EVENTS, 0.0, ms * 1e-3)) for ms in DELAYS_MS] for c in CONTRASTS}
     margins = []

@@ -47,7 +47,7 @@ def run(tags: bool) -> Cost:
 
 
 def main(pairs: int) -> None:
-    """Prints each pair, then by how much more processor time and time the tagged run takes, with a 95 % interval."""
+    """Print each pair, then by how much more processor time and time the tagged run takes, with a 95 % interval."""
     run(True)  # compiles what is not compiled yet
     logs = []
     for number in range(pairs):

@@ -29,7 +29,7 @@ SERVE = "--serve"
 
 
 def serve(tree: str, answers: IO[str]) -> None:
-    """Runs one turn of the composed run of `tree` for each line of standard input and prints its cost [ns]."""
+    """Run one turn of the composed run of `tree` for each line of standard input and print its cost [ns]."""
     # Imports of the checkout under test, whose modules may have other names than ours.
     import palpate_bus  # noqa: PLC0415
     import palpate_models  # noqa: PLC0415
@@ -58,7 +58,7 @@ def serve(tree: str, answers: IO[str]) -> None:
 
 
 def started(tree: Path) -> subprocess.Popen[str]:
-    """The composed run of a checkout, whose packages come before those that are installed."""
+    """Return the composed run of a checkout, whose packages come before those that are installed."""
     folders = (
         tree,
         *(tree / name for name in ("bus", "models", "dashboards", "fmus/abdomen")),
@@ -74,7 +74,7 @@ def started(tree: Path) -> subprocess.Popen[str]:
 
 
 def _answer(run: subprocess.Popen[str], question: str = "") -> str:
-    """The next line that a run prints, after a question."""
+    """Return the next line that a run prints, after a question."""
     assert run.stdin is not None
     assert run.stdout is not None
     run.stdin.write(question)

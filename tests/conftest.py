@@ -21,13 +21,13 @@ LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", 
 
 @pytest.fixture(scope="session")
 def distributed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """A short examination by the command, in real processes."""
+    """Return a short examination by the command, in real processes."""
     return palpate_run("clean", tmp_path_factory.mktemp("distributed"), settings=GATE)
 
 
 @pytest.fixture(scope="session")
 def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """The same examination in one process."""
+    """Return the same examination in one process."""
     return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--record", "none", settings=GATE)
 
 

@@ -48,7 +48,7 @@ class Elsewhere:
 
 @pytest.fixture(scope="module")
 def elsewhere() -> Iterator[Elsewhere]:
-    """The environment of 1.5 GB is removed at the end."""
+    """Return the environment of 1.5 GB is removed at the end."""
     with tempfile.TemporaryDirectory(prefix="palpate-install-") as folder:
         yield Elsewhere(Path(folder))
 

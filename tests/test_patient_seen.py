@@ -28,7 +28,7 @@ IDEAL = Errors.model_validate({"level": "none", "camera": {"noise_scale": 0.0}})
 
 
 def surface(phantom: Phantom, t: int) -> Any:
-    """The surface that the tissue sends at `t` [ns]."""
+    """Return the surface that the tissue sends at `t` [ns]."""
     service = create(Scenario(phantom=phantom, errors=Errors(level="none")))
     service.start()
     return service.step(t, HandInbox())["sim/surface"]

@@ -27,7 +27,7 @@ class Codec:
     param_names = ("message", "codec")
 
     def setup(self, name: str, by: str) -> None:
-        """Prepares encoder, decoder and payload."""
+        """Prepare encoder, decoder and payload."""
         kind, self.message = example(name)
         self.payload = codec.encode(self.message, kind)
         if by == "palpate":
@@ -37,9 +37,9 @@ class Codec:
             self.decode = lambda payload: codec.store.deserialize_cdr(payload, kind)
 
     def time_encode(self, *_: str) -> None:
-        """Encodes the message."""
+        """Encode the message."""
         self.encode(self.message)
 
     def time_decode(self, *_: str) -> None:
-        """Decodes the payload."""
+        """Decode the payload."""
         self.decode(self.payload)

@@ -37,7 +37,7 @@ class Step:
         return str(path)
 
     def setup(self, path: str, by: str) -> None:
-        """Loads the FMU and presses."""
+        """Load the FMU and press."""
         model = build_phantom(Phantom(), seed=0)
         top = float(model.vertices[np.hypot(*model.vertices[:, :2].T).argmin(), 2])
         self.position, self.velocity, self.k = np.array((0.0, 0.0, top + RADIUS_M - DEPTH_M)), np.zeros(3), 0
@@ -53,7 +53,7 @@ class Step:
             self.wrench = self.fmu.port(["contact_force", "contact_torque"])
 
     def time_step(self, _path: str, by: str) -> None:
-        """Sets the motion, steps, reads the wrench."""
+        """Set the motion, step, read the wrench."""
         self.k += 1
         if by == "fmpy":
             self.fmu.setFloat64(MOTION, [*self.position, *self.velocity])

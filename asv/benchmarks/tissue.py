@@ -47,7 +47,7 @@ class Abdomen(Slide):
     param_names = ("tier", "wall")
 
     def setup(self, tier: str, wall: str) -> None:
-        """Builds the wall and the path over its surface."""
+        """Build the wall and the path over its surface."""
         lesion = Lesion(centre_m=(-0.055, 0.01), depth_m=0.01)
         muscles = (Guarding(centre_m=(-0.03, 0.01)),) if wall == "guarding" else ()
         phantom = Phantom(lesions=(lesion,), guarding=muscles)
@@ -79,7 +79,7 @@ class FlatPatch(Slide):
     param_names = ("tier", "vertices")
 
     def setup(self, tier: str, vertices: int) -> None:
-        """Builds the patch. Skips sizes that a tier refuses."""
+        """Build the patch. Skips sizes that a tier refuses."""
         model = flat_patch(vertices)
         try:
             if tier == "surface":
@@ -97,7 +97,7 @@ class FlatPatch(Slide):
         self.step()
 
     def time_surface(self, *_: object) -> None:
-        """Reads the deformed surface."""
+        """Read the deformed surface."""
         _ = self.body.deformed_vertices
 
 

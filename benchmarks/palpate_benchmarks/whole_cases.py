@@ -74,7 +74,7 @@ CASES: Final = CaseTuning()
 
 
 def is_whole(case: FaultCase) -> bool:
-    """True if a case hits a run from outside."""
+    """Return True if a case hits a run from outside."""
     return case.kind in (PARTITION, *SCARCE_KINDS) or (case.kind in KINDS and case.where not in WORKERS)
 
 

@@ -81,7 +81,7 @@ def record_graph(folder: Path) -> None:
 
 
 def _has_started(folder: Path) -> bool:
-    """True once the recorder has written something."""
+    """Return True once the recorder has written something."""
     path = folder / "recording_mcap" / "recording_mcap_0.mcap"
     return path.is_file() and path.stat().st_size > 0
 

@@ -63,7 +63,7 @@ def _node(
 
 
 def in_background(role: Role, runtime: str) -> bool:
-    """True for services of low priority: observers, and in lockstep all that are not in the 1 kHz loop."""
+    """Return True for services of low priority: observers, and in lockstep all that are not in the 1 kHz loop."""
     return role.observer or (runtime == "lockstep" and role.period > MS)
 
 

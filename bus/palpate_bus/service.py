@@ -37,7 +37,7 @@ class Inbox(Protocol):
         """Return the time [ns] of `latest(topic)`: of the producer's tick in lockstep, of reception in wall-clock mode."""
 
     def lost(self, role: str) -> bool:
-        """True if the service of that role is lost (its liveliness token vanished)."""
+        """Return True if the service of that role is lost (its liveliness token vanished)."""
 
 
 class Service(ABC):

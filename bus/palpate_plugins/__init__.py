@@ -32,7 +32,7 @@ class PluginError(UserError):
 
 
 def is_file(choice: str) -> bool:
-    """True if a choice is a path, not a name."""
+    """Return True if a choice is a path, not a name."""
     return choice.endswith(".py")
 
 
@@ -77,7 +77,7 @@ class PluginKind:
             raise self._error(choice, needs(missing, extra))
 
     def foreign(self, choice: str) -> bool:
-        """True for a user's file and for a plug-in of another distribution."""
+        """Return True for a user's file and for a plug-in of another distribution."""
         if is_file(choice):
             return True
         point = next(iter(entry_points(group=f"palpate.{self.kind}", name=choice)), None)
@@ -197,7 +197,7 @@ def _imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
 
 
 def _importable(name: str, folder: Path) -> bool:
-    """True if the package is installed or in `folder`. Imports nothing."""
+    """Return True if the package is installed or in `folder`. Imports nothing."""
     return name in sys.modules or find_spec(name) is not None or PathFinder.find_spec(name, [str(folder)]) is not None
 
 

@@ -19,7 +19,7 @@ def buffer(topic: str, edge: Edge) -> InputBuffer:
 
 
 def first_ready(tested: InputBuffer, t: int) -> int:
-    """The earliest tick [ns] of the producer at which the reader may step at `t`."""
+    """Return the earliest tick [ns] of the producer at which the reader may step at `t`."""
     for tick in (-1, *range(0, t + MS, MS)):
         tested.advanced = tick
         if tested.ready(t):

@@ -65,7 +65,7 @@ def wrench(x: float = 0.0) -> Any:
 
 
 def misbehave(how: str) -> None:
-    """Does what foreign code may do."""
+    """Do what foreign code may do."""
     print(f"{how} by print")
     os.write(1, f"{how} by file descriptor 1\n".encode())
     if how.startswith("exit"):

@@ -53,7 +53,7 @@ class Columns:
         self._rows: dict[str, tuple[Kind, list[int], list[Row]]] = {}
 
     def add(self, entity: str, kind: Kind, t: int, row: Row) -> None:
-        """Adds a row of `entity` at simulated time `t` [ns]. An entity has one kind."""
+        """Add a row of `entity` at simulated time `t` [ns]. An entity has one kind."""
         try:
             _, times, rows = self._rows[entity]
         except KeyError:
@@ -62,7 +62,7 @@ class Columns:
         rows.append(row)
 
     def send(self) -> None:
-        """Sends the collected rows, one chunk per entity."""
+        """Send the collected rows, one chunk per entity."""
         for entity, (kind, times, rows) in self._rows.items():
             if times:
                 index = rr.TimeColumn(TIMELINE, duration=np.array(times, dtype="timedelta64[ns]"))

@@ -61,7 +61,7 @@ class NoPicture(UserError):
 
 @contextmanager
 def page_at(port: int, width: int, height: int) -> Iterator[Page]:
-    """Opens the viewer served at `port` in a headless browser of `width` x `height` px. Raises NoPicture."""
+    """Open the viewer served at `port` in a headless browser of `width` x `height` px. Raises NoPicture."""
     chromium = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if chromium is None:
         raise NoPicture(f"no browser: none of {', '.join(BROWSERS)} is on the PATH")
@@ -89,7 +89,7 @@ def screenshot(page: Page) -> Pixels:
 
 @contextmanager
 def _shown(folder: Path, port: int, size: tuple[int, int]) -> Iterator[tuple[DashboardService, Callable[[], Page]]]:
-    """Yields the empty dashboard of a recorded run and a function that opens its page. Raises NoPicture and OSError."""
+    """Yield the empty dashboard of a recorded run and a function that opens its page. Raises NoPicture and OSError."""
     if not recording_of(folder):
         raise NoPicture(f"{folder}: no recording there; give the folder of a recorded run")
     service = DashboardService(load_scenario(str(folder / "scenario.yaml")), None, Live(serve_port=port), paced=False)
@@ -99,7 +99,7 @@ def _shown(folder: Path, port: int, size: tuple[int, int]) -> Iterator[tuple[Das
 
 
 def take(folder: Path, target: Path, at_s: float, port: int, size: tuple[int, int], report: Callable[[str], None]) -> None:
-    """Writes the dashboard of the run in `folder` at `at_s` [s] to the PNG file `target`; `size`: browser window [px].
+    """Write the dashboard of the run in `folder` at `at_s` [s] to the PNG file `target`; `size`: browser window [px].
 
     Raises NoPicture, also when the run was not recorded, and OSError.
     """
@@ -114,7 +114,7 @@ def take(folder: Path, target: Path, at_s: float, port: int, size: tuple[int, in
 
 
 def film(folder: Path, target: Path, port: int, size: tuple[int, int], report: Callable[[str], None]) -> None:
-    """Writes the whole run in `folder` as a time lapse to the GIF file `target`; `size`: browser window [px].
+    """Write the whole run in `folder` as a time lapse to the GIF file `target`; `size`: browser window [px].
 
     Raises NoPicture, also when the run was not recorded, and OSError.
     """

@@ -68,7 +68,7 @@ class ForceDepth:
         self._recording.log("force_depth/wanted_depth", guide, static=True)
 
     def add(self, t: int, depth_m: float, force_n: float, in_contact: bool) -> None:
-        """Adds a sample at simulated time `t` [ns]; samples without contact are skipped."""
+        """Add a sample at simulated time `t` [ns]; samples without contact are skipped."""
         if not in_contact:
             return
         self._past.append((STRETCH * 1e3 * depth_m, -STRETCH * force_n))
@@ -171,48 +171,48 @@ class Plots:
         self._columns.add(path, scalars, t, np.array(values, dtype=np.float64))
 
     def force(self, t: int, measured_n: float) -> None:
-        """Plots the tared normal force and its working limit."""
+        """Plot the tared normal force and its working limit."""
         self._add("plots/force/measured", t, measured_n)
         self._columns.add("plots/force/limit", scalars, t, self._limit)
 
     def true_contact(self, t: int, depth_m: float, force_n: float) -> None:
-        """Plots the true contact depth and force."""
+        """Plot the true contact depth and force."""
         self._add("plots/force/true", t, force_n)
         self._add("plots/depth/true", t, 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else np.nan)
 
     def true_patient(self, t: int, excursion_m: float, moved_m: float) -> None:
-        """Plots the true breathing excursion and the displacement of the umbilicus from its initial position."""
+        """Plot the true breathing excursion and the displacement of the umbilicus from its initial position."""
         self._add("plots/truth/breath", t, 1e3 * excursion_m)
         self._add("plots/truth/moved", t, 1e3 * moved_m)
 
     def wall(self, t: int, displacement_m: float, forecast_m: float, ahead: int) -> None:
-        """Plots the measured breathing displacement, and its forecast `ahead` [ns] later."""
+        """Plot the measured breathing displacement, and its forecast `ahead` [ns] later."""
         self._add("plots/wall/displacement", t, 1e3 * displacement_m)
         self._add("plots/wall/forecast", t + ahead, 1e3 * forecast_m)
 
     def depth(self, t: int, measured_m: float, setpoint_m: float) -> None:
-        """Plots measured depth and set-point, along the inward normal from the perceived surface."""
+        """Plot measured depth and set-point, along the inward normal from the perceived surface."""
         self._add("plots/depth/measured", t, 1e3 * measured_m if measured_m > DEPTH_FLOOR_M else np.nan)
         self._add("plots/depth/setpoint", t, 1e3 * setpoint_m if setpoint_m > DEPTH_FLOOR_M else np.nan)
 
     def torques(self, t: int, share: Array) -> None:
-        """Plots applied torques over their limits [1], shape (7,)."""
+        """Plot applied torques over their limits [1], shape (7,)."""
         self._columns.add("plots/torque/joints", scalars, t, 100.0 * share)
 
     def progress(self, t: int, visited: int, total: int) -> None:
-        """Plots the share of visited targets."""
+        """Plot the share of visited targets."""
         self._add("plots/progress/targets", t, 100.0 * visited / total if total else 0.0)
 
     def speed(self, t: int, real_time_factor: float) -> None:
-        """Plots simulated over wall time during the last simulated second."""
+        """Plot simulated over wall time during the last simulated second."""
         self._add("plots/speed/real_time_factor", t, real_time_factor)
 
     def waits(self, t: int, share: Array) -> None:
-        """Plots the share of the observed waits caused by each of `AWAITED` [1], shape (k,)."""
+        """Plot the share of the observed waits caused by each of `AWAITED` [1], shape (k,)."""
         self._columns.add("plots/waits/roles", scalars, t, 100.0 * share)
 
     def state(self, t: int, path: str, name: str) -> bool:
-        """Writes a state when it changes; returns True if it did."""
+        """Write a state when it changes; return True if it did."""
         if self._states.get(path) == name:
             return False
         self._states[path] = name
@@ -232,14 +232,14 @@ class Plots:
             self.log(t, f"log/{path}", row.message, _LOG_LEVELS[row.word])
 
     def log(self, t: int, path: str, text: str, level: str = "INFO") -> None:
-        """Logs a line unless it equals the previous one on this path."""
+        """Log a line unless it equals the previous one on this path."""
         if text and self._texts.get(path) != text:
             self._texts[path] = text
             self._at(t)
             self._recording.log(path, rr.TextLog(text, level=level))
 
     def document(self, t: int, path: str, markdown: str) -> None:
-        """Writes a page of text when it changes."""
+        """Write a page of text when it changes."""
         if self._texts.get(path) != markdown:
             self._texts[path] = markdown
             self._at(t)

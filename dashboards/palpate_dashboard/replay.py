@@ -50,7 +50,7 @@ class RecordedInbox:
         self._stamps: dict[str, int] = {}
 
     def put(self, topic: str, payload: bytes, stamp: int) -> None:
-        """Stores one message."""
+        """Store one message."""
         self._payloads[topic] = payload
         self._messages.pop(topic, None)
         self._stamps[topic] = stamp
@@ -92,7 +92,7 @@ def end_of(files: Sequence[Path]) -> int | None:
 
 
 def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
-    """Yields time [ns], topic and payload of all complete messages on observed topics, ordered by time.
+    """Yield time [ns], topic and payload of all complete messages on observed topics, ordered by time.
 
     The last file may still be written or be truncated. Services send messages in chunks, so order is restored within `DISORDER`.
     Raises OSError, RecordingError for a topic of another type than the contract's.
@@ -128,7 +128,7 @@ def _records(files: Sequence[Path], topics: Mapping[str, Topic]) -> Iterator[tup
 def draw(
     source: Iterable[tuple[int, str, bytes]], service: DashboardService, progress: Callable[[int], None] | None = None
 ) -> int:
-    """Steps `service` through time-ordered messages at its period; returns the last time [ns], -1 without messages.
+    """Step `service` through time-ordered messages at its period; return the last time [ns], -1 without messages.
 
     `progress` receives the simulated time [ns].
     """
@@ -146,7 +146,7 @@ def draw(
 
 
 def replay(files: Sequence[Path], service: DashboardService, progress: Callable[[int], None] | None = None) -> None:
-    """Steps `service` through the messages of a recording and finishes it. Raises OSError."""
+    """Step `service` through the messages of a recording and finish it. Raises OSError."""
     draw(messages(files), service, progress)
     service.finish()
 

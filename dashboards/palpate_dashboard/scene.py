@@ -59,7 +59,7 @@ class SceneView:
         recording.log("world/tool/force", red, static=True)
 
     def at(self, t: int) -> None:
-        """Sets the simulated time [ns] of the following rows."""
+        """Set the simulated time [ns] of the following rows."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
 
     def box(self, name: str, X_WB: Array, size: tuple[float, float, float], color: palette.Rgba) -> None:
@@ -121,7 +121,7 @@ class SceneView:
         self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
 
     def body(self, t: int, X_WA: NDArray[np.float64], excursion: float) -> None:
-        """Moves `world/truth` by the patient's true pose, shape (4, 4), and breathing excursion [m]."""
+        """Move `world/truth` by the patient's true pose, shape (4, 4), and breathing excursion [m]."""
         lifted = np.concatenate((X_WA[:3, 3] + excursion * X_WA[:3, 2], quaternion(X_WA[:3, :3])))
         if self._lifted is None or np.abs(lifted - self._lifted).max() > RESOLUTION_M:
             self._lifted = lifted
@@ -157,7 +157,7 @@ class SceneView:
         self._recording.log("world/furniture/tripod", legs, static=True)
 
     def lens(self, k: Array, width: int, height: int) -> None:
-        """Sets the camera intrinsics, shape (3, 3) [px]."""
+        """Set the camera intrinsics, shape (3, 3) [px]."""
         view = rr.Pinhole(
             image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.2
         )
@@ -178,7 +178,7 @@ class SceneView:
         self._recording.log("world/perception/points", shape)
 
     def clear_cloud(self, t: int) -> None:
-        """Removes the cloud: it would hide the abdomen's colours."""
+        """Remove the cloud: it would hide the abdomen's colours."""
         self.at(t)
         self._recording.log("world/perception/points", rr.Points3D([]))
 
@@ -206,7 +206,7 @@ class SceneView:
         self._recording.log("world/plan/path", shape)
 
     def tool(self, t: int, position: Array, in_contact: bool) -> None:
-        """Extends the travelled path by the tool's position, shape (3,)."""
+        """Extend the travelled path by the tool's position, shape (3,)."""
         if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
             return
         self._trail.append(position)

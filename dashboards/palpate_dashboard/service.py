@@ -174,7 +174,7 @@ class DashboardService(Service):
         return {}
 
     def flush(self) -> None:
-        """Sends the collected rows."""
+        """Send the collected rows."""
         self._columns.send()
         self._recording.flush()
 
@@ -340,7 +340,7 @@ class DashboardService(Service):
         self._plots.document(t, "text/services", text.services(rows, zip(plots.AWAITED, share, strict=True)))
 
     def _count_wait(self, what: str) -> None:
-        """Counts an observed wait for a topic or for the grant; waits for observers are ignored."""
+        """Count an observed wait for a topic or for the grant; waits for observers are ignored."""
         role = self._producers.get(what, what)
         if role in plots.AWAITED:
             self._waits[plots.AWAITED.index(role)] += 1

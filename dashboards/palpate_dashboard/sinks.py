@@ -33,7 +33,7 @@ class Live:
 
     @staticmethod
     def parse(text: str) -> Live:
-        """Parses PALPATE_VIEWER; an empty value means no live view. Raises ValueError naming the allowed forms."""
+        """Parse PALPATE_VIEWER; an empty value means no live view. Raises ValueError naming the allowed forms."""
         kind, _, rest = text.partition(":")
         if not text:
             return Live()

@@ -98,7 +98,7 @@ def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
 
 
 def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
-    """A smooth belly in A with n x n vertices."""
+    """Return a smooth belly in A with n x n vertices."""
     x, y = np.meshgrid(np.linspace(-0.17, 0.17, n), np.linspace(-0.21, 0.21, n))
     z = 0.1 * (np.cos(x / 0.18 * 1.3) * np.cos(y / 0.24 * 1.1) - 1.0) - 0.0
     vertices = np.stack((x, y, z), axis=-1).reshape(-1, 3).astype(np.float32)

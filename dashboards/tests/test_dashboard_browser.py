@@ -28,7 +28,7 @@ CURVE = {"curve": (palette.FORCE, 6, 0.0001)}
 
 
 def free_ports() -> int:
-    """A port that is free together with the next."""
+    """Return a port that is free together with the next."""
     for port in range(19_876, 20_876, 2):
         with socket.socket() as a, socket.socket() as b:
             try:
@@ -62,7 +62,7 @@ def wait_for(port: int, process: subprocess.Popen[bytes]) -> None:
 
 
 def look_for(port: int, wanted: dict[str, tuple[palette.Rgba, int, float]]) -> np.ndarray:
-    """The page in a headless browser, once each colour fills its share: (colour, reach of hue [deg], share)."""
+    """Return the page in a headless browser, once each colour fills its share: (colour, reach of hue [deg], share)."""
     pytest.importorskip("playwright.sync_api", reason="SKIPPED: playwright is not installed")
     if not any(map(shutil.which, BROWSERS)):
         pytest.skip(f"SKIPPED for want of a browser: none of {', '.join(BROWSERS)} is on the PATH")

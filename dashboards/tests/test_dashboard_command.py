@@ -30,7 +30,7 @@ app.command()(dashboard)
 
 
 def record(folder: Path, seconds: float) -> Path:
-    """A run's folder with an MCAP recording of hand-made messages in chunks of 0.1 s."""
+    """Return a run's folder with an MCAP recording of hand-made messages in chunks of 0.1 s."""
     (folder / "recording_mcap").mkdir(parents=True)
     (folder / "scenario.yaml").write_text(dump_scenario(Scenario(name="recorded")), encoding="utf-8")
     path = folder / "recording_mcap" / "recording_mcap_0.mcap"

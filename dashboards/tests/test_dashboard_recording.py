@@ -216,7 +216,7 @@ def test_the_file_has_the_layout(recording: Recording) -> None:
 
 
 def _parts(part: Any) -> list[Any]:
-    """A part of the layout and all within it, outermost first."""
+    """Return a part of the layout and all within it, outermost first."""
     inner = [item for item in getattr(part, "contents", ()) if not isinstance(item, str)]
     return [part, *(found for item in inner for found in _parts(item))]
 

@@ -24,7 +24,7 @@ def table(seed: int = 0, **fields: object) -> np.ndarray:
 
 
 def many(**fields: object) -> np.ndarray:
-    """The breaths of twenty patients, one after the other."""
+    """Return the breaths of twenty patients, one after the other."""
     return np.concatenate([table(seed, **fields) for seed in range(20)])
 
 

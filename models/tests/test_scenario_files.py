@@ -21,7 +21,7 @@ from palpate_plugins import PluginError
 
 
 def scenario(folder: Path, text: str) -> str:
-    """The path of a scenario file with this text."""
+    """Return the path of a scenario file with this text."""
     path = folder / "mine.yaml"
     path.write_text(text, encoding="utf-8")
     return str(path)

@@ -79,7 +79,7 @@ class LiveRig(Rig):
     # -- protocol
 
     def await_implementation(self, seconds: float, report: ConformanceReport) -> None:
-        """Waits for the role to appear, sends hello and starts it. Raises NoBus if it does not appear within `seconds`."""
+        """Wait for the role to appear, send hello and start it. Raises NoBus if it does not appear within `seconds`."""
         report.section("protocol")
         gc.freeze()  # a full collection during a check would delay commands beyond their validity
         end = monotonic() + seconds
@@ -136,7 +136,7 @@ class LiveRig(Rig):
         report.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
 
     def finish(self, report: ConformanceReport) -> None:
-        """Sends garbage to it, ends it, and checks its reactions."""
+        """Send garbage to it, end it, and check its reactions."""
         report.section("garbage")
         self._disturb(report)
         report.section("end")
@@ -161,7 +161,7 @@ class LiveRig(Rig):
         self._reports.close()
 
     def _disturb(self, report: ConformanceReport) -> None:
-        """Sends undecodable bytes and messages of an unknown sender on every input."""
+        """Send undecodable bytes and messages of an unknown sender on every input."""
         stranger = AttachmentWriter(gid("a stranger")).pack
         for name in self._publishers:
             topic = self.rules.topics[name]
@@ -230,11 +230,11 @@ class LiveRig(Rig):
             sleep(max(0.0, (MS - (time_ns() - self._epoch) % MS) / NS))
 
     def send(self, topic: str, message: Message) -> None:
-        """Publishes a message as its producer."""
+        """Publish a message as its producer."""
         self._next(topic, codec.encode(message, self.rules.topics[topic].type))
 
     def lose(self, role: str) -> None:
-        """Reports a role as lost, as a conductor does."""
+        """Report a role as lost, as a conductor does."""
         self._say(RunControl.LOST, self.t, role=role, reason="conformance check")
 
     def _next(self, topic: str, payload: bytes) -> None:

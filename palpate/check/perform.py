@@ -31,7 +31,7 @@ from palpate_models.scenario.load import dump_scenario, view_of
 
 @contextmanager
 def started(command: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
-    """Starts the implementation for the duration of the check, if a command was given."""
+    """Start the implementation for the duration of the check, if a command was given."""
     if command is None:
         yield
         return
@@ -65,7 +65,7 @@ class CheckDisplay(Progress):
     """A bar that follows the clock of a rig, for a `with` block; nothing without a terminal."""
 
     def __init__(self, rig: Rig, report: ConformanceReport) -> None:
-        """Reads rig and report about ten times a second while the suite runs."""
+        """Read rig and report about ten times a second while the suite runs."""
         console = Console(stderr=True)
         text = TextColumn("{task.description}, {task.fields[checks]} checks")
         columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
@@ -74,7 +74,7 @@ class CheckDisplay(Progress):
         self._shown = self.add_task(rig.role.name, total=DURATION_S[rig.role.name], checks=0)
 
     def get_renderables(self) -> Iterable[RenderableType]:
-        """Updates the task and returns what to draw; rich calls it at each refresh."""
+        """Update the task and return what to draw; rich calls it at each refresh."""
         if self.task_ids:  # rich also draws before there is a task
             about = f"{self._rig.role.name}: {self._report.group}"
             checks = len(self._report.results)
@@ -86,7 +86,7 @@ _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED
 
 
 def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceReport:
-    """Checks an implementation in a child process, in simulated time. Raises PluginError for one that there is not, RunError for
+    """Check an implementation in a child process, in simulated time. Raises PluginError for one that there is not, RunError for
     one that exits, crashes or hangs.
     """
     steps = shared_numbers()
@@ -104,7 +104,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
 def check_live(
     role: str, settings: RigSettings, connect: list[str] | None, listen: str, start: str | None, domain: int, wait: float
 ) -> ConformanceReport:
-    """Waits for an implementation on the bus and checks it there. Raises NoBus if none joins."""
+    """Wait for an implementation on the bus and check it there. Raises NoBus if none joins."""
     options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
     report = ConformanceReport(role)
     with session(options) as bus:
@@ -123,7 +123,7 @@ def check_live(
 
 
 def print_report(report: ConformanceReport, failures: bool) -> None:
-    """Prints each check, or with `failures` only failed ones, and the verdict."""
+    """Print each check, or with `failures` only failed ones, and the verdict."""
     out = wide_console()
     rows = table("", "check", "expected", "got")
     group = ""

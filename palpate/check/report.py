@@ -40,13 +40,13 @@ class ConformanceReport:
         self.group = name
 
     def expect(self, name: str, ok: bool, expected: object, got: object) -> bool:
-        """Records a check; returns True if it passed."""
+        """Record a check; returns True if it passed."""
         verdict = Verdict.PASSED if ok else Verdict.FAILED
         self.results.append(Result(self.group, name, verdict, str(expected), str(got)))
         return ok
 
     def skip(self, name: str, why: str) -> None:
-        """Records a check that was not made."""
+        """Record a check that was not made."""
         self.results.append(Result(self.group, name, Verdict.SKIPPED, "", why))
 
     @property

@@ -88,11 +88,11 @@ class Rig(ABC):
 
     @abstractmethod
     def send(self, topic: str, message: Message) -> None:
-        """Sends one message now."""
+        """Send one message now."""
 
     @abstractmethod
     def lose(self, role: str) -> None:
-        """Reports a role as lost."""
+        """Report a role as lost."""
 
 
 class ServiceRig(Rig):
@@ -124,7 +124,7 @@ class ServiceRig(Rig):
         buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic], checked=True))
 
     def lose(self, role: str) -> None:
-        """Marks a role lost."""
+        """Mark a role lost."""
         self._stepper.inbox.lost_roles.add(role)
 
     def _log_refused(self, refused: RefusedMessage) -> None:

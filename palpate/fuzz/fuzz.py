@@ -61,7 +61,7 @@ def _codec_check(name: str) -> Callable[[bytes], None]:
     decode, encode = codec.decoder(name), codec.encoder(name)
 
     def check(data: bytes) -> None:
-        """Checks that data is refused with CodecError, or that its canonical bytes are a fixed point, also for rosbags."""
+        """Check that data is refused with CodecError, or that its canonical bytes are a fixed point, also for rosbags."""
         try:
             message = decode(data)
         except codec.CodecError:
@@ -202,7 +202,7 @@ def _texts(_: random.Random) -> list[bytes]:
 
 
 def _scenario(data: bytes) -> None:
-    """Checks that data is refused with ScenarioError, or that a scenario is equal after writing and reading it."""
+    """Check that data is refused with ScenarioError, or that a scenario is equal after writing and reading it."""
     file = Path(_FOLDER.name) / "fuzz.yaml"
     file.write_bytes(data)
     try:
@@ -286,7 +286,7 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
 
 
 def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | None:
-    """Runs one input; returns a find or None."""
+    """Run one input; return a find or None."""
     begin = thread_time()
     try:
         target.check(data)
@@ -304,7 +304,7 @@ def campaign(
     most: int = 100,
     slow_s: float = SLOW_S,
 ) -> FuzzCampaign:
-    """Runs `inputs` inputs, divided among the targets. A target stops after `most` finds; one of each kind is kept.
+    """Run `inputs` inputs, divided among the targets. A target stops after `most` finds; one of each kind is kept.
 
     Calls `progress` after each target with the number of finished targets, the number of all, and the result as text.
     """

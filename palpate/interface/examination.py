@@ -47,7 +47,7 @@ class Examination:
     """
 
     def __init__(self, folder: str | Path) -> None:
-        """Opens the results of `palpate.run` or `palpate run`. Raises EvidenceError for any other folder."""
+        """Open the results of `palpate.run` or `palpate run`. Raises EvidenceError for any other folder."""
         self.folder = Path(folder)
         """The results folder."""
         self.report: Report = read_report(self.folder)
@@ -130,7 +130,7 @@ def run(
     quiet: bool = False,
     **settings: Any,
 ) -> Examination:
-    """Runs a whole examination with arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
+    """Run a whole examination with arm, camera, perception, planning, control and assessment, as `palpate run --composed` does.
 
     Uses its own process with the environment that makes results repeatable: the run hash equals that of the command line.
 
@@ -186,7 +186,7 @@ def run(
 
 
 def _palpate(*arguments: str, quiet: bool) -> tuple[int, list[str]]:
-    """Runs a `palpate` command and forwards an interruption to it; returns its status and its lines on stderr."""
+    """Run a `palpate` command and forward an interruption to it; return its status and its lines on stderr."""
     command = [sys.executable, "-m", "palpate", *arguments]
     with subprocess.Popen(
         command,

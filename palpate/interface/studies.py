@@ -64,7 +64,7 @@ def study(
     out: str | Path | None = None,
     **settings: Any,
 ) -> StudyResult:
-    """Runs a study or continues an interrupted one, as `palpate study run` does on this machine.
+    """Run a study or continues an interrupted one, as `palpate study run` does on this machine.
 
     Parameters
     ----------

@@ -55,7 +55,7 @@ class Joined:
 
 @contextmanager
 def joined(chosen: ChosenBus) -> Iterator[Joined]:
-    """Joins a bus for a `with` block. Ctrl-C ends the command with status 0.
+    """Join a bus for a `with` block. Ctrl-C ends the command with status 0.
 
     Raises UserError if there is no such bus.
     """
@@ -70,7 +70,7 @@ def joined(chosen: ChosenBus) -> Iterator[Joined]:
 
 
 def _wait_for_links(bus: zenoh.Session, options: BusOptions) -> None:
-    """Waits until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBus if none has."""
+    """Wait until every endpoint has answered, at most `LINK_TIMEOUT_S`. Raises NoBus if none has."""
     wanted = len(options.connect) + bool(options.router)
     end = monotonic() + LINK_TIMEOUT_S
     while (links := len(bus.info.peers_zid()) + len(bus.info.routers_zid())) < wanted and monotonic() < end:

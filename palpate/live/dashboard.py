@@ -132,7 +132,7 @@ def _drawn(source: Path, place: Path, console: Console) -> Path:
 
 @contextmanager
 def _progress(console: Console, files: Sequence[Path]) -> Iterator[Callable[[int], None] | None]:
-    """Shows a bar with the remaining time, on a terminal; yields the function that takes the time drawn so far [ns]."""
+    """Show a bar with the remaining time, on a terminal; yields the function that takes the time drawn so far [ns]."""
     from palpate_dashboard import replay
 
     if not console.is_terminal:
@@ -145,7 +145,7 @@ def _progress(console: Console, files: Sequence[Path]) -> Iterator[Callable[[int
 
 
 def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:
-    """Shows a .rrd file until Ctrl+C, or until the native viewer is closed."""
+    """Show a .rrd file until Ctrl+C, or until the native viewer is closed."""
     from palpate_dashboard.sinks import MEMORY_LIMIT, address
 
     if native:

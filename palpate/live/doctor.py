@@ -78,7 +78,7 @@ class Diagnosis:
 
 
 def examine(bus: Joined, seconds: float) -> Diagnosis:
-    """Monitors a bus for `seconds` and returns the diagnosis."""
+    """Monitor a bus for `seconds` and returns the diagnosis."""
     live = _monitor(bus)
     end = monotonic() + seconds
     try:
@@ -183,13 +183,13 @@ def _who(bus: Joined, rules: Contract, live: LiveMonitor) -> list[Remark]:
 
 
 def _processes(live: LiveMonitor) -> list[Remark]:
-    """Reports which roles share a process."""
+    """Report which roles share a process."""
     shared = [f"{', '.join(names)} share one" for names in graph.processes(live.graph.alive.values()) if len(names) > 1]
     return [Remark("processes", Severity.OK, "; ".join([*shared, "every other role has its own"]) if shared else "one per role")]
 
 
 def _waiting(live: LiveMonitor) -> list[Remark]:
-    """Reports which service waits for which, from the services' own reports."""
+    """Report which service waits for which, from the services' own reports."""
     findings = []
     now = monotonic()
     for role, report in sorted(live.reports.items()):
@@ -245,7 +245,7 @@ def _monitor(bus: Joined) -> LiveMonitor:
 
 
 def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
-    """Prints every violation of the contract when it occurs, until Ctrl-C."""
+    """Print every violation of the contract when it occurs, until Ctrl-C."""
     began = monotonic()
     try:
         while True:

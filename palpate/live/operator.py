@@ -59,7 +59,7 @@ def step(
 
 
 def _request(word: str, reason: str, name: str | None, *, everyone: bool = False, ms: int = 0) -> None:
-    """Sends a request to one run, or to all, and prints the answers.
+    """Send a request to one run, or to all, and print the answers.
 
     Raises UserError if there is no such run, typer.Exit if a run does not answer.
     """

@@ -213,7 +213,7 @@ class Spacing:
         self._reported = 0
 
     def add(self, sent_ns: int, stamp_ns: int | None) -> None:
-        """Adds a message by its source time (wall clock) and its stamp."""
+        """Add a message by its source time (wall clock) and its stamp."""
         self._sent_ns.append(sent_ns)
         self._stamps_ns.append(stamp_ns)
         self.messages += 1
@@ -241,7 +241,7 @@ class Spacing:
 
 @contextmanager
 def _subscribed(name: str, chosen: ChosenBus) -> Iterator[tuple[Topic, TopicReader]]:
-    """Joins the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
+    """Join the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
     with joined(chosen) as bus:
         name = name.strip("/")
         row = contract().topics.get(name)
@@ -267,7 +267,7 @@ def _unknown(name: str) -> NoBus:
 
 
 def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
-    """Yields messages until the time is over. Says once that none arrives."""
+    """Yield messages until the time is over. Says once that none arrives."""
     begin = monotonic()
     end, silent = None if seconds is None else begin + seconds, True
     while end is None or monotonic() < end:
@@ -281,7 +281,7 @@ def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
 
 
 def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Received]]:
-    """Yields the messages of each report period until the time is over."""
+    """Yield the messages of each report period until the time is over."""
     left = inf if seconds is None else seconds
     while left > 0:
         yield list(_until(reader, min(left, REPORT_PERIOD_S)))

@@ -85,7 +85,7 @@ def _round(values: Any) -> Any:
 def write_recording(
     path: Path, rules: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
-    """Writes messages to an MCAP file and replaces an old file when the new one is complete.
+    """Write messages to an MCAP file and replaces an old file when the new one is complete.
 
     `attachments`: media type and content by name.
     """
@@ -143,7 +143,7 @@ class GoldenCase:
 
 
 def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase:
-    """Opens a recording and creates the service `choice`: ROLE with the scenario's implementation, or ROLE=NAME_OR_FILE.
+    """Open a recording and creates the service `choice`: ROLE with the scenario's implementation, or ROLE=NAME_OR_FILE.
 
     The scenario is `scenario`, else the one in the recording, else the one in its folder. Raises RecordingError, PluginError or
     ScenarioError.
@@ -204,7 +204,7 @@ def replay_service(
 
 
 def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
-    """Writes a reference: the inputs of the service from `begin` to `end` [ns] and its outputs."""
+    """Write a reference: the inputs of the service from `begin` to `end` [ns] and its outputs."""
     period = case.rules.roles[case.role].period
     begin -= begin % max(period, 100 * MS)  # a tick of every role
     end = min(end, case.end)
@@ -221,7 +221,7 @@ def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[R
 
 
 def write_reference(file: Path, service: str, scenario: Path | None, start: int, end: int | None, target: Path) -> None:
-    """Writes the reference of a service from a recording between `start` and `end` [ns]."""
+    """Write the reference of a service from a recording between `start` and `end` [ns]."""
 
     def write() -> None:
         case = prepare(file, service, scenario)
@@ -232,7 +232,7 @@ def write_reference(file: Path, service: str, scenario: Path | None, start: int,
 
 
 def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:
-    """Runs a service again on its recorded inputs and prints the comparison. Raises typer.Exit(3) if the outputs differ."""
+    """Run a service again on its recorded inputs and print the comparison. Raises typer.Exit(3) if the outputs differ."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     role, allowed, reached = service.partition("=")[0], parse_tolerance(tolerance), shared_numbers()
 

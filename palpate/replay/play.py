@@ -46,7 +46,7 @@ class Player:
         listen: str | None = None,
         drive: bool = False,
     ) -> None:
-        """Joins the bus.
+        """Join the bus.
 
         Raises UserError if nothing can be played, or if a running service sends a topic that would be played, or, without
         `drive`, would act on it.
@@ -94,7 +94,7 @@ class Player:
         """Largest delay of a message."""
 
     def _look(self) -> None:
-        """Raises UserError if a service of another process sends a topic that is played, or would act on it."""
+        """Raise UserError if a service of another process sends a topic that is played, or would act on it."""
         self._graph.changes()
         own = str(self._session.zid())
         alive = {e.node for e in self._graph.alive.values() if e.kind is EntityKind.NODE and e.zid != own}
@@ -145,7 +145,7 @@ class Player:
             self.sent += 1
 
     def _prelude(self, start: int) -> None:
-        """Sends the last message before `start` of each topic that is not periodic, which a late joiner would receive."""
+        """Send the last message before `start` of each topic that is not periodic, which a late joiner would receive."""
         rules = contract()
         quiet = [name for name in self.topics if not rules.topics[name].periodic]
         last = {message.topic: message for message in self._recording.messages(quiet, end=start - 1)}

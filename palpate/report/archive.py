@@ -143,7 +143,7 @@ class Evidence:
 def write_evidence(
     path: Path, c: Collected, touched: Touched | None = None, pressed: Pressed | None = None, run: str = ""
 ) -> None:
-    """Writes the collected messages of the run named `run`, complete or not, and its truth if known."""
+    """Write the collected messages of the run named `run`, complete or not, and its truth if known."""
     known: dict[str, Any] = {"run": np.array(run)}
     if touched is not None:
         known |= {"touched_believed": touched.believed, "touched_true": touched.true}
@@ -342,7 +342,7 @@ class InterruptedRun:
 
 
 def interrupted_run(folder: Path) -> InterruptedRun:
-    """Reads the folder of a run.
+    """Read the folder of a run.
 
     Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
     """

@@ -20,7 +20,7 @@ PRINT_TIMEOUT_S = 120
 
 
 def write_pdf(page: Path) -> Path:
-    """Prints report.html to report.pdf in the same folder with a Chromium browser. Raises UserError."""
+    """Print report.html to report.pdf in the same folder with a Chromium browser. Raises UserError."""
     browser = next((found for name in BROWSERS if (found := shutil.which(name))), None)
     if browser is None:
         raise UserError(f"--pdf needs a Chromium browser ({', '.join(BROWSERS)}): none is on the PATH; {page} prints as well")

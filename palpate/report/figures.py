@@ -247,7 +247,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
 
 
 def panel_title(axes: Any, letter: str, title: str, small: str) -> None:
-    """Writes the title of a panel with a note in small letters below it."""
+    """Write the title of a panel with a note in small letters below it."""
     axes.set_title(f"({letter}) {title}\n", fontsize=12, weight="bold", color=INK, loc="left")
     place = axes.text2D if hasattr(axes, "text2D") else axes.text
     place(0.0, 1.02, small, transform=axes.transAxes, fontsize=9, color=QUIET)

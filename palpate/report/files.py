@@ -13,7 +13,7 @@ import typer
 
 @contextmanager
 def drafted(path: Path) -> Iterator[Path]:
-    """Yields the path of a draft that replaces `path` at the end: readers see the old file or the new one, even after a kill."""
+    """Yield the path of a draft that replaces `path` at the end: readers see the old file or the new one, even after a kill."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
         yield draft
@@ -23,7 +23,7 @@ def drafted(path: Path) -> Iterator[Path]:
 
 
 def write_text(path: Path, text: str) -> None:
-    """Writes a text file atomically. Raises OSError."""
+    """Write a text file atomically. Raises OSError."""
     with drafted(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
@@ -42,7 +42,7 @@ def docs_option(name: str) -> Any:
 
 
 def write_part(path: Path, name: str, text: str) -> None:
-    """Replaces the part `name` of a page. Raises typer.BadParameter if the page has none or cannot be written."""
+    """Replace the part `name` of a page. Raises typer.BadParameter if the page has none or cannot be written."""
     before, after = _around(path, name)
     try:
         write_text(path, f"{before}{text}{after}")

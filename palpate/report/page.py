@@ -55,7 +55,7 @@ def read_report(folder: Path) -> Report:
 
 
 def write_page(folder: Path) -> Path:
-    """Writes report.html into the results folder of a run; returns its path. Raises EvidenceError."""
+    """Write report.html into the results folder of a run; return its path. Raises EvidenceError."""
     report, evidence = read_report(folder), read_evidence(folder)
     if report.run != evidence.run:
         raise EvidenceError(

@@ -142,7 +142,7 @@ def _has_no_map(c: Collected) -> bool:
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
-    """Writes samples.csv, evidence.mcap, report.json and, if there is a map, map.png into a run's folder."""
+    """Write samples.csv, evidence.mcap, report.json and, if there is a map, map.png into a run's folder."""
     c = result.collected
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
@@ -182,7 +182,7 @@ def sample_columns(samples: Samples) -> dict[str, Array]:
 
 
 def write_samples(path: Path, samples: Samples, run: str = "") -> None:
-    """Writes samples.csv: one row per sample of the run named `run`, in the abdomen frame."""
+    """Write samples.csv: one row per sample of the run named `run`, in the abdomen frame."""
     columns = sample_columns(samples)
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
@@ -218,7 +218,7 @@ def _level(report: Report) -> str:
 
 
 def print_findings(console: Console, report: Report) -> None:
-    """Prints unassessed areas, the findings as a table, and their scores in a line."""
+    """Print unassessed areas, the findings as a table, and their scores in a line."""
     if unknown := unassessed(report):
         console.print(unknown.rstrip(), highlight=False, soft_wrap=True)
     if report.findings:
@@ -247,7 +247,7 @@ def print_findings(console: Console, report: Report) -> None:
 
 
 def print_scores(console: Console, report: Report) -> None:
-    """Prints the scores against the truth in a line, if anything was assessed."""
+    """Print the scores against the truth in a line, if anything was assessed."""
     if report.scores is not None and report.assessed:
         console.print(
             f"against the truth{clean_world_note(report)}: {scores_text(report.scores)}", highlight=False, soft_wrap=True

@@ -105,7 +105,7 @@ def load_services(scenario: Scenario, roles: tuple[str, ...], loading: Callable[
 
 
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
-    """Runs all services in one child process. Raises PluginError for a service that cannot be made."""
+    """Run all services in one child process. Raises PluginError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
     place = ChildPlace.shared()
@@ -200,7 +200,7 @@ class _Limits:
 
 
 def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: ChildPlace, send: Send) -> RunResult:
-    """Runs all services in this process. What is collected goes to `send`, as `News`, and not into the result.
+    """Run all services in this process. What is collected goes to `send`, as `News`, and not into the result.
 
     The result's `start_time_s` is the time of the first tick by `perf_counter`.
     """

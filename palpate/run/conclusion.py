@@ -44,7 +44,7 @@ def conclude(
     quiet: bool = False,
     as_json: bool = False,
 ) -> None:
-    """Writes the results and prints the findings. Raises typer.Exit(3) if the run failed or its folder is not writable."""
+    """Write the results and print the findings. Raises typer.Exit(3) if the run failed or its folder is not writable."""
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):
         report, page, trouble = _write(folder, scenario, result)
     if as_json:
@@ -86,7 +86,7 @@ def _contract_violations(result: RunResult) -> list[str]:
 
 
 def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
-    """Writes the results into a folder, or into another if that fails; returns the report, its page, and what went wrong.
+    """Write the results into a folder, or into another if that fails; return the report, its page, and what went wrong.
 
     If no folder is writable, there is no page.
     """
@@ -109,7 +109,7 @@ def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report,
 
 
 def _write_into(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:
-    """Writes the results into a folder, without a map that cannot be drawn; returns report, page and why. Raises OSError."""
+    """Write the results into a folder, without a map that cannot be drawn; return report, page and why. Raises OSError."""
     try:
         return write_results(folder, scenario, result), write_page(folder), ""
     except OSError:

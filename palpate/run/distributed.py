@@ -33,7 +33,7 @@ def run_distributed(
     absent: Absent | None = None,
     groups: Groups | None = None,
 ) -> RunResult:
-    """Starts the local processes of the compose file and conducts them to the end; with `secure` over its router.
+    """Start the local processes of the compose file and conducts them to the end; with `secure` over its router.
 
     The user starts the roles of `absent`. `groups`: roles of each process, by default one each.
 
@@ -96,7 +96,7 @@ def run_distributed(
 
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:
-    """Raises PluginError if the implementation of a role cannot be started here. Other programs are not checked."""
+    """Raise PluginError if the implementation of a role cannot be started here. Other programs are not checked."""
     if process.words is not None:
         name = process.words[0] if process.words else choice(scenario, process.role)
         implementations.check(process.role, name)
@@ -104,7 +104,7 @@ def _check(process: ServiceProcess, scenario: Scenario) -> None:
 
 
 def _check_shares(process: ServiceProcess, absent: Absent) -> None:
-    """Raises UserError for a service that cannot share a process."""
+    """Raise UserError for a service that cannot share a process."""
     if process.role in absent.roles:
         raise UserError(f"--without {process.role}: you start it in its own process; leave it out of --group and --processes")
     process.shared_words()

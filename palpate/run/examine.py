@@ -44,7 +44,7 @@ def resume(options: RunOptions) -> None:
 
 
 def examine(scenario: Scenario, options: RunOptions, before: Resumption | None = None) -> None:
-    """Runs an examination, or continues the one `before`, and writes its results.
+    """Run an examination, or continue the one `before`, and write its results.
 
     Raises UserError if it cannot start, typer.Exit if it failed.
     """
@@ -99,7 +99,7 @@ def _announce(console: Console, scenario: Scenario, options: RunOptions, folder:
 
 
 def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:
-    """Raises UserError for options that exclude each other."""
+    """Raise UserError for options that exclude each other."""
     o, shared = options, bool(options.group) or options.processes is not None
     for contradiction, why in (
         (

@@ -36,7 +36,7 @@ def usual_folder(scenario: str) -> Path:
 
 @contextmanager
 def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
-    """Removes the folder if Ctrl-C or an error ends the block before the examination has `begun`."""
+    """Remove the folder if Ctrl-C or an error ends the block before the examination has `begun`."""
     try:
         yield
     except BaseException:
@@ -46,7 +46,7 @@ def unless_begun(path: Path, begun: Callable[[], bool]) -> Iterator[None]:
 
 
 def set_aside(path: Path) -> Path | None:
-    """Moves the results of an earlier run into a subfolder named by its start and name; returns that, or None if there are none.
+    """Move the results of an earlier run into a subfolder named by its start and name; return that, or None if there are none.
 
     Raises UserError if a run is writing into the folder.
     """
@@ -65,7 +65,7 @@ def set_aside(path: Path) -> Path | None:
 
 @contextmanager
 def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Makes the folder and holds its lock until the run is over.
+    """Make the folder and holds its lock until the run is over.
 
     With `overwrite` the results of an earlier run are moved away, removed after this run, and restored if it leaves no folder,
     as a run that could not begin. Raises UserError if the folder is in use, not empty, or cannot be made.
@@ -90,7 +90,7 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
 
 
 def _moved_away(path: Path) -> Path:
-    """Moves the results of an earlier run away and returns their folder. Raises UserError if there are none."""
+    """Move the results of an earlier run away and return their folder. Raises UserError if there are none."""
     if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
         raise UserError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
     aside = path.with_name(f".{path.name}.{os.getpid()}")
@@ -150,7 +150,7 @@ def megabytes_of(folder: Path) -> float:
 
 
 def check_room(folder: Path, exam: Exam, record: Record) -> None:
-    """Raises UserError if the disk of a folder has no room for the results of an examination."""
+    """Raise UserError if the disk of a folder has no room for the results of an examination."""
     needed, free = expected_mb(exam, record), free_mb(folder)
     if free < needed:
         shorter = (
@@ -175,7 +175,7 @@ class WatchedRoom:
         self._warned = False
 
     def check(self, progress: RunProgress) -> None:
-        """Checks the free space and passes on the progress."""
+        """Check the free space and passes on the progress."""
         if not self._warned and (left := free_mb(self._folder)) < LOW_MB:
             self._warned = True
             self._warn(f"{self._folder}: {left:.0f} MB are left there: recordings will stop, the examination continues")

@@ -27,13 +27,13 @@ class Child(Protocol):
         """Return the exit status, negative for a signal; None while it runs."""
 
     def send_signal(self, sig: int) -> None:
-        """Sends a signal if it still runs."""
+        """Send a signal if it still runs."""
 
     def kill(self) -> None:
         """Kills it."""
 
     def wait(self, timeout: float | None = None) -> int:
-        """Waits for its end; returns the exit status. Raises subprocess.TimeoutExpired."""
+        """Wait for its end; return the exit status. Raises subprocess.TimeoutExpired."""
 
 
 class Forked:
@@ -76,7 +76,7 @@ class Forks:
         self._context.set_forkserver_preload(["palpate.service", *modules])
 
     def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Forked:
-        """Starts `command`, which must be a Python module's, with that environment; what it prints goes to `log`.
+        """Start `command`, which must be a Python module's, with that environment; what it prints goes to `log`.
 
         Raises ValueError for another command.
         """

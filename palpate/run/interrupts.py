@@ -31,7 +31,7 @@ _CURRENT: Final[ContextVar[Ending | None]] = ContextVar("_CURRENT", default=None
 
 
 def all_is_measured() -> None:
-    """Marks the measurement as finished; does nothing outside `results_first`."""
+    """Mark the measurement as finished; does nothing outside `results_first`."""
     if (ending := _CURRENT.get()) is not None:
         ending.measured = True
 

@@ -59,13 +59,13 @@ class Absent:
                 raise UserError(f"--without {role}: allowed are {', '.join(known)}")
 
     def check(self, roles: Collection[str]) -> None:
-        """Raises UserError for a role that this run does not have."""
+        """Raise UserError for a role that this run does not have."""
         for role in self.roles:
             if role not in roles:
                 raise UserError(f"--without {role}: this run has no {role}, but {', '.join(roles)}")
 
     def call(self, out: Path, places: Mapping[str, ServicePlace]) -> None:
-        """Prints where each role is awaited."""
+        """Print where each role is awaited."""
         for role in self.roles:
             given = places[role].environment
             where = given.get("PALPATE_LISTEN") or given.get("PALPATE_ROUTER", "")
@@ -83,7 +83,7 @@ class Absent:
 
 
 def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
-    """Writes places.json into a results folder."""
+    """Write places.json into a results folder."""
     rows = {role: place._asdict() for role, place in places.items()}
     (out / FILE).write_text(json.dumps(rows, indent=2) + "\n", encoding="utf-8")
 
@@ -134,7 +134,7 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
 
 
 def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
-    """Replaces this process by another program; `environment` is added to that of this process."""
+    """Replace this process by another program; `environment` is added to that of this process."""
     program = sys.executable if command[0] == "python" else command[0]
     os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
 

@@ -62,7 +62,7 @@ class SecureBus:
         return options
 
     def __enter__(self) -> Self:
-        """Starts the router. Raises BusConfigError."""
+        """Start the router. Raises BusConfigError."""
         try:
             if self._own is not None:
                 init(self.keys, days=2)
@@ -78,7 +78,7 @@ class SecureBus:
         self._remove_own_keys()
 
     def _remove_own_keys(self) -> None:
-        """Removes keys that were made for this run alone."""
+        """Remove keys that were made for this run alone."""
         if self._own is not None:
             self._own.remove()
 
@@ -210,7 +210,7 @@ class LocalProcesses:
         secure: SecureBus | None = None,
         forks: Forks | None = None,
     ) -> None:
-        """Prepares the processes.
+        """Prepare the processes.
 
         Args:
             groups: roles of each process.
@@ -269,7 +269,7 @@ class LocalProcesses:
         self._ends: dict[str, str] = {}
 
     def _copy(self, file: Path) -> Path:
-        """Copies a scenario file into a neutral folder: the name of the results folder may reveal the patient."""
+        """Copy a scenario file into a neutral folder: the name of the results folder may reveal the patient."""
         folder = self.folder / file.stem
         folder.mkdir(exist_ok=True)
         return Path(shutil.copy(file, folder))
@@ -289,11 +289,11 @@ class LocalProcesses:
         }
 
     def as_conductor(self) -> AbstractContextManager[None]:
-        """Sets the run's key in the environment of this process within a `with` block."""
+        """Set the run's key in the environment of this process within a `with` block."""
         return given({variable("key"): str(self._given["key"] or "")})
 
     def start(self, *processes: ServiceProcess) -> None:
-        """Starts a service, or several in one process. Raises UserError for a program that cannot share one."""
+        """Start a service, or several in one process. Raises UserError for a program that cannot share one."""
         roles = [process.role for process in processes]
         for role in roles:
             self._ends.pop(role, None)
@@ -336,7 +336,7 @@ class LocalProcesses:
         return dict(self._ends)
 
     def stop(self, patience_s: float = 5.0, *, at_once: bool = False) -> None:
-        """Waits for the processes to exit, then ends the remaining ones with SIGTERM and SIGKILL; removes the sockets.
+        """Wait for the processes to exit, then end the remaining ones with SIGTERM and SIGKILL; remove the sockets.
 
         Suspended processes are resumed, so that they receive the end of the run. `at_once`: kills without waiting; for a run that
         has not begun, whose services have nothing to complete and may still be importing.

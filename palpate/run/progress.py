@@ -80,7 +80,7 @@ class Narration:
         return name, sentence
 
     def _touching(self, state: Any) -> bool:
-        """True if this stroke is one of the touches before the scan."""
+        """Return True if this stroke is one of the touches before the scan."""
         return not self._scanning and state.stroke - self._strokes_before <= self._outlook.touches
 
     def _touching_text(self) -> str:
@@ -143,7 +143,7 @@ class RunDisplay:
         self._bar.stop()
 
     def show(self, progress: RunProgress) -> None:
-        """Shows the state of the run."""
+        """Show the state of the run."""
         for sentence in progress.trouble[self._troubles_shown :]:
             self._console.print(f"[bold red]{escape(sentence)}[/]", highlight=False, soft_wrap=True)
         self._troubles_shown = len(progress.trouble)
@@ -177,7 +177,7 @@ class RunDisplay:
         return f"{self._most} {duration_text(left)} left"
 
     def _pass_requests(self, progress: RunProgress) -> None:
-        """Passes on an operator's keys and shows when the supervisor stops or releases the arm."""
+        """Pass on an operator's keys and shows when the supervisor stops or releases the arm."""
         if self._bar.disable or progress.request is None:
             return
         if not self.begun and not self._keys.attached and self._keys.__enter__().attached:

@@ -94,7 +94,7 @@ def checked(scenario: Scenario) -> Scenario:
 
 
 def _check_policy(scenario: Scenario) -> None:
-    """Raises PluginError for a policy that cannot be loaded, or a user's whose first press is not usable."""
+    """Raise PluginError for a policy that cannot be loaded, or a user's whose first press is not usable."""
     name = scenario.search.policy
     if not POLICY.foreign(name):
         policy(name)
@@ -114,7 +114,7 @@ def foreign_roles(scenario: Scenario) -> frozenset[str]:
 
 
 def _check_fmu(scenario: Scenario) -> None:
-    """Raises PluginError if an FMU or a map of its variables is missing, or the file is not an FMU."""
+    """Raise PluginError if an FMU or a map of its variables is missing, or the file is not an FMU."""
     for field, given in (("fmu", scenario.tissue.fmu), ("fmu_map", scenario.tissue.fmu_map)):
         if given and not Path(given).is_file():
             raise PluginError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
@@ -132,7 +132,7 @@ def _is_fmu(path: Path) -> bool:
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
-    """Makes the results folder, names its run and writes its scenario files; returns the file that each role may read.
+    """Make the results folder, names its run and write its scenario files; returns the file that each role may read.
 
     Only scenario.yaml names the run, so that the inputs of the examination do not depend on its time.
     """

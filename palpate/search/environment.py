@@ -70,7 +70,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         self.observation_space: spaces.Space[Any] = spaces.Dict(parts)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Observation, dict[str, Any]]:
-        """Starts an episode with a patient drawn from the environment's seed, or `options={"patient": 7}`."""
+        """Start an episode with a patient drawn from the environment's seed, or `options={"patient": 7}`."""
         super().reset(seed=seed)
         patient = (options or {}).get("patient", int(self.np_random.integers(self._patients)))
         self._begin(_cases(patient))

@@ -56,7 +56,7 @@ class _Timed:
         self._strokes = 0
 
     def _begin(self, xy: Array, depth: float) -> float:
-        """Checks and counts a press; returns its duration [s]."""
+        """Check and count a press; return its duration [s]."""
         if not np.all((xy >= self.task.low - 1e-9) & (xy <= self.task.high + 1e-9)):
             raise ValueError(f"place = {xy.tolist()} m: want one within {self.task.low.tolist()} to {self.task.high.tolist()} m")
         if not 0 < depth <= self.task.deepest + 1e-9:

@@ -88,7 +88,7 @@ class Trial:
 
 
 def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Posterior | None = None) -> Trial:
-    """Runs a policy on a patient until the budget is spent, or for `presses` presses.
+    """Run a policy on a patient until the budget is spent, or for `presses` presses.
 
     `posterior`: initial posterior; updated in place.
     """

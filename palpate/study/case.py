@@ -61,7 +61,7 @@ class Attempt(BaseModel):
 
 
 def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
-    """Examines cases, given as JSON, one after another in one process; the task of a Dask worker.
+    """Examine cases, given as JSON, one after another in one process; the task of a Dask worker.
 
     Returns the attempts as JSON, in order. Fewer than there are cases if the process ended early: the last one is then the
     failure of the case that it was busy with. `runs`: folder on the worker for the results of whole examinations.
@@ -99,7 +99,7 @@ def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
 
 
 def examine(case: Case, runs: Path | None = None) -> Attempt:
-    """Examines a patient in this process. A failed run is part of the report; errors of the code are raised."""
+    """Examine a patient in this process. A failed run is part of the report; errors of the code are raised."""
     begin, used = perf_counter(), _core_s()
     for path, known in case.files.items():
         if file_hash(path) != known:
@@ -169,7 +169,7 @@ def _attempt(line: str, runs: Path | None) -> Attempt:
 
 
 def _end_with(parent: int) -> None:
-    """Ends this process as soon as its parent has ended."""
+    """End this process as soon as its parent has ended."""
     while os.getppid() == parent:
         sleep(1.0)
     os._exit(1)

@@ -28,7 +28,7 @@ class _RunByDefault(typer.core.TyperGroup):
     """`palpate study NAME` is short for `palpate study run NAME`."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
-        """Parses the arguments, with `run` inserted before a name that is not a command."""
+        """Parse the arguments, with `run` inserted before a name that is not a command."""
         implicit = bool(args) and not args[0].startswith("-") and args[0] not in self.commands
         return super().parse_args(ctx, ["run", *args] if implicit else args)
 
@@ -175,7 +175,7 @@ def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | 
 
 
 def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tuple[int | None, str | None], runs: bool) -> None:
-    """Runs the cases without an outcome on a number of local workers or a scheduler. Ends the command if they cannot be run."""
+    """Run the cases without an outcome on a number of local workers or a scheduler. Ends the command if they cannot be run."""
     from palpate.study.folder import Outcome, Session
     from palpate.study.runner import StudyStopped, cluster, cores, run_cases
 
@@ -208,7 +208,7 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
 
 
 def _conclude(folder: Folder, manifest: Manifest) -> None:
-    """Writes tables, figures and page, and prints the result. The exit status is 3 if a case failed."""
+    """Write tables, figures and page, and print the result. The exit status is 3 if a case failed."""
     from palpate.study.summary import conclude
     from palpate_errors import UserError
 

@@ -150,11 +150,11 @@ class Folder:
     """A study's folder on the disk."""
 
     def __init__(self, path: Path) -> None:
-        """Refers to a folder, which need not exist."""
+        """Refer to a folder, which need not exist."""
         self.path = path
 
     def open(self, manifest: Manifest) -> None:
-        """Creates the folder, or reuses one of the same study, split and settings. Raises StudyError for any other."""
+        """Create the folder, or reuses one of the same study, split and settings. Raises StudyError for any other."""
         old = self.manifest()
         if old is not None and (old.study, old.split) != (manifest.study, manifest.split):
             raise StudyError(f"{self.path} holds {old.study}, split {old.split}: give {manifest.study} another folder with -o")
@@ -181,7 +181,7 @@ class Folder:
         return self.path / "cases" / f"{case_id}.json"
 
     def write(self, outcome: Outcome) -> None:
-        """Writes the outcome of a case, atomically."""
+        """Write the outcome of a case, atomically."""
         write_text(self.case_file(outcome.case.case_id), outcome.model_dump_json() + "\n")
 
     def outcome(self, case_id: str) -> Outcome | None:
@@ -216,7 +216,7 @@ class Folder:
         return list(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else []
 
     def add_failure(self, case_id: str, why: str) -> None:
-        """Appends the cause of a failed attempt."""
+        """Append the cause of a failed attempt."""
         write_text(self._failures_file(case_id), json.dumps([*self.failures(case_id), why]) + "\n")
 
     def sessions(self) -> list[Session]:
@@ -226,7 +226,7 @@ class Folder:
         return [Session.model_validate_json(line) for line in lines]
 
     def add_session(self, session: Session) -> None:
-        """Appends a call of the command."""
+        """Append a call of the command."""
         with (self.path / SESSIONS).open("a", encoding="utf-8") as file:
             file.write(session.model_dump_json() + "\n")
 
@@ -246,7 +246,7 @@ def manifest_of(study: str, cases: Sequence[Case], command: str = "") -> Manifes
 
 
 def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> tuple[Folder, Manifest]:
-    """Creates or reopens the folder of a study of these cases, which `command` runs again.
+    """Create or reopens the folder of a study of these cases, which `command` runs again.
 
     Raises StudyError for the folder of another study and, unless `keep`, for cases of another version of the code.
     """
@@ -259,7 +259,7 @@ def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bo
 
 
 def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
-    """Merges the parts of one study into a folder; repeated merges change nothing.
+    """Merge the parts of one study into a folder; repeated merges change nothing.
 
     Raises StudyError if the parts are not of one study, or if a case has no outcome in any of them.
     """

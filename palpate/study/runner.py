@@ -93,7 +93,7 @@ def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
 
 
 def _end_cases() -> None:
-    """Ends the case processes of an interrupted study, so that the threads that wait for them end."""
+    """End the case processes of an interrupted study, so that the threads that wait for them end."""
     for child in psutil.Process().children():
         if "palpate.study.case" in child.cmdline():
             child.kill()
@@ -110,7 +110,7 @@ def part_of(cases: Sequence[Case], shard: str) -> list[Case]:
 def run_cases(
     folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], *, runs: bool = False
 ) -> None:
-    """Examines all cases without an outcome, in any order, and calls `done` after each. Raises StudyStopped.
+    """Examine all cases without an outcome, in any order, and calls `done` after each. Raises StudyStopped.
 
     `runs`: keep the results of whole examinations in the folder `runs`.
     """
@@ -142,7 +142,7 @@ def run_cases(
 
 
 def _batches(cases: Sequence[Case], size: int) -> Iterator[list[Case]]:
-    """Yields up to `size` consecutive cases with the same periods, which are set for a whole process."""
+    """Yield up to `size` consecutive cases with the same periods, which are set for a whole process."""
     batch: list[Case] = []
     for case in cases:
         if batch and (len(batch) == size or case.periods != batch[0].periods):

@@ -119,7 +119,7 @@ of the outline. `found`: by a reported finding. `confidence`: greatest one of it
 
 
 def write_tables(folder: Path, study: str, outcomes: Iterable[Outcome]) -> None:
-    """Writes cases.parquet, findings.parquet and lumps.parquet into the folder of a study, in the order of the outcomes."""
+    """Write cases.parquet, findings.parquet and lumps.parquet into the folder of a study, in the order of the outcomes."""
     rows: dict[str, list[Record]] = {"cases": [], "findings": [], "lumps": []}
     for outcome in outcomes:
         hits = list(_findings(outcome))
@@ -318,7 +318,7 @@ class Analysed:
 
 
 def conclude(folder: Folder, manifest: Manifest) -> tuple[RunRecord, list[Outcome]]:
-    """Writes tables, run.json, study.json and study.html. Raises UserError if a case has no outcome yet."""
+    """Write tables, run.json, study.json and study.html. Raises UserError if a case has no outcome yet."""
     outcomes = folder.outcomes(manifest)
     if len(outcomes) < len(manifest.cases):
         left = len(manifest.cases) - len(outcomes)
@@ -332,7 +332,7 @@ def conclude(folder: Folder, manifest: Manifest) -> tuple[RunRecord, list[Outcom
 
 
 def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
-    """Writes study.json and study.html from cases.parquet, findings.parquet and lumps.parquet in `folder`. Raises UserError.
+    """Write study.json and study.html from cases.parquet, findings.parquet and lumps.parquet in `folder`. Raises UserError.
 
     Args:
         folder: folder of the study.

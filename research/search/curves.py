@@ -28,7 +28,7 @@ _BOOTSTRAPS: Final = 2000
 
 
 def thresholds(trials: pd.DataFrame) -> pd.Series:
-    """The threshold of each policy."""
+    """Return the threshold of each policy."""
     healthy = trials[(trials.seed < TUNING) & trials.apart_m.isna()]
     greatest = healthy.groupby(["policy", "seed"]).near.max()
     return greatest.groupby("policy").quantile(SPECIFICITY, interpolation="higher")
@@ -51,14 +51,14 @@ def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
 
 
 def in_words(values: Array, quantile: float, rng: np.random.Generator) -> str:
-    """A quantile of values, and its 95 % interval."""
+    """Return a quantile of values, and its 95 % interval."""
     drawn = values[rng.integers(0, len(values), (_BOOTSTRAPS, len(values)))]
     low, high = np.quantile(np.quantile(drawn, quantile, axis=1), (0.025, 0.975))
     return _words((float(np.quantile(values, quantile)), float(low), float(high)), "{:.0f}")
 
 
 def _mean(values: Array, rng: np.random.Generator) -> tuple[float, float, float]:
-    """The mean of values, and its 95 % interval."""
+    """Return the mean of values, and its 95 % interval."""
     means = values[rng.integers(0, len(values), (_BOOTSTRAPS, len(values)))].mean(axis=1)
     low, high = np.quantile(means, (0.025, 0.975))
     return float(values.mean()), float(low), float(high)
@@ -87,7 +87,7 @@ def _reached(seconds: Array, share: float) -> float:
 
 
 def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
-    """The comparison, as Markdown."""
+    """Return the comparison, as Markdown."""
     there = trials[(trials.seed >= TUNING) & trials.apart_m.notna()]
     rng = np.random.Generator(np.random.PCG64(0))
     lines = [
@@ -120,7 +120,7 @@ def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
 
 
 def share(k: int, n: int) -> str:
-    """A share, k of n, with its 95 % interval."""
+    """Return a share, k of n, with its 95 % interval."""
     if not n:
         return "none of them"
     low, high = proportion_confint(k, n, method="wilson")

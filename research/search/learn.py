@@ -65,12 +65,12 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[NDArray[np.float32], dict[str, Any]]:
-        """The first maps."""
+        """Return the first maps."""
         observed, given = self._env.reset(seed=seed, options=options)
         return observed["maps"], given
 
     def step(self, action: int) -> tuple[NDArray[np.float32], float, bool, bool, dict[str, Any]]:
-        """A press of the usual depth at a place, or of the greatest."""
+        """Return a press of the usual depth at a place, or of the greatest."""
         depth, row, column = np.unravel_index(int(action), (2, *self._shape[1:]))
         share = 2.0 * np.array((row / (self._shape[1] - 1), column / (self._shape[2] - 1))) - 1.0
         press = np.array((*share, self._env.usual_depth if depth == 0 else 1.0), dtype=np.float32)
@@ -78,7 +78,7 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
         return observed["maps"], reward, over, cut, given
 
     def shown(self) -> int:
-        """The action that the teacher would take."""
+        """Return the action that the teacher would take."""
         task, posterior = self._env.task, self._env.posterior
         xy, depth = policy(TEACHER)(posterior, posterior.left(0.0))
         place = int(np.argmin(np.linalg.norm(task.places - xy, axis=1)))
@@ -124,7 +124,7 @@ class Whole(nn.Module):
         self.features_dim = int(np.prod(space.shape))
 
     def forward(self, maps: torch.Tensor) -> torch.Tensor:
-        """The maps."""
+        """Return the maps."""
         return maps
 
 

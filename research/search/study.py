@@ -24,7 +24,7 @@ HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}
 
 
 def run(seeds: Sequence[int], hand: str, names: Sequence[str], out: Path) -> None:
-    """Makes the trials that are not there yet: a file for each patient, a row for each press."""
+    """Make the trials that are not there yet: a file for each patient, a row for each press."""
     out.mkdir(parents=True, exist_ok=True)
     for seed in track(seeds, "searching"):
         file = out / f"{hand}-{seed}.csv"

@@ -154,7 +154,7 @@ def test_an_end_that_names_no_role_is_bad() -> None:
 
 
 def found(where: str, detected_ms: float, peak_force_n: float) -> FaultFinding:
-    """A run in lockstep that ended because of a killed role."""
+    """Return a run in lockstep that ended because of a killed role."""
     text = f"{where} lost"
     return FaultFinding(
         *("kill", where, "lockstep", 8.0, detected_ms, text, "run ended", 5.0, peak_force_n, CaseOutcome.ENDED, text), named=True

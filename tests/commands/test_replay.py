@@ -59,7 +59,7 @@ def changed_service(folder: Path, role: str, change: str) -> str:
 
 @pytest.fixture
 def weaker(tmp_path: Path) -> str:
-    """A controller with 1 % less torque."""
+    """Return a controller with 1 % less torque."""
     return changed_service(tmp_path, "control", "out['control/joint_torque'].torque[:] *= 0.99")
 
 

@@ -43,13 +43,13 @@ SCORE_FIELDS = [
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
-    """The patient of the synthetic messages, with a coarse mesh."""
+    """Return the patient of the synthetic messages, with a coarse mesh."""
     return load_scenario("clean", SETTINGS, seed=3)
 
 
 @pytest.fixture(scope="module")
 def felt(scenario: Scenario) -> Known:
-    """The truth of a whole run."""
+    """Return the truth of a whole run."""
     return truth_of_run(scenario, collected())
 
 

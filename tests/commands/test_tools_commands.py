@@ -96,7 +96,7 @@ def output_of(*words: str) -> Any:
 
 @pytest.fixture(scope="module")
 def robot() -> Iterator[SmallRobot]:
-    """A robot on an announced bus; control and tissue of the run do not answer."""
+    """Return a robot on an announced bus; control and tissue of the run do not answer."""
     with tempfile.TemporaryDirectory(prefix="small-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setenv("PALPATE_RUNS", folder)
         for name in ENDPOINT_VARIABLES:

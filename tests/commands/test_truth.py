@@ -36,7 +36,7 @@ REGION = "exam.region_m=[0.08, 0.08]"
 
 @pytest.fixture(autouse=True, scope="module")
 def cache(tmp_path_factory: pytest.TempPathFactory) -> Iterator[None]:
-    """A new cache, shared by the tests of this file."""
+    """Return a new cache, shared by the tests of this file."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("XDG_CACHE_HOME", str(tmp_path_factory.mktemp("cache")))
         yield

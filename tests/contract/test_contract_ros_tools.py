@@ -36,7 +36,7 @@ TRANSIENT_LOCAL = ("/tf_static", "/robot_description")
 
 @pytest.fixture(scope="module")
 def bag(distributed: Finished) -> Iterator[AnyReader]:
-    """The recording of a short examination, opened without Palpate."""
+    """Return the recording of a short examination, opened without Palpate."""
     with AnyReader([distributed.folder / "recording_mcap"], default_typestore=get_typestore(Stores.ROS2_JAZZY)) as reader:
         yield reader
 

@@ -118,7 +118,7 @@ def leaking_file(scenario: Scenario, out: Path) -> Any:
 
 
 def leaking_seed(scenario: Scenario, out: Path) -> Any:
-    """The examination draws from the patient's seed."""
+    """Return the examination draws from the patient's seed."""
     return distributed(scenario.model_copy(update={"exam": scenario.exam.model_copy(update={"seed": scenario.seed})}), out)
 
 

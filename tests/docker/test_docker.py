@@ -48,7 +48,7 @@ def builds() -> list[tuple[str, str]]:
 
 @pytest.fixture(scope="module")
 def lists(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The libraries of every image, as the image's build writes them."""
+    """Return the libraries of every image, as the image's build writes them."""
     folder = tmp_path_factory.mktemp("requirements") / "lists"
     subprocess.run([sys.executable, str(ROOT / "compose/requirements.py"), str(folder)], cwd=ROOT, check=True, timeout=60)
     return folder
@@ -167,7 +167,7 @@ def attached(images: None, tmp_path_factory: pytest.TempPathFactory) -> Iterator
 
 
 def same_platform(a: dict[str, Any], b: dict[str, Any]) -> bool:
-    """True if equal hashes are expected: the same C library, processor and versions of common packages."""
+    """Return True if equal hashes are expected: the same C library, processor and versions of common packages."""
     one, other = a["platform"], b["platform"]
     common = one["packages"].keys() & other["packages"].keys()
     return all(one[key] == other[key] for key in ("libc", "cpu")) and all(

@@ -51,7 +51,7 @@ def true_radius(chance: float, felt_contrast: float, depth_m: float, lapse: floa
 
 
 def case(number: int, population: str, **fields: Any) -> dict[str, Any]:
-    """A row of cases.parquet."""
+    """Return a row of cases.parquet."""
     method = fields.get("method", "palpate")
     row = {
         "case_id": f"{population}-{number}-{method}-{fields.get('errors', 'typical')}",
@@ -66,7 +66,7 @@ def case(number: int, population: str, **fields: Any) -> dict[str, Any]:
 
 
 def finding(case_id: str, confidence: float, lump: int, **fields: Any) -> dict[str, Any]:
-    """A row of findings.parquet."""
+    """Return a row of findings.parquet."""
     row = {
         "case_id": case_id, "index": 0, "reported": confidence >= 0.5, "x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "area_m2": 1.1e-3,
         "ratio": 1.6, "ratio_lower": 1.3, "ratio_upper": 1.9, "confidence": confidence, "lump": lump,
@@ -77,7 +77,7 @@ def finding(case_id: str, confidence: float, lump: int, **fields: Any) -> dict[s
 
 
 def lump(case_id: str, **fields: Any) -> dict[str, Any]:
-    """A row of lumps.parquet."""
+    """Return a row of lumps.parquet."""
     row = {
         "case_id": case_id, "lump": 0, "felt_contrast": 1.5, "felt_radius_m": 0.015, "depth_m": 0.01, "radius_m": 0.015,
         "contrast": 4.0, "palpable": True, "found": False, "confidence": 0.0, "place_error_m": np.nan,

@@ -69,13 +69,13 @@ def digest_of(folder: Path) -> str:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """The toy done by one worker."""
+    """Return the toy done by one worker."""
     return examined(tmp_path_factory.mktemp("toy"), CASES)
 
 
 @pytest.fixture(scope="module")
 def scheduler() -> Iterator[tuple[str, subprocess.Popen[bytes]]]:
-    """A scheduler of its own with a worker, as on a cluster."""
+    """Return a scheduler of its own with a worker, as on a cluster."""
     address = "tcp://127.0.0.1:18786"
     head = subprocess.Popen(
         [sys.executable, "-m", "distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "18786", "--no-dashboard"]

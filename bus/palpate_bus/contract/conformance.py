@@ -217,7 +217,7 @@ class _Reader:
         self._nested = [leaf.path for leaf in chosen if leaf.repeated]
 
     def within(self, message: Message, least: float, most: float) -> bool:
-        """True if all numbers are in the closed range; NaN is outside."""
+        """Return True if all numbers are in the closed range; NaN is outside."""
         if self._scalars is not None:
             values = self._scalars(message)
             for value in (values,) if self._single else values:
@@ -232,7 +232,7 @@ class _Reader:
         return True
 
     def finite(self, message: Message) -> bool:
-        """True if all numbers are finite."""
+        """Return True if all numbers are finite."""
         if self._scalars is not None:
             values = self._scalars(message)
             if not (isfinite(values) if self._single else all(map(isfinite, values))):

@@ -47,7 +47,7 @@ class PortCheck:
         self._conforms = conforms(topic.model_dump_json())
 
     def __call__(self, message: Message) -> None:
-        """Raises RefusedMessage if the message breaks the contract."""
+        """Raise RefusedMessage if the message breaks the contract."""
         if not self._conforms(message):
             raise RefusedMessage(self._topic, self._violation(message), message)
 

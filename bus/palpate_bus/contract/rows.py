@@ -206,7 +206,7 @@ class Contract(_Row):
         return tuple((topic, topic.readers[role]) for topic in self.topics.values() if role in topic.readers)
 
     def tagged(self, name: str) -> bool:
-        """True if messages of this topic, or of this name of the runtime, carry a tag in runs with a key."""
+        """Return True if messages of this topic, or of this name of the runtime, carry a tag in runs with a key."""
         row = self.topics.get(name) or self.internal.get(name) or self.internal.get(f"{name.rpartition('/')[0]}/<role>")
         return row is not None and row.tagged
 

@@ -94,7 +94,7 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
 @cache
 def decodes_to_itself(name: str) -> bool:
-    """True if encoding and decoding returns an equal message: the type has no arrays and no float32.
+    """Return True if encoding and decoding returns an equal message: the type has no arrays and no float32.
 
     An array may differ in type or layout from its field, and its owner may write to it later.
     """

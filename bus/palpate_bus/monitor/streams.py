@@ -139,7 +139,7 @@ def timing_problems(topic: Topic, stream: Stream, time: BusTime, rate: float | N
 
 
 def is_due(topic: Topic, time: BusTime) -> bool:
-    """True if enough bus time passed for several messages of a periodic topic."""
+    """Return True if enough bus time passed for several messages of a periodic topic."""
     return time.passed / topic.period > TUNING.least_off
 
 

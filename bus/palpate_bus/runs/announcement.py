@@ -112,7 +112,7 @@ def matching(chosen: str | None) -> list[Run]:
 
 
 def _is_announcement(path: Path) -> bool:
-    """True if the name is that of an announcement: a folder of PALPATE_RUNS may contain other files."""
+    """Return True if the name is that of an announcement: a folder of PALPATE_RUNS may contain other files."""
     return re.fullmatch(r"\d+-\d+\.json", path.name) is not None
 
 

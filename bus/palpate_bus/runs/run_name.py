@@ -30,7 +30,7 @@ def name_run(folder: Path) -> str:
 
 
 def in_use(folder: Path) -> bool:
-    """True if a run still writes to a results folder. Raises OSError if the folder cannot be read."""
+    """Return True if a run still writes to a results folder. Raises OSError if the folder cannot be read."""
     with suppress(FileNotFoundError), (folder / LOCK).open("rb") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

@@ -244,7 +244,7 @@ class TickInbox:
         return None if latest is None else latest.stamp
 
     def lost(self, role: str) -> bool:
-        """True if the service of `role` is lost."""
+        """Return True if the service of `role` is lost."""
         return role in self.lost_roles
 
 

@@ -88,7 +88,7 @@ class Member:
         return new
 
     def transport_lost(self) -> bool:
-        """True if all traffic went through a router that has closed, so that no silent role is at fault."""
+        """Return True if all traffic went through a router that has closed, so that no silent role is at fault."""
         info = self.session.info
         return self._routed and not list(info.routers_zid()) and not list(info.peers_zid())
 

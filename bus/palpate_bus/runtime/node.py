@@ -41,7 +41,7 @@ class Seat:
         self.reports.send(ServiceReport.FINISHED, self.tick, detail=detail)
 
     def fail(self, failure: Failure) -> None:
-        """Reports a failure and closes the service; further errors are suppressed."""
+        """Report a failure and close the service; further errors are suppressed."""
         with suppress(Exception):
             self.output.flush(self.tick)  # the recording needs every message that was sent
         self.reports.send(ServiceReport.FAILED, self.tick, detail=failure.report())

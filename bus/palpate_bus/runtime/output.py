@@ -51,7 +51,7 @@ class ChunkWriter:
         self._bytes += len(payload)
 
     def due(self, t: int) -> bool:
-        """True if a chunk is due at tick `t` [ns]."""
+        """Return True if a chunk is due at tick `t` [ns]."""
         return t >= self._next or self._bytes > CHUNK_BYTES
 
     def chunk(self, t: int) -> bytes:

@@ -85,7 +85,7 @@ def process_identity() -> dict[str, object]:
 
 
 def is_running(pid: int) -> bool:
-    """True if the process exists and is not stopped. If it makes no progress it is starved of CPU."""
+    """Return True if the process exists and is not stopped. If it makes no progress it is starved of CPU."""
     try:
         status: str = psutil.Process(pid).status()
         return status not in STOPPED | ENDED
@@ -112,7 +112,7 @@ class Activity:
     """Distinguishes slow processes from frozen ones: a slow one uses processor time or waits for a core."""
 
     def __init__(self, pid: int) -> None:
-        """Raises psutil.Error if the process does not exist."""
+        """Raise psutil.Error if the process does not exist."""
         self.pid = pid
         self._process = psutil.Process(pid)
         self._used = self._usage()
@@ -137,6 +137,6 @@ class Activity:
         return times.user, times.system, switches.voluntary, switches.involuntary
 
     def _wants_core(self) -> bool:
-        """True if one of its threads could run."""
+        """Return True if one of its threads could run."""
         tasks = (psutil.Process(thread.id) for thread in self._process.threads())
         return any(task.status() == psutil.STATUS_RUNNING for task in tasks)

@@ -94,7 +94,7 @@ TIMES = WallClockTimes()
 
 
 def _awaited(edge: Edge, topic: Topic) -> bool:
-    """True if the first step needs a message of the topic."""
+    """Return True if the first step needs a message of the topic."""
     return edge is Edge.LATCHED or (edge is Edge.SAME_TICK and topic.periodic and topic.visibility is Visibility.PUBLIC)
 
 

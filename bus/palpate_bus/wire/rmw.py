@@ -62,7 +62,7 @@ class Tagger:
         return mac.digest()
 
     def holds(self, attachment: bytes, payload: bytes) -> bool:
-        """True if an attachment ends with the tag of its message."""
+        """Return True if an attachment ends with the tag of its message."""
         return compare_digest(attachment[-TAG_SIZE:], self.tag(attachment[:-TAG_SIZE], payload))
 
 

@@ -91,7 +91,7 @@ class RosNode:
     """A named node; topics are absolute, without the leading slash."""
 
     def __init__(self, name: str, domain: int, options: BusOptions) -> None:
-        """Raises BusConfigError if a session cannot be opened."""
+        """Raise BusConfigError if a session cannot be opened."""
         self._session = open_session(options)
         self._domain = domain
         self._tokens = NodeTokens(self._session, name, domain)

@@ -50,7 +50,7 @@ class CompileError(UserError):
 
 
 def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platform, ...]:
-    """The platforms that an FMI version has a folder for; those of `names` (of FMI 3.0), if given.
+    """Return the platforms that an FMI version has a folder for; those of `names` (of FMI 3.0), if given.
 
     Raises ValueError naming one that is not known.
     """
@@ -64,21 +64,21 @@ def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platfor
 
 
 def native() -> str:
-    """The platform of this machine, by its name in FMI 3.0."""
+    """Return the platform of this machine, by its name in FMI 3.0."""
     name = platform.machine().lower()
     machine = {"arm64": "aarch64", "amd64": "x86_64"}.get(name, name)
     return f"{machine}-{platform.system().lower()}"
 
 
 def fmi_headers() -> Path:
-    """The folder of the standard's C headers, which the FMPy package brings."""
+    """Return the folder of the standard's C headers, which the FMPy package brings."""
     import fmpy  # noqa: PLC0415  (slow to import)
 
     return Path(fmpy.__file__).parent / "c-code"
 
 
 def compile_library(folder: Path, sources: Sequence[str], target: Platform, includes: Sequence[Path] = ()) -> bytes:
-    """The shared library of `sources` in `folder` for a platform; remembered in a cache by their content.
+    """Return the shared library of `sources` in `folder` for a platform; remembered in a cache by their content.
 
     Raises CompileError.
     """

@@ -25,14 +25,14 @@ _EPOCH = (2020, 1, 1, 0, 0, 0)
 
 
 def source_folder() -> Path:
-    """The C sources, in a wheel or in a checkout."""
+    """Return the C sources, in a wheel or in a checkout."""
     here = Path(__file__).resolve().parent
     packaged = here / "src"
     return packaged if packaged.is_dir() else here.parent / "src"
 
 
 def write_sources(folder: Path, version: int) -> tuple[str, ...]:
-    """Copies the sources of an FMI version, with the generated table and the standard's headers; returns what to compile."""
+    """Copy the sources of an FMI version, with the generated table and the standard's headers; return what to compile."""
     folder.mkdir(parents=True, exist_ok=True)
     names = (f"fmi{version}.c", *SOURCES)
     for path in (*(source_folder() / name for name in names), *source_folder().glob("*.h")):
@@ -53,7 +53,7 @@ def build_fmu(
     model: PhantomModel | None = None,
     compiling: Callable[[str], None] = lambda _: None,
 ) -> Path:
-    """Writes the FMU of a phantom to `out` and returns that path.
+    """Write the FMU of a phantom to `out` and return that path.
 
     `version` is FMI's, 2 or 3; `targets` are platforms by FMI 3.0's names, all by default; `radius_m` is the indenter's
     start value; `model` replaces the surface and background that `phantom` would give; `compiling` is called with each platform
@@ -110,7 +110,7 @@ def build_scenario_fmu(
 
 
 def _token(content: bytes, version: int) -> str:
-    """The instantiation token: of the phantom, the sources and the FMI version."""
+    """Return the instantiation token: of the phantom, the sources and the FMI version."""
     parts = [path.read_bytes() for path in sorted(source_folder().glob("*.[ch]"))]
     digest = uuid.uuid5(_NAMESPACE, f"{version} {c_table()} {[part.hex() for part in parts]} {content.hex()}")
     return f"{{{digest}}}"

@@ -133,11 +133,11 @@ class Port:
         return self._views[name]
 
     def push(self) -> None:
-        """Sets the variables in the FMU. Raises FmuError if it refuses a value."""
+        """Set the variables in the FMU. Raises FmuError if it refuses a value."""
         self._call("Set", self._arguments)
 
     def pull(self) -> NDArray[Any]:
-        """Gets the variables from the FMU; returns all their values, one after the other. Raises FmuError."""
+        """Get the variables from the FMU; return all their values, one after the other. Raises FmuError."""
         self._call("Get", self._arguments)
         return self.values
 
@@ -283,7 +283,7 @@ class FmuInstance:
         return port[name].copy()
 
     def set(self, name: str, value: ArrayLike) -> None:
-        """Sets a variable."""
+        """Set a variable."""
         port = self.port([name])
         port[name][...] = value
         port.push()

@@ -26,7 +26,7 @@ class ExportError(UserError):
 
 
 def start_values(phantom: Phantom, radius_m: float) -> dict[str, Array]:
-    """The start value of every parameter for a phantom and an indenter radius [m]: a flat array each.
+    """Return the start value of every parameter for a phantom and an indenter radius [m]: a flat array each.
 
     Lesions are those that the skin shows: one that lies below it is felt as a weaker and wider one.
     Raises ExportError if it has more lesions or Prony branches than the FMU has room for.
@@ -81,7 +81,7 @@ def sizes_of(model: PhantomModel, starts: Mapping[str, Array]) -> Sizes:
 
 
 def encode_phantom(model: PhantomModel, breaths: Array, starts: dict[str, Array], token: str) -> bytes:
-    """The phantom file; `breaths` is the table of a `BreathingCurve`, shape (n, 5)."""
+    """Return the phantom file; `breaths` is the table of a `BreathingCurve`, shape (n, 5)."""
     laplacian = model.laplacian.copy()
     laplacian.sort_indices()
     sizes = sizes_of(model, starts)

@@ -31,7 +31,7 @@ class Probing:
     """Stored [J]."""
 
     def table(self) -> Array:
-        """The columns of the reference results, shape (n, 5)."""
+        """Return the columns of the reference results, shape (n, 5)."""
         return np.column_stack((self.time, self.depth, self.force, self.contacts, self.energy))
 
 

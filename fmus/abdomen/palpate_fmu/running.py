@@ -10,7 +10,7 @@ from palpate_fmu.reading import FmuError, read_description
 
 
 def run_and_plot(file: Path, out: Path) -> tuple[str, ...]:
-    """Simulates an FMU over its default experiment with its start values; writes a PNG, and a CSV of the same name.
+    """Simulate an FMU over its default experiment with its start values; write a PNG, and a CSV of the same name.
 
     Returns the names of the outputs. Raises FmuError if it fails or has no scalar output.
     """

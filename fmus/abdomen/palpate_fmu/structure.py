@@ -56,17 +56,17 @@ class Indices:
             used += variable.count(sizes)
 
     def of(self, variable: Variable) -> range:
-        """The places of all elements of a variable."""
+        """Return the places of all elements of a variable."""
         first = self._first[variable.name]
         return range(first, first + variable.count(self._sizes))
 
     def at(self, name: str, elements: Iterable[int]) -> Iterator[int]:
-        """The places of some elements, counted from 0, of a variable."""
+        """Return the places of some elements, counted from 0, of a variable."""
         return (self._first[name] + int(k) for k in elements)
 
 
 def _dependencies(variable: Variable, indices: Indices, sizes: Sizes, model: PhantomModel) -> Iterator[Iterable[int] | None]:
-    """The dependencies of each element; None: all."""
+    """Return the dependencies of each element; None: all."""
     n = sizes.vertices
     if variable.rate_of == "displacement":
         for near, tension in zip(couplings(model), model.tension, strict=True):

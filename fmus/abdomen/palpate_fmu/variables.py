@@ -113,7 +113,7 @@ def _parameter(
 def _state(
     vr: int, rate_vr: int, name: str, member: str, doc: str, shape: tuple[int | str, ...], unit: str = "m", **more: Any
 ) -> tuple[Variable, Variable]:
-    """A continuous state of model exchange, a length unless `more` fields say otherwise, and its derivative."""
+    """Return a continuous state of model exchange, a length unless `more` fields say otherwise, and its derivative."""
     fields: dict[str, Any] = {"low": -2, "high": 2, "nominal": 1e-3, "start": 0.0} | more
     rate_unit = "m/s" if unit == "m" else "1/s"
     return (
@@ -230,12 +230,12 @@ TABLE: tuple[Variable, ...] = (
 
 
 def variables(version: int, sizes: Sizes) -> tuple[Variable, ...]:
-    """The variables of an FMI version (2 or 3) that a phantom of some sizes has any values of."""
+    """Return the variables of an FMI version (2 or 3) that a phantom of some sizes has any values of."""
     return tuple(variable for variable in TABLE if version in variable.versions and variable.count(sizes))
 
 
 def parameters() -> Iterator[Variable]:
-    """The variables that have a start value in the phantom file, in its order."""
+    """Return the variables that have a start value in the phantom file, in its order."""
     return (variable for variable in TABLE if variable.parameter)
 
 

@@ -59,12 +59,12 @@ class Exchange:
         shutil.rmtree(self.folder, ignore_errors=True)
 
     def set(self, name: str, values: Any) -> None:
-        """Sets a real variable."""
+        """Set a real variable."""
         references = list(self.variables[name].references)
         (self.fmu.setReal if self.older else self.fmu.setFloat64)(references, [float(value) for value in values])
 
     def put(self, position: Array, velocity: Array, time: float = 0.0) -> None:
-        """Sets time and inputs."""
+        """Set time and inputs."""
         self.fmu.setTime(time)
         self.set("indenter_position", position)
         self.set("indenter_velocity", velocity)
@@ -77,7 +77,7 @@ class Exchange:
         return np.array(self.fmu.getFloat64(list(v.references), nValues=v.size))
 
     def rates(self, x: Array) -> Array:
-        """The derivatives of the states at x."""
+        """Return the derivatives of the states at x."""
         pointer = np.ctypeslib.as_ctypes(np.ascontiguousarray(x))
         rates = np.zeros(self.states)
         self.fmu.setContinuousStates(pointer, self.states)
@@ -92,7 +92,7 @@ class Exchange:
         return x
 
     def runge_kutta(self, x: Array, steps: int, h: float) -> Array:
-        """The classical fourth-order method with inputs held."""
+        """Return the classical fourth-order method with inputs held."""
         for _ in range(steps):
             a = self.rates(x)
             b = self.rates(x + h / 2 * a)
@@ -102,7 +102,7 @@ class Exchange:
         return x
 
     def derivative(self, unknowns: list[str], knowns: dict[str, Array]) -> dict[str, Array]:
-        """The directional derivative of some variables along a direction of others."""
+        """Return the directional derivative of some variables along a direction of others."""
         seed = np.concatenate([np.ravel(value) for value in knowns.values()]).astype(float)
         sizes = [self.variables[name].size for name in unknowns]
         known = [r for name in knowns for r in self.variables[name].references]

@@ -33,7 +33,7 @@ def press(fmu: FmuInstance, steps: int = 300, first: int = 0) -> np.ndarray:
 
 
 def ball(folder: Path, version: int) -> Path:
-    """The FMU of a phantom of some 130 vertices."""
+    """Return the FMU of a phantom of some 130 vertices."""
     trimesh = pytest.importorskip("trimesh")
     trimesh.creation.icosphere(subdivisions=3, radius=0.06).apply_translation((0, 0, -0.06)).export(folder / "ball.stl")
     phantom = Phantom(kind="mesh", mesh=str(folder / "ball.stl"), edge_m=0.02)
@@ -176,7 +176,7 @@ def test_parameters_that_disagree_are_refused(fmu: Path) -> None:
 
 
 def save(instance: FmuInstance) -> bytes:
-    """The state of the FMU, serialised, by FMPy's names of FMI 2.0 and 3.0."""
+    """Return the state of the FMU, serialised, by FMPy's names of FMI 2.0 and 3.0."""
     fmu = instance._fmu
     get, serialize, free = (
         ("getFMUstate", "serializeFMUstate", "freeFMUstate")

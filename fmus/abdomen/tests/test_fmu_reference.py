@@ -108,7 +108,7 @@ RADIUS_M = 0.015
 
 @pytest.fixture(scope="module")
 def model() -> PhantomModel:
-    """A phantom that is tensed on its right side."""
+    """Return a phantom that is tensed on its right side."""
     plain = build_phantom(PHANTOM, 1)
     return replace(plain, tension=np.clip(-plain.vertices[:, 0] / 0.05, 0, 1.6))
 

@@ -20,13 +20,13 @@ def row(table: Array, k: int, first: int = 0) -> Vector:
 
 @compiled
 def add(a: Vector, b: Vector) -> Vector:
-    """A + b."""
+    """Return a + b."""
     return a[0] + b[0], a[1] + b[1], a[2] + b[2]
 
 
 @compiled
 def subtract(a: Vector, b: Vector) -> Vector:
-    """A - b."""
+    """Return a - b."""
     return a[0] - b[0], a[1] - b[1], a[2] - b[2]
 
 
@@ -38,25 +38,25 @@ def scale(factor: float, a: Vector) -> Vector:
 
 @compiled
 def divide(a: Vector, divisor: float) -> Vector:
-    """A / `divisor`."""
+    """Return a / `divisor`."""
     return a[0] / divisor, a[1] / divisor, a[2] / divisor
 
 
 @compiled
 def dot(a: Vector, b: Vector) -> float:
-    """The scalar product."""
+    """Return the scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @compiled
 def cross(a: Vector, b: Vector) -> Vector:
-    """The vector product."""
+    """Return the vector product."""
     return a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]
 
 
 @compiled
 def norm(a: Vector) -> float:
-    """The length."""
+    """Return the length."""
     return sqrt(dot(a, a))
 
 

@@ -175,7 +175,7 @@ def _close(plan: Array, inner: int, outer: tuple[float, float]) -> NDArray[np.in
 
 
 def _ordinary(length: float) -> Anatomy:
-    """The default anatomy of a body of this length [m]."""
+    """Return the default anatomy of a body of this length [m]."""
     usual, scale = Skeleton(), length / 0.46
     across, along = usual.iliac_crest_m
     skeleton = Skeleton.model_construct(  # without validation: a parametric body may exceed the limits of a person

@@ -38,7 +38,7 @@ _SPREAD = 0.5
 
 
 def at_skin(lesion: Lesion) -> Lesion:
-    """The column through the wall that is felt as this lesion; one that reaches from the skin inward is its own."""
+    """Return the column through the wall that is felt as this lesion; one that reaches from the skin inward is its own."""
     if lesion.depth_m is None:
         return lesion
     depth, half, size = lesion.depth_m, min(lesion.radii_m), harmonic_mean(lesion.radii_m)
@@ -66,13 +66,13 @@ _COSTAL_SLOPE = 0.45
 
 
 def smoothstep(t: Array) -> Array:
-    """The cubic that rises from 0 at t <= 0 to 1 at t >= 1 with zero slope at both ends."""
+    """Return the cubic that rises from 0 at t <= 0 to 1 at t >= 1 with zero slope at both ends."""
     t = np.clip(t, 0.0, 1.0)
     return np.asarray(t * t * (3 - 2 * t))
 
 
 def gaussian_field(points: Array, correlation_m: float, seed: int) -> Array:
-    """A zero-mean, unit-variance Gaussian random field at points (n, 3) [m], shape (n,).
+    """Return a zero-mean, unit-variance Gaussian random field at points (n, 3) [m], shape (n,).
 
     Covariance exp(-r^2 / (2 correlation_m^2)), by random Fourier features (Rahimi and Recht 2007): a function of
     position, so the field does not depend on the mesh.

@@ -55,7 +55,7 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
 
 
 def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """The mesh with equal vertices joined (STL repeats them) and unused ones dropped."""
+    """Return the mesh with equal vertices joined (STL repeats them) and unused ones dropped."""
     if not len(triangles):
         raise MeshError("it has no triangles")
     if not np.isfinite(vertices).all():
@@ -233,7 +233,7 @@ def vertex_normals(vertices: Array, triangles: IntArray) -> Array:
 
 
 def _check_fans(vertices: Array, triangles: IntArray) -> None:
-    """Raises MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
+    """Raise MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
     m = len(triangles)
     half = np.sort(_half_edges(triangles), axis=1)
     face = np.tile(np.arange(m), 3)

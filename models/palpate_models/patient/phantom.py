@@ -122,7 +122,7 @@ def _breathing_profile(vertices: Array, normals: Array, half_length: float, fixe
 def flat_phantom(
     half_m: float = 0.13, edge_m: float = 0.005, k_w_n_per_m3: float = 1.7e5, lesions: Sequence[Lesion] = ()
 ) -> PhantomModel:
-    """A square of half width `half_m` [m] in z = 0 on a hexagonal lattice of `edge_m` [m]; its border is fixed.
+    """Return a square of half width `half_m` [m] in z = 0 on a hexagonal lattice of `edge_m` [m]; its border is fixed.
 
     A vertex is at the origin. The breathing profile is 1 everywhere inside.
     """

@@ -55,7 +55,7 @@ def curves() -> Mapping[tuple[str, str], Curve]:
 
 
 def curve(region: str, person: str) -> Curve:
-    """The curve of a region and an id. Raises KeyError if there is none: P03 is missing in R1 and R2."""
+    """Return the curve of a region and an id. Raises KeyError if there is none: P03 is missing in R1 and R2."""
     try:
         return curves()[region, person]
     except KeyError:
@@ -63,7 +63,7 @@ def curve(region: str, person: str) -> Curve:
 
 
 def relaxed_people() -> list[tuple[str, str]]:
-    """The 48 region and person of places 1 to 5 at rest, in the file's order."""
+    """Return the 48 region and person of places 1 to 5 at rest, in the file's order."""
     return [(f"R{place}", person) for place in PLACES for person in PEOPLE if (f"R{place}", person) in curves()]
 
 
@@ -73,7 +73,7 @@ def median_force(depth_m: Array) -> Array:
 
 
 def activated(region: str) -> str:
-    """The region of the same place with tensed muscles: "A3" for "R3"."""
+    """Return the region of the same place with tensed muscles: "A3" for "R3"."""
     return region.replace("R", "A")
 
 

@@ -119,13 +119,13 @@ _ARM_CAPSULES: Final[tuple[tuple[Capsule, ...], ...]] = (
 
 
 def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
-    """A solid cylinder along z with its centre at height z of the link frame."""
+    """Return a solid cylinder along z with its centre at height z of the link frame."""
     across = mass * (3 * radius**2 + length**2) / 12
     return Inertia(mass, (0.0, 0.0, z), (across, across, mass * radius**2 / 2))
 
 
 def _sphere(mass: float, radius: float) -> Inertia:
-    """A solid sphere about the link frame's origin."""
+    """Return a solid sphere about the link frame's origin."""
     inertia = 0.4 * mass * radius**2
     return Inertia(mass, (0.0, 0.0, 0.0), (inertia, inertia, inertia))
 
@@ -164,7 +164,7 @@ def _inertial(inertia: Inertia) -> str:
 
 
 def _geometry(tag: str, capsule: Capsule) -> str:
-    """A capsule as URDF primitives: a cylinder and a sphere at each end."""
+    """Return a capsule as URDF primitives: a cylinder and a sphere at each end."""
     start, end = np.array(capsule.start), np.array(capsule.end)
     axis = end - start
     length = float(np.linalg.norm(axis))
@@ -201,7 +201,7 @@ def _arm_joint(i: int, robot: Robot) -> str:
 
 
 def urdf(robot: Robot, *, geometry: bool = True) -> str:
-    """The robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file.
+    """Return the robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file.
 
     `geometry=False` leaves out visual and collision shapes.
     """

@@ -23,7 +23,7 @@ Z = (0.0, 0.0, 1.0)
 
 
 def cone(start: Point, end: Point, r_start: float, r_end: float) -> Field:
-    """A capsule from `start` to `end` whose radius varies linearly between the two spheres."""
+    """Return a capsule from `start` to `end` whose radius varies linearly between the two spheres."""
     a, b = np.asarray(start, float), np.asarray(end, float)
     axis = b - a
 
@@ -36,7 +36,7 @@ def cone(start: Point, end: Point, r_start: float, r_end: float) -> Field:
 
 
 def cylinder(axis: Point, low: Point, length: float, radius: float, rounding: float = 0.0) -> Field:
-    """A cylinder from `low` along the unit vector `axis`, its edges rounded."""
+    """Return a cylinder from `low` along the unit vector `axis`, its edges rounded."""
     u = np.asarray(axis, float)
     centre = np.asarray(low, float) + u * length / 2
 
@@ -51,7 +51,7 @@ def cylinder(axis: Point, low: Point, length: float, radius: float, rounding: fl
 
 
 def box(centre: Point, size: Point, rounding: float) -> Field:
-    """A box with rounded edges."""
+    """Return a box with rounded edges."""
     middle, half = np.asarray(centre, float), np.asarray(size, float) / 2 - rounding
 
     def field(p: Array) -> Array:
@@ -93,7 +93,7 @@ def cut(width: float, field: Field, *limits: Field) -> Field:
 
 
 def mirrored(field: Field) -> Field:
-    """The mirror image in the xz plane."""
+    """Return the mirror image in the xz plane."""
     return lambda p: field(p * np.array((1.0, -1.0, 1.0)))
 
 
@@ -147,7 +147,7 @@ def mesh(field: Field, low: Point, high: Point, edge: float) -> tuple[Array, Tri
 
 
 def revolve(profile: Array, axis: Point = Z, origin: Point = (0.0, 0.0, 0.0), segments: int = 48) -> tuple[Array, Triangles]:
-    """A profile of (radius, height) rows, from the low end of the axis to its high end, turned about `axis`.
+    """Return a profile of (radius, height) rows, from the low end of the axis to its high end, turned about `axis`.
 
     Closed where the profile begins and ends on the axis (radius 0). Vertices [m], shape (n, 3), and outward triangles.
     """

@@ -60,18 +60,18 @@ class VisualMesh(NamedTuple):
 
 
 def _half_bulb(centre_z: float, middle_y: float) -> Field:
-    """The half of a joint's bulb on the +y side of its middle plane, closed by a dome."""
+    """Return the half of a joint's bulb on the +y side of its middle plane, closed by a dome."""
     over = 0.03  # the inner dome lies beyond the middle plane and is cut off
     return cylinder(Y, (0.0, middle_y - over, centre_z), BULB_END_M + over, BULB_M, 0.036)
 
 
 def _other_half(centre_z: float, middle_y: float) -> Field:
-    """The room of the bulb's other half, which belongs to the next housing."""
+    """Return the room of the bulb's other half, which belongs to the next housing."""
     return cylinder(Y, (0.0, middle_y + SEAM_M - 0.3, centre_z), 0.3, BULB_M + 0.012, 0.004)
 
 
 def _below(height: float, middle_y: float) -> Field:
-    """A housing from a rotary joint at z = 0 up to half of a bulb at `height`, on the +y side (links 1 and 3)."""
+    """Return a housing from a rotary joint at z = 0 up to half of a bulb at `height`, on the +y side (links 1 and 3)."""
     tube = cylinder(Z, (0.0, 0.0, -0.02), 0.10, TUBE_M, 0.004)
     bulb = _half_bulb(height, middle_y)
     neck = cone((0.0, 0.006, 0.07), (0.0, middle_y + 0.04, height), TUBE_M - 0.004, BULB_M - 0.020)
@@ -85,7 +85,7 @@ def _below(height: float, middle_y: float) -> Field:
 
 
 def _above(height: float, shift: float) -> Field:
-    """A housing from half of a bulb at z = 0, on the +y side, up to a rotary joint at `height` (links 2 and 4)."""
+    """Return a housing from half of a bulb at z = 0, on the +y side, up to a rotary joint at `height` (links 2 and 4)."""
     tube = cylinder(Z, (0.0, shift, height - 0.09), 0.11, TUBE_M, 0.004)
     bulb = _half_bulb(0.0, 0.0)
     neck = cone((0.0, 0.04, 0.0), (0.0, shift + 0.006, height - 0.08), BULB_M - 0.020, TUBE_M - 0.004)
@@ -99,7 +99,7 @@ def _above(height: float, shift: float) -> Field:
 
 
 def _base() -> Field:
-    """The foot with its connector panel at the back."""
+    """Return the foot with its connector panel at the back."""
     foot = cylinder(Z, (0.0, 0.0, 0.0), 0.05, 0.096, 0.008)
     column = cone((0.0, 0.0, 0.03), (0.0, 0.0, 0.20), 0.088, TUBE_M - 0.008)
     panel = box((-0.085, 0.0, 0.045), (0.06, 0.11, 0.075), 0.01)
@@ -141,26 +141,26 @@ def _turned(
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
     axis: tuple[float, float, float] = Z,
 ) -> VisualMesh:
-    """A revolved profile of (radius, height), closed at both ends."""
+    """Return a revolved profile of (radius, height), closed at both ends."""
     closed = [(0.0, profile[0][1]), *profile, (0.0, profile[-1][1])]
     return VisualMesh(*revolve(np.array(closed), axis, origin), rgba)
 
 
 def _ring(radius: float, rgba: Rgba, z: float = 0.0, y: float = 0.0, half: float = 0.005) -> VisualMesh:
-    """The ring about a rotary joint."""
+    """Return the ring about a rotary joint."""
     return _turned(
         [(radius - 0.003, -half), (radius, -half + 0.002), (radius, half - 0.002), (radius - 0.003, half)], rgba, (0.0, y, z)
     )
 
 
 def _disc(radius: float, rgba: Rgba, y: float, z: float, half: float = 0.004) -> VisualMesh:
-    """The disc in the middle plane of a bulb."""
+    """Return the disc in the middle plane of a bulb."""
     profile = [(radius - 0.003, -half), (radius, -half + 0.0015), (radius, half - 0.0015), (radius - 0.003, half)]
     return _turned(profile, rgba, (0.0, y, z), Y)
 
 
 def _cap(y: float, z: float, side: float, radius: float = 0.033) -> VisualMesh:
-    """The round cover at a bulb's end."""
+    """Return the round cover at a bulb's end."""
     profile = [(radius, -0.008), (radius, 0.0), (radius - 0.003, 0.002), (radius - 0.012, 0.003)]
     return _turned(profile, ORANGE, (0.0, y, z), (0.0, side, 0.0))
 

@@ -35,7 +35,7 @@ DURATION_S = {
 
 
 def check(rig: Rig, report: ConformanceReport | None = None) -> ConformanceReport:
-    """Runs the suite of a rig's role, then the common checks, and returns the report."""
+    """Run the suite of a rig's role, then the common checks, and return the report."""
     report = report or ConformanceReport(rig.role.name)
     SUITES[rig.role.name](rig, report)
     common.suite(rig, report)

@@ -89,7 +89,7 @@ class PlayedScan:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks silence before contact, samples, map and findings."""
+    """Check silence before contact, samples, map and findings."""
     exam = rig.settings.scenario.exam
     half = min(0.05, exam.region_m[0] / 2, exam.region_m[1] / 2)
     X_WA = np.array(exam_input(rig.settings.scenario).X_WA)

@@ -47,7 +47,7 @@ def plane(centre: Array) -> Source:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks pose, bursts, format and geometry."""
+    """Check pose, bursts, format and geometry."""
     report.section("pose")
     centre = np.array(rig.settings.scenario.camera.look_at_m)
     feed = {"sim/surface": plane(centre)}
@@ -88,7 +88,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _small(images: list[ReceivedMessage], infos: list[ReceivedMessage], report: ConformanceReport) -> None:
-    """Checks the small images, by which perception follows the wall: sent continuously, with their own intrinsics."""
+    """Check the small images, by which perception follows the wall: sent continuously, with their own intrinsics."""
     if not report.expect("sent without a request", bool(images), "some in half a second", len(images)):
         return
     same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
@@ -131,7 +131,7 @@ def _format(image: ReceivedMessage, info: ReceivedMessage, report: ConformanceRe
 
 
 def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: ConformanceReport) -> None:
-    """Checks the depth of the pixels that see the plane."""
+    """Check the depth of the pixels that see the plane."""
     if not rig.settings.motion:
         report.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")
         return

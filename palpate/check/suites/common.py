@@ -20,7 +20,7 @@ MAX_LOST_SHARE = 0.05
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks topics, rates, stamps and values."""
+    """Check topics, rates, stamps and values."""
     report.section("contract")
     for topic in rig.rules.outputs(rig.role.name):
         received = rig.log[topic.name]
@@ -55,7 +55,7 @@ def _values(topic: Topic, received: list[ReceivedMessage], report: ConformanceRe
 
 
 def _rate(rig: Rig, topic: Topic, received: list[ReceivedMessage], report: ConformanceReport) -> None:
-    """Checks that every tick has its message; on a live bus, the mean rate by the sender's clock."""
+    """Check that every tick has its message; on a live bus, the mean rate by the sender's clock."""
     wanted = f"{1000 / topic.period_ms:g} Hz"
     if not rig.live:
         times = [item.t for item in received]

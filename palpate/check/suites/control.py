@@ -65,7 +65,7 @@ def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks signs, limits, expiry and reactions to garbage."""
+    """Check signs, limits, expiry and reactions to garbage."""
     report.section("law")
     idle = rig.run(0.3, feed())[TORQUE]
     quiet = max((float(np.max(np.abs(item.message.torque))) for item in idle), default=np.inf)

@@ -43,7 +43,7 @@ class PerfectFollower:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks set-points, the phases up to the first camera burst, and a stop."""
+    """Check set-points, the phases up to the first camera burst, and a stop."""
     report.section("set-points")
     arm = PerfectFollower(rig)
     rig.run(0.5, arm.feed())
@@ -90,7 +90,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _first(received: list[ReceivedMessage], report: ConformanceReport) -> None:
-    """Checks that the first set-point is at the arm's position."""
+    """Check that the first set-point is at the arm's position."""
     message = received[0].message
     if message.mode == ImpedanceSetpoint.MODE_JOINT:
         off = float(np.max(np.abs(np.asarray(message.joint_position) - lbr.HOME)))

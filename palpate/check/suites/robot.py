@@ -51,7 +51,7 @@ def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> 
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks signs, gravity, holds, latches and limits."""
+    """Check signs, gravity, holds, latches and limits."""
     report.section("joints")
     rest = rig.run(0.5, quiet(rig))
     _joints(rest["joint_states"], report)
@@ -122,7 +122,7 @@ def _description(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _gravity(rig: Rig, report: ConformanceReport) -> None:
-    """Checks that commands exclude gravity: with zero torque the arm stays where it is."""
+    """Check that commands exclude gravity: with zero torque the arm stays where it is."""
     moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
     report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
@@ -135,7 +135,7 @@ def _gravity(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _signs(rig: Rig, report: ConformanceReport) -> None:
-    """Checks that a positive torque accelerates its joint positively and is reported with that sign."""
+    """Check that a positive torque accelerates its joint positively and is reported with that sign."""
     wrong, unreported = [], []
     settle(rig)
     for joint in range(7):
@@ -164,12 +164,12 @@ def _signs(rig: Rig, report: ConformanceReport) -> None:
 
 
 def settle(rig: Rig) -> None:
-    """Waits in the driver's hold until the arm rests."""
+    """Wait in the driver's hold until the arm rests."""
     rig.run(0.4, quiet(rig))
 
 
 def release(rig: Rig) -> None:
-    """Sends a release, as the supervisor grants it."""
+    """Send a release, as the supervisor grants it."""
     rig.run(0.02, quiet(rig))
     rig.memory["releases"] = rig.memory.get("releases", 0) + 1
     rig.run(0.05 + rig.slack / 1e9, quiet(rig))
@@ -262,7 +262,7 @@ def _pressing(rig: Rig, force_W: Any) -> Feed:
 
 
 def _force(rig: Rig, report: ConformanceReport) -> None:
-    """Checks the sign of `ft/wrench`, the wrench of tool and environment on the sensor in its axes."""
+    """Check the sign of `ft/wrench`, the wrench of tool and environment on the sensor in its axes."""
     if not rig.log["sim/tool_state"]:
         report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
         return
@@ -287,7 +287,7 @@ def _mean_force(received: list[ReceivedMessage]) -> np.ndarray[Any, Any]:
 
 
 def _twist(rig: Rig, report: ConformanceReport) -> None:
-    """Checks that the twist is the pose's rate of change, over the whole suite."""
+    """Check that the twist is the pose's rate of change, over the whole suite."""
     states = [item.message for item in rig.log["sim/tool_state"]]
     if not states:
         report.skip("sim/tool_state: twist", "not simulated")
@@ -318,7 +318,7 @@ def _lost(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _limits(rig: Rig, report: ConformanceReport) -> None:
-    """Checks the limits over the whole suite."""
+    """Check the limits over the whole suite."""
     efforts = [item.message.effort for item in rig.log["joint_states"] if np.shape(item.message.effort) == (7,)]
     worst = np.max(np.abs(efforts), axis=0)
     report.expect(

@@ -48,7 +48,7 @@ class Play:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks silence before contact, one request at a time, places in the region, and an end within the budget."""
+    """Check silence before contact, one request at a time, places in the region, and an end within the budget."""
     exam = rig.settings.scenario.exam
     stiff_at = np.array(exam.centre_m) + 0.2 * np.array(exam.region_m)
     play = Play()

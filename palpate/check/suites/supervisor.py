@@ -53,7 +53,7 @@ class PlayedArm:
         self.calm()
 
     def calm(self) -> None:
-        """Returns to rest."""
+        """Return to rest."""
         self.q, self.qd = lbr.HOME.copy(), np.zeros(7)
         self.push_N = 0.0
         """Upward force on the tool [N]."""
@@ -80,7 +80,7 @@ class PlayedArm:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks measures, each limit, the latch, operator requests, silence and loss."""
+    """Check measures, each limit, the latch, operator requests, silence and loss."""
     arm = PlayedArm(rig)
     limits = exam_input(rig.settings.scenario).limits
     report.section("rest")
@@ -143,7 +143,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
-    """Checks the reported force, speed and depth."""
+    """Check the reported force, speed and depth."""
     report.section("measures")
     arm.qd = _turning(arm, 0.05)
     rig.send(SURFACE, arm.surface(rig.t, 0.004))
@@ -190,7 +190,7 @@ def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 def _stops(
     rig: Rig, arm: PlayedArm, report: ConformanceReport, what: str, levels: tuple[int, ...], cause: int, within_ms: float
 ) -> None:
-    """Expects a stop with the right cause and a reason."""
+    """Expect a stop with the right cause and a reason."""
     start = rig.t
     received = rig.run(0.5, arm.feed())[STATE]
     first = next((item for item in received if item.message.level in levels), None)
@@ -205,7 +205,7 @@ def _stops(
 
 
 def _refuses(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
-    """Expects that a release is refused while the force is still present."""
+    """Expect that a release is refused while the force is still present."""
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
     received = rig.run(0.3, arm.feed())[STATE]
     report.expect(
@@ -214,7 +214,7 @@ def _refuses(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 
 
 def _released(rig: Rig, arm: PlayedArm, report: ConformanceReport, name: str) -> None:
-    """Expects that a stop stays when its cause is gone, and ends on release, which is counted."""
+    """Expect that a stop stays when its cause is gone, and ends on release, which is counted."""
     arm.calm()
     received = rig.run(0.5, arm.feed())[STATE]
     stays = _level(received) in STOPPED

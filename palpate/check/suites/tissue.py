@@ -31,7 +31,7 @@ class PressingTool:
         self._since = 0
 
     def lead(self, rig: Rig, to: Array, seconds: float) -> list[ReceivedMessage]:
-        """Moves to `to` [m] in `seconds`; returns the contact wrenches during this time."""
+        """Move to `to` [m] in `seconds`; returns the contact wrenches during this time."""
         start, t0 = self.p.copy(), rig.t
         self.v = (to - start) / seconds
 
@@ -59,7 +59,7 @@ def force(item: ReceivedMessage) -> Array:
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
-    """Checks truth, contact, friction, energy and silence."""
+    """Check truth, contact, friction, energy and silence."""
     report.section("truth")
     rig.run(0.05, {})
     truth = rig.last("truth/phantom")
@@ -180,7 +180,7 @@ def _check_truth(rig: Rig, n_W: Array, report: ConformanceReport) -> None:
 
 
 def _check_energy(legs: list[tuple[list[ReceivedMessage], Array]], report: ConformanceReport) -> None:
-    """Checks passivity: over a closed loop the work of the tissue on the tool is not positive."""
+    """Check passivity: over a closed loop the work of the tissue on the tool is not positive."""
     work = 0.0
     stored = 0.0
     for received, v in legs:

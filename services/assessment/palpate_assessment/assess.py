@@ -91,7 +91,7 @@ def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, li
 
 
 def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
-    """The cheap variant for a growing map: with usual amplitudes, and without findings."""
+    """Return the cheap variant for a growing map: with usual amplitudes, and without findings."""
     calibration: Calibration = learned()
     o = observe(samples, calibration)
     if o is None:

@@ -44,12 +44,12 @@ class Calibration(BaseModel):
         return np.asarray(self.guarding[0] + features @ np.array(self.guarding[1:]))
 
     def threshold(self, false_findings: float) -> float:
-        """The logit that a healthy examination exceeds with the probability `false_findings`."""
+        """Return the logit that a healthy examination exceeds with the probability `false_findings`."""
         location, scale = self.tail
         return float(location - scale * np.log(false_findings))
 
 
 @cache
 def learned() -> Calibration:
-    """The calibration of this version."""
+    """Return the calibration of this version."""
     return Calibration.model_validate(yaml.safe_load(files(__package__).joinpath("calibration.yaml").read_text("utf-8")))

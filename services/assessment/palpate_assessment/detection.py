@@ -130,7 +130,7 @@ def detect(o: Observations, calibration: Calibration) -> tuple[Regression, list[
 
 
 def weigh(regression: Regression, lump: Bump) -> Candidate:
-    """A lump of a regression, tested under the regression without it."""
+    """Return a lump of a regression, tested under the regression without it."""
     others = tuple(other for other in regression.lumps if other is not lump)
     without = replace(regression, lumps=others)
     (log_contrast,), (t,) = matched(without, [lump])
@@ -155,7 +155,7 @@ def agreed(regression: Regression, lump: Bump, t: float) -> float:
 
 
 def strongest(regression: Regression) -> tuple[Bump | None, float]:
-    """The bump that stands out most from what the regression explains, and how much (|t|)."""
+    """Return the bump that stands out most from what the regression explains, and how much (|t|)."""
     xy = regression.observations.xy
     low, high = xy.min(axis=0) - _BORDER_M, xy.max(axis=0) + _BORDER_M
     x, y = (np.arange(a, b + 1e-9, PITCH_M) for a, b in zip(low, high, strict=True))
@@ -188,6 +188,6 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
 
 
 def _free(bump: Bump, lumps: Sequence[Bump]) -> bool:
-    """True if a bump does not overlap those found before."""
+    """Return True if a bump does not overlap those found before."""
     apart = [np.hypot(bump.x - one.x, bump.y - one.y) / (bump.radius + one.radius) for one in lumps]
     return all(a >= _TOO_NEAR for a in apart)

@@ -70,7 +70,7 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
 
 
 def causes(calibration: Calibration, features: Array, signs: Array) -> tuple[Array, Array]:
-    """The logit that each candidate is a lump, and the probability that it is a tensed muscle, shape (k,) each.
+    """Return the logit that each candidate is a lump, and the probability that it is a tensed muscle, shape (k,) each.
 
     `features`, `signs`: of candidates and of muscles about them, shapes (k, f) and (k, 2). Three causes compete, of weights
     exp(l) a lump, exp(g) a muscle, 1 neither. A muscle that is tensed is never softer.
@@ -83,7 +83,7 @@ def causes(calibration: Calibration, features: Array, signs: Array) -> tuple[Arr
 def _area(
     regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, probability: tuple[float, float]
 ) -> Area | None:
-    """The connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left.
+    """Return the connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left.
 
     `probability`: as of `causes`.
     """

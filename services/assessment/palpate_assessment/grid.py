@@ -56,7 +56,7 @@ def _terms(x: Array, y: Array) -> Array:
 
 
 def map_grid(surface: Array, centre: tuple[float, float], size: tuple[float, float], margin: float, pitch: float) -> MapGrid:
-    """The grid over a region of `size` [m] about `centre` [m], widened by `margin` [m], on a perceived surface.
+    """Return the grid over a region of `size` [m] about `centre` [m], widened by `margin` [m], on a perceived surface.
 
     `surface`: vertices [m], shape (n, 3), in A. Where none is near, the smooth shape through all of them stands in.
     Raises ValueError when fewer than 30 vertices lie in the region.

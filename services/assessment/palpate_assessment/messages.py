@@ -17,7 +17,7 @@ SEEN: Final = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
 
 
 def skin_of(perceived: Message, correction: Message, X_AW: Array) -> KnownSkin | None:
-    """The skin by `perception/surface` and `exam/correction`; None where one is not of the other. `X_AW`: shape (4, 4)."""
+    """Return the skin by `perception/surface` and `exam/correction`; None where one is not of the other. `X_AW`: shape (4, 4)."""
     p_W, n_W = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (perceived.vertices, perceived.normals))
     outward, sigma = (np.asarray(values, dtype=np.float64) for values in (correction.outward, correction.uncertainty))
     if not len(p_W) == len(n_W) == len(outward) == len(sigma):

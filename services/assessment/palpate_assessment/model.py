@@ -84,7 +84,7 @@ class Bump:
     """Standard deviation of its edge [m]."""
 
     def __call__(self, xy: Array, beyond: float = 0.0) -> Array:
-        """The shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
+        """Return the shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
         r = np.hypot(xy[:, 0] - self.x, xy[:, 1] - self.y)
         return np.asarray(0.5 * erfc((r - self.radius - beyond) / (np.sqrt(2) * self.edge)))
 

@@ -56,7 +56,7 @@ class Observations:
         return np.asarray(self.stroke[:, None] == self.stroke)
 
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
-        """Some of the samples."""
+        """Return some of the samples."""
         return Observations(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
 
 

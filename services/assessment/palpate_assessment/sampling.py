@@ -81,7 +81,7 @@ class Sampler:
         self._onset: float | None = None
 
     def add(self, state: ContactState) -> ForceSample | None:
-        """Takes the next state; returns the sample that it completes, if any."""
+        """Take the next state; return the sample that it completes, if any."""
         if not state.in_contact:
             sample, self._onset = self._average(), None
             return sample
@@ -137,7 +137,7 @@ def columns(samples: Sequence[ForceSample], before: float) -> FeltSoFar:
 
 
 def samples_of(felt: FeltSoFar) -> list[ForceSample]:
-    """The samples of a checkpoint."""
+    """Return the samples of a checkpoint."""
     names = [field.name for field in fields(ForceSample)]
     plain = ((values if values.ndim > 1 else values.tolist()) for values in (getattr(felt, name) for name in names))
     return [ForceSample(**dict(zip(names, row, strict=True))) for row in zip(*plain, strict=True)]

@@ -49,7 +49,7 @@ class BreathingShares:
         self._vertices, self._breathing = cKDTree(vertices), breathing
 
     def __call__(self, points: Array) -> Array:
-        """The share at points of the surface [m], in the frame of the vertices, shape (k, 3) -> (k,)."""
+        """Return the share at points of the surface [m], in the frame of the vertices, shape (k, 3) -> (k,)."""
         if not len(self._breathing):
             return np.zeros(len(points))
         return np.asarray(self._breathing[self._vertices.query(points)[1]])
@@ -65,7 +65,7 @@ class SeenBreath:
         self._waiting: list[ContactState] = []
 
     def perceive(self, vertices: Array, breathing: Array) -> None:
-        """Takes the perceived surface, in A: vertices and their shares as `BreathingShares` has them."""
+        """Take the perceived surface, in A: vertices and their shares as `BreathingShares` has them."""
         self._shares = BreathingShares(vertices, breathing)
 
     def add_image(self, exposed: float, displacement: float) -> None:
@@ -74,7 +74,7 @@ class SeenBreath:
         self._displacement.append(displacement)
 
     def take(self, state: ContactState) -> None:
-        """Takes the next state."""
+        """Take the next state."""
         self._waiting.append(state)
 
     def forget(self) -> None:
@@ -93,7 +93,7 @@ class SeenBreath:
         return self._seen(ready)
 
     def _follows(self, t: float) -> bool:
-        """True if a later image is expected."""
+        """Return True if a later image is expected."""
         return self._shares is not None and bool(self._exposed) and t - self._exposed[-1] <= LONGEST_S
 
     def _seen(self, states: Sequence[ContactState]) -> list[ContactState]:

@@ -122,17 +122,17 @@ class AssessmentService(Service):
         return deque(sorted(came, key=lambda one: one[0]))
 
     def add_motion(self, motion: Message) -> None:
-        """Takes the next `perception/motion`."""
+        """Take the next `perception/motion`."""
         if motion.state in SEEN and self._exam.breathing is not Following.IGNORE:
             self._breath.add_image(nanoseconds(motion.header.stamp) / NS, float(motion.displacement))
 
     def correct(self, message: Message) -> None:
-        """Takes the `exam/correction`."""
+        """Take the `exam/correction`."""
         if self._perceived is not None:
             self._skin = skin_of(self._perceived, message, self._X_AW)
 
     def take(self, state: Message) -> list[ForceSample]:
-        """Takes the next `exam/state`; returns the samples that are complete now. The last ones are at the end of the scan."""
+        """Take the next `exam/state`; returns the samples that are complete now. The last ones are at the end of the scan."""
         if state.patient_moved:
             self._forget_motion(nanoseconds(state.header.stamp) / NS)
             return []
@@ -153,7 +153,7 @@ class AssessmentService(Service):
         }
 
     def perceive(self, message: Message) -> None:
-        """Takes a `perception/surface`. Raises ValueError for one in another frame than the contract's."""
+        """Take a `perception/surface`. Raises ValueError for one in another frame than the contract's."""
         wanted = contract().topics["perception/surface"].frame
         if message.header.frame_id != wanted:
             raise ValueError(f"perception/surface: header.frame_id = {message.header.frame_id!r}, want {wanted!r}")
@@ -219,7 +219,7 @@ class AssessmentService(Service):
 
 
 def create(scenario: Scenario) -> Service:
-    """The assessment of a scenario; it knows nothing of the phantom but where the patient is registered."""
+    """Return the assessment of a scenario; it knows nothing of the phantom but where the patient is registered."""
     return AssessmentService(exam_input(scenario), read_checkpoint(Settings.read().checkpoint))
 
 

@@ -34,7 +34,7 @@ def lump(xy: np.ndarray, centre: tuple[float, float], radius: float, contrast: f
 
 
 def natural(seed: int, sd: float, length: float = 0.05) -> Field:
-    """A smooth random field, by random Fourier features."""
+    """Return a smooth random field, by random Fourier features."""
     rng = np.random.Generator(np.random.PCG64(seed))
     frequencies, phases = rng.standard_normal((2, 256)) / length, rng.uniform(0, 2 * np.pi, 256)
     return lambda xy: sd * np.sqrt(2 / 256) * np.cos(xy @ frequencies + phases).sum(axis=1)

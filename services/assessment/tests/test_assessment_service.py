@@ -26,7 +26,7 @@ Examined = tuple[Any, Any, list[Any]]
 
 @pytest.fixture(scope="module")
 def small() -> Scan:
-    """A small region over a lesion: 9 lines, half a minute of simulated time."""
+    """Return a small region over a lesion: 9 lines, half a minute of simulated time."""
     lesion = Lesion(centre_m=(-0.012, -0.01), radii_m=(0.024, 0.020), contrast=4.0)
     return scan(Scenario(seed=4, phantom=Phantom(lesions=(lesion,)), exam=Exam(region_m=REGION)))
 

@@ -33,7 +33,7 @@ SHAPE = (240, 320)
 
 
 def plane(z: float, tilt: float = 0.0) -> View:
-    """A view whose every pixel sees the same: a plane at depth `z` [m], tilted [rad] about the image's v axis."""
+    """Return a view whose every pixel sees the same: a plane at depth `z` [m], tilted [rad] about the image's v axis."""
     view = View.empty(*SHAPE)
     view.w[:] = 1 / z
     view.gu[:] = np.tan(tilt) / (z * FOCAL)

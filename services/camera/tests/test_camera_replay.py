@@ -28,7 +28,7 @@ SCENARIO = load_scenario("clean")
 
 @pytest.fixture(scope="module")
 def seen() -> dict[str, list[ReceivedMessage]]:
-    """A burst of the simulated camera that looks at a level square, as the conformance suite puts it there."""
+    """Return a burst of the simulated camera that looks at a level square, as the conformance suite puts it there."""
     rig = ServiceRig(create_camera(SCENARIO), RigSettings(SCENARIO))
     rig.send("planning/camera_trigger", CameraTrigger(header(0), FRAMES))
     rig.run(0.1 * FRAMES + 0.5, {"sim/surface": plane(np.array(SCENARIO.camera.look_at_m))})

@@ -27,7 +27,7 @@ def scenario(**errors: Any) -> Scenario:
 
 
 def plate(height: float = 0.9, half: float = 0.15, frame: str = "world") -> Any:
-    """A horizontal square at the patient's place."""
+    """Return a horizontal square at the patient's place."""
     corners = np.array([(-half, -half), (half, -half), (half, half), (-half, half)])
     vertices = np.column_stack((corners[:, 0] + 0.56, corners[:, 1], np.full(4, height))).astype(np.float32)
     return SurfaceMesh(
@@ -184,7 +184,7 @@ X_WC = look_at(np.array([0.3, -0.4, 1.2]), np.array([0.05, 0.02, 0.0]))
 
 
 def flat_plate(height: float, half: float = 3.0, at: tuple[float, float] = (0.0, 0.0)) -> Mesh:
-    """A horizontal square."""
+    """Return a horizontal square."""
     x, y = at
     corners = [(-half, -half), (half, -half), (half, half), (-half, half)]
     vertices = np.array([(x + a, y + b, height) for a, b in corners])

@@ -247,7 +247,7 @@ class Conductor:
         return "; ".join(texts)
 
     def _not_in_run(self, name: str) -> bool:
-        """True if `name` is a topic whose producer has no part in this run."""
+        """Return True if `name` is a topic whose producer has no part in this run."""
         topic = self._rules.topics.get(name)
         return topic is not None and topic.producer not in (*self._roles, self._collector.role)
 

@@ -25,7 +25,7 @@ class Slots:
     """Roles of a replacement. The end of their first process is ignored."""
 
     def keeps(self, role: str) -> bool:
-        """True if the slot of `role` is kept when its process leaves."""
+        """Return True if the slot of `role` is kept when its process leaves."""
         return self.patience_s > 0 and role in ROLES
 
     def leave(self, role: str, how: str) -> bool:

@@ -146,7 +146,7 @@ class Query:
         self.answer = json.loads(text)
 
     def drop(self) -> None:
-        """Does nothing."""
+        """Do nothing."""
 
 
 class Session:

@@ -96,7 +96,7 @@ class ImpedanceController:
     """The control law with its safety net. One instance per arm: the rate limit needs the previous torque."""
 
     def __init__(self, model: ArmModel, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
-        """Creates a controller called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
+        """Create a controller called every `period_s`, with joint-limit repulsion in the last `limit_zone` [rad]."""
         self.model = model
         self._net = SafetyNet(model.position_lower, model.position_upper, model.torque_limit, limit_zone, period_s)
         self._dead_time = TUNING.dead_ticks * period_s

@@ -24,7 +24,7 @@ class ArmModel:
     J_W: Array
 
     def __init__(self, urdf: str, frame: str = "indenter") -> None:
-        """Builds the model from URDF text. Raises ValueError unless it is a seven-joint arm with a link `frame`."""
+        """Build the model from URDF text. Raises ValueError unless it is a seven-joint arm with a link `frame`."""
         self._model = pin.buildModelFromXML(urdf)
         if self._model.nq != DOF or self._model.nv != DOF:
             raise ValueError(f"robot description has {self._model.nv} joints, want {DOF}")
@@ -45,14 +45,14 @@ class ArmModel:
         self.coulomb_friction: Array = self._model.upperDryFrictionLimit.copy()
 
     def update(self, q: Array, qd: Array) -> None:
-        """Evaluates the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
+        """Evaluate the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
         model, data, frame = self._model, self._data, self._frame
         self.J_W = pin.computeFrameJacobian(model, data, q, frame, _AXES)  # also places the frame
         pin.nonLinearEffects(model, data, q, qd)
         self.update_gravity(q)
 
     def update_gravity(self, q: Array) -> None:
-        """Evaluates `gravity` only, for joint-space control."""
+        """Evaluate `gravity` only, for joint-space control."""
         pin.computeGeneralizedGravity(self._model, self._data, q)
 
     @property

@@ -90,7 +90,7 @@ class Extrapolator:
     """
 
     def __init__(self, period: int) -> None:
-        """Creates an extrapolator for set-points that arrive every `period` [ns]."""
+        """Create an extrapolator for set-points that arrive every `period` [ns]."""
         self._max_age = TUNING.bridged_periods * period
         self._terms = np.zeros((4, 39))
         """Rows: coordinates at the set-point's stamp, coefficients of its age [s] and of the age squared, and the gap."""
@@ -103,7 +103,7 @@ class Extrapolator:
         self.current = None
 
     def accept(self, setpoint: Setpoint, t: int) -> None:
-        """Accepts a new set-point at time `t` [ns]."""
+        """Accept a new set-point at time `t` [ns]."""
         before = self.current
         if before is None or before.mode is not setpoint.mode:
             self.current, self._tick, self._terms = setpoint, t, _terms(setpoint, np.zeros(7))

@@ -21,7 +21,7 @@ class SafetyNet:
     """
 
     def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float) -> None:
-        """Takes joint limits [rad] and torque limits [N m], shapes (7,); `zone` [rad] (0: no repulsion); one torque per
+        """Take joint limits [rad] and torque limits [N m], shapes (7,); `zone` [rad] (0: no repulsion); one torque per
         `period_s`.
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)

@@ -96,7 +96,7 @@ class ControlService(Service):
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Runs one control tick."""
+        """Run one control tick."""
         joints = inbox.latest("joint_states")
         received = inbox.stamp("joint_states")
         if received is None:

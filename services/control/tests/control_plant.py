@@ -72,7 +72,7 @@ class Plant:
 def setpoint(
     arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: ControlMode = ControlMode.CARTESIAN, **changes: object
 ) -> Setpoint:
-    """A set-point that holds posture `at`, with `changes`."""
+    """Return a set-point that holds posture `at`, with `changes`."""
     arm.update(np.asarray(at, dtype=float), np.zeros(7))
     fields: dict[str, object] = {
         "mode": mode,
@@ -91,5 +91,5 @@ def setpoint(
 
 
 def reference(setpoint_: Setpoint) -> Reference:
-    """A set-point as the law follows it, without extrapolation."""
+    """Return a set-point as the law follows it, without extrapolation."""
     return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros(7))))

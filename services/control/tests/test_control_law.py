@@ -28,13 +28,13 @@ def arm() -> ArmModel:
 
 @pytest.fixture
 def unlimited(arm: ArmModel, monkeypatch: pytest.MonkeyPatch) -> ImpedanceController:
-    """The law without its rate limit."""
+    """Return the law without its rate limit."""
     monkeypatch.setattr(safety, "TORQUE_RATE_NM", 1e9)
     return ImpedanceController(arm)
 
 
 def offset(arm: ArmModel, q: np.ndarray, twist: np.ndarray) -> Reference:
-    """A reference away from posture `q` by a displacement in world, without null-space posture."""
+    """Return a reference away from posture `q` by a displacement in world, without null-space posture."""
     held = setpoint(arm, q, **NO_POSTURE)
     moved = setpoint(arm, q, p_WD=held.p_WD + twist[:3], R_WD=pin.exp3(twist[3:]) @ held.R_WD, **NO_POSTURE)
     return reference(moved)

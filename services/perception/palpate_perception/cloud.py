@@ -47,7 +47,7 @@ class Intrinsics:
     """Height and width of the full image [px]."""
 
     def same(self, other: Intrinsics) -> bool:
-        """True if the other has the same intrinsics and pose."""
+        """Return True if the other has the same intrinsics and pose."""
         return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)
 
 

@@ -252,7 +252,7 @@ class Palpation:
     # --- the sequence -------------------------------------------------------------------------------------------------
 
     def _remaining(self) -> Stages[None]:
-        """The segments from the next one on."""
+        """Return the segments from the next one on."""
         while self._number + 1 < len(self._segments) or (self._more and (yield from self._wait())):
             self._number += 1
             segment = self._segments[self._number]
@@ -267,7 +267,7 @@ class Palpation:
         yield from _done()
 
     def _interrupted(self) -> Stages[None]:
-        """The lift after an interruption, the rest of the segment and the remaining ones."""
+        """Return the lift after an interruption, the rest of the segment and the remaining ones."""
         yield from self._lift()
         yield from self._remaining()
 

@@ -39,7 +39,7 @@ def known(robot: Robot = BASE, **exam: object) -> ExamInput:
 
 
 def height(xy: Array) -> Array:
-    """A dome over A's xy plane [m]."""
+    """Return a dome over A's xy plane [m]."""
     return -(xy[:, 0] ** 2) / (2 * 0.25) - xy[:, 1] ** 2 / (2 * 0.6)
 
 
@@ -178,7 +178,7 @@ class World:
         return BreathObservation(stamp, forecast, 3e-4, self.calm and seen, self.moved, self.shift_A, seen)
 
     def run(self, until: Callable[[], bool] | None = None, seconds: float = 120.0) -> None:
-        """Steps until the exam has ended (or `until`), at most `seconds` of simulated time."""
+        """Step until the exam has ended (or `until`), at most `seconds` of simulated time."""
         ended = until or (lambda: self.exam.status.end_tick >= 0)
         while not ended():
             if self.t > seconds * SECOND:

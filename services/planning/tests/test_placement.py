@@ -16,7 +16,7 @@ ROBOT = Robot()
 
 
 def dome(spacing: float = 0.02, half: float = 0.1, centre: tuple[float, float] = (0.56, 0.0)) -> tuple[np.ndarray, np.ndarray]:
-    """A snake over a dome of 0.45 m radius about (x, y) with its crown at 0.93 m: positions and normals, shapes (n, 3)."""
+    """Return a snake over a dome of 0.45 m radius about (x, y) with its crown at 0.93 m: positions and normals, shapes (n, 3)."""
     axis = np.linspace(-half, half, round(2 * half / spacing) + 1)
     xy = np.array([(x, y) for i, y in enumerate(axis) for x in (axis if i % 2 == 0 else axis[::-1])])
     normals = np.column_stack((xy, np.sqrt(0.45**2 - (xy**2).sum(axis=1)))) / 0.45

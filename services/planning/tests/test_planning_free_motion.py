@@ -86,7 +86,7 @@ def palpated(times: list[int]) -> list[Setpoint]:
 
 
 def free_palpation() -> Palpation:
-    """A palpation of two segments that both are `MOTION`."""
+    """Return a palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
     wall = plane(np.eye(4))
     return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S, wall)

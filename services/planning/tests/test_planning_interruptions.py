@@ -123,7 +123,7 @@ def drawn_sideways(world: World) -> float:
 
 
 def push(world: World, aside: float, down: float) -> None:
-    """Moves the arm along y and down [m]."""
+    """Move the arm along y and down [m]."""
     X = world.kinematics.pose(world.q)
     X[:3, 3] += (0.0, aside, -down)
     solution = world.kinematics.solve(X, world.q, world.q)

@@ -25,7 +25,7 @@ SCENE = CollisionScene(KINEMATICS, BASE, (SEEN.vertices, SEEN.triangles))
 
 
 def above(x: float, y: float, gap: float) -> np.ndarray:
-    """A posture with the indenter's deepest point `gap` above the surface over (x, y) of A."""
+    """Return a posture with the indenter's deepest point `gap` above the surface over (x, y) of A."""
     p, n = (a[0] for a in SEEN.surface.at(np.array([[x, y]])))
     R = least_twist(-n, KINEMATICS.pose(lbr.HOME)[:3, :3])
     goal = pose(R, centre(p, n, BASE.indenter_radius_m, -gap))

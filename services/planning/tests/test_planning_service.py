@@ -36,7 +36,7 @@ OUTPUTS = {topic.name: topic for topic in contract().outputs("planning")}
 
 
 def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_ACTIVE, reason: str = "") -> Any:
-    """The robot's status with mean joint positions and F/T reading."""
+    """Return the robot's status with mean joint positions and F/T reading."""
     force, torque = (Vector3(*map(float, part)) for part in (w[:3], w[3:]))
     zero = np.zeros(7)
     cause = RobotStatus.CAUSE_DEVICE if reason else RobotStatus.CAUSE_NONE

@@ -186,7 +186,7 @@ DOWN = np.diag((1.0, -1.0, -1.0))
 
 
 def dome_path(samples: int) -> SurfacePath:
-    """A path over a dome, reached targets 7, 3 and 5 on it."""
+    """Return a path over a dome, reached targets 7, 3 and 5 on it."""
     xy = np.column_stack((np.linspace(-0.05, 0.05, samples), np.full(samples, 0.01))) if samples > 1 else np.zeros((1, 2))
     x, y = np.meshgrid(np.arange(-0.1, 0.1, 0.01), np.arange(-0.1, 0.1, 0.01))
     vertices = np.column_stack((x.ravel(), y.ravel(), -(x.ravel() ** 2) / 0.5 - y.ravel() ** 2))

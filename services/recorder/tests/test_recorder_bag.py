@@ -360,7 +360,7 @@ def test_a_folder_that_is_lost_ends_the_recording_and_not_the_run(service: Recor
 
 @pytest.fixture
 def small_disk(tmp_path: Path) -> Iterator[Path]:
-    """A disk of 14 MB of its own."""
+    """Return a disk of 14 MB of its own."""
     folder = tmp_path / "disk"
     folder.mkdir()
     if subprocess.run(["mount", "-t", "tmpfs", "-o", "size=14m", "tmpfs", folder], capture_output=True, check=False).returncode:

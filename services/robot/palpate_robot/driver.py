@@ -187,7 +187,7 @@ class Driver:
                 self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
 
     def _take(self, t: int, command: Command, gravity: Array) -> None:
-        """Accepts a command, ignores it (already expired while IDLE), or holds."""
+        """Accept a command, ignores it (already expired while IDLE), or holds."""
         no_command = command.expires <= command.stamp  # also if the sender's clock is ahead
         expires = min(command.expires, command.stamp + TUNING.validity_ns)
         if no_command or t > expires:

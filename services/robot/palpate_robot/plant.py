@@ -35,7 +35,7 @@ class Plant(Protocol):
     """Joint velocities [rad/s], a fresh array at every step."""
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
-        """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
+        """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         ...
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:

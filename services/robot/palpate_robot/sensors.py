@@ -55,7 +55,7 @@ class JointSensor:
     """Measured positions [rad] and velocities [rad/s], shapes (7,). Without white noise they are `q` and `v`."""
 
     def __init__(self, drawn: DrawnArm, rng: np.random.Generator, q: Array, torque: Array) -> None:
-        """Starts with an arm at rest at positions `q` [rad] under joint torques including gravity [N m], shapes (7,)."""
+        """Start with an arm at rest at positions `q` [rad] under joint torques including gravity [N m], shapes (7,)."""
         given = drawn.given
         ripple, compliance = np.full(7, given.ripple_rad), np.full(7, given.compliance_radpnm)
         self._table = np.array((drawn.zero_rad, compliance, ripple, drawn.ripple_phase_rad, compliance * torque))
@@ -88,7 +88,7 @@ class FtSensor:
     """Adds the sensor's errors to the true wrench. Wrenches: force [N], then moment [N m], in sensor axes."""
 
     def __init__(self, drawn: DrawnForce, rng: np.random.Generator, period_s: float) -> None:
-        """Creates a sensor that powers on at the first reading and is read every `period_s` [s]."""
+        """Create a sensor that powers on at the first reading and is read every `period_s` [s]."""
         given = drawn.given
         self._drawn = drawn
         self._sensitivity = np.ascontiguousarray(drawn.sensitivity)

@@ -54,7 +54,7 @@ class RobotService(Service):
     role: ClassVar[str] = "robot"
 
     def __init__(self, known: PlantInput, plant: PlantFactory) -> None:
-        """Starts at rest at `lbr.HOME`. `plant` creates the physics."""
+        """Start at rest at `lbr.HOME`. `plant` creates the physics."""
         robot, drawn = known.robot, draw_errors(known.errors, known.seed)
         streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
@@ -79,7 +79,7 @@ class RobotService(Service):
         self._peak_force = 0.0
 
     def start(self) -> Outbox:
-        """Publishes the robot description."""
+        """Publish the robot description."""
         return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -115,7 +115,7 @@ class RobotService(Service):
         }
 
     def _drive(self, t: int, inbox: Inbox) -> None:
-        """Steps driver and plant up to `t`. The first tick is the initial state."""
+        """Step driver and plant up to `t`. The first tick is the initial state."""
         plant, driver, joints = self._plant, self._driver, self._joints
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
@@ -139,7 +139,7 @@ class RobotService(Service):
         return self._command
 
     def _read_contact(self, t: int, inbox: Inbox) -> None:
-        """Reads the tissue's wrench: zero before its first message and after the tissue is lost.
+        """Read the tissue's wrench: zero before its first message and after the tissue is lost.
 
         In wall-clock mode the driver holds if tissue is late in contact: the missed deformation would act on the arm at once.
         """

@@ -124,7 +124,7 @@ class Rig:
 
 
 def active_rig() -> Rig:
-    """A rig whose driver obeys commands."""
+    """Return a rig whose driver obeys commands."""
     rig = Rig()
     rig.tick(600)
     assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason

@@ -208,7 +208,7 @@ def test_a_state_that_was_overtaken_is_passed_over(moving: tuple[Arm, Stream], b
 
 
 def stamps(rig: Rig, ticks: int, topic: str) -> list[int]:
-    """The age [ms] of each message of a topic by its own stamp, a tick a message."""
+    """Return the age [ms] of each message of a topic by its own stamp, a tick a message."""
     found = []
     for _ in range(ticks):
         rig.tick(1)

@@ -32,7 +32,7 @@ PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 
 def dead_driver(watched: bool) -> Emulator:
-    """The arm 0.6 s after a driver that pushed has died."""
+    """Return the arm 0.6 s after a driver that pushed has died."""
     emulator = Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()

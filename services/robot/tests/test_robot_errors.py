@@ -157,7 +157,7 @@ def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None
 
 
 def lbr_rotation(x: float, y: float, z: float, w: float) -> Array:
-    """The rotation of a unit quaternion."""
+    """Return the rotation of a unit quaternion."""
     return np.array(
         (
             (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),

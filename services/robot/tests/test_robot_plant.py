@@ -219,7 +219,7 @@ ROBOT = Robot(tool_mass_kg=0.6)
 
 
 def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = NOTHING) -> np.ndarray:
-    """The true wrench at the sensor with the arm held still."""
+    """Return the true wrench at the sensor with the arm held still."""
     for _ in range(3):
         plant.step(plant.gravity_torque(), force, moment, np.full(7, 1e6))
     return np.array(plant.sensor_wrench())

@@ -179,7 +179,7 @@ class Posterior:
     # --- one more press -----------------------------------------------------------------------------------------------
 
     def add(self, felt: Press) -> None:
-        """Updates the posterior with a press."""
+        """Update the posterior with a press."""
         calibration = learned()
         depth, force = max(felt.depth, LEAST_MEASURED_M), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty

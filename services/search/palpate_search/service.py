@@ -50,7 +50,7 @@ class SearchService(Service):
     role: ClassVar[str] = "search"
 
     def __init__(self, scenario: Scenario) -> None:
-        """Raises PluginError for an unknown policy."""
+        """Raise PluginError for an unknown policy."""
         self._posterior = Posterior(Task.of(exam_input(scenario)))
         self._policy = policy(scenario.search.policy)
         self._missed = scenario.search.missed
@@ -68,7 +68,7 @@ class SearchService(Service):
         self._ended = ""
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Sends a request when the examination is ready for one."""
+        """Send a request when the examination is ready for one."""
         self._felt += [_press(sample) for sample in inbox.new("assessment/samples")]
         state = inbox.latest("exam/state")
         if state is not None and state.patient_moved:  # samples since the last request may be misplaced

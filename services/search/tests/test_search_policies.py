@@ -229,7 +229,7 @@ def test_information_is_the_entropy_that_an_observation_takes_away() -> None:
 
 
 def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
-    """The conformance suite's examination, of a small region."""
+    """Return the conformance suite's examination, of a small region."""
     scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam))
     rig, report = ServiceRig(create(scenario), RigSettings(scenario)), ConformanceReport("search")
     suite(rig, report)
@@ -261,7 +261,7 @@ def test_it_keeps_to_the_budget_of_time() -> None:
 
 
 def playing(phase: int = ExamState.PHASE_RETRACT, search: Search | None = None, **exam: Any) -> tuple[ServiceRig, Play]:
-    """A service and an examination of a small region in this phase."""
+    """Return a service and an examination of a small region in this phase."""
     scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam), search=search or Search())
     rig, play = ServiceRig(create(scenario), RigSettings(scenario)), Play()
     play.phase = phase

@@ -50,7 +50,7 @@ class Latch:
         self._begun: dict[StopCause, int] = {}  # start of each uninterrupted present cause [ns]
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
-        """Updates the latch at `t` [ns] with the present breaches and an operator's request for release."""
+        """Update the latch at `t` [ns] with the present breaches and an operator's request for release."""
         if not (breaches or release):
             self._recovering.clear()
             self._begun.clear()

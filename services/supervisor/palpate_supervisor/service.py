@@ -67,7 +67,7 @@ class SupervisorService(Service):
         self._peak_force = self._peak_speed = 0.0
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Runs one period: measure, judge, latch."""
+        """Run one period: measure, judge, latch."""
         release = False
         breaches = self._presence(t, inbox)
         for request in inbox.new("operator/request"):

@@ -76,7 +76,7 @@ class RestSurface:
     """
 
     def __init__(self, vertices_W: Array, normals_W: Array, radius: float) -> None:
-        """Takes vertices [m] and outward unit normals, shapes (n, 3), and the sphere's `radius` [m].
+        """Take vertices [m] and outward unit normals, shapes (n, 3), and the sphere's `radius` [m].
 
         Raises ValueError for an empty mesh, different shapes, or values that are not finite.
         """

@@ -301,7 +301,7 @@ def status(stamp: int, force: float) -> RobotStatus:
 
 
 def after(service: SupervisorService, t: int, **messages: Any) -> Any:
-    """The state after a step at `t` [ns] in which the messages come."""
+    """Return the state after a step at `t` [ns] in which the messages come."""
     inbox = HandInbox()
     for topic, message in messages.items():
         inbox.events[topic.replace("__", "/")] = [message]

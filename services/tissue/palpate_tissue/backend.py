@@ -42,7 +42,7 @@ class TissueBackend(ABC):
 
     @abstractmethod
     def settle(self) -> None:
-        """Resets the body to its undisturbed rest state."""
+        """Reset the body to its undisturbed rest state."""
 
     def in_steps_of(self, dt: float) -> TissueBackend:
         """Return this body, at rest, for steps of about `dt` [s] if the physics allows them, else with its own steps."""
@@ -50,7 +50,7 @@ class TissueBackend(ABC):
         return self
 
     def press(self, places: Array, normals: Array, radius: float) -> tuple[Array, NDArray[np.bool_]]:
-        """Performs standard presses with a sphere of `radius` [m], each into the body at rest, and leaves it at rest.
+        """Perform standard presses with a sphere of `radius` [m], each into the body at rest, and leave it at rest.
 
         Guarding muscle is contracted at rest; involuntary contraction stays during a press, voluntary contraction fades.
         `places` [m] on the rest surface and outward unit `normals` there have shape (k, 3). Returns the apparent stiffness [N]

@@ -52,7 +52,7 @@ class VertexSearch:
     """Finds the vertices near a sphere. All quantities are in frame A."""
 
     def __init__(self, vertices: Array, normals: Array, excursion: float, margin: float) -> None:
-        """Takes rest `vertices` [m] and outward `normals`, shapes (n, 3), and the largest breathing `excursion` [m].
+        """Take rest `vertices` [m] and outward `normals`, shapes (n, 3), and the largest breathing `excursion` [m].
 
         The centre may move by `margin` [m] before the next search.
         """
@@ -101,7 +101,7 @@ class Bristle(NamedTuple):
     """s: shear of the skin [m], shape (3,). Changed in place."""
 
     def release(self) -> None:
-        """Resets the shear after contact is lost."""
+        """Reset the shear after contact is lost."""
         self.stretch[:] = 0.0
 
     def energy(self) -> float:

@@ -54,7 +54,7 @@ class MovingBody(Service):
         }
 
     def start(self) -> Outbox:
-        """Publishes the tissue's latched topics, with the pose before the motion."""
+        """Publish the tissue's latched topics, with the pose before the motion."""
         return self._tissue.start()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:

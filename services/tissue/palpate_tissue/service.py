@@ -37,7 +37,7 @@ class TissueService(Service):
     role: ClassVar[str] = "tissue"
 
     def __init__(self, backend: TissueBackend, truth: PhantomModel, pose: Pose, facts: Mapping[str, Any]) -> None:
-        """Takes the physics, the true phantom and its true pose in world; `facts` go to log and report."""
+        """Take the physics, the true phantom and its true pose in world; `facts` go to log and report."""
         self.backend = backend
         self._truth = truth
         self._facts = {"vertices": len(truth.vertices), **facts}
@@ -72,7 +72,7 @@ class TissueService(Service):
         self._touching = False
 
     def start(self) -> Outbox:
-        """Publishes the latched ground truth of the phantom; logs the facts."""
+        """Publish the latched ground truth of the phantom; logs the facts."""
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
         surface = SurfaceMesh(
@@ -112,7 +112,7 @@ class TissueService(Service):
         }
 
     def _wrench(self, t: int, tool: Message | None) -> Array:
-        """Steps the tissue to `t` [ns]; returns force [N] and torque [N m] on the indenter about its centre, world axes, (6,)."""
+        """Step the tissue to `t` [ns]; return force [N] and torque [N m] on the indenter about its centre, world axes, (6,)."""
         if tool is None:
             self.backend.idle(t / NS)
             self._t = None
@@ -141,7 +141,7 @@ class TissueService(Service):
         return [(self._t + (t - self._t) * k // steps, self._p_A + (end - self._p_A) * (k / steps)) for k in range(1, steps + 1)]
 
     def _count(self, F_W: Array) -> None:
-        """Updates contact counts and the peak force."""
+        """Update contact counts and the peak force."""
         touching = self.backend.touching
         if touching:
             self._contact_steps += 1

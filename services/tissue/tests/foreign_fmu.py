@@ -122,7 +122,7 @@ def _description(version: int) -> str:
 
 
 def build_lag(folder: Path, version: int) -> Path:
-    """Writes lag.fmu for this platform. FMPy wants every function of the standard to be there: the rest answers fmi2Error."""
+    """Write lag.fmu for this platform. FMPy wants every function of the standard to be there: the rest answers fmi2Error."""
     from fmpy import fmi2, fmi3
 
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave

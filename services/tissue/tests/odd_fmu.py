@@ -160,7 +160,7 @@ def description(version: int, more: str = "", start: str = "", base: int | None 
 
 
 def build_wall(path: Path, version: int, text: str = "", others: Mapping[str, str] | None = None) -> Path:
-    """Writes the FMU for this platform, with `text` as its model description and `others` as further entries."""
+    """Write the FMU for this platform, with `text` as its model description and `others` as further entries."""
     from fmpy import fmi2, fmi3
 
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave

@@ -43,7 +43,7 @@ def scenario() -> Scenario:
 
 
 def chosen(scenario: Scenario, **fields: str) -> Scenario:
-    """The scenario with an FMU as its tissue."""
+    """Return the scenario with an FMU as its tissue."""
     services = scenario.services.model_copy(update={"tissue": "fmu"})
     return scenario.model_copy(update={"tissue": TissueChoice(**fields), "services": services})
 
@@ -57,7 +57,7 @@ class Playback:
 
 
 def tool(scenario: Scenario, k: int) -> Any:
-    """A slide down into the lesion, in world."""
+    """Return a slide down into the lesion, in world."""
     X_WA = matrix(true_pose(scenario))
     p = X_WA[:3, :3] @ np.array((-0.07 + 2e-5 * k, -0.055, 0.012 - 4e-5 * k)) + X_WA[:3, 3]
     v = X_WA[:3, :3] @ np.array((0.02, 0.0, -0.04))

@@ -208,7 +208,7 @@ def test_far_vertices_catch_up_exactly_with_stepping_every_one() -> None:
 
 
 def loop(rng: np.random.Generator, steps: int) -> np.ndarray:
-    """A random closed path of the sphere's centre that dips in and out, starting and ending out of contact."""
+    """Return a random closed path of the sphere's centre that dips in and out, starting and ending out of contact."""
     t = np.linspace(0, 2 * np.pi, steps + 1)
     p = np.zeros((steps + 1, 3))
     for axis in range(2):

@@ -117,7 +117,7 @@ class CollisionScene:
         return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))
 
     def _add_arm(self, robot: Robot) -> list[tuple[str, int]]:
-        """Adds the arm's capsules; returns link name and geometry index of each, base first."""
+        """Add the arm's capsules; return link name and geometry index of each, base first."""
         shapes = _arm_shapes(self._model, robot)
         return [(link, self._add(f"{link}_{k}", joint, pose, shape)) for k, (link, joint, pose, shape) in enumerate(shapes)]
 

@@ -48,7 +48,7 @@ class JerkLimitedAxis:
     """
 
     def __init__(self, position: float, acceleration: float, jerk: float, period_s: float) -> None:
-        """Starts at rest at `position` [m or rad]; each step lasts `period_s`."""
+        """Start at rest at `position` [m or rad]; each step lasts `period_s`."""
         self._otg = ruckig.Ruckig(1, period_s)
         self._in = ruckig.InputParameter(1)
         self._out = ruckig.OutputParameter(1)
@@ -80,7 +80,7 @@ class JerkLimitedAxis:
         self._in.current_position = [self.position]
 
     def stand(self) -> None:
-        """Sets velocity and acceleration to zero."""
+        """Set velocity and acceleration to zero."""
         self.velocity = self.acceleration = 0.0
         self._in.current_velocity = self._in.current_acceleration = [0.0]
 
@@ -110,7 +110,7 @@ class SpeedLimit:
     """Speed limit along a path, lowered ahead of slow positions so that braking with `acceleration` suffices."""
 
     def __init__(self, s: Array, speed: Array, acceleration: float) -> None:
-        """Takes speeds [m/s or rad/s] at increasing path positions s, shapes (n,)."""
+        """Take speeds [m/s or rad/s] at increasing path positions s, shapes (n,)."""
         places, reachable = s.tolist(), speed.tolist()
         for k in range(len(places) - 2, -1, -1):
             reachable[k] = min(reachable[k], sqrt(reachable[k + 1] ** 2 + 2 * acceleration * (places[k + 1] - places[k])))

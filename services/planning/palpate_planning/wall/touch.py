@@ -68,7 +68,7 @@ class Onset:
         self._moving: list[tuple[int, float]] = []
 
     def add(self, depth: float, force: float, t: int, displacement: float) -> None:
-        """Adds depth [m] and normal force [N] measured at `t` [ns], and the wall displacement contained in the depth [m]."""
+        """Add depth [m] and normal force [N] measured at `t` [ns], and the wall displacement contained in the depth [m]."""
         self._rows.append((depth, force))
         self._moving.append((t, displacement))
 

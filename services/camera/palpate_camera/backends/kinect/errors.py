@@ -65,7 +65,7 @@ class DepthBias:
 
 
 def field(drawn: DrawnCamera, shape: tuple[int, int]) -> Array:
-    """The smooth error that is fixed to the image [m], of that shape: of zero mean, its largest value as given."""
+    """Return the smooth error that is fixed to the image [m], of that shape: of zero mean, its largest value as given."""
     rows, columns = (np.cos(np.pi * np.outer((np.arange(size) + 0.5) / size, np.arange(len(drawn.field)))) for size in shape)
     waves = rows @ drawn.field @ columns.T
     return np.asarray(drawn.given.field_m * waves / np.abs(waves).max())

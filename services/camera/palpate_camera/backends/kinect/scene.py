@@ -38,7 +38,7 @@ _NEAR_M = 1e-3
 
 @compiled
 def _bounds(x: float, y: float, z: float, size: int) -> tuple[int, int]:
-    """The pixels from the first to before the last that may lie between three coordinates."""
+    """Return the pixels from the first to before the last that may lie between three coordinates."""
     low, high = min(x, y, z), max(x, y, z)
     return min(max(math.ceil(low), 0), size), min(max(math.floor(high) + 1, 0), size)
 
@@ -119,11 +119,11 @@ class View:
 
     @classmethod
     def empty(cls, height: int, width: int) -> View:
-        """A view of nothing."""
+        """Return a view of nothing."""
         return cls(*(np.zeros((height, width), np.float32) for _ in range(4)))
 
     def nearest(self, other: View) -> View:
-        """The view of both scenes: at each pixel, what is nearer."""
+        """Return the view of both scenes: at each pixel, what is nearer."""
         near = other.w > self.w
         return View(*(np.where(near, b, a) for a, b in zip(self.images, other.images, strict=True)))
 
@@ -142,7 +142,7 @@ class Caster:
         self._X_CW = inverse(X_WC)
 
     def cast(self, mesh: Mesh) -> View:
-        """The view of one mesh, either side of its triangles."""
+        """Return the view of one mesh, either side of its triangles."""
         view = View.empty(self.pinhole.height, self.pinhole.width)
         lens = np.array((self.pinhole.fx, self.pinhole.fy, self.pinhole.cx, self.pinhole.cy))
         rasterise(apply(self._X_CW, mesh.vertices), mesh.triangles, lens, *view.images)
@@ -166,7 +166,7 @@ class Scene:
         self._merged = None
 
     def view(self) -> View:
-        """The view of all layers; the same object as long as nothing changed. Raises ValueError without a layer."""
+        """Return the view of all layers; the same object as long as nothing changed. Raises ValueError without a layer."""
         if self._merged is None:
             if not self._layers:
                 raise ValueError("the scene has no layer: put a mesh first")
@@ -178,7 +178,7 @@ class Scene:
         return self._merged
 
     def seen(self, name: str) -> NDArray[np.bool_]:
-        """The pixels of `view` that show a layer, shape (height, width)."""
+        """Return the pixels of `view` that show a layer, shape (height, width)."""
         w = self._layers[name][1].w
         return (w > 0) & (w >= self.view().w)
 
@@ -219,6 +219,6 @@ def links(robot: Robot) -> dict[str, Mesh]:
 
 
 def placed(shapes: dict[str, Mesh], X_WL: dict[str, Array]) -> Mesh | None:
-    """The links of which the pose is known, in world; None when there is none."""
+    """Return the links of which the pose is known, in world; None when there is none."""
     parts = [Mesh(apply(X_WL[name], shape.vertices), shape.triangles) for name, shape in shapes.items() if name in X_WL]
     return merge(parts) if parts else None

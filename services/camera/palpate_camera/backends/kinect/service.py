@@ -33,7 +33,7 @@ class CameraService(Service):
     role: ClassVar[str] = "camera"
 
     def __init__(self, known: PlantInput) -> None:
-        """Takes camera, robot, errors and seed of a scenario."""
+        """Take camera, robot, errors and seed of a scenario."""
         camera, drawn = known.camera, draw_errors(known.errors, known.seed)
         self._pinhole = Pinhole.of(camera)
         self._X_WC = look_at(np.array(camera.position_m), np.array(camera.look_at_m))
@@ -84,7 +84,7 @@ class _Picture:
     """One resolution of the camera's image."""
 
     def __init__(self, sensor: Pinhole, spacing: int, X_WC: Array, furniture: Mesh, noise: KinectNoise) -> None:
-        """Takes every `spacing`-th pixel of the `sensor` in both directions."""
+        """Take every `spacing`-th pixel of the `sensor` in both directions."""
         self.pinhole = sensor.every(spacing)
         """Intrinsics of this resolution."""
         self._scene = Scene(Caster(self.pinhole, X_WC))

@@ -116,7 +116,7 @@ class Kinematics:
     """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (7,)."""
 
     def __init__(self, robot: Robot, origin_m: Array | None = None) -> None:
-        """Takes the arm on its base with its tool. Compiles, which takes seconds the first time.
+        """Take the arm on its base with its tool. Compiles, which takes seconds the first time.
 
         `origin_m`, shape (7, 3), is added to the nominal origin of each joint in the previous link.
         """

@@ -43,7 +43,7 @@ class Clearance:
     def __init__(
         self, links: Mapping[str, Any], capsules: Mapping[str, tuple[Capsule, ...]], boxes: tuple[Box, ...], stop: Array
     ):
-        """Takes DART bodies and capsules by link, the boxes, and the joint stops [rad], shape (7,)."""
+        """Take DART bodies and capsules by link, the boxes, and the joint stops [rad], shape (7,)."""
         pairs = [(links[name], capsule) for name, parts in capsules.items() for capsule in parts]
         self._bodies = [body for body, _ in pairs]
         ends = np.array([(capsule.start, capsule.end) for _, capsule in pairs])
@@ -117,7 +117,7 @@ class DartPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
-        """Creates the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
+        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
         self._arm = _load_arm(robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass}))
         for joint, origin, error in zip(self._arm.getJoints()[1:8], lbr.JOINT_ORIGIN, drawn.origin_m, strict=True):
             X_PL = np.eye(4)
@@ -174,7 +174,7 @@ class DartPlant:
             _add_shape(body, dart.dynamics.SphereShape(capsule.radius), X)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
-        """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
+        """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         self._arm.setPositions(np.asarray(q, dtype=float))
         self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()

@@ -64,7 +64,7 @@ class Arm:
         self._fault: str | None = "no LBRState received yet"
 
     def update(self, t: int, state: Any) -> bool:
-        """Takes a state received at `t` [ns]; returns True if it is new and usable.
+        """Take a state received at `t` [ns]; returns True if it is new and usable.
 
         Velocities restart from zero after the controller's clock was set.
         """

@@ -124,19 +124,19 @@ class FriSession:
         self.state, self._in_state = state, 0.0
 
     def end(self, why: str) -> None:
-        """Ends the session."""
+        """End the session."""
         if not self.ended:
             self.ended = why
             self._enter(SessionState.IDLE)
 
     def take(self, position: Array, torque: Array) -> None:
-        """Takes a command: joint positions [rad], overlay [N m], shapes (7,). Ignored unless COMMANDING_ACTIVE."""
+        """Take a command: joint positions [rad], overlay [N m], shapes (7,). Ignored unless COMMANDING_ACTIVE."""
         if self.state is SessionState.COMMANDING_ACTIVE:
             self._target = Drive(position, torque)
             self._since_command = 0.0
 
     def cycle(self, q: Array, gravity: Array, *, answered: bool = True) -> Drive:
-        """Runs one send period at measured positions q [rad] and gravity torques [N m]; returns the applied drive."""
+        """Run one send period at measured positions q [rad] and gravity torques [N m]; returns the applied drive."""
         self._in_state += self._dt
         self._answers.append(answered)
         lost = 1.0 - sum(self._answers) / len(self._answers)
@@ -211,7 +211,7 @@ class Emulator:
     """Physics and session; call `cycle` once per send period. Time comes from the caller."""
 
     def __init__(self, known: PlantInput, options: Options) -> None:
-        """Creates the arm of a scenario, with its errors."""
+        """Create the arm of a scenario, with its errors."""
         drawn = draw_errors(known.errors, known.seed)
         self._options = options
         self._plant = DartPlant(known.robot, drawn=drawn.arm)
@@ -294,7 +294,7 @@ class Metronome:
     """
 
     def __init__(self, period: int, now: int, wall: int) -> None:
-        """Puts the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns]."""
+        """Put the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns]."""
         self._period = period
         self._due = now + period
         self._stamp = wall
@@ -326,7 +326,7 @@ class Graph:
 
 
 def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool]) -> None:
-    """Runs cycles in wall-clock time while `running[0]`; after the session ends the arm stands and no state is published."""
+    """Run cycles in wall-clock time while `running[0]`; after the session ends the arm stands and no state is published."""
     metronome = Metronome(options.period_ms * 1_000_000, monotonic_ns(), time_ns())
     contact_at = 0
     cycles = 0
@@ -359,7 +359,7 @@ def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Runs the emulator until a signal; returns the exit status."""
+    """Run the emulator until a signal; return the exit status."""
     parser = argparse.ArgumentParser(prog="python -m palpate_robot.backends.lbr.emulator", description=__doc__.partition("\n")[0])
     parser.add_argument("scenario", nargs="?", default="clean", help="base placement and tool")
     parser.add_argument("--listen", default="tcp/127.0.0.1:7447", help="zenoh endpoint that replaces rmw_zenohd")

@@ -44,7 +44,7 @@ DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat6
 
 
 def register() -> None:
-    """Registers the messages with the codec; further calls do nothing."""
+    """Register the messages with the codec; further calls do nothing."""
     if STATE in codec.store.types:
         return
     types: dict[str, Any] = {}
@@ -123,7 +123,7 @@ class LbrPort(ABC):
 
     @abstractmethod
     def command(self, q: Array, torque: Array) -> None:
-        """Sends joint positions [rad] and torque overlay [N m], shapes (7,)."""
+        """Send joint positions [rad] and torque overlay [N m], shapes (7,)."""
 
     @abstractmethod
     def rivals(self) -> list[bytes]:
@@ -146,7 +146,7 @@ class ZenohPort(LbrPort):
     """Connection over zenoh, with the keys of rmw_zenoh."""
 
     def __init__(self, connection: LbrConnection) -> None:
-        """Connects. Raises BusConfigError."""
+        """Connect. Raises BusConfigError."""
         name = connection.namespace.strip("/")
         self._node = RosNode("palpate_robot.backends.lbr", connection.domain, BusOptions(router=connection.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
@@ -167,7 +167,7 @@ class ZenohPort(LbrPort):
         return self._wrenches.take()
 
     def command(self, q: Array, torque: Array) -> None:
-        """Sends both; the stack's torque controller also needs a joint position, see docs/real-robot.md on its stiffness."""
+        """Send both; the stack's torque controller also needs a joint position, see docs/real-robot.md on its stiffness."""
         self._command.publish(LBRTorqueCommand(q, torque))
 
     def rivals(self) -> list[bytes]:
@@ -175,7 +175,7 @@ class ZenohPort(LbrPort):
         return self._commands.others(self._command.gid)
 
     def contact(self, wrench: Any) -> None:
-        """Sends the tissue's wrench to the emulator."""
+        """Send the tissue's wrench to the emulator."""
         self._contact.publish(wrench)
 
     def physics(self) -> tuple[Any | None, Any | None]:

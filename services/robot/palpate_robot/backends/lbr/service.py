@@ -67,7 +67,7 @@ class InnerLoop:
         self._setpoints: list[Message] = []
 
     def collect(self, inbox: Inbox) -> None:
-        """Collects set-points; call it on every tick."""
+        """Collect set-points; call it on every tick."""
         self._setpoints.extend(inbox.new(SETPOINT))
 
     def command(self, t: int, inbox: Inbox, joints: Message) -> Any | None:
@@ -129,11 +129,11 @@ class LbrService(Service):
         self._peak_torque = np.zeros(7)
 
     def start(self) -> Outbox:
-        """Publishes the robot description."""
+        """Publish the robot description."""
         return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Runs one tick: arm state, driver, command to the arm."""
+        """Run one tick: arm state, driver, command to the arm."""
         outbox: dict[str, Message] = {}
         fresh = self._receive(t)
         self._stop_requests.apply(t, inbox)
@@ -176,7 +176,7 @@ class LbrService(Service):
         }
 
     def _receive(self, t: int) -> bool:
-        """Takes messages of the ROS side; returns True if the joint state is new."""
+        """Take messages of the ROS side; return True if the joint state is new."""
         since = self._commanding_since
         if self._port.rivals() and since is not None and t - since > TAKE_OVER_NS:
             self._driver.hold(t, HoldCause.DEVICE, "another process (watchdog?) commands the arm")

@@ -48,7 +48,7 @@ class Watchdog:
         self.holding = False
 
     def state(self, t: int, state: Any) -> None:
-        """Takes an LBRState. A driver from before this process started may be dead, so the time-out starts with the first
+        """Take an LBRState. A driver from before this process started may be dead, so the time-out starts with the first
         state.
         """
         self._arm.update(t, state)
@@ -56,7 +56,7 @@ class Watchdog:
             self._commanded = t
 
     def command(self, t: int, sender: bytes) -> None:
-        """Takes a command of a driver. A new driver ends the hold; the old one does not."""
+        """Take a command of a driver. A new driver ends the hold; the old one does not."""
         if sender == self._commander and self.holding:
             return
         self._commander, self._commanded, self.holding = sender, t, False
@@ -74,7 +74,7 @@ class Watchdog:
 
 
 def main() -> int:
-    """Runs until a signal; returns the exit status."""
+    """Run until a signal; return the exit status."""
     parser = argparse.ArgumentParser(description="Damps the arm when the driver's commands stop.")
     parser.add_argument("--router", default=LbrConnection().router, help="zenoh endpoint of the ROS side")
     parser.add_argument("--domain", type=int, default=0, help="its ROS domain")

@@ -130,7 +130,7 @@ class MujocoPlant:
     """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
 
     def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
-        """Creates the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
+        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
         self._model = build(robot, drawn)
         self._data = mujoco.MjData(self._model)
         data = self._data
@@ -158,7 +158,7 @@ class MujocoPlant:
         self.reset(q)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
-        """Puts the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
+        """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         model, data = self._model, self._data
         mujoco.mj_resetData(model, data)
         self._qpos[:] = q

@@ -40,7 +40,7 @@ class ContactSolver:
         self._columns = np.empty((len(matrix), 0))
 
     def begin_with(self, active: Mask) -> None:
-        """Sets the initial contact set, shape (m,)."""
+        """Set the initial contact set, shape (m,)."""
         if not np.array_equal(active, self.active):
             self._choose(active)
 
@@ -182,14 +182,14 @@ class ElasticPatch:
         return w
 
     def step(self, w: Array, advance: Array, feed: Array, activation: float) -> bool:
-        """Steps the vertices, (u, y)+ = M (u, y) + b (S f), held by the sphere; returns True if it touches any."""
+        """Step the vertices, (u, y)+ = M (u, y) + b (S f), held by the sphere; return True if it touches any."""
         free = advance @ self.state
         self.force, moved = self.solver.solve(w - free[0])
         self._finish(advance, feed, free, moved, self.force)
         return bool(self.force.any())
 
     def _finish(self, advance: Array, feed: Array, free: Array, moved: Array, load: Array) -> None:
-        """Sets the state from the `free` motion [m], shape (branches + 1, m), and the motion `moved` [m] by a `load` [N],
+        """Set the state from the `free` motion [m], shape (branches + 1, m), and the motion `moved` [m] by a `load` [N],
         (m,).
         """
         self.state = free + (feed / feed[0])[:, None] * moved

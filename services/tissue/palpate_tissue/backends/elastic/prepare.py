@@ -16,7 +16,7 @@ from palpate_tissue.backends.elastic.service import create
 
 
 def main() -> None:
-    """Prints the time taken; status 2 for an unusable scenario."""
+    """Print the time taken; status 2 for an unusable scenario."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenario")
     parser.add_argument("--set", action="append", default=[], dest="settings", metavar="a.b=c")

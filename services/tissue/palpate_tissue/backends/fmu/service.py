@@ -70,7 +70,7 @@ class FmuService(Service):
         _log.info("%s: FMI %s, %d variables", fmu_file.name, self._fmu.description.fmiVersion, len(self._fmu.variables))
 
     def start(self) -> Outbox:
-        """Publishes the latched topics."""
+        """Publish the latched topics."""
         return {output.topic.name: output.message(0) for output in self._latched}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:

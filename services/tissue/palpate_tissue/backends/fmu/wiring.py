@@ -203,7 +203,7 @@ class InputTopic:
     moves: tuple[tuple[NDArray[Any], Callable[[Message], Any], Change], ...]
 
     def write(self, message: Message) -> None:
-        """Sets the FMU's variables from a message."""
+        """Set the FMU's variables from a message."""
         for target, read, change in self.moves:
             target[...] = np.reshape(change(read(message)), target.shape)
         for port in self.ports:

@@ -332,7 +332,7 @@ class ImplicitTissue(TissueBackend):
         self.activation = 1.0
 
     def _tick(self, t_s: float) -> None:
-        """Counts a step, and advances the vertices far from the sphere when due."""
+        """Count a step, and advances the vertices far from the sphere when due."""
         self._excursion = self.excursion(t_s)
         if self._steps % self._every == 0 or self._steps < self._sprung:
             if self._patch is not None:
@@ -341,7 +341,7 @@ class ImplicitTissue(TissueBackend):
         self._steps += 1
 
     def _leave(self) -> None:
-        """Ends the stepping of the patch after the sphere has left."""
+        """End the stepping of the patch after the sphere has left."""
         if self._patch is not None:
             self._wall.clock[self._patch.near] = self._steps
             self._sprung = self._steps + round(TUNING.recovery_s / self.dt)

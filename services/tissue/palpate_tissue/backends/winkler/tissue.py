@@ -290,7 +290,7 @@ class WinklerTissue(TissueBackend):
         self._advance(self._patch, radius, wrench)
 
     def _advance(self, patch: Patch, radius: float, wrench: Array) -> None:
-        """Runs one explicit step; in contact sets `wrench` (6,) to force [N] and torque [N m] on the sphere."""
+        """Run one explicit step; in contact sets `wrench` (6,) to force [N] and torque [N m] on the sphere."""
         self._wall.activation[0] = self.activation
         touching = step(self._wall, patch, self.friction, self._motion, radius, self._excursion, self.disturbed, wrench)
         if touching:
@@ -300,7 +300,7 @@ class WinklerTissue(TissueBackend):
         self.touching = touching
 
     def _gather(self, p: list[float], radius: float) -> None:
-        """Finds the vertices that a sphere near `p` [m] can touch."""
+        """Find the vertices that a sphere near `p` [m] can touch."""
         deepest = float(self.displacement[self._patch.vertex].max(initial=0.0))
         self._near = self._search.around(p, radius, deepest)
         self._patch = self._patch_of(self._free[self._near.vertex])
