@@ -40,7 +40,7 @@ class SteadyConsole(Console):
     """Console that tolerates a closed pipe."""
 
     def on_broken_pipe(self) -> None:
-        """Discards further output."""
+        """Discard further output."""
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
 
@@ -131,7 +131,7 @@ _DOCUMENT: TextIO | None = None
 
 
 def reserve_output() -> None:
-    """Reserves standard output for `print_json` and `print_line`; what libraries print there goes to standard error."""
+    """Reserve standard output for `print_json` and `print_line`; what libraries print there goes to standard error."""
     global _DOCUMENT  # noqa: PLW0603 - standard output is one for the process
     if _DOCUMENT is None:
         sys.stdout.flush()

@@ -273,7 +273,7 @@ def start_posture(contrast: float = 1.0) -> Array:
 
 @cache
 def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
-    """Presses a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
+    """Press a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
 
     Runs repeat exactly, so one that has been made is remembered.
     """

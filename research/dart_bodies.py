@@ -133,7 +133,7 @@ class ForceCurve:
 
 
 def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> ForceCurve:
-    """Presses DART's soft body. The force is freed of DART's time-step factor (see `Flesh.at_rest`)."""
+    """Press DART's soft body. The force is freed of DART's time-step factor (see `Flesh.at_rest`)."""
     scene = DartScene(flesh, RADIUS_M, DT, friction=friction)
     forces: list[float] = []
     costs: list[float] = []
@@ -152,7 +152,7 @@ def press_dart(flesh: Flesh, friction: float, depths: Array = DEPTHS_M) -> Force
 
 
 def press_ours(flesh: Flesh, depths: Array = DEPTHS_M) -> ForceCurve:
-    """Presses our tissue with the same vertices and springs, in the same way."""
+    """Press our tissue with the same vertices and springs, in the same way."""
     tissue = twin(flesh)
     forces: list[float] = []
     costs: list[float] = []
@@ -194,7 +194,7 @@ class Bodies:
 
 
 def measure(depths: Array = DEPTHS_M) -> Bodies:
-    """Presses each body in DART and in ours."""
+    """Press each body in DART and in ours."""
     return Bodies(
         press_dart(BOX, 1.0, depths), press_ours(BOX, depths), press_dart(BOX, 0.0, depths),
         press_dart(ELLIPSOID, 1.0, depths), press_ours(ELLIPSOID, depths),

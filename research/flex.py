@@ -120,7 +120,7 @@ class FlexCurves:
 
 
 def measure() -> FlexCurves:
-    """Presses the block and our wall."""
+    """Press the block and our wall."""
     block = FlexBlock()
     pressed = [block.press(float(depth)) for depth in DEPTHS_M]
     model = flat_phantom(0.12)

@@ -44,7 +44,7 @@ Simulated = Callable[[float, float], Array]
 
 
 def simulate() -> Simulated:
-    """Presses walls of all lengths and stiffenings; what is between them is interpolated."""
+    """Press walls of all lengths and stiffenings; what is between them is interpolated."""
     table = [
         [press(MEDIAN._replace(length_m=length, stiffening_per_m=beta)) / MEDIAN.k_w_n_per_m3 for beta in STIFFENINGS_PER_M]
         for length in track(LENGTHS_M.tolist(), "walls")

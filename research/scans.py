@@ -215,7 +215,7 @@ def _state(
 
 
 def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
-    """Drives the service with a scan: its last map, its findings, and all samples."""
+    """Drive the service with a scan: its last map, its findings, and all samples."""
     service = AssessmentService(exam_input(data.scenario))
     stiffness_map = findings = None
     samples: list[Any] = []

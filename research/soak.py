@@ -124,7 +124,7 @@ def read_growths(folder: Path) -> list[Growth]:
 
 @app.command(context_settings={"ignore_unknown_options": True, "allow_extra_args": True})
 def run(context: typer.Context, count: int, folder: Path) -> None:
-    """Repeats `palpate run` with the remaining options until Ctrl-C or `count` examinations."""
+    """Repeat `palpate run` with the remaining options until Ctrl-C or `count` examinations."""
     folder.mkdir(parents=True, exist_ok=True)
     soak = Soak()
     with _sampled(soak, folder) as begin:

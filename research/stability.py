@@ -81,7 +81,7 @@ def measure() -> Stability:
 
 
 def section(found: Stability | None = None) -> PageSection:
-    """Sweeps and margins with their bounds."""
+    """Sweep and margins with their bounds."""
     found = found or measure()
     checks = []
     for margin in found.margins:

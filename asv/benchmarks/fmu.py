@@ -30,7 +30,7 @@ class Step:
     timeout = 300
 
     def setup_cache(self) -> str:
-        """Compiles the FMU once."""
+        """Compile the FMU once."""
         path = Path(tempfile.mkdtemp(prefix="palpate-asv-")) / "abdomen.fmu"
         phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
         build_fmu(phantom, 0, path, 3, [native()], RADIUS_M, build_phantom(phantom, seed=0))
@@ -67,7 +67,7 @@ class Step:
             self.wrench.pull()
 
     def teardown(self, _path: str, by: str) -> None:
-        """Frees the FMU."""
+        """Free the FMU."""
         if by == "fmpy":
             self.fmu.terminate()
             self.fmu.freeInstance()

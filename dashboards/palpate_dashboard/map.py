@@ -60,7 +60,7 @@ class MapView:
     def update(
         self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Array, spread: Array, scanned: NDArray[np.bool_]
     ) -> None:
-        """Draws stiffness over background [1] and half width of the 90 % band over the mean [1], at the vertices."""
+        """Draw stiffness over background [1] and half width of the 90 % band over the mean [1], at the vertices."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         flat = vertices * np.array((1, 1, 0), dtype=np.float32)
         shape = self._shape
@@ -75,13 +75,13 @@ class MapView:
             self._recording.log(f"map/{layer}/surface", mesh)
 
     def lesions(self, segments: Iterable[Array]) -> None:
-        """Draws true lesion outlines, one (k, 2, 3) array of segments each."""
+        """Draw true lesion outlines, one (k, 2, 3) array of segments each."""
         strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
         self._recording.log("map/mean/truth", shape, static=True)
 
     def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
-        """Draws centroids of the findings, shape (n, 3)."""
+        """Draw centroids of the findings, shape (n, 3)."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         places = centroids * (1, 1, 0) + (0, 0, 0.004)
         shape = rr.Points3D(places, colors=[palette.FINDING], radii=[0.003], labels=labels, show_labels=True)

@@ -77,7 +77,7 @@ class ForceDepth:
             self.flush(t)
 
     def flush(self, t: int) -> None:
-        """Draws the new samples; the view shows the latest piece as a line and earlier ones as dots."""
+        """Draw the new samples; the view shows the latest piece as a line and earlier ones as dots."""
         if not self._new:
             return
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
@@ -221,7 +221,7 @@ class Plots:
         return True
 
     def health(self, t: int, row: Health) -> None:
-        """Draws the health line of a service or topic, and logs its message unless it is ok."""
+        """Draw the health line of a service or topic, and logs its message unless it is ok."""
         path = f"health/{'topics' if row.is_topic else 'services'}/{row.name}"
         if path not in self._health_lines:
             self._health_lines.add(path)

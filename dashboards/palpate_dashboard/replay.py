@@ -152,7 +152,7 @@ def replay(files: Sequence[Path], service: DashboardService, progress: Callable[
 
 
 def main(folder: Path, progress: Callable[[int], None] | None = None) -> Path:
-    """Draws the run in `folder`; returns the file. Raises FileNotFoundError naming the missing file."""
+    """Draw the run in `folder`; return the file. Raises FileNotFoundError naming the missing file."""
     files, scenario = recording_of(folder), folder / "scenario.yaml"
     if not files or not scenario.is_file():
         needed = scenario if files else folder / RECORDING
@@ -185,7 +185,7 @@ def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Sess
 
 
 def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
-    """Draws `run` until it ends, and forwards operator `keys`. Returns how the run ended."""
+    """Draw `run` until it ends, and forwards operator `keys`. Returns how the run ended."""
     rules = contract()
     with session(run.options()) as bus, _operator(run, bus) as operator:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)

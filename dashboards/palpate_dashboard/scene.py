@@ -63,14 +63,14 @@ class SceneView:
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
 
     def box(self, name: str, X_WB: Array, size: tuple[float, float, float], color: palette.Rgba) -> None:
-        """Draws a static box: centre pose, shape (4, 4), and edge lengths [m]."""
+        """Draw a static box: centre pose, shape (4, 4), and edge lengths [m]."""
         path = f"world/furniture/{name}"
         self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
         shape = rr.Boxes3D(sizes=[size], colors=[color], fill_mode="solid")
         self._recording.log(path, shape, static=True)
 
     def link_shape(self, link: str, meshes: Iterable[Shaded]) -> None:
-        """Draws the shape of a robot link, in its own frame."""
+        """Draw the shape of a robot link, in its own frame."""
         for i, mesh in enumerate(meshes):
             shape = rr.Mesh3D(
                 vertex_positions=mesh.positions,
@@ -81,7 +81,7 @@ class SceneView:
             self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
 
     def link_poses(self, t: int, poses: Mapping[str, Array]) -> None:
-        """Draws link poses by name: x y z [m] qx qy qz qw, shape (7,). A resting link is not repeated."""
+        """Draw link poses by name: x y z [m] qx qy qz qw, shape (7,). A resting link is not repeated."""
         for link, pose in poses.items():
             before = self._poses.get(link)
             if before is None or np.abs(pose - before).max() > 2e-5:
@@ -89,7 +89,7 @@ class SceneView:
                 self._columns.add(f"world/robot/{link}", transforms, t, pose)
 
     def abdomen(self, t: int, vertices: NDArray[np.float32], triangles: Indices | None) -> None:
-        """Draws the deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), only on the first call."""
+        """Draw the deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), only on the first call."""
         if self._normals is None:
             if triangles is None:
                 return
@@ -128,7 +128,7 @@ class SceneView:
             self._columns.add("world/truth", transforms, t, lifted)
 
     def lesions(self, segments: Iterable[Array]) -> None:
-        """Draws true lesion outlines in A, one (k, 2, 3) array of segments each, and A's axes; initially hidden."""
+        """Draw true lesion outlines in A, one (k, 2, 3) array of segments each, and A's axes; initially hidden."""
         axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
         self._recording.log("world/truth/axes", axes, static=True)
         strips = [segment for outline in segments for segment in outline]
@@ -136,13 +136,13 @@ class SceneView:
         self._recording.log("world/truth/lesions", shape, static=True)
 
     def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
-        """Draws centroids of the findings, shape (n, 3), with labels."""
+        """Draw centroids of the findings, shape (n, 3), with labels."""
         self.at(t)
         shape = rr.Points3D(centroids, colors=[palette.FINDING], radii=[0.006], labels=labels, show_labels=True)
         self._recording.log("world/findings", shape)
 
     def camera(self, X_WC: Array) -> None:
-        """Draws the camera at the calibrated pose of its optical frame, shape (4, 4), with its tripod."""
+        """Draw the camera at the calibrated pose of its optical frame, shape (4, 4), with its tripod."""
         pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
         self._recording.log("world/camera", pose, static=True)
         self._recording.log("world/furniture/camera", pose, static=True)
@@ -164,14 +164,14 @@ class SceneView:
         self._recording.log("world/camera", view, static=True)
 
     def depth(self, t: int, image: NDArray[np.float32]) -> None:
-        """Draws a depth image [m], shape (height, width), NaN where invalid; stored in whole millimetres."""
+        """Draw a depth image [m], shape (height, width), NaN where invalid; stored in whole millimetres."""
         self.at(t)
         millimetres = np.nan_to_num(image * 1000.0, nan=0.0).astype(np.uint16)
         shape = rr.DepthImage(millimetres, meter=1000.0, colormap="viridis", depth_range=(500.0, 1700.0))
         self._recording.log("world/camera/depth", shape)
 
     def cloud(self, t: int, points: NDArray[np.float32]) -> None:
-        """Draws the perceived point cloud, shape (n, 3), thinned to `CLOUD_POINTS`."""
+        """Draw the perceived point cloud, shape (n, 3), thinned to `CLOUD_POINTS`."""
         self.at(t)
         thinned = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
         shape = rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012])
@@ -183,7 +183,7 @@ class SceneView:
         self._recording.log("world/perception/points", rr.Points3D([]))
 
     def perceived(self, t: int, vertices: NDArray[np.float32], triangles: Indices) -> None:
-        """Draws the perceived rest surface."""
+        """Draw the perceived rest surface."""
         self.at(t)
         normals = VertexNormals(triangles, len(vertices))(vertices)
         shape = rr.Mesh3D(
@@ -192,7 +192,7 @@ class SceneView:
         self._recording.log("world/perception/surface", shape)
 
     def targets(self, t: int, positions: Array, normals: Array) -> None:
-        """Draws palpation targets and outward normals, shapes (n, 3)."""
+        """Draw palpation targets and outward normals, shapes (n, 3)."""
         self.at(t)
         points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
         self._recording.log("world/perception/targets", points)
@@ -200,7 +200,7 @@ class SceneView:
         self._recording.log("world/perception/normals", needles)
 
     def planned(self, t: int, positions: Array) -> None:
-        """Draws the planned path of the tool, shape (n, 3)."""
+        """Draw the planned path of the tool, shape (n, 3)."""
         self.at(t)
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._recording.log("world/plan/path", shape)
@@ -214,7 +214,7 @@ class SceneView:
             self.extend_trail(t, in_contact)
 
     def extend_trail(self, t: int, in_contact: bool) -> None:
-        """Draws the travelled path since the last call."""
+        """Draw the travelled path since the last call."""
         if len(self._trail) < 2:
             return
         self.at(t)
@@ -224,7 +224,7 @@ class SceneView:
         del self._trail[:-1]
 
     def force(self, t: int, position: Array, force: Array) -> None:
-        """Draws the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
+        """Draw the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)

@@ -154,7 +154,7 @@ class DashboardService(Service):
         )
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Draws new messages that are due at `t` [ns]. Returns an empty outbox."""
+        """Draw new messages that are due at `t` [ns]. Returns an empty outbox."""
         start = perf_counter()
         for topic, period, draw in self._drawing:
             if inbox.stamp(topic) is not None and self._is_due(topic, t, period):
@@ -179,7 +179,7 @@ class DashboardService(Service):
         self._recording.flush()
 
     def finish(self) -> Mapping[str, Any]:
-        """Completes the recording."""
+        """Complete the recording."""
         self.flush()
         self._recording.disconnect()
         return {
@@ -193,7 +193,7 @@ class DashboardService(Service):
         return period == 0 or t >= self._due.get(key, 0)
 
     def _measure_speed(self, t: int) -> None:
-        """Measures simulated over wall time since the last call; the only use of a wall clock, for display."""
+        """Measure simulated over wall time since the last call; the only use of a wall clock, for display."""
         before, then = self._speed_mark
         now = perf_counter()
         self._speed_mark = (t, now)

@@ -151,7 +151,7 @@ class LiveRig(Rig):
         self._say(RunControl.END)
 
     def close(self) -> None:
-        """Aborts an implementation that still runs, and leaves the bus."""
+        """Abort an implementation that still runs, and leave the bus."""
         self._say(RunControl.ABORT, reason="the conformance check is over")
         for tokens in self._tokens.values():
             tokens.undeclare()

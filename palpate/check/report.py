@@ -36,7 +36,7 @@ class ConformanceReport:
     group: str = ""
 
     def section(self, name: str) -> None:
-        """Begins a group of checks."""
+        """Begin a group of checks."""
         self.group = name
 
     def expect(self, name: str, ok: bool, expected: object, got: object) -> bool:

@@ -72,7 +72,7 @@ class Rig(ABC):
         return round(self.settings.slack_ms * MS) if self.live else 0
 
     def run(self, seconds: float, feed: Feed) -> dict[str, list[ReceivedMessage]]:
-        """Advances by `seconds` while `feed` is sent; returns the messages received in this time, by topic."""
+        """Advance by `seconds` while `feed` is sent; return the messages received in this time, by topic."""
         before = {name: len(received) for name, received in self.log.items()}
         self._advance(self.t + round(seconds * 1e9), feed)
         return {name: received[before[name] :] for name, received in self.log.items()}
@@ -84,7 +84,7 @@ class Rig(ABC):
 
     @abstractmethod
     def _advance(self, end: int, feed: Feed) -> None:
-        """Advances to `end` [ns]."""
+        """Advance to `end` [ns]."""
 
     @abstractmethod
     def send(self, topic: str, message: Message) -> None:
@@ -118,7 +118,7 @@ class ServiceRig(Rig):
             self.t += MS
 
     def send(self, topic: str, message: Message) -> None:
-        """Delivers a message as bytes, like the wire."""
+        """Deliver a message as bytes, like the wire."""
         self._sequences[topic] += 1
         buffer = self._stepper.buffers[topic]
         buffer.deliver(Packet(codec.encode(message, self.rules.topics[topic].type), self.t, self._sequences[topic], checked=True))

@@ -71,7 +71,7 @@ class StiffnessMap(Map):
         return pd.DataFrame({**columns, "scanned": self.scanned, "finding": self.finding})
 
     def plot(self, axes: Axes | None = None, values: Array | None = None, label: str = "", cmap: str = "inferno") -> Axes:
-        """Draws the map seen from the front, in millimetres.
+        """Draw the map seen from the front, in millimetres.
 
         Parameters
         ----------

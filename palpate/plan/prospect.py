@@ -99,7 +99,7 @@ CONTOURS = "#c9d1d4"
 
 
 def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospect) -> None:
-    """Draws the plan on the body, seen from the front with the head at the top, into a PNG file. Raises OSError."""
+    """Draw the plan on the body, seen from the front with the head at the top, into a PNG file. Raises OSError."""
     figure = Figure(figsize=(8.5, 8.0), dpi=110, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
     front = phantom.normals[:, 2] > 0.1

@@ -116,7 +116,7 @@ class Player:
         progress: Callable[[int], None] = lambda _: None,
         gap: Callable[[float], None] = lambda _: None,
     ) -> None:
-        """Plays from `start` to `until` [ns after the origin].
+        """Play from `start` to `until` [ns after the origin].
 
         It begins with the last earlier message of each topic that is not periodic.
 
@@ -171,7 +171,7 @@ class Player:
             sleep(min(due - now, LOOK_NS) / NS)
 
     def hold(self) -> None:
-        """Stays on the bus, for late joiners of latched topics, until interrupted."""
+        """Stay on the bus, for late joiners of latched topics, until interrupted."""
         while True:
             sleep(1.0)
 
@@ -220,7 +220,7 @@ def play(
     hold: bool,
     drive: bool,
 ) -> None:
-    """Plays a recording on the bus from `start` to `end` [ns] or Ctrl-C; with `hold` until Ctrl-C. Raises UserError."""
+    """Play a recording on the bus from `start` to `end` [ns] or Ctrl-C; with `hold` until Ctrl-C. Raises UserError."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
     console = Console(stderr=True)
     recording = open_recording(file)

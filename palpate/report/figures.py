@@ -102,14 +102,14 @@ class Drawing:
     def panel(
         self, axes: Axes, layer: MapQuantity, letter: str, title: str, small: str, *, truth: bool = False, labels: bool = False
     ) -> None:
-        """Draws a quantity seen from the front, with the outlines of findings, a title and a colour bar."""
+        """Draw a quantity seen from the front, with the outlines of findings, a title and a colour bar."""
         image = self.plane(axes, layer)
         self.outlines(axes, truth, labels)
         panel_title(axes, letter, title, small)
         colour_bar(image, axes, layer.label)
 
     def plane(self, axes: Axes, layer: MapQuantity) -> ScalarMappable:
-        """Draws a quantity, where known, seen from the front, with quadrants."""
+        """Draw a quantity, where known, seen from the front, with quadrants."""
         values, cmap, norm, _ = layer
         known = np.isfinite(values)[self.triangles].all(axis=1)
         tri = Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles[known])
@@ -147,7 +147,7 @@ class Drawing:
         return member
 
     def outlines(self, axes: Axes, truth: bool, labels: bool = False) -> None:
-        """Draws the outlines of findings and, with `truth`, of true lumps if known."""
+        """Draw the outlines of findings and, with `truth`, of true lumps if known."""
         for i, f in enumerate(self.findings):
             member = (self.map.finding == i).astype(float)
             if not member.any():
@@ -175,7 +175,7 @@ class Drawing:
             contour.set_path_effects([withStroke(linewidth=2.8, foreground=INK)])
 
     def space(self, axes: Any, height: Array, layer: MapQuantity, label: str) -> None:
-        """Draws the map as a surface in space: `height` above the xy plane, coloured by a quantity."""
+        """Draw the map as a surface in space: `height` above the xy plane, coloured by a quantity."""
         z = height.copy()
         surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)
         surface.set_cmap(layer.cmap)
@@ -198,7 +198,7 @@ class Drawing:
 def draw_map(
     path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str, run: str = ""
 ) -> None:
-    """Draws `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
+    """Draw `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
 
     The file's metadata has the name of the run. Writes nothing for a map that is not `drawable`.
     """
@@ -254,7 +254,7 @@ def panel_title(axes: Any, letter: str, title: str, small: str) -> None:
 
 
 def colour_bar(image: ScalarMappable, axes: Axes, label: str) -> None:
-    """Draws a colour bar next to `axes`, with round numbers on a logarithmic scale."""
+    """Draw a colour bar next to `axes`, with round numbers on a logarithmic scale."""
     figure = axes.get_figure()
     assert figure is not None
     bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)

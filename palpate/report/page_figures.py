@@ -68,7 +68,7 @@ def _png(figure: Figure) -> bytes:
 
 
 def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
-    """Draws labels and a light grid."""
+    """Draw labels and a light grid."""
     axes.set_ylabel(ylabel, color=INK, fontsize=9)
     axes.set_xlabel(xlabel, color=INK, fontsize=9)
     axes.tick_params(labelsize=8.5, colors=INK)

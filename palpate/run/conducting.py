@@ -23,7 +23,7 @@ NEEDS_WALLCLOCK = "services.tissue = 'none' is for hardware, which does not wait
 
 
 def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallclock: bool, quiet: bool) -> None:
-    """Conducts services that others start and writes the results into `out`, which has scenario.yaml."""
+    """Conduct services that others start and write the results into `out`, which has scenario.yaml."""
     console = SteadyConsole(stderr=True)
     for name in observers:
         if name not in OBSERVERS:

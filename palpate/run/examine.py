@@ -35,7 +35,7 @@ from palpate_plugins import PluginError
 
 
 def resume(options: RunOptions) -> None:
-    """Continues the interrupted examination `options.resume`. Raises UserError if it cannot, typer.Exit if it failed."""
+    """Continue the interrupted examination `options.resume`. Raises UserError if it cannot, typer.Exit if it failed."""
     assert options.resume is not None
     before = resumption(options.resume)
     if not options.silent:

@@ -30,7 +30,7 @@ class Child(Protocol):
         """Send a signal if it still runs."""
 
     def kill(self) -> None:
-        """Kills it."""
+        """Kill it."""
 
     def wait(self, timeout: float | None = None) -> int:
         """Wait for its end; return the exit status. Raises subprocess.TimeoutExpired."""
@@ -90,7 +90,7 @@ class Forks:
 
 
 def _become(words: Sequence[str], environment: Mapping[str, str], log: str) -> None:
-    """Acts in the child as shell and interpreter for `python -m WORDS > log`."""
+    """Act in the child as shell and interpreter for `python -m WORDS > log`."""
     os.setpgid(0, 0)
     os.environ.clear()
     os.environ.update(environment)

@@ -140,7 +140,7 @@ def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
 
 
 def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
-    """Becomes the process of the place that `find` returns for the run."""
+    """Become the process of the place that `find` returns for the run."""
     place = find(role, named_runs(run)[-1])
     become(command_for(role, place, service), place.environment)
 

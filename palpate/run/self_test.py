@@ -48,7 +48,7 @@ class TimingResult(NamedTuple):
 
 
 def measure() -> TimingResult:
-    """Measures for a second; takes about two and a half."""
+    """Measure for a second; takes about two and a half."""
     start = monotonic_ns() + STARTS_WITHIN_NS
     command = [sys.executable, str(Path(__file__)), str(start)]
     children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(3)]
@@ -57,7 +57,7 @@ def measure() -> TimingResult:
 
 
 def _tick(start: int) -> tuple[float, float]:
-    """Wakes at each tick; returns the share of ticks in time, and the lateness [ms] that one in a thousand exceeds."""
+    """Wake at each tick; return the share of ticks in time, and the lateness [ms] that one in a thousand exceeds."""
     late: list[int] = []
     tick = max(0, (monotonic_ns() - start) // MS)
     while tick < TICKS:

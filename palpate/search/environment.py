@@ -77,7 +77,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._observed(), {"patient": patient}
 
     def step(self, action: NDArray[np.float32]) -> tuple[Observation, float, bool, bool, dict[str, Any]]:
-        """Presses once; returns observation, reward, terminated, truncated, info."""
+        """Press once; return observation, reward, terminated, truncated, info."""
         task = self._hand.task
         share = 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0)
         xy = task.low + share[:2] * (task.high - task.low)

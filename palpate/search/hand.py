@@ -40,7 +40,7 @@ class Hand(Protocol):
     """Time since the search began [s]."""
 
     def press(self, xy: Array, depth: float) -> Press:
-        """Presses at a place [m], shape (2,), to `depth` [m]; returns the measurement. Raises ValueError outside the region."""
+        """Press at a place [m], shape (2,), to `depth` [m]; return the measurement. Raises ValueError outside the region."""
 
 
 class _Timed:

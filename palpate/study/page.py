@@ -76,7 +76,7 @@ def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "b
 
 
 def _human(axes: Axes) -> None:
-    """Draws the detection rate of human examiners."""
+    """Draw the detection rate of human examiners."""
     label = f"80 physicians, breast models: {human_line.FOUND:.0%} (Fletcher 1985)"
     axes.axhline(human_line.FOUND, color=HUMAN, ls="--", lw=1.2, label=label)
 
@@ -86,7 +86,7 @@ def _title(axes: Axes, words: str) -> None:
 
 
 def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: str, label: str) -> None:
-    """Draws estimates with their intervals."""
+    """Draw estimates with their intervals."""
     known = [(at, e.value, e.low, e.high) for at, e in zip(x, rows, strict=True) if e.value is not None]
     if known:
         at, value, low, high = np.array([[np.nan if v is None else v for v in row] for row in known], dtype=float).T
@@ -175,7 +175,7 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
 
 
 def _sections(axes: Axes, surface: Surface, name: str) -> None:
-    """Draws the surface along one covariate, at the quartiles of another one, with the rest at their medians."""
+    """Draw the surface along one covariate, at the quartiles of another one, with the rest at their medians."""
     second = next((other for other in surface.names if other != name), None)
     _, scale = COVARIATES[name]
     x = np.geomspace(*surface.range[name], 60) if name in LOGARITHMIC else np.linspace(*surface.range[name], 60)

@@ -78,7 +78,7 @@ class Copies:
 
 
 def press_patient(scenario: Scenario) -> Pressed | None:
-    """Presses the patient of a scenario over the examined region; returns None if the tissue cannot be copied.
+    """Press the patient of a scenario over the examined region; return None if the tissue cannot be copied.
 
     Takes seconds; cached in the user's cache folder by patient, tier and indenter.
     """

@@ -197,7 +197,7 @@ def turned(maps: NDArray[np.float32], action: NDArray[np.int64], how: int) -> tu
 
 
 def imitate(model: PPO, rng: np.random.Generator) -> float:
-    """Fits actor and critic to what the teacher shows; returns the teacher's mean reward."""
+    """Fit actor and critic to what the teacher shows; return the teacher's mean reward."""
     maps, actions, returns, reward = lessons(rng)
     optimizer = torch.optim.Adam(model.policy.parameters(), lr=3e-3)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, PASSES)

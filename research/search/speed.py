@@ -21,7 +21,7 @@ _KINDS: Final[tuple[tuple[Literal["surrogate", "patient"], bool, int], ...]] = (
 
 
 def rate(env: SearchEnv, episodes: int) -> float:
-    """Presses a second of processor time, of random presses; making the patients is not counted."""
+    """Press a second of processor time, of random presses; making the patients is not counted."""
     rng, spent = np.random.default_rng(0), 0.0
     for episode in range(episodes):
         env.reset(options={"patient": episode % 2})

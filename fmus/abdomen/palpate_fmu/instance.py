@@ -289,7 +289,7 @@ class FmuInstance:
         port.push()
 
     def step(self, t_s: float, dt_s: float) -> None:
-        """Advances from `t_s` by `dt_s` [s].
+        """Advance from `t_s` by `dt_s` [s].
 
         Raises FmuError if the FMU did not reach the end of the step, or must not be stepped again; its state is then undefined.
         """
@@ -318,7 +318,7 @@ class FmuInstance:
         return time + (", it asks to end the simulation" if ended.value else "")
 
     def close(self) -> None:
-        """Frees the instance, its library and its unpacked files."""
+        """Free the instance, its library and its unpacked files."""
         if self._fmu is not None:
             if not self._fatal:  # after a fatal error no function may be called
                 self._fmu.freeInstance()

@@ -20,7 +20,7 @@ from palpate_models.patient.schema import Phantom
 
 
 def press(fmu: FmuInstance, steps: int = 300, first: int = 0) -> np.ndarray:
-    """Slides down into the abdomen from step `first` on; the force at each step."""
+    """Slide down into the abdomen from step `first` on; the force at each step."""
     motion, wrench = fmu.port(["indenter_position", "indenter_velocity"]), fmu.port(["contact_force", "contact_torque"])
     forces = []
     for k in range(first, first + steps):

@@ -158,7 +158,7 @@ def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 
 
 def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:
-    """Presses up to `force` [N] as slowly as an examination does, and holds for half a second."""
+    """Press up to `force` [N] as slowly as an examination does, and hold for half a second."""
     for push in np.linspace(arm.push_N, force, 2 + int(abs(force - arm.push_N) / EXPECTED.rise_nps / EXPECTED.step_s)):
         arm.push_N = float(push)
         rig.run(EXPECTED.step_s, arm.feed())

@@ -42,7 +42,7 @@ class PressingTool:
         return rig.run(seconds, {"sim/tool_state": source})[WRENCH]
 
     def rest(self, rig: Rig, seconds: float) -> list[ReceivedMessage]:
-        """Stays for `seconds`; returns the contact wrenches."""
+        """Stay for `seconds`; return the contact wrenches."""
         return self.lead(rig, self.p.copy(), seconds)
 
 

@@ -62,7 +62,7 @@ class Bootstrap:
 
     @staticmethod
     def draw(populations: ArrayLike, folds: int = FOLDS, seed: int = 0) -> Bootstrap:
-        """Draws the resamplings; `populations`: population of each patient, shape (patients,)."""
+        """Draw the resamplings; `populations`: population of each patient, shape (patients,)."""
         rng = np.random.Generator(np.random.PCG64(np.random.SeedSequence([seed, crc32(b"bootstrap over patients")])))
         names = np.asarray(populations)
         counts = np.zeros((folds, len(names)), dtype=np.int32)

@@ -96,7 +96,7 @@ class Sampler:
         return self._average() if complete else None
 
     def forget(self) -> None:
-        """Forgets the states of a sample that is not complete, and the touch."""
+        """Forget the states of a sample that is not complete, and the touch."""
         self._block, self._onset = [], None
 
     def _average(self) -> ForceSample | None:

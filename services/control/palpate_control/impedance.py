@@ -107,7 +107,7 @@ class ImpedanceController:
         self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
 
     def reset(self) -> None:
-        """Restarts the rate limit from zero torque, after a pause without commands."""
+        """Restart the rate limit from zero torque, after a pause without commands."""
         self._net.reset()
         self._designed_for = None
 

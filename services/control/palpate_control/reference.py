@@ -99,7 +99,7 @@ class Extrapolator:
         self.current: Setpoint | None = None
 
     def clear(self) -> None:
-        """Discards the set-point; the next one is not blended."""
+        """Discard the set-point; the next one is not blended."""
         self.current = None
 
     def accept(self, setpoint: Setpoint, t: int) -> None:

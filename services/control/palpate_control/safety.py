@@ -30,7 +30,7 @@ class SafetyNet:
         self._last = np.zeros_like(torque_limit)
 
     def reset(self) -> None:
-        """Restarts from zero torque, as after a pause without commands."""
+        """Restart from zero torque, as after a pause without commands."""
         self._last = np.zeros_like(self._last)
 
     def torque(self, wanted: Array, q: Array, gravity: Array) -> Array:

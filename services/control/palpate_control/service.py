@@ -72,7 +72,7 @@ class ControlService(Service):
         self._warm_up()
 
     def _warm_up(self) -> None:
-        """Compiles the law in both modes on decoded set-points, which would take too long at 1 kHz."""
+        """Compile the law in both modes on decoded set-points, which would take too long at 1 kHz."""
         kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", np.zeros(DOF), Vector3(0.0, 0.0, 0.0)
         pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
         for mode in ControlMode:

@@ -124,14 +124,14 @@ class Driver:
         return self.mode is DriverMode.SAFE_HOLD
 
     def hold(self, t: int, cause: HoldCause, reason: str, culprit: str = "") -> None:
-        """Latches a safe hold at `t` [ns]. The first cause is kept until the release. `culprit`: role or topic at fault."""
+        """Latch a safe hold at `t` [ns]. The first cause is kept until the release. `culprit`: role or topic at fault."""
         if not self.held:
             self.mode, self.cause, self.reason, self.culprit = DriverMode.SAFE_HOLD, cause, reason, culprit
             self._brake = TUNING.brake_ticks
             self.holds.append((t, cause, reason))
 
     def release(self, t: int) -> None:
-        """Leaves a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again."""
+        """Leave a safe hold at `t` [ns] for IDLE. Only commands sent after `t` count; a violated limit holds again."""
         if self.mode is DriverMode.SAFE_HOLD:
             self.mode, self.cause, self.reason, self.culprit = DriverMode.IDLE, HoldCause.NONE, "", ""
             self._since = t

@@ -39,7 +39,7 @@ class Plant(Protocol):
         ...
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
-        """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
+        """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.

@@ -68,7 +68,7 @@ class JointSensor:
         self.q, self.v = _read(self._table, q, np.zeros(7), torque, 0.0)
 
     def update(self, q: Array, v: Array, torque: Array) -> None:
-        """Advances by a step of the plant: true positions and velocities after it, and the torque during it."""
+        """Advance by a step of the plant: true positions and velocities after it, and the torque during it."""
         self.q, self.v = _read(self._table, q, v, torque, DT)
 
     def read(self) -> tuple[Array, Array]:

@@ -214,7 +214,7 @@ class Posterior:
         self._weigh()
 
     def refuse(self, xy: Array) -> None:
-        """Excludes the place nearest to xy [m], shape (2,): the arm cannot press it."""
+        """Exclude the place nearest to xy [m], shape (2,): the arm cannot press it."""
         self.open[np.argmin(np.linalg.norm(self.task.places - xy, axis=1))] = False
 
     def accept(self, bump: Bump) -> Posterior:

@@ -84,7 +84,7 @@ class Latch:
         self.stops.append(Stop(t, breach.level, breach.cause, breach.reason))
 
     def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
-        """Grants a release unless a breach that motion cannot end is present; returns the breaches still to be judged."""
+        """Grant a release unless a breach that motion cannot end is present; return the breaches still to be judged."""
         against = [breach for breach in standing if breach.cause not in RECOVERABLE and breach.cause is not StopCause.DRIVER]
         if against:
             self.refusals += 1

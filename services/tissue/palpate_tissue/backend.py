@@ -30,7 +30,7 @@ class TissueBackend(ABC):
 
     @abstractmethod
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
-        """Advances by one period to time `t_s` [s] with the sphere's centre at `p_A` [m]; returns the wrench on it.
+        """Advance by one period to time `t_s` [s] with the sphere's centre at `p_A` [m]; return the wrench on it.
 
         `v_A` [m/s] and `w_A` [rad/s] are the sphere's velocities, `radius` [m]. The result is the force [N] on the sphere and the
         torque about its centre [N m], shapes (3,), averaged over the period. Raises ValueError for a position that is not finite.
@@ -38,7 +38,7 @@ class TissueBackend(ABC):
 
     @abstractmethod
     def idle(self, t_s: float) -> None:
-        """Advances by one period to time `t_s` [s] without contact."""
+        """Advance by one period to time `t_s` [s] without contact."""
 
     @abstractmethod
     def settle(self) -> None:
@@ -89,7 +89,7 @@ class TissueBackend(ABC):
         return self.model.vertices - self.inward[:, None] * self.model.normals
 
     def guard(self, v_A: Array) -> None:
-        """Advances `activation` by a period for a sphere of velocity `v_A` [m/s]. Each `step` ends with it."""
+        """Advance `activation` by a period for a sphere of velocity `v_A` [m/s]. Each `step` ends with it."""
         if self._guarding.voluntary and self.touching:
             vertex, depth = self.deepest
             self.activation = self._guarding.after(self.activation, depth, -float(v_A @ self.model.normals[vertex]))

@@ -58,7 +58,7 @@ class MovingBody(Service):
         return self._tissue.start()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advances the tissue by one period."""
+        """Advance the tissue by one period."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:

@@ -82,7 +82,7 @@ class TissueService(Service):
         return {"truth/phantom": message}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advances the tissue by one period."""
+        """Advance the tissue by one period."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:

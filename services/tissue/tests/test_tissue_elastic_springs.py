@@ -54,7 +54,7 @@ def layer(half_m: float = 0.045) -> Compliance:
 
 
 def reach(beside_m: float, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Lets springs act away from the sphere."""
+    """Let springs act away from the sphere."""
     tuning = ElasticTuning(springs_beyond_m=beside_m, muscle_beyond_m=beside_m)
     monkeypatch.setattr("palpate_tissue.backends.elastic.tissue.TUNING", tuning)
 

@@ -58,7 +58,7 @@ class JerkLimitedAxis:
         self._target = self._speed = nan
 
     def step(self, target: float, speed: float) -> bool:
-        """Advances one period towards rest at `target` with at most `speed`; returns True on arrival.
+        """Advance one period towards rest at `target` with at most `speed`; return True on arrival.
 
         Raises RunError if ruckig fails, which requires limits that are not positive.
         """
@@ -75,7 +75,7 @@ class JerkLimitedAxis:
         return bool(result == _FINISHED)
 
     def shift(self, change: float) -> None:
-        """Shifts the origin: the present position increases by `change`."""
+        """Shift the origin: the present position increases by `change`."""
         self.position += change
         self._in.current_position = [self.position]
 

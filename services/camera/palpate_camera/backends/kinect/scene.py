@@ -45,7 +45,7 @@ def _bounds(x: float, y: float, z: float, size: int) -> tuple[int, int]:
 
 @compiled
 def rasterise(p_C: Array, triangles: NDArray[np.uint32], lens: Array, w: Image, gu: Image, gv: Image, cos: Image) -> None:
-    """Draws a mesh into a view where it is nearer: `w`, `gu`, `gv` and `cos` as in `scene.View`.
+    """Draw a mesh into a view where it is nearer: `w`, `gu`, `gv` and `cos` as in `scene.View`.
 
     `p_C`: vertices [m], shape (n, 3); `triangles`: shape (m, 3); `lens`: fx, fy, cx, cy [px].
     """

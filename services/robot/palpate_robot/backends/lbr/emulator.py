@@ -228,7 +228,7 @@ class Emulator:
         self.measured: Array = self._joints.q.copy()
 
     def cycle(self, *, answered: bool = True) -> None:
-        """Advances the arm by one send period under the newest command."""
+        """Advance the arm by one send period under the newest command."""
         plant, joints, options = self._plant, self._joints, self._options
         self.measured, _ = joints.read()
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
@@ -304,7 +304,7 @@ class Metronome:
         return max(self._due - now, 0)
 
     def begin(self, now: int) -> int:
-        """Begins a cycle; returns its stamp [ns]."""
+        """Begin a cycle; return its stamp [ns]."""
         if now - self._due > self._period:
             self._due = now
         self._due += self._period

@@ -139,7 +139,7 @@ class LbrPort(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Disconnects from the ROS side."""
+        """Disconnect from the ROS side."""
 
 
 class ZenohPort(LbrPort):
@@ -183,5 +183,5 @@ class ZenohPort(LbrPort):
         return self._tool.newest(), self._links.newest()
 
     def close(self) -> None:
-        """Disconnects from the ROS side."""
+        """Disconnect from the ROS side."""
         self._node.close()

@@ -207,7 +207,7 @@ class LbrService(Service):
         return fault is None
 
     def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
-        """Answers a new state with a command."""
+        """Answer a new state with a command."""
         arm = self._arm
         tool = self._model.at(arm.q)
         weight = self._robot.tool_mass_kg * GRAVITY
@@ -250,7 +250,7 @@ class LbrService(Service):
         )  # fmt: skip
 
     def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:
-        """Relays exact poses and contact wrenches between the emulator and the simulated tissue and camera."""
+        """Relay exact poses and contact wrenches between the emulator and the simulated tissue and camera."""
         for contact in inbox.new("sim/contact_wrench"):
             self._port.contact(contact)
         tool, links = self._port.physics()

@@ -169,7 +169,7 @@ class MujocoPlant:
         self.q, self.v = self._qpos.copy(), self._qvel.copy()
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
-        """Advances 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
+        """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
         `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre (its centre of mass), in world axes, and is held over the step.

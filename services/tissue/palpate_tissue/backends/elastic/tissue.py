@@ -158,7 +158,7 @@ class ElasticTissue(TissueBackend):
             self.friction.release()
 
     def _catch_up(self) -> None:
-        """Advances all vertices to the present."""
+        """Advance all vertices to the present."""
         if not self._behind or not self.disturbed:
             self._behind = 0
             return

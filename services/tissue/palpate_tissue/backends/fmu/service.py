@@ -74,7 +74,7 @@ class FmuService(Service):
         return {output.topic.name: output.message(0) for output in self._latched}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advances the FMU to `t` [ns]. Raises FmuError with the FMU's message if it fails."""
+        """Advance the FMU to `t` [ns]. Raises FmuError with the FMU's message if it fails."""
         for source in self._wiring.inputs:
             message = inbox.latest(source.topic.name)
             if message is not None:
