@@ -1,0 +1,1 @@
+"""Recordings of other robots: contacts, their faults, and the assessment of them."""

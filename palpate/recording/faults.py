@@ -1,0 +1,71 @@
+"""Faults of a recording: codes, counts and what was done; the text is made here and nowhere else."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from enum import StrEnum
+
+
+class FaultCode(StrEnum):
+    """Kinds of faults."""
+
+    SIGN = "sign"
+    UNIT = "unit"
+    FRAME = "frame"
+    NO_FREE_AIR = "no_free_air"
+    DRIFT = "drift"
+    CLIPPED = "clipped"
+    FROZEN = "frozen"
+    REPEATED = "repeated"
+    CLOCK = "clock"
+    NO_CONTACT = "no_contact"
+    JUMP = "jump"
+    DISAGREE = "disagree"
+    SHALLOW = "shallow"
+    INVALID = "invalid"
+
+
+_TEXTS = {
+    FaultCode.SIGN: "{count} of {of} contacts have a force that pulls where the tool presses: the sign of the force is wrong",
+    FaultCode.UNIT: "lengths are implausible by a factor of 1000: the contacts span {value:.3g} m; check units.length",
+    FaultCode.FRAME: "the force of {count} of {of} contacts is not along the normal (median angle {value:.0f} deg): wrong frame",
+    FaultCode.NO_FREE_AIR: "no part of the recording is free of contact, so that the force cannot be tared",
+    FaultCode.DRIFT: "the force drifts by {value:.2g} N between the first and the last free motion",
+    FaultCode.CLIPPED: "{count} of {of} samples are at the end of the sensor's range ({value:.3g} N)",
+    FaultCode.FROZEN: "{count} of {of} samples repeat a force while the tool moves: the sensor froze",
+    FaultCode.REPEATED: "{count} of {of} rows are there twice",
+    FaultCode.CLOCK: "force and position are {value:.3g} s apart",
+    FaultCode.NO_CONTACT: "{count} of {of} contacts never touch",
+    FaultCode.JUMP: "{count} of {of} positions jump by up to {value:.3g} m",
+    FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
+    FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to tell",
+    FaultCode.INVALID: "{count} of {of} rows have no number, or a normal of length 0",
+}
+
+
+class Remedy(StrEnum):
+    """What was done about a fault."""
+
+    LEFT_OUT = "left out"
+    KEPT = "kept as they are"
+    CORRECTED = "corrected"
+    REFUSED = "not assessed until it is mended"
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault that was found in a recording."""
+
+    code: FaultCode
+    count: int
+    """Affected rows, contacts or samples."""
+    of: int
+    """All of them."""
+    remedy: Remedy
+    value: float = 0.0
+    """Size, in the unit of the text."""
+
+    @property
+    def text(self) -> str:
+        """One line for the user."""
+        return f"{_TEXTS[self.code].format(count=self.count, of=self.of, value=self.value)}; {self.remedy}"
