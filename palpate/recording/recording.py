@@ -14,7 +14,6 @@ from palpate.recording.faults import Fault
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler
 from palpate_models.numerics.frames import Array
 
-
 PROBES_APART_S: Final = 10.0
 """Time given between probes without time: their errors of one moment are unrelated."""
 LOADING_SHARE: Final = 0.5
