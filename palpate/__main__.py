@@ -43,7 +43,7 @@ def main() -> None:
 
 
 def _hung_up(number: int, frame: FrameType | None) -> None:
-    """Treat a closed terminal as Ctrl-C, and redirects output so that writing does not fail."""
+    """Treat a closed terminal as Ctrl-C, and redirect output so that writing does not fail."""
     for terminal in TERMINALS:
         if not os.isatty(terminal):
             os.dup2(os.open(os.devnull, os.O_RDWR), terminal)

@@ -191,7 +191,7 @@ class _Child:
 
 
 def _serve(work: Callable[[Send], Any], pipe: Connection, parent: int, mask: Any) -> NoReturn:
-    """Act in the child: works, send the result and exits."""
+    """Act in the child: work, send the result and exit."""
     try:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:

@@ -39,7 +39,7 @@ def test_the_lesion_is_found(distributed: Finished) -> None:
 
 
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
-    """Sum in another order differ by 1e-13 of a force, which stick and slip amplify; the scores do not differ."""
+    """Sums in another order differ by 1e-13 of a force, which stick and slip amplify; the scores do not differ."""
     finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*GATE, "services.tissue=fmu"))
     assert_within_bounds(finished)
     ours, theirs = finished.report, composed.report

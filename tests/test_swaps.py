@@ -100,7 +100,7 @@ ELASTIC = (*SHORT, "services.tissue=elastic")
 
 @pytest.mark.timeout(900)
 def test_an_examination_of_the_elastic_tissue_completes_with_findings(tmp_path: Path) -> None:
-    """Need an idle machine (docs/wall-clock.md). The compliance is computed before the run, as its README asks."""
+    """Needs an idle machine (docs/wall-clock.md). The compliance is computed before the run, as its README asks."""
     words = [sys.executable, "-m", "palpate_tissue.backends.elastic.prepare", "clean"]
     subprocess.run([*words, *(word for setting in ELASTIC for word in ("--set", setting))], check=True, timeout=600)
     finished = palpate_run("clean", tmp_path, "--wallclock", "--record", "none", settings=ELASTIC, timeout=300)

@@ -221,7 +221,7 @@ class Plots:
         return True
 
     def health(self, t: int, row: Health) -> None:
-        """Draw the health line of a service or topic, and logs its message unless it is ok."""
+        """Draw the health line of a service or topic, and log its message unless it is ok."""
         path = f"health/{'topics' if row.is_topic else 'services'}/{row.name}"
         if path not in self._health_lines:
             self._health_lines.add(path)

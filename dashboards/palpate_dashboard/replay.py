@@ -185,7 +185,7 @@ def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Sess
 
 
 def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
-    """Draw `run` until it ends, and forwards operator `keys`. Returns how the run ended."""
+    """Draw `run` until it ends, and forward operator `keys`. Returns how the run ended."""
     rules = contract()
     with session(run.options()) as bus, _operator(run, bus) as operator:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)

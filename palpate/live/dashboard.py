@@ -75,7 +75,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
 
 
 def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
-    """Follow a run to its end; unless `leave`, keeps showing it afterwards."""
+    """Follow a run to its end; unless `leave`, keep showing it afterwards."""
     from palpate_bus.runs.operator import HINT, OperatorKeys
     from palpate_dashboard.replay import follow
     from palpate_dashboard.service import DashboardService

@@ -32,7 +32,7 @@ ENDED: Final = frozenset({psutil.STATUS_ZOMBIE, psutil.STATUS_DEAD})
 
 @contextmanager
 def rare_collections() -> Iterator[None]:
-    """Freeze existing objects and raises the GC threshold. A full collection during a run took 0.06 to 0.17 s."""
+    """Freeze existing objects and raise the GC threshold. A full collection during a run took 0.06 to 0.17 s."""
     thresholds = gc.get_threshold()
     gc.freeze()
     gc.set_threshold(GC_THRESHOLD)

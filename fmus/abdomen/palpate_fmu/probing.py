@@ -47,7 +47,7 @@ def probe(
     step_s: float = 1e-3,
     start_s: float = 0.0,
 ) -> Probing:
-    """Press at a point (x, y) of the abdomen frame [m] to a depth, hold it and withdraws, from `start_s` on.
+    """Press at a point (x, y) of the abdomen frame [m] to a depth, hold it and withdraw, from `start_s` on.
 
     The FMU must be fresh. Its sphere moves along the normal of the rest surface beneath (x, y, 0.05 m).
     """

@@ -83,7 +83,7 @@ class RobotService(Service):
         return {"robot_description": String(lbr.urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
-        """Advance the plant to `t` under the messages of the previous tick, and measures."""
+        """Advance the plant to `t` under the messages of the previous tick, and measure."""
         return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
 
     def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
