@@ -30,7 +30,7 @@ WHERE_FELT = "dashed: where a lump is felt; solid: finding"
 _FINDING, _TRUE = "#18e0d0", "#ffffff"
 _SMALL = 8.5
 APPARENT = "force of the standard press"
-_LOG_TICKS = [m * 10.0**e for e in range(-1, 3) for m in (1, 1.5, 2, 3, 4, 5, 7)]
+_LOG_TICKS = [m * 10.0**e for e in range(-1, 3) for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
 
 
 def drawable(message: Any) -> bool:
@@ -223,7 +223,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -
     drawing.panel(flat, layer, "a", f"Normal force at {depth_mm:.0f} mm depth", f"{count} samples (dots)")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
     drawing.space(solid, drawing.force, layer, layer.label)
-    solid.set_box_aspect((1, 1, 0.72), zoom=1.14)
+    solid.set_box_aspect((1, 1, 0.72), zoom=1.0)
     panel_title(solid, "b", "Normal force in 3-D", "height and colour are force")
     spread = figure.add_subplot(grid[0, 2])
     drawing.panel(spread, drawing.spread_layer, "c", "Uncertainty of the apparent stiffness", "half width of the 90 % band")
@@ -236,7 +236,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
     drawing.panel(flat, layer, "d", "Apparent stiffness, estimated", small, labels=True)
     solid = figure.add_subplot(grid[1, 1], projection="3d")
     drawing.space(solid, drawing.xyz[:, 2], layer, "z [mm]")
-    solid.set_box_aspect((1, 1, 0.45), zoom=1.14)
+    solid.set_box_aspect((1, 1, 0.45), zoom=1.0)
     panel_title(solid, "e", "The same on the abdomen", "perceived surface")
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:

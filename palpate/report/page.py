@@ -127,8 +127,8 @@ def verdict(report: Report) -> str:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
     muscles = rows.tensed(report.candidates)
     if not report.findings:
-        return f"{unassessed(report)}No lump was found{_unreached(report)}. {muscles}".rstrip()
-    return f"{unassessed(report)}{' '.join(map(_finding_text, report.findings))} {muscles}".rstrip()
+        return f"No lump was found{_unreached(report)}. {muscles} {unassessed(report)}".strip()
+    return f"{' '.join(map(_finding_text, report.findings))} {muscles} {unassessed(report)}".strip()
 
 
 def _reached(report: Report, evidence: Evidence) -> int:
