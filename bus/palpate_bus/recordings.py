@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import heapq
+import re
 import shlex
 import struct
 from collections import Counter
@@ -10,20 +11,21 @@ from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from operator import attrgetter
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import IO, NamedTuple
 
-import yaml
+import zstandard
+from mcap import stream_reader
 from mcap.exceptions import McapError
 from mcap.reader import McapReader, NonSeekingReader, make_reader
 from mcap.records import Channel, Message, Schema
 from mcap.stream_reader import StreamReader
-from zstandard import ZstdError
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import RECORDING
 from palpate_errors import UserError
+from palpate_inputs import MB, InputFile, bounds, over, read_yaml
 
 KEPT_EVERY = "kept_every_ms"
 """Metadata of a channel: period [ms] in which one message was kept."""
@@ -31,12 +33,54 @@ SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
 UNIX_NS = 10**17
 """Stamps from here on [ns] are Unix time, as other recorders write it, not the simulated time of a run."""
-BROKEN = (McapError, EOFError, RuntimeError, ValueError, KeyError, MemoryError, ZstdError, struct.error)
+BROKEN = (
+    McapError,
+    EOFError,
+    RuntimeError,
+    ValueError,
+    LookupError,
+    OverflowError,
+    MemoryError,
+    zstandard.ZstdError,
+    struct.error,
+)
 """Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum or length."""
 
 
 class RecordingError(UserError):
     """A recording that cannot be used. Names file, topic, what was found and what is needed."""
+
+
+class _Decompressor:
+    """Decompresses a chunk within `chunk_mb`. The library believes the size that a chunk states, up to any memory."""
+
+    _lz4 = stream_reader.lz4
+
+    def __init__(self, method: str) -> None:
+        self.decompress = getattr(self, method)
+
+    def zstd(self, data: bytes, size: int) -> bytes:
+        """Return the content of a zstd frame."""
+        stated = zstandard.get_frame_parameters(data).content_size
+        self._check(size if stated == zstandard.CONTENTSIZE_UNKNOWN else max(size, stated))
+        return bytes(zstandard.decompress(data, size))
+
+    def lz4(self, data: bytes) -> bytes:
+        """Return the content of an lz4 frame."""
+        frame = self._lz4.LZ4FrameDecompressor()
+        content = bytes(frame.decompress(data, max_length=bounds().chunk_mb * MB + 1))
+        self._check(len(content))
+        if not frame.eof:
+            raise EOFError("an lz4 chunk that is not whole")
+        return content
+
+    @staticmethod
+    def _check(size: int) -> None:
+        if size > bounds().chunk_mb * MB:
+            raise over("a chunk of the recording", f"{size / MB:.0f} MB decompressed", "chunk_mb", RecordingError)
+
+
+stream_reader.zstandard, stream_reader.lz4 = _Decompressor("zstd"), _Decompressor("lz4")
 
 
 class RecordedMessage(NamedTuple):
@@ -106,7 +150,7 @@ class Recording:
         if not names:
             return
         with ExitStack() as stack:
-            streams = [(file, stack.enter_context(file.open("rb"))) for file in self.files]
+            streams = [(file, stack.enter_context(_opened(file))) for file in self.files]
             readers = [
                 self._reader(file, stream).iter_messages(topics=names, starting_at=begin, ending_at=end)
                 for file, stream in streams
@@ -121,6 +165,8 @@ class Recording:
             ]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
+            except RecordingError as error:
+                raise RecordingError(f"{self.path}: {error}") from error
             except BROKEN as error:
                 broken = self.path if self.path.is_file() else self.files[0].parent
                 raise RecordingError(f"{self.path}: is damaged; {_recover(broken)}") from error
@@ -163,7 +209,7 @@ def _convert(path: Path) -> str:
 
 def _unreadable(file: Path, path: Path) -> RecordingError:
     """Return the error for a file that is not a complete MCAP file. `path`: its recording."""
-    with file.open("rb") as stream:
+    with _opened(file) as stream:
         head = stream.read(16)
     if not head:
         return RecordingError(f"{file}: is empty, so nothing was recorded")
@@ -200,17 +246,20 @@ def _files(path: Path) -> tuple[Path, tuple[Path, ...]]:
 def _listed(metadata: Path) -> tuple[Path, ...]:
     """Return the files that rosbag2's description of a recording lists."""
     try:
-        info = yaml.safe_load(metadata.read_text(encoding="utf-8"))["rosbag2_bagfile_information"]
-        files = tuple(metadata.parent / name for name in info["relative_file_paths"])
+        info = read_yaml(metadata, RecordingError)["rosbag2_bagfile_information"]
+        names = [PurePath(name) for name in info["relative_file_paths"]]
+        files = tuple(metadata.parent / name for name in names)
         compression = str(info.get("compression_mode") or "").lower()
-    except (yaml.YAMLError, UnicodeDecodeError, LookupError, TypeError, AttributeError) as error:
+    except (RecordingError, LookupError, TypeError, AttributeError) as error:
         why = str(error).partition("\n")[0]
         raise RecordingError(f"{metadata}: is not rosbag2's description of a recording ({why}); give its .mcap file") from error
     if compression == "message":
         raise RecordingError(f"{metadata}: compression_mode = message, want none or chunks of MCAP; {_convert(metadata.parent)}")
-    for file in files:
+    for name, file in zip(names, files, strict=True):
+        if name.is_absolute() or ".." in name.parts:
+            raise RecordingError(f"{metadata}: lists {name}; want files of its folder")
         if not file.is_file():
-            raise RecordingError(f"{metadata}: lists {file.name}, which is not there")
+            raise RecordingError(f"{metadata}: lists {name}, which is not there")
     if not files:
         raise RecordingError(f"{metadata}: lists no file")
     return files
@@ -231,7 +280,7 @@ class _Contents:
 
 def _contents(file: Path) -> _Contents:
     """Return what a file has, by its summary, or read from beginning to end if that is missing or incomplete."""
-    with file.open("rb") as stream:
+    with _opened(file) as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
         scenario = next((a.data.decode() for a in reader.iter_attachments() if a.name == SCENARIO), None)
@@ -273,6 +322,8 @@ def open_recording(path: Path) -> Recording:
             if not file.stat().st_size or error.filename is None:  # too short for its footer
                 raise _unreadable(file, where) from error
             raise RecordingError(f"{file}: {error.strerror}") from error
+        except RecordingError as error:
+            raise RecordingError(f"{file}: {error}") from error
         except BROKEN as error:
             raise _unreadable(file, where) from error
         stamps += contents.stamps
@@ -288,12 +339,23 @@ def open_recording(path: Path) -> Recording:
             if (earlier.name, earlier.encoding) != (kind.name, kind.encoding):
                 kind = RecordedType(f"{earlier.name} ({earlier.encoding}) and {kind.name} ({kind.encoding})")
             types[topic] = kind
-            if every := int(channel.metadata.get(KEPT_EVERY, 0)):
+            if every := kept_every_ms(channel):
                 thinned[topic] = every
             counts[topic] += contents.counts.get(channel.id, 0)
     if not stamps:
         raise RecordingError(f"{path}: holds no message")
     return Recording(path, files, types, dict(counts), thinned, min(stamps), max(stamps), scenario, frozenset(unindexed))
+
+
+def kept_every_ms(channel: Channel) -> int:
+    """Return the period in which one message of a channel was kept [ms]; 0 if all were, or if the text is not a number."""
+    text = channel.metadata.get(KEPT_EVERY, "")
+    return int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
+
+
+def _opened(path: Path) -> InputFile:
+    """Open a file of a recording; a single record may be twice as large as a chunk."""
+    return InputFile(path, RecordingError, 2 * bounds().chunk_mb * MB)
 
 
 def recorded_type(channel: Channel, schema: Schema) -> RecordedType:
@@ -306,5 +368,5 @@ def recorded_type(channel: Channel, schema: Schema) -> RecordedType:
 
 def complete_records(path: Path) -> Iterator[object]:
     """Yield schemas, channels and messages of an MCAP file, up to its end or to where it is truncated. Raises OSError."""
-    with path.open("rb") as stream, suppress(*BROKEN):
+    with _opened(path) as stream, suppress(*BROKEN):
         yield from StreamReader(stream, validate_crcs=True).records

@@ -14,6 +14,7 @@ import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
+from dataclasses import fields
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -21,6 +22,7 @@ from pydantic import Field, ValidationError, field_validator
 from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
 
 from palpate_errors import UserError
+from palpate_inputs import Bounds
 
 PREFIX = "PALPATE_"
 DOMAIN_MAX = 232
@@ -144,6 +146,12 @@ class Settings(BaseSettings):
     )
     fmu: Path | None = Field(default=None, description="The FMU that implements this service.")
     fmu_map: Path | None = Field(default=None, description="File that maps the FMU's variables to topics.")
+    bounds: str = Field(
+        default="",
+        description="Bounds of files and texts from outside, such as `text_kb=1024,chunk_mb=128`, separated by commas: "
+        + ", ".join(f"`{field.name}` ({field.default})" for field in fields(Bounds))
+        + ".",
+    )
     log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="Log level of a service.")
 
     @field_validator("listen", "connect", "absent", mode="before")
@@ -166,6 +174,12 @@ class Settings(BaseSettings):
             if len(pair) != 2 or not pair[0] or not pair[1].isdigit() or int(pair[1]) < 1:
                 raise ValueError(f"{'='.join(pair)!r} is not ROLE=MILLISECONDS")
         return {role: int(period) for role, period in pairs}
+
+    @field_validator("bounds")
+    @classmethod
+    def _bounds(cls, value: str) -> str:
+        Bounds.parse(value)
+        return value
 
     @classmethod
     def read(cls, environ: Mapping[str, str] | None = None) -> Self:
@@ -258,7 +272,7 @@ def allowed(name: str) -> str:
         return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
     most = "".join(f", up to {rule.le:g}" for rule in field.metadata if hasattr(rule, "le"))
     words: dict[Any, str] = {bool: "0, 1", Path: "a path", float: f"a number above 0{most}"}
-    return words.get(kinds[0], "text")
+    return "NAME=NUMBER, ..." if name == "bounds" else words.get(kinds[0], "text")
 
 
 def main() -> int:

@@ -21,6 +21,7 @@ from traceback import extract_tb
 from typing import Any
 
 from palpate_errors import UserError
+from palpate_inputs import read_text
 
 DISTRIBUTION = "palpate"
 USER_MODULE = "palpate_user_"
@@ -130,8 +131,8 @@ class PluginKind:
         if not path.is_file():
             raise self._error(str(path), f"there is no such file; {self.expected(str(path))}")
         try:
-            tree = ast.parse(path.read_text(encoding="utf-8"), str(path))
-        except (SyntaxError, ValueError) as error:
+            tree = ast.parse(read_text(path), str(path))
+        except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
             raise self._error(str(path), f"is not Python: {error}") from error
         if self.function not in _defined(tree):
             raise self._error(str(path), f"the file has no function {self.function}({self.arguments})")

@@ -7,7 +7,6 @@ start, a control message at least every half second, and the end.
 from __future__ import annotations
 
 import gc
-import json
 from dataclasses import dataclass
 from time import monotonic, sleep, time_ns
 from typing import Any
@@ -25,6 +24,7 @@ from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch, NodeTokens, gid
 from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
 from palpate_bus.wire.transport import Publisher, Subscription
+from palpate_inputs import parse_json
 
 
 @dataclass(frozen=True)
@@ -113,7 +113,7 @@ class LiveRig(Rig):
             sleep(TIMING.hello_s)
             for message in self._received_reports():
                 if message.state == ServiceReport.READY:
-                    missing = list(json.loads(message.detail or "{}").get("missing", []))
+                    missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
         self.ready = missing == []
         got = (
             "READY" if self.ready else "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
@@ -196,7 +196,7 @@ class LiveRig(Rig):
             received.append(message)
             if message.state == ServiceReport.FINISHED:
                 self.finished = True
-                self.facts = json.loads(message.detail or "{}")
+                self.facts = parse_json(message.detail or "{}", "the detail of palpate/report")
             elif message.state == ServiceReport.FAILED:
                 self.error = message.detail
         return received

@@ -8,7 +8,6 @@ are read from its recording.
 from __future__ import annotations
 
 import io
-import json
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
@@ -40,6 +39,7 @@ from palpate_bus.runs.run_name import in_use
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
 from palpate_errors import UserError
+from palpate_inputs import InputFile, read_arrays, read_json
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -216,12 +216,11 @@ def read_evidence(folder: Path) -> Evidence:
             f"{path} is not there: give the results folder of a run; after a loss of the conductor, with --recover"
         )
     try:
-        with path.open("rb") as stream:
+        with InputFile(path, EvidenceError) as stream:
             reader = make_reader(stream)
             attached = {a.name: a.data for a in reader.iter_attachments()}
             summary = reader.get_summary()
-        with np.load(io.BytesIO(attached[_TRUTH]), allow_pickle=False) as stored:
-            known = {name: stored[name] for name in stored.files}
+        known = read_arrays(attached[_TRUTH], path, EvidenceError)
         collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
     except KeyError as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
@@ -317,7 +316,7 @@ def _depth_seen(c: Collected, states: dict[str, Array]) -> Array:
 
 def read_figures(folder: Path) -> dict[str, Any]:
     """Return report.json of the run in `folder`, unchecked. Raises OSError or ValueError."""
-    report: dict[str, Any] = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+    report: dict[str, Any] = read_json(folder / "report.json")
     return report
 
 

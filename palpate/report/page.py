@@ -24,6 +24,7 @@ from palpate.report.files import write_text
 from palpate.report.results import clean_world_note, unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
+from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import ScenarioError, exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -42,12 +43,12 @@ def read_report(folder: Path) -> Report:
     """Return report.json of the run in `folder`. Raises EvidenceError that names file and fault."""
     path = folder / "report.json"
     try:
-        return Report.model_validate_json(path.read_text(encoding="utf-8"))
+        return Report.model_validate_json(read_text(path, EvidenceError))
     except FileNotFoundError as error:
         raise EvidenceError(
             f"{path} is not there: give the results folder of a run; for an interrupted run without a report, add --recover"
         ) from error
-    except (OSError, UnicodeDecodeError) as error:
+    except OSError as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error
     except ValidationError as error:
         wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
@@ -74,7 +75,7 @@ def sample_places(folder: Path) -> Array:
     """Return the xy positions of the samples in A [m], shape (n, 2), from samples.csv. Raises EvidenceError."""
     path = folder / "samples.csv"
     try:
-        _, *rows = path.read_text(encoding="utf-8").splitlines()
+        _, *rows = read_text(path).splitlines()
         return np.loadtxt(rows, delimiter=",", usecols=(1, 2), ndmin=2) if rows else np.empty((0, 2))
     except (OSError, ValueError) as error:
         raise EvidenceError(f"{path} cannot be read: {error}") from error

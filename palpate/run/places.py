@@ -25,6 +25,7 @@ from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.handover import ROLES
 from palpate_errors import UserError
+from palpate_inputs import read_json
 from palpate_plugins import is_file
 
 FILE = "places.json"
@@ -91,7 +92,7 @@ def write_places(out: Path, places: Mapping[str, ServicePlace]) -> None:
 def read_places(run: Run) -> dict[str, ServicePlace]:
     """Return the places of a run; none if it started all services itself and keeps no slot."""
     file = Path(run.out) / FILE
-    rows = json.loads(file.read_text(encoding="utf-8")) if file.is_file() else {}
+    rows = read_json(file) if file.is_file() else {}
     return {role: ServicePlace(tuple(row["command"]), row["environment"], row["awaited"]) for role, row in rows.items()}
 
 

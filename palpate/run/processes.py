@@ -17,8 +17,6 @@ from time import monotonic
 from types import TracebackType
 from typing import IO, Any, Self
 
-import yaml
-
 from palpate.apart import ended
 from palpate.environment import FIXED, given
 from palpate.run.forks import Child, Forks
@@ -35,6 +33,7 @@ from palpate_bus.wire.rmw import make_key
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions, close_session, free_port, mesh, open_session
 from palpate_conductor.outcome import Timing
 from palpate_errors import UserError
+from palpate_inputs import read_yaml
 from palpate_models.scenario.load import view_of
 
 
@@ -146,8 +145,8 @@ def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path]
 
 def _services(path: Path) -> dict[str, Any]:
     try:
-        document = yaml.safe_load(path.read_text(encoding="utf-8"))
-    except (OSError, yaml.YAMLError) as error:
+        document = read_yaml(path)
+    except OSError as error:
         raise UserError(f"{path}: cannot be read: {error}") from error
     services = document.get("services") if isinstance(document, dict) else None
     if not isinstance(services, dict):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from collections.abc import Sequence
 from pathlib import Path
-from zipfile import ZipFile, is_zipfile
 
 from palpate.apart import guarded
 from palpate.run.options import Record
@@ -118,17 +117,14 @@ def _check_fmu(scenario: Scenario) -> None:
     for field, given in (("fmu", scenario.tissue.fmu), ("fmu_map", scenario.tissue.fmu_map)):
         if given and not Path(given).is_file():
             raise PluginError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
-    if (given := scenario.tissue.fmu) and not _is_fmu(Path(given)):
-        raise PluginError(
-            f"{scenario.name}: tissue.fmu = {given!r}: this is not an FMU, which is a zip archive with modelDescription.xml in it"
-        )
+    if given := scenario.tissue.fmu:
+        from palpate_fmu.reading import FmuError, opened_fmu  # noqa: PLC0415 - images of other roles lack its libraries
 
-
-def _is_fmu(path: Path) -> bool:
-    if not is_zipfile(path):
-        return False
-    with ZipFile(path) as archive:
-        return "modelDescription.xml" in archive.namelist()
+        try:
+            with opened_fmu(Path(given)):
+                pass
+        except FmuError as error:
+            raise PluginError(f"{scenario.name}: tissue.fmu = {given!r}: {error}") from error
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:

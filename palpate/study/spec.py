@@ -21,9 +21,10 @@ from pydantic import Field, ValidationError, model_validator
 
 from palpate.run.roles import OBSERVERS, WORKERS
 from palpate_errors import UserError
+from palpate_inputs import parse_yaml, read_text
 from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
 from palpate_models.scenario.errors import Errors, Level, table
-from palpate_models.scenario.load import ScenarioError, explain, parse_yaml
+from palpate_models.scenario.load import explain
 from palpate_models.section import Length, Section
 
 Split = Literal["tune", "test"]
@@ -181,11 +182,8 @@ def load_study(source: str) -> Study:
         path = Path(source)
         if not path.is_file():
             raise StudyError(f"{source}: no such study; known are {', '.join(study_names())}, or give the path of a YAML file")
-    try:
-        text = path.read_text(encoding="utf-8")
-        raw = parse_yaml(text, source)
-    except (ScenarioError, UnicodeDecodeError) as error:
-        raise StudyError(str(error)) from error
+    text = read_text(path, StudyError)
+    raw = parse_yaml(text, source, StudyError)
     if not isinstance(raw, Mapping):
         raise StudyError(f"{source}: want a mapping of fields, not {type(raw).__name__}")
     return checked_study({"name": path.stem, **raw}, source, path.parent, text)

@@ -14,6 +14,8 @@ from pathlib import Path
 from typing import Final
 from uuid import uuid4
 
+from palpate_inputs import read_json
+
 FILE: Final = "run.json"
 LOCK: Final = "run.lock"
 """File in a results folder that the run locks; it contains the process id. The kernel releases the lock at the end."""
@@ -42,5 +44,5 @@ def in_use(folder: Path) -> bool:
 def run_of(folder: Path) -> str:
     """Return the name of the run of a results folder; empty if it has none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        return str(json.loads((folder / FILE).read_text(encoding="utf-8"))["run"])
+        return str(read_json(folder / FILE)["run"])
     return ""

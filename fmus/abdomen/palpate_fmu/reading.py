@@ -8,19 +8,23 @@ from __future__ import annotations
 import re
 import tempfile
 import zipfile
-from collections.abc import Collection, Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from math import prod
 from pathlib import Path
 from typing import Any
 from xml.etree import ElementTree as ET
+from xml.parsers import expat
 
 from palpate_errors import UserError
+from palpate_inputs import MB, InputFile, bounds, brief, checked_archive, over
 
 DESCRIPTION = "modelDescription.xml"
 _VERSION = re.compile(r"2\.0|3\.\d+")
 _ELEMENT = re.compile(r"^(.*?)((?:\[ *-?\d+(?: *, *-?\d+)* *\])+)$")
 _INDEX = re.compile(r"-?\d+")
+NAME_CHARACTERS = 2000
 _NAMED = 30
 """Variables that a message lists."""
 
@@ -55,18 +59,22 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
     """Return FMPy's model description and the validator's findings. Raises FmuError if it is not an FMU, or of FMI 1.0."""
     import fmpy  # noqa: PLC0415  (slow to import)
 
-    if not path.is_file():
-        raise FmuError(f"{path}: no such file")
-    try:
-        with zipfile.ZipFile(path) as archive:
-            root = ET.fromstring(archive.read(DESCRIPTION))
-    except Exception as error:  # a damaged archive raises many kinds
-        raise FmuError(f"{path}: not an FMU: {error}") from error
+    with opened_fmu(path) as archive:
+        try:
+            root = ET.fromstring(_checked_xml(archive))
+        except FmuError as error:
+            raise FmuError(f"{path}: {error}") from error
+        except Exception as error:  # a damaged archive raises many kinds
+            raise FmuError(f"{path}: not an FMU: {error}") from error
     if root.tag != "fmiModelDescription":
         raise FmuError(f"{path}: not an FMU: the root of its {DESCRIPTION} is {root.tag}")
     version = root.get("fmiVersion", "")
     if not _VERSION.fullmatch(version):
         raise FmuError(f"{path}: FMI {version or 'of no version'}; want 2.0 or 3.0")
+    for element in root:
+        name = element.get("modelIdentifier")
+        if name is not None and not (name.isascii() and name.isidentifier()):  # FMI: it names the library and its functions
+            raise FmuError(f"{path}: modelIdentifier = {brief(name)}: want an identifier of C")
     try:
         return fmpy.read_model_description(str(path)), ()
     except Exception as error:
@@ -79,6 +87,39 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
             return fmpy.read_model_description(str(file), validate=False), findings
     except Exception as error:
         raise FmuError(f"{path}: its {DESCRIPTION} cannot be read: {error}; {'; '.join(findings)}") from error
+
+
+@contextmanager
+def opened_fmu(path: Path) -> Iterator[zipfile.ZipFile]:
+    """Open an FMU whose files are within the bounds and may be unpacked. Raises FmuError."""
+    if not path.is_file():
+        raise FmuError(f"{path}: no such file")
+    with ExitStack() as stack:
+        try:
+            file = stack.enter_context(InputFile(path, FmuError, bounds().document_mb * MB))
+            archive = checked_archive(stack.enter_context(zipfile.ZipFile(file)), path, FmuError)
+            if DESCRIPTION not in archive.namelist():
+                raise FmuError(f"{path}: not an FMU: it has no {DESCRIPTION}")
+        except FmuError:
+            raise
+        except Exception as error:  # a damaged archive raises many kinds
+            raise FmuError(f"{path}: not an FMU: {error}") from error
+        yield archive
+
+
+def _checked_xml(archive: zipfile.ZipFile) -> bytes:
+    """Return the model description. Raises FmuError if it is too large, or has entities, which may name other files."""
+    if archive.getinfo(DESCRIPTION).file_size > bounds().document_mb * MB:
+        raise over(DESCRIPTION, f"{archive.getinfo(DESCRIPTION).file_size / MB:.0f} MB", "document_mb", FmuError)
+    content = archive.read(DESCRIPTION)
+    parser = expat.ParserCreate()
+
+    def refuse(*_: object) -> None:
+        raise FmuError(f"its {DESCRIPTION} has a document type; want none")
+
+    parser.StartDoctypeDeclHandler = refuse
+    parser.Parse(content, True)
+    return content
 
 
 def _simplify(root: ET.Element) -> None:
@@ -106,7 +147,7 @@ def _simplify(root: ET.Element) -> None:
 
 def binary_folders(path: Path) -> tuple[str, ...]:
     """Return the platforms for which an FMU has binaries, as its folders name them."""
-    with zipfile.ZipFile(path) as archive:
+    with opened_fmu(path) as archive:
         parts = [name.split("/") for name in archive.namelist()]
     return tuple(sorted({part[1] for part in parts if part[0] == "binaries" and len(part) > 2 and part[-1]}))
 
@@ -144,11 +185,18 @@ def _shape(indices: Collection[tuple[int, ...]]) -> tuple[int, ...] | None:
 
 
 def read_scalars(description: Any) -> dict[str, FmuVariable]:
-    """Return the variables as the FMU has them: an array of FMI 2.0 is one scalar per element."""
+    """Return the variables as the FMU has them: an array of FMI 2.0 is one scalar per element. Raises FmuError."""
     by_reference = {v.valueReference: v for v in description.modelVariables}
     found = {}
     for v in description.modelVariables:
-        extents = [int(by_reference[d.valueReference].start if d.start is None else d.start) for d in v.dimensions or ()]
+        try:
+            extents = [int(by_reference[d.valueReference].start if d.start is None else d.start) for d in v.dimensions or ()]
+        except (KeyError, TypeError, ValueError) as error:
+            raise FmuError(f"variable {brief(v.name)}: the size of a dimension is not a number: {error}") from error
+        if not 0 <= prod(extents) <= bounds().elements or min(extents, default=0) < 0:
+            raise over(f"variable {brief(v.name)}", f"dimensions {brief(extents)}", "elements", FmuError)
+        if len(v.name) > NAME_CHARACTERS:
+            raise FmuError(f"variable {brief(v.name)}: a name of {len(v.name)} characters; allowed are {NAME_CHARACTERS}")
         unit = v.unit or (v.declaredType.unit if v.declaredType else None)
         rest = (v.causality, v.variability, v.type, unit, v.min, v.max, v.description)
         found[v.name] = FmuVariable(v.name, (v.valueReference,), tuple(extents), *rest)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -10,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_errors import UserError
+from palpate_inputs import bounds, over, read_bytes
 from palpate_models.numerics.frames import Array
 
 if TYPE_CHECKING:
@@ -39,12 +41,17 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
         raise MeshError(f"want a file in {', '.join(SUFFIXES)}")
     if not path.is_file():
         raise MeshError("no such file")
+    content = read_bytes(path, MeshError)
     try:
         if path.suffix.lower() == ".stl":
-            _check_stl(path.read_bytes())
+            _check_stl(content)
         elif path.suffix.lower() == ".obj":
-            _check_obj(path.read_text(errors="replace"))
-        loaded = trimesh.load_mesh(path, process=False, skip_materials=True)
+            _check_obj(content.decode(errors="replace"))
+        else:
+            _check_counts(
+                *map(int, re.findall(rb"^element\s+\w+\s+(\d{1,18})", content.partition(b"end_header")[0], re.MULTILINE))
+            )
+        loaded = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix.lower()[1:], process=False, skip_materials=True)
         _check_ply(loaded)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
         triangles = np.array(loaded.faces, dtype=np.int32).reshape(-1, 3)
@@ -52,8 +59,14 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
         raise
     except Exception as error:
         raise MeshError(f"cannot be read as {path.suffix.lower()}, it is damaged or not whole: {error}") from error
+    _check_counts(len(vertices), len(triangles))
     _check_indices(triangles, 0, len(vertices) - 1)
     return vertices, triangles
+
+
+def _check_counts(*counts: int) -> None:
+    if max(counts, default=0) > bounds().elements:
+        raise over("the mesh", f"{max(counts)} vertices or faces", "elements", MeshError)
 
 
 def _check_indices(faces: IntArray, first: int, last: int) -> None:
@@ -79,11 +92,12 @@ def _check_ply(loaded: trimesh.Trimesh) -> None:
 def _check_stl(content: bytes) -> None:
     """Raise MeshError if an STL file ends early."""
     if content[:5] == b"solid" and b"facet" in content[:1000]:
-        begun, ended = len(re.findall(rb"^\s*facet\s", content, re.MULTILINE)), content.count(b"endfacet")
+        begun, ended = len(re.findall(rb"^[ \t]*facet\s", content, re.MULTILINE)), content.count(b"endfacet")
         if begun != ended or b"endsolid" not in content[-1000:]:
             raise MeshError(f"{begun} triangles begin and {ended} end, and it has no endsolid: the file is not whole")
         return
     promised = int.from_bytes(content[80:STL_HEADER_BYTES], "little")
+    _check_counts(promised)
     room = max(len(content) - STL_HEADER_BYTES, 0)
     if room != promised * STL_TRIANGLE_BYTES:
         there = room / STL_TRIANGLE_BYTES
@@ -92,8 +106,10 @@ def _check_stl(content: bytes) -> None:
 
 def _check_obj(content: str) -> None:
     """Raise MeshError if a face of an OBJ file names vertices that are not there: they count from 1, or from -1 backwards."""
-    vertices = len(re.findall(r"^\s*v\s", content, re.MULTILINE))
-    for number, face in enumerate(re.findall(r"^\s*f\s(.*)$", content, re.MULTILINE)):
+    vertices = len(re.findall(r"^[ \t]*v\s", content, re.MULTILINE))
+    faces = re.findall(r"^[ \t]*f[ \t](.*)$", content, re.MULTILINE)
+    _check_counts(vertices, len(faces))
+    for number, face in enumerate(faces):
         corners = [int(corner.split("/")[0]) for corner in face.split("#")[0].split()]
         if len(corners) < 3:
             raise MeshError(f"face {number} names {len(corners)} vertices, want at least 3: the file is not whole")

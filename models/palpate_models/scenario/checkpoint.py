@@ -5,12 +5,12 @@ from __future__ import annotations
 import io
 from dataclasses import dataclass
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate_errors import UserError
+from palpate_inputs import read_arrays
 from palpate_models.numerics.frames import Array
 
 
@@ -74,10 +74,17 @@ def read_checkpoint(path: Path | None) -> Checkpoint | None:
     """Return the checkpoint in a file; None without a path. Raises CheckpointError."""
     if path is None:
         return None
+    held = dict(read_arrays(path, path, CheckpointError))
     try:
-        with np.load(path, allow_pickle=False) as stored:
-            held = {name: stored[name] for name in stored.files}
         left, surface, strokes = (held.pop(name) for name in ("left", "surface", "strokes"))
+        rows = len(held["time"])
+        wanted: dict[str, tuple[int, ...]] = {
+            name: (rows, 3) if name in ("position", "normal", "velocity") else (rows,) for name in held
+        }
+        wanted |= {"left": (len(left), 2), "surface": (len(surface), 3), "strokes": ()}
+        for name, array in {**held, "left": left, "surface": surface, "strokes": strokes}.items():
+            if array.shape != wanted[name] or array.dtype.kind not in "bif" or not np.isfinite(array).all():
+                raise ValueError(f"{name}: want finite numbers of shape {wanted[name]}, got {array.dtype} {array.shape}")
         return Checkpoint(FeltSoFar(**held), left, surface, int(strokes))
-    except (OSError, ValueError, KeyError, TypeError, BadZipFile) as error:
+    except (ValueError, KeyError, TypeError) as error:
         raise CheckpointError(f"{path}: not a checkpoint of this version: {error}") from error

@@ -16,6 +16,7 @@ import yaml
 from pydantic import BaseModel, ValidationError
 
 from palpate_errors import UserError
+from palpate_inputs import brief, parse_yaml, read_text
 from palpate_models.numerics.frames import matrix, pose_of
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import ExamInput, PlantInput, Scenario
@@ -31,7 +32,7 @@ def did_you_mean(word: str, known: Collection[str]) -> str:
 def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel], error: ValidationError) -> str:
     """Return a line per invalid value of the scenario `name`, given as YAML in `text` and changed by `a.b=c` settings."""
     lines = []
-    for item in error.errors():
+    for item in error.errors()[:_EXPLAINED]:
         field = [str(part) for part in item["loc"]]
         what = item["msg"].removeprefix("Value error, ").replace("Input should be ", "want ")
         if item["type"] == "extra_forbidden":
@@ -48,10 +49,12 @@ def explain(name: str, text: str, settings: Sequence[str], model: type[BaseModel
         elif item["type"] in _NUMBERS and (unit := _unit(field)):
             what += f" (in {unit})"
         path = ".".join(field) or "scenario"
-        lines.append(f"{_origin(name, text, settings, field)}: {path} = {item['input']!r}: {what}")
+        lines.append(f"{_origin(name, text, settings, field)}: {path} = {brief(item['input'])}: {what}")
     return "\n".join(lines)
 
 
+_EXPLAINED = 20
+"""Invalid values that a message lists."""
 _NO_SECTION = frozenset(("model_type", "model_attributes_type", "dict_type"))
 """pydantic's error types for a value in place of a section."""
 
@@ -117,29 +120,10 @@ _VIEWS: Mapping[str, View] = {
     "robot": "plant",
     "camera": "plant",
 }
-_MERGE = "tag:yaml.org,2002:merge"
 
 
 class ScenarioError(UserError):
     """A scenario that cannot be used. The message names file, field, value and what is allowed."""
-
-
-class _TwiceError(ValueError):
-    """A mapping has a field twice."""
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML loader that rejects duplicate fields; PyYAML would silently use the last one."""
-
-    def construct_mapping(self, node: yaml.MappingNode, deep: bool = False) -> dict[Any, Any]:
-        """Return the mapping. Raises _TwiceError that names line and field."""
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.tag != _MERGE:
-                if key.value in seen:
-                    raise _TwiceError(f"line {key.start_mark.line + 1}: field {key.value} is given twice")
-                seen.add(key.value)
-        return super().construct_mapping(node, deep)
 
 
 def scenario_names() -> tuple[str, ...]:
@@ -163,10 +147,7 @@ def _read(source: str) -> tuple[str, str]:
             f"{source}: no such scenario; known are {', '.join(scenario_names())}, or give the path of a YAML file"
             f"{did_you_mean(source, scenario_names())}"
         )
-    try:
-        return path.read_text(encoding="utf-8"), source
-    except UnicodeDecodeError as error:
-        raise ScenarioError(f"{source}: not UTF-8: {error.reason} at byte {error.start}") from error
+    return read_text(path, ScenarioError), source
 
 
 def _override(raw: dict[str, Any], setting: str) -> None:
@@ -180,7 +161,7 @@ def _override(raw: dict[str, Any], setting: str) -> None:
         node = node[_index(node, parent, setting)] if isinstance(node, list) else node.setdefault(parent, {})
         if not isinstance(node, dict | list):
             raise ScenarioError(f"--set {setting}: {parent!r} is a value, not a section")
-    node[_index(node, last, setting) if isinstance(node, list) else last] = parse_yaml(value, f"--set {setting}")
+    node[_index(node, last, setting) if isinstance(node, list) else last] = parse_yaml(value, f"--set {setting}", ScenarioError)
 
 
 def _index(items: list[Any], word: str, setting: str) -> int:
@@ -190,25 +171,10 @@ def _index(items: list[Any], word: str, setting: str) -> int:
     return int(word)
 
 
-def parse_yaml(text: str, name: str) -> Any:
-    """Return YAML as Python values. Raises ScenarioError that names the file `name` and the problem."""
-    try:
-        return yaml.load(text, _Loader)
-    except _TwiceError as error:
-        raise ScenarioError(f"{name}: {error}") from error
-    except yaml.MarkedYAMLError as error:
-        mark = error.problem_mark or error.context_mark
-        where = "" if mark is None else f", line {mark.line + 1}, column {mark.column + 1}"
-        why = ", ".join(part for part in (error.problem, error.context) if part)
-        raise ScenarioError(f"{name}{where}: not YAML: {why}") from error
-    except (yaml.YAMLError, ValueError, RecursionError) as error:  # ValueError for 2001-13-45, RecursionError for deep nesting
-        raise ScenarioError(f"{name}: not YAML: {error}") from error
-
-
 def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = None) -> Scenario:
     """Return a scenario by name or YAML file, with overrides `a.b=c` applied in order. Raises ScenarioError."""
     text, name = _read(source)
-    raw = parse_yaml(text, name) or {}
+    raw = parse_yaml(text, name, ScenarioError) or {}
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)

@@ -11,15 +11,17 @@ from __future__ import annotations
 import sys
 from collections import Counter, deque
 from collections.abc import Collection, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
-import yaml
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
 
-from palpate_bus.recordings import KEPT_EVERY, RecordedMessage, RecordedType, Recording, complete_records, recorded_type
+from palpate_bus.recordings import RecordedMessage, RecordedType, Recording, complete_records, kept_every_ms, recorded_type
+from palpate_inputs import InputError, parse_yaml
 from palpate_recorder.bag import BagWriter, Channel
 
 
@@ -118,16 +120,24 @@ def _number(path: Path) -> tuple[int, str]:
 
 def _channel(record: ChannelRecord, schema: Schema) -> Channel:
     kind = recorded_type(record, schema)
-    profiles = yaml.safe_load(record.metadata.get("offered_qos_profiles", "")) or [{}]
+    profile = _offered(record)
     return Channel(
         topic=f"/{record.topic.removeprefix('/')}",
         type=kind.name,
         schema=kind.definition,
         type_hash=kind.type_hash,
-        depth=profiles[0].get("depth", 1),
-        transient_local=profiles[0].get("durability") in ("transient_local", 1),  # 1: as before ROS 2 Jazzy
-        kept_every_ms=int(record.metadata.get(KEPT_EVERY, 0)),
+        depth=depth if isinstance(depth := profile.get("depth"), int) else 1,
+        transient_local=profile.get("durability") in ("transient_local", 1),  # 1: as before ROS 2 Jazzy
+        kept_every_ms=kept_every_ms(record),
     )
+
+
+def _offered(record: ChannelRecord) -> dict[str, Any]:
+    """Return the first quality of service that a channel was offered with; empty if that is not known."""
+    with suppress(InputError, LookupError, TypeError):
+        profile = parse_yaml(record.metadata.get("offered_qos_profiles", ""), record.topic)[0]
+        return profile if isinstance(profile, dict) else {}
+    return {}
 
 
 if __name__ == "__main__":

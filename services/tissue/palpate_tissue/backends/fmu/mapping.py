@@ -15,11 +15,11 @@ from __future__ import annotations
 
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
-import yaml
 from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError, model_validator
 
+from palpate_inputs import read_yaml
 from palpate_plugins import PluginError
 
 
@@ -86,9 +86,8 @@ class FmuMap(BaseModel):
 def load_map(path: Path) -> FmuMap:
     """Load a map from a YAML file. Raises MapError with the faulty entry."""
     try:
-        raw: Any = yaml.safe_load(path.read_text(encoding="utf-8"))
-        return FmuMap.model_validate(raw)
-    except (OSError, yaml.YAMLError) as error:
+        return FmuMap.model_validate(read_yaml(path, MapError))
+    except OSError as error:
         raise MapError(f"{path}: {error}") from error
     except ValidationError as error:
         first = error.errors()[0]

@@ -1,0 +1,191 @@
+"""Input that means harm: each kind is refused with one line, quickly and in little memory."""
+
+import io
+import os
+import stat
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from time import process_time
+
+import numpy as np
+import pytest
+import zstandard
+
+from palpate_bus.recordings import RecordingError, open_recording
+from palpate_errors import UserError
+from palpate_fmu.reading import FmuError, read_description
+from palpate_inputs import Bounds, InputError, InputFile, bounds, brief, parse_json, parse_yaml, printable, read_arrays
+from palpate_models.patient.mesh_file import MeshError, read_mesh
+from palpate_models.scenario.load import ScenarioError, load_scenario
+
+ALIASES = "a0: &a0 [1]\n" + "".join(f"a{i}: &a{i} [{','.join(9 * [f'*a{i - 1}'])}]\n" for i in range(1, 9))
+MAGIC = b"\x89MCAP0\r\n"
+
+
+@pytest.mark.parametrize(
+    ("text", "why"),
+    [
+        (ALIASES, "with its aliases"),
+        ("a: &a [*a]", "with its aliases"),
+        ("a: " + 200_000 * "[", "nested more than 50"),
+        ("a: 1" + 200_000 * ":1", "a number of"),
+        ("a: 0x" + 5000 * "f", "a number of"),
+        ("a: !!timestamp x", "does not suit its tag"),
+        ("a: 1\na: 2", "given twice"),
+        ("a: " + 600_000 * "x", "characters; allowed are 512"),
+    ],
+)
+def test_yaml_beyond_its_bounds_is_refused_soon(text: str, why: str) -> None:
+    begin = process_time()
+    with pytest.raises(InputError, match=f"^here.*{why}"):
+        parse_yaml(text, "here")
+    assert process_time() - begin < 2.0
+
+
+def _chunk(compression: bytes, stated: int, data: bytes) -> bytes:
+    chunk = struct.pack("<QQQII", 0, 1, stated, 0, len(compression)) + compression + struct.pack("<Q", len(data)) + data
+    return MAGIC + _record(1, bytes(8)) + _record(6, chunk) + _record(15, bytes(4)) + _record(2, bytes(20)) + MAGIC
+
+
+def _record(opcode: int, data: bytes) -> bytes:
+    return struct.pack("<BQ", opcode, len(data)) + data
+
+
+def _lz4(size: int) -> bytes:
+    from lz4.frame import compress
+
+    return bytes(compress(bytes(size)))
+
+
+@pytest.mark.parametrize(
+    "content",
+    [
+        _chunk(b"zstd", 8 << 30, b"\x28\xb5\x2f\xfd\xe0" + struct.pack("<Q", 8 << 30) + b"\1\0\0"),
+        _chunk(b"zstd", 100, zstandard.compress(bytes(64 << 20))),
+        _chunk(b"lz4", 100, _lz4(64 << 20)),
+    ],
+    ids=["states 8 GiB", "zstd of 64 MiB", "lz4 of 64 MiB"],
+)
+def test_a_chunk_that_decompresses_to_too_much_is_refused(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "a.mcap"
+    file.write_bytes(content)
+    with pytest.raises(RecordingError, match=r"a\.mcap.* MB decompressed; allowed are 32"):
+        open_recording(file)
+
+
+DESCRIPTION = (
+    '<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="g"><CoSimulation modelIdentifier="m"/>'
+    "<ModelVariables/><ModelStructure/></fmiModelDescription>"
+)
+
+
+def _fmu(name: str, mode: int = 0, size: int = 1, description: str = DESCRIPTION) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("modelDescription.xml", description)
+        entry = zipfile.ZipInfo(name)
+        entry.external_attr = mode << 16
+        archive.writestr(entry, bytes(size), zipfile.ZIP_DEFLATED)
+    return file.getvalue()
+
+
+@pytest.mark.parametrize(
+    ("content", "why"),
+    [
+        (_fmu("/tmp/x"), "relative names"),
+        (_fmu("resources/../../x"), "relative names"),
+        (_fmu("C:x"), "relative names"),
+        (_fmu("resources/x", stat.S_IFLNK), "a link"),
+        (_fmu("resources/x", size=3 << 20), "3 MB unpacked; allowed are 2"),
+        (_fmu("x", description=DESCRIPTION.replace('"m"/>', '"../../x"/>')), "an identifier of C"),
+        (_fmu("x", description=DESCRIPTION.replace("?>", "?><!DOCTYPE a []>")), "a document type"),
+        (b"PK", "not an FMU"),
+    ],
+)
+def test_an_fmu_that_reaches_out_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, content: bytes, why: str) -> None:
+    monkeypatch.setenv("PALPATE_BOUNDS", "unpacked_mb=2")
+    bounds.cache_clear()
+    file = tmp_path / "a.fmu"
+    file.write_bytes(content)
+    try:
+        with pytest.raises(FmuError, match=why):
+            read_description(file)
+    finally:
+        bounds.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "why"),
+    [
+        ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n", "allowed are 2000000"),
+        ("a.stl", bytes(80) + b"\xff\xff\xff\xff", "allowed are 2000000"),
+        ("a.obj", 300_000 * b"\n" + b"f 1 2 3\n", "names vertex 1"),
+    ],
+)
+def test_a_mesh_that_promises_too_much_is_refused_soon(tmp_path: Path, name: str, content: bytes, why: str) -> None:
+    (tmp_path / name).write_bytes(content)
+    begin = process_time()
+    with pytest.raises(MeshError, match=why):
+        read_mesh(tmp_path / name)
+    assert process_time() - begin < 2.0
+
+
+def _open(path: Path) -> object:
+    return InputFile(path)
+
+
+@pytest.mark.parametrize("reader", [_open, open_recording], ids=["any", "recording"])
+def test_a_pipe_is_refused_without_waiting_for_its_writer(tmp_path: Path, reader: Callable[[Path], object]) -> None:
+    os.mkfifo(tmp_path / "a.mcap")
+    with pytest.raises(UserError, match="is a pipe"):
+        reader(tmp_path / "a.mcap" if reader is _open else tmp_path)
+
+
+def test_a_read_allocates_no_more_than_the_file_has(tmp_path: Path) -> None:
+    (tmp_path / "a").write_bytes(b"abc")
+    with InputFile(tmp_path / "a") as file:
+        assert file.read(1 << 60) == b"abc"
+    with InputFile(tmp_path / "a", most=2) as file, pytest.raises(InputError, match="3 bytes in one piece; allowed are 2"):
+        file.read()
+
+
+def test_arrays_with_objects_or_without_data_are_refused() -> None:
+    for array in (np.array([{}], dtype=object), None):
+        file = io.BytesIO()
+        if array is None:
+            header = (
+                b"\x93NUMPY\1\0"
+                + struct.pack("<H", 70)
+                + b"{'descr': '<f8', 'fortran_order': False, 'shape': (99999999999,), }".ljust(69)
+                + b"\n"
+            )
+            with zipfile.ZipFile(file, "w") as archive:
+                archive.writestr("a.npy", header)
+        else:
+            np.savez(file, a=array)
+        with pytest.raises(InputError, match="not an npz file"):
+            read_arrays(file.getvalue(), "here")
+
+
+def test_a_setting_and_a_value_of_any_size_give_a_short_line(tmp_path: Path) -> None:
+    file = tmp_path / "a.yaml"
+    file.write_text("seed: [" + 50_000 * "1," + "]\n")
+    with pytest.raises(ScenarioError) as refused:
+        load_scenario(str(file))
+    assert len(str(refused.value)) < 400
+    with pytest.raises(InputError, match="not JSON"):
+        parse_json(200_000 * "[", "here")
+    assert len(brief("x" * 9999)) < 200
+
+
+def test_text_for_a_terminal_has_no_commands() -> None:
+    assert printable("a\x1b[31m\x07\x9b1m\u202eb\tc\n\ud800") == "a\\x1b[31m\\x07\\x9b1m\\u202eb\tc\n\\ud800"
+
+
+def test_bounds_are_set_by_name() -> None:
+    assert Bounds.parse("depth=7, chunk_mb=128") == Bounds(depth=7, chunk_mb=128)
+    for wrong in ("depth", "depth=0", "deep=7", "depth=1e3"):
+        with pytest.raises(ValueError, match="is not NAME=NUMBER"):
+            Bounds.parse(wrong)
