@@ -92,7 +92,9 @@ class Settings(BaseSettings):
         description="File with the run's key, mode 0600. Topics marked as tagged in the contract carry a tag; "
         "messages without a valid tag are dropped.",
     )
-    tags: bool | None = Field(default=None, description="Creation of a run key by `palpate run` for its processes (default: on).")
+    tags: bool | None = Field(
+        default=None, description="Tags on messages (default: on). Off, an operator's release and end still need one."
+    )
     zenoh_config: Path | None = Field(
         default=None,
         description="A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect.",

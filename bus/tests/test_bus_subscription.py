@@ -6,7 +6,7 @@ import threading
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from time import sleep
+from time import sleep, time_ns
 from typing import Any
 
 import pytest
@@ -14,10 +14,12 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from palpate_bus.contract import contract
+from palpate_bus.messages import OperatorRequest, codec
+from palpate_bus.messages.stamps import header
 from palpate_bus.settings import BusConfigError
 from palpate_bus.wire import rmw
 from palpate_bus.wire.rmw import KEY_SIZE, TAG_SIZE, AttachmentWriter, Tagger, make_key, read_key
-from palpate_bus.wire.transport import HELLO, Subscription
+from palpate_bus.wire.transport import HELLO, Subscription, TagCheck
 
 KEY = bytes(range(KEY_SIZE))
 ATTACHMENT = rmw.AttachmentWriter(b"g" * 16).pack(7, 8)
@@ -65,9 +67,15 @@ def test_a_key_is_readable_to_its_owner_only(tmp_path: Path) -> None:
 
 def test_messages_that_move_the_arm_or_conduct_are_tagged() -> None:
     rules = contract()
-    for name in ("control/joint_torque", "planning/setpoint", "supervisor/state", "palpate/control", "palpate/report/robot"):
+    for name in (
+        "control/joint_torque",
+        "planning/setpoint",
+        "supervisor/state",
+        "palpate/control",
+        "palpate/report/robot",
+        "operator/request",
+    ):
         assert rules.tagged(name)
-    assert not rules.tagged("operator/request"), "anyone may ask for a stop, ROS 2 too"
     assert not rules.tagged("palpate/record/robot")
     assert not rules.tagged("nothing")
 
@@ -156,3 +164,16 @@ def test_dropped_messages_do_not_extend_the_timeout(wire: Wire) -> None:
     assert wire.subscription.get(0.1) is None
     assert wire.subscription.foreign < 50
     meddler.join()
+
+
+@pytest.mark.parametrize(("request_", "obeyed"), [("STOP", True), ("SOFT_STOP", True), ("RELEASE", False), ("END", False)])
+def test_only_holders_of_the_key_move_the_arm_and_anyone_stops_it(request_: str, obeyed: bool) -> None:
+    topic = contract().topics["operator/request"]
+    tagger = Tagger(KEY, "0/a")
+    check = TagCheck(tagger, topic)
+    payload = codec.encode(OperatorRequest(header(0), getattr(OperatorRequest, request_), ""), topic.type)
+    tagged = ATTACHMENT + tagger.tag(ATTACHMENT, payload)
+    now = time_ns()
+    assert check.accepts(ATTACHMENT, now, payload) is obeyed
+    assert check.accepts(tagged, now, payload)
+    assert check.accepts(tagged, now, payload) is obeyed, "replayed"

@@ -186,7 +186,7 @@ def _operator(run: Run, bus: zenoh.Session) -> AbstractContextManager[zenoh.Sess
 
 def follow(run: Run, service: DashboardService, report: Callable[[str], None], keys: OperatorKeys) -> str:
     """Draw `run` until it ends, and forward operator `keys`. Returns how the run ended."""
-    rules = contract()
+    rules, key = contract(), run.secret()
     with session(run.options()) as bus, _operator(run, bus) as operator:
         member = Member(bus, f"viewer_{os.getpid()}", rules, run.domain)
         control = member.internal_subscription("palpate/control", "palpation_msgs/msg/RunControl")
@@ -203,7 +203,7 @@ def follow(run: Run, service: DashboardService, report: Callable[[str], None], k
             if not observed.drain_and_step():
                 sleep(LIMITS.idle_s)
             for word in keys.pressed():
-                report(order(operator, run.domain, word, "a key of palpate dashboard"))
+                report(order(operator, run.domain, word, "a key of palpate dashboard", key))
             while (sample := control.get(0)) is not None:
                 message = decode(sample.payload)
                 if message.command == RunControl.END:

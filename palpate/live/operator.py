@@ -12,7 +12,7 @@ from rich.markup import escape
 
 from palpate.console import EXIT_FAILED, say
 from palpate.live.bus import ChosenRun
-from palpate_bus.runs.announcement import find, find_all
+from palpate_bus.runs.announcement import BusTarget, find, find_all
 from palpate_bus.runs.operator import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
 from palpate_errors import PalpateError
@@ -68,7 +68,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
     for bus in find_all(chosen=name) if everyone else [find(chosen=name)]:
         try:
             with session(bus.operator()) as joined:
-                answer, after_ms = _answer(joined, bus.domain, word, reason, ms)
+                answer, after_ms = _answer(joined, bus, word, reason, ms)
         except PalpateError as error:
             failed = True
             say(f"{bus.title}: {error}")
@@ -79,12 +79,12 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
         raise typer.Exit(EXIT_FAILED)
 
 
-def _answer(joined: zenoh.Session, domain: int, word: str, reason: str, ms: int) -> tuple[str, float]:
+def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: int) -> tuple[str, float]:
     """Return the answer to a request; asks again until the run is discovered, since links to its peers come up one by one."""
-    begin = monotonic()
+    begin, key = monotonic(), bus.secret()
     while True:
         try:
-            return ask(joined, domain, word, reason, ms)
+            return ask(joined, bus.domain, word, reason, ms, key)
         except NoConductorError:
             if monotonic() - begin > DISCOVERY_TIMEOUT_S:
                 raise

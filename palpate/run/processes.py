@@ -230,10 +230,7 @@ class LocalProcesses:
         self._own = RunFolder()
         self.folder = self._own.path
         """Folder of sockets and key, removed at the end."""
-        key = settings.key
-        if key is None and settings.tags is not False:
-            key = make_key(self.folder / "run.key")
-        self._given["key"] = key
+        self._given["key"] = key = settings.key or make_key(self.folder / "run.key")
         self._given["rate"] = timing.rate if timing.wallclock else None
         self._scenario_files = {
             role: file if view_of(role) == "scenario" else self._copy(file) for role, file in scenario_files.items()
@@ -259,6 +256,7 @@ class LocalProcesses:
                 router=router,
                 out=str(out),
                 keys=None if secure is None else str(secure.keys),
+                key=str(key),
             )
         )
         self._logs: list[IO[bytes]] = []
@@ -289,7 +287,7 @@ class LocalProcesses:
 
     def as_conductor(self) -> AbstractContextManager[None]:
         """Set the run's key in the environment of this process within a `with` block."""
-        return given({variable("key"): str(self._given["key"] or "")})
+        return given({variable("key"): str(self._given["key"])})
 
     def start(self, *processes: ServiceProcess) -> None:
         """Start a service, or several in one process. Raises UserError for a program that cannot share one."""

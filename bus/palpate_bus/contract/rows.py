@@ -101,6 +101,8 @@ class Topic(_Row):
     """Senders other than the producer are allowed."""
     tagged: bool = False
     """In runs with a key, its messages carry an authentication tag."""
+    tagged_values: dict[str, tuple[int, ...]] = {}
+    """Of an open topic: field values that are accepted with a tag only; other messages are accepted from anyone."""
     doc: str
 
     @property

@@ -22,6 +22,7 @@ from pathlib import Path
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import Settings
+from palpate_bus.wire.rmw import read_key
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 
@@ -55,12 +56,18 @@ class Run:
     """The results folder."""
     keys: str | None = None
     """Folder of all certificates, in a secure run."""
+    key: str | None = None
+    """File with the run's key, which requests that move the arm need."""
     pid: int = field(default_factory=os.getpid)
     started: float = field(default_factory=time.time)
     """Wall time [s]."""
     versions: Mapping[str, str] = field(default_factory=versions)
     rate: float | None = None
     """Simulated seconds per second in wall-clock mode."""
+
+    def secret(self) -> bytes | None:
+        """Return the run's key. Raises BusConfigError if it cannot be read."""
+        return read_key(Path(self.key) if self.key else None)
 
     def options(self, member: str = "viewer") -> BusOptions:
         """Return the options of a tool: a peer of every role without a listener; in a secure run a client with `member`'s key."""
@@ -153,6 +160,10 @@ class BusTarget:
     def rate(self) -> float | None:
         """Simulated seconds per second of a wall-clock run; None in lockstep or if unknown."""
         return self.run.rate if self.run else None
+
+    def secret(self) -> bytes | None:
+        """Return the run's key, by default that of PALPATE_KEY. Raises BusConfigError if it cannot be read."""
+        return self.run.secret() if self.run else read_key(Settings.read().key)
 
     def operator(self) -> BusOptions:
         """Return the options of an operator: in a secure run the operator's key instead of the viewer's."""

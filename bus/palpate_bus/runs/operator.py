@@ -14,12 +14,14 @@ import termios
 import tty
 from contextlib import suppress
 from select import select
+from time import time_ns
 from types import TracebackType
 from typing import Any, Self
 
 import zenoh
 
 from palpate_bus.messages import OperatorRequest
+from palpate_bus.wire.rmw import Tagger
 from palpate_errors import RunError
 
 CONFIRM_S = 2.0
@@ -33,6 +35,8 @@ WORDS = {
 """Requests to the examination and the message constant of each."""
 TIME_REQUESTS = ("pause", "resume", "step")
 """Requests to the conductor of a lockstep run: stop, continue, or briefly continue granting time."""
+TAGGED = frozenset(("release", "end", "resume", "step"))
+"""Requests after which the arm may move: in runs with a key they need a tag. Anyone may stop or pause."""
 
 
 class NotAnswered(RunError):
@@ -48,13 +52,15 @@ def request_key(domain: int) -> str:
     return f"{domain}/palpate/operator"
 
 
-def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0) -> tuple[str, float]:
+def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0, key: bytes | None = None) -> tuple[str, float]:
     """Send a request of `WORDS` or `TIME_REQUESTS` to the run on this bus; return its answer and confirmation time [ms].
 
-    `ms`: simulated time to grant, for `step`. Raises NotAnswered.
+    `ms`: simulated time to grant, for `step`; `key`: the run's key. Raises NotAnswered.
     """
-    payload = json.dumps({"word": word, "reason": reason, "ms": ms})
-    for reply in session.get(request_key(domain), payload=payload, timeout=2 * CONFIRM_S):
+    where = request_key(domain)
+    payload = json.dumps({"word": word, "reason": reason, "ms": ms, "sent": time_ns()}).encode()
+    tag = b"" if key is None else Tagger(key, where).tag(b"", payload)
+    for reply in session.get(where, payload=payload, attachment=tag, timeout=2 * CONFIRM_S):
         if reply.ok is None:
             continue
         answer = json.loads(reply.ok.payload.to_bytes())
@@ -64,10 +70,10 @@ def ask(session: zenoh.Session, domain: int, word: str, reason: str, ms: int = 0
     raise NoConductorError("the run does not answer: its conductor has left, or has not started it yet")
 
 
-def order(session: zenoh.Session, domain: int, word: str, reason: str) -> str:
+def order(session: zenoh.Session, domain: int, word: str, reason: str, key: bytes | None) -> str:
     """Send a request as `ask` does; return text for the operator, also without an answer."""
     try:
-        answer, after_ms = ask(session, domain, word, reason)
+        answer, after_ms = ask(session, domain, word, reason, key=key)
     except NotAnswered as error:
         return f"{word}: {error}"
     return f"{word}: {answer} (confirmed after {after_ms:.0f} ms)"

@@ -67,7 +67,7 @@ class _Feed:
         self.garbage = 0
         self.forged = 0
         self.refused = 0
-        self._tagger = member.transport.tagger(key)
+        self._tags = member.transport.tag_check(key)
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
         """Return the messages since the last call: (sequence, payload, message)."""
@@ -75,12 +75,12 @@ class _Feed:
         while (sample := self._try()) is not None:
             try:
                 attachment = sample.attachment.to_bytes()
-                sequence, _, _ = unpack(attachment)
+                sequence, sent, _ = unpack(attachment)
             except (WireError, AttributeError):
                 self.garbage += 1
                 continue
             payload = sample.payload.to_bytes()
-            if self._tagger is not None and not self._tagger.holds(attachment, payload):
+            if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
                 self.forged += 1
                 continue
             message = decoded(self._decode, payload)

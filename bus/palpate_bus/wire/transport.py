@@ -5,6 +5,7 @@ Callbacks only put samples into the subscription's queue, which the service's th
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from itertools import count
 from queue import Empty, SimpleQueue
@@ -13,7 +14,8 @@ from typing import Any, NamedTuple, Protocol
 
 import zenoh
 
-from palpate_bus.contract import Qos, contract
+from palpate_bus.contract import Qos, Topic, contract
+from palpate_bus.messages import codec
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.settings import Settings
 from palpate_bus.wire.rmw import AttachmentWriter, Tagger, WireError, hello_key, parse_key, read_key, unpack
@@ -92,6 +94,32 @@ class Publisher:
         self._publisher.undeclare()
 
 
+class TagCheck:
+    """Accepts the messages of one key by their tags.
+
+    On an open topic only messages with `tagged_values` need one, and each must be newer than the last, so none can be replayed.
+    """
+
+    def __init__(self, tagger: Tagger, topic: Topic | None) -> None:
+        """`topic`: the row of the contract; None for messages of the runtime."""
+        self._tagger = tagger
+        self._decode = codec.decoder(topic.type) if topic is not None and topic.open else None
+        self._values = {} if topic is None else topic.tagged_values
+        self._newest = time_ns()
+
+    def accepts(self, attachment: bytes, sent: int, payload: bytes) -> bool:
+        """Return True if a message needs no tag or has a valid one; `sent` is its source time [ns]."""
+        if self._decode is None:
+            return self._tagger.holds(attachment, payload)
+        message = decoded(self._decode, payload)
+        if message is None or not any(getattr(message, field) in values for field, values in self._values.items()):
+            return True
+        if sent <= self._newest or not self._tagger.holds(attachment, payload):
+            return False
+        self._newest = sent
+        return True
+
+
 class Subscription:
     """Receives on one key.
 
@@ -106,19 +134,19 @@ class Subscription:
         key: str,
         history: bool = False,
         decode: Callable[[bytes], object] | None = None,
-        tagger: Tagger | None = None,
+        tags: TagCheck | None = None,
     ) -> None:
         """Subscribe.
 
-        `history` also delivers earlier messages of a latched topic; `decode` opens the topic to all senders; with a `tagger` only
-        tagged messages are accepted.
+        `history` also delivers earlier messages of a latched topic; `decode` opens the topic to all senders; `tags` decides which
+        messages need a tag.
         """
         self.key = key
         self._decode = decode
         self.garbage = 0
         self.foreign = 0
         self.forged = 0
-        self._tagger = tagger
+        self._tags = tags
         self.hello_received = False
         self.replaced = False
         """Set when a hello reveals a new sender; cleared by the reader."""
@@ -159,7 +187,7 @@ class Subscription:
             self.garbage += 1
             return None
         payload = raw.payload.to_bytes()
-        if self._tagger is not None and not self._tagger.holds(attachment, payload):
+        if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
             self.forged += 1
             return None
         if gid != self._gid:
@@ -206,7 +234,10 @@ class Transport:
 
     def __init__(self, session: zenoh.Session) -> None:
         self.session = session
-        self._key = read_key(Settings.read().key)
+        settings = Settings.read()
+        self.key = read_key(settings.key)
+        """Key of the run, or None."""
+        self._tags = settings.tags is not False
         self.ids = count()
         """Ids of the entities that members declare."""
 
@@ -226,12 +257,22 @@ class Transport:
 
     def subscription(self, key: str, history: bool = False, decode: Callable[[bytes], object] | None = None) -> Subscription:
         """Return a subscription to a key."""
-        return Subscription(self.session, key, history, decode, self.tagger(key))
+        return Subscription(self.session, key, history, decode, self.tag_check(key))
 
     def tagger(self, key: str) -> Tagger | None:
         """Return the tagger for the messages of a key; None if they carry no tags."""
-        tagged = self._key is not None and contract().tagged(parse_key(key).topic)
-        return Tagger(self._key, key) if self._key is not None and tagged else None
+        name = parse_key(key).topic
+        tagged = contract().tagged(name) and (self._tags or _is_open(name))
+        return Tagger(self.key, key) if self.key is not None and tagged else None
+
+    def tag_check(self, key: str) -> TagCheck | None:
+        """Return the check of received messages of a key; None if they carry no tags."""
+        tagger = self.tagger(key)
+        return None if tagger is None else TagCheck(tagger, contract().topics.get(parse_key(key).topic))
+
+
+def _is_open(name: str) -> bool:
+    return name in contract().topics and contract().topics[name].open
 
 
 def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
@@ -240,3 +281,16 @@ def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
         return decode(payload)
     except CodecError:
         return None
+
+
+def json_object(text: bytes | str, limit: int) -> dict[str, Any]:
+    """Return the object in a JSON text from the bus. Raises ValueError if it is not one, too deep, or longer than `limit`."""
+    if len(text) > limit:
+        raise ValueError(f"{len(text)} bytes; allowed are {limit}")
+    try:
+        document = json.loads(text)
+    except RecursionError:
+        raise ValueError("nested too deeply") from None
+    if not isinstance(document, dict):
+        raise ValueError("not an object")
+    return document

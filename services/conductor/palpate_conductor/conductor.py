@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import logging
 from collections.abc import Callable, Container, Iterable, Mapping, Set
 from dataclasses import dataclass
@@ -21,6 +20,7 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
+from palpate_bus.wire.transport import json_object
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import EXAM_SILENT_S, Grants
@@ -42,6 +42,8 @@ class ConductorTuning:
     after_loss_ns: int = NS
     """Simulated time that the others run after a loss, so that the safe reaction is simulated and recorded."""
     observers_finish_s: float = 60.0
+    report_bytes: int = 1 << 20
+    """A service's report with longer details is dropped."""
     silent_s: float = 2.0
     """If all services are silent for longer, the connection to the conductor is at fault."""
 
@@ -90,7 +92,7 @@ class Conductor:
         self._contract = ContractWatch(session, rules, domain, timing.wallclock_rate)
         collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._send(RunControl.GRANT, tick, last), timing)
-        self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace)
+        self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace, member.transport.key)
         self._started_at = 0.0
         self._warned = False
         self.started_at_perf = 0.0
@@ -122,9 +124,13 @@ class Conductor:
         reports = []
         for role, subscription in self._subscriptions.items():
             while (sample := subscription.get(0)) is not None:
-                message = self._decode(sample.payload)
+                try:
+                    message = self._decode(sample.payload)
+                    detail = json_object(message.detail or "{}", TUNING.report_bytes)
+                except (codec.CodecError, ValueError) as error:
+                    self._notify_once([f"palpate/report/{role}: dropping unreadable reports: {error}"])
+                    continue
                 self.watchdog.report(role, int(message.tick), message.waiting_for)
-                detail = json.loads(message.detail) if message.detail else {}
                 self._notify_once(detail.get("suspicions", ()))
                 reports.append((role, message, detail))
         return reports

@@ -9,14 +9,19 @@ import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from queue import Empty, SimpleQueue
-from time import monotonic
+from time import monotonic, time_ns
 from typing import Any
 
 import zenoh
 
 from palpate_bus.messages import SupervisorState
-from palpate_bus.runs.operator import CONFIRM_S, TIME_REQUESTS, WORDS, request_key
+from palpate_bus.runs.operator import CONFIRM_S, TAGGED, TIME_REQUESTS, WORDS, request_key
+from palpate_bus.wire.rmw import Tagger
+from palpate_bus.wire.transport import json_object
 from palpate_errors import UserError
+
+REQUEST_BYTES = 4096
+"""A longer request is refused."""
 
 
 @dataclass
@@ -32,14 +37,22 @@ class OperatorRequestServer:
     """The conductor's side. Call `poll` often."""
 
     def __init__(
-        self, session: zenoh.Session, domain: int, send: Callable[[int, str], None], pace: Callable[[str, int], str]
+        self,
+        session: zenoh.Session,
+        domain: int,
+        send: Callable[[int, str], None],
+        pace: Callable[[str, int], str],
+        key: bytes | None = None,
     ) -> None:
         """`send(request, reason)` publishes a request, see `palpation_msgs/OperatorRequest`.
 
-        `pace(word, ms)` carries out one of `TIME_REQUESTS` and returns the answer, or raises UserError.
+        `pace(word, ms)` carries out one of `TIME_REQUESTS` and returns the answer, or raises UserError. With the
+        run's `key`, the requests in `TAGGED` need a tag.
         """
         self._pace = pace
         self._key = request_key(domain)
+        self._tagger = None if key is None else Tagger(key, self._key)
+        self._newest = time_ns()
         self._send = send
         self._asked: SimpleQueue[Any] = SimpleQueue()
         self._pending: list[_Pending] = []
@@ -61,12 +74,16 @@ class OperatorRequestServer:
 
     def _take(self, query: Any, supervisor: Any | None) -> None:
         try:
-            asked = json.loads(query.payload.to_bytes())
+            payload = bytes(query.payload.to_bytes())
+            asked = json_object(payload, REQUEST_BYTES)
             reason = str(asked["reason"]).encode(errors="replace").decode()  # invalid bytes of a terminal must not prevent a stop
-            word, ms = asked["word"], int(asked.get("ms", 0))
+            word, ms, sent = asked["word"], int(asked.get("ms", 0)), int(asked.get("sent", 0))
             request = None if word in TIME_REQUESTS else WORDS[word]
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError):
-            self._reply(query, False, f"not a request: want one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
+        except (AttributeError, KeyError, OverflowError, TypeError, ValueError, zenoh.ZError):
+            self._reply(query, False, f"no request: want one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
+            return
+        if word in TAGGED and not self._authentic(query, payload, sent):
+            self._reply(query, False, f"{word} is refused: it needs the run's key (PALPATE_KEY), and a time after the last", 0.0)
             return
         if request is None:
             try:
@@ -77,6 +94,16 @@ class OperatorRequestServer:
         self._send(request, reason)
         before = (0, 0) if supervisor is None else (int(supervisor.releases), int(supervisor.refusals))
         self._pending.append(_Pending(query, word, monotonic(), *before))
+
+    def _authentic(self, query: Any, payload: bytes, sent: int) -> bool:
+        """Return True if a request has a valid tag and is newer [ns] than the last, or if the run has no key."""
+        if self._tagger is None:
+            return True
+        tag = b"" if query.attachment is None else bytes(query.attachment.to_bytes())
+        if sent <= self._newest or not self._tagger.holds(tag, payload):
+            return False
+        self._newest = sent
+        return True
 
     def _reply(self, query: Any, done: bool, text: str, after_s: float) -> None:
         query.reply(self._key, json.dumps({"done": done, "words": text, "after_ms": round(after_s * 1e3, 1)}))

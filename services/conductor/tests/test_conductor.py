@@ -8,7 +8,7 @@ import sys
 import tempfile
 import tracemalloc
 from collections.abc import Callable
-from time import sleep
+from time import sleep, time_ns
 from types import SimpleNamespace
 from typing import Any
 
@@ -17,10 +17,12 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages import IndentationTruth, Point, SupervisorState, codec
 from palpate_bus.messages.stamps import header
+from palpate_bus.runs.operator import TIME_REQUESTS, WORDS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import pid_space
+from palpate_bus.wire.rmw import Tagger
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 from palpate_conductor import grants, heartbeat
 from palpate_conductor.collector import Collector, KeptMessages
@@ -137,9 +139,11 @@ def test_a_standstill_is_longer_than_the_services_wait_and_stops_the_heartbeat(
 class Query:
     """A query of an operator."""
 
-    def __init__(self, word: str, ms: int = 0) -> None:
-        text = json.dumps({"word": word, "reason": "test", "ms": ms})
+    def __init__(self, word: str, ms: int = 0, text: str = "", key: bytes | None = None) -> None:
+        text = text or json.dumps({"word": word, "reason": "test", "ms": ms, "sent": time_ns()})
         self.payload = SimpleNamespace(to_bytes=text.encode)
+        tag = b"" if key is None else Tagger(key, "0/palpate/operator").tag(b"", text.encode())
+        self.attachment = SimpleNamespace(to_bytes=lambda: tag)
         self.answer: dict[str, Any] | None = None
 
     def reply(self, key: str, text: str) -> None:
@@ -194,6 +198,36 @@ def test_the_conductor_answers_requests_about_time() -> None:
         server.poll(None)
         assert query.answer is not None
         assert (query.answer["done"], query.answer["words"]) == answer
+
+
+@pytest.mark.parametrize(
+    "text", ["[" * 100_000, "[" * 3000, "9" * 4090, "[]", '{"word": ["stop"], "reason": ""}', '{"word": "stop"}']
+)
+def test_an_unreadable_request_is_answered(text: str) -> None:
+    server = OperatorRequestServer(Session(), 0, lambda request, reason: None, never)  # type: ignore[arg-type]
+    query = Query("", text=text)
+    server._asked.put(query)
+    server.poll(None)
+    assert query.answer is not None
+    assert query.answer["words"].startswith("no request")
+
+
+@pytest.mark.parametrize("word", [*WORDS, *TIME_REQUESTS])
+def test_in_a_run_with_a_key_only_its_holders_may_move_the_arm(word: str) -> None:
+    key = bytes(32)
+    done: list[object] = []
+    server = OperatorRequestServer(Session(), 0, lambda *sent: done.append(sent), lambda *pace: str(done.append(pace)), key)  # type: ignore[arg-type, func-returns-value]
+
+    def served(query: Query) -> bool:
+        done.clear()
+        server._asked.put(query)
+        server.poll(None)
+        return bool(done)
+
+    valid = Query(word, key=key)
+    assert served(valid)
+    for query in (Query(word), Query(word, key=bytes(31) + b"k"), valid):  # the last is a replay
+        assert served(query) is (word in ("stop", "soft-stop", "pause"))
 
 
 # -- the watchdog
