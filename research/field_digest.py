@@ -16,9 +16,10 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from mcap.reader import make_reader
 from rosbags.typesys import Stores, get_typestore
 from rosbags.typesys.msg import get_types_from_msg
+
+from palpate_bus.recordings import open_recording
 
 ADDED: Final = {
     "palpation_msgs/msg/PalpationTargets": re.compile("reason|[A-Z_]+"),
@@ -52,27 +53,21 @@ def digests(folder: Path) -> dict[str, str]:
     """Return the digest of each recorded topic."""
     store = get_typestore(Stores.ROS2_JAZZY)
     by_topic: dict[str, Any] = {}
-    for path in sorted((folder / "recording_mcap").glob("*.mcap")):
-        with path.open("rb") as stream:
-            reader = make_reader(stream)
-            known: set[str] = set()
-            for schema, channel, message in reader.iter_messages(log_time_order=True):
-                assert schema is not None
-                if channel.topic.endswith(NOT_HASHED):
-                    continue
-                if schema.name not in known:
-                    known.add(schema.name)
-                    parts = schema.data.decode().split("=" * 80)
-                    types = get_types_from_msg(parts[0].strip("\n"), schema.name)
-                    for part in parts[1:]:
-                        head, _, text = part.strip("\n").partition("\n")
-                        name = head.removeprefix("MSG: ").strip()
-                        name = name if "/msg/" in name else name.replace("/", "/msg/")
-                        types |= get_types_from_msg(text, name)
-                    store.register({k: v for k, v in types.items() if k not in store.types})
-                digest = by_topic.setdefault(channel.topic, hashlib.sha256())
-                digest.update(f"{message.sequence} {message.publish_time};".encode())
-                update(digest, store.deserialize_cdr(message.data, schema.name))
+    recording = open_recording(folder)
+    for topic, kind in recording.types.items():
+        head, *parts = kind.definition.split("=" * 80)
+        types = get_types_from_msg(head.strip("\n"), kind.name)
+        for part in parts:
+            line, _, text = part.strip("\n").partition("\n")
+            name = line.removeprefix("MSG: ").strip()
+            types |= get_types_from_msg(text, name if "/msg/" in name else name.replace("/", "/msg/"))
+        store.register({k: v for k, v in types.items() if k not in store.types})
+        if not topic.endswith(NOT_HASHED) and recording.counts[topic]:
+            by_topic[f"/{topic}"] = hashlib.sha256()
+    for message in recording.messages([topic.removeprefix("/") for topic in by_topic]):
+        digest = by_topic[f"/{message.topic}"]
+        digest.update(f"{message.sequence} {message.stamp};".encode())
+        update(digest, store.deserialize_cdr(message.payload, recording.types[message.topic].name))
     return {topic: digest.hexdigest()[:16] for topic, digest in sorted(by_topic.items())}
 
 

@@ -81,7 +81,7 @@ def measured(folder: Path) -> tuple[Array, Array]:
 def recorded_samples(folder: Path) -> int:
     """Return the number of samples in the recording of a run."""
     recording = folder / "recording_mcap"
-    whole = recording if (recording / "metadata.yaml").is_file() else recover(recording)
+    whole = recording if (recording / "metadata.yaml").is_file() else recover(recording)[0]
     return open_recording(whole).counts["assessment/samples"]
 
 

@@ -10,16 +10,21 @@ from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
 from dataclasses import dataclass
+from io import BytesIO
+from mmap import ACCESS_READ, mmap
 from operator import attrgetter
 from pathlib import Path, PurePath
 from typing import IO, NamedTuple
 
 import zstandard
 from mcap import stream_reader
+from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
+from mcap.opcode import Opcode
 from mcap.reader import McapReader, NonSeekingReader, make_reader
-from mcap.records import Channel, Message, Schema
-from mcap.stream_reader import StreamReader
+from mcap.records import Channel, Chunk, McapRecord, Message, Schema
+from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
+from mcap.writer import MCAP0_MAGIC
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.typestore import CodecError, definition_hash
@@ -140,6 +145,8 @@ class Recording:
     """Scenario as YAML, if the file has one."""
     unindexed: frozenset[Path] = frozenset()
     """Files without a usable index, which are read from beginning to end."""
+    damage: tuple[str, ...] = ()
+    """Texts of the damaged parts that were skipped."""
 
     def messages(self, topics: Collection[str], begin: int | None = None, end: int | None = None) -> Iterator[RecordedMessage]:
         """Yield messages of `topics` in order of their stamps, from `begin` to `end` [ns], both included.
@@ -366,7 +373,78 @@ def recorded_type(channel: Channel, schema: Schema) -> RecordedType:
     return RecordedType(full, channel.metadata.get("topic_type_hash", ""), definition, channel.message_encoding)
 
 
+class Gap(NamedTuple):
+    """A damaged part of a file, whose messages are lost."""
+
+    begin: int
+    """First byte."""
+    size: int
+    """Bytes."""
+
+
+_CHUNK = re.compile(rb"\x06(?=.{36}(?:\0{4}|\x04\0{3}zstd|\x03\0{3}lz4))", re.DOTALL)
+"""Beginning of a chunk: its opcode, and the name of its compression after length, stamps, size and checksum."""
+_FRAME = struct.Struct("<BQ")
+"""Opcode and length before the content of a record."""
+
+
 def complete_records(path: Path) -> Iterator[object]:
-    """Yield schemas, channels and messages of an MCAP file, up to its end or to where it is truncated. Raises OSError."""
-    with _opened(path) as stream, suppress(*BROKEN):
-        yield from StreamReader(stream, validate_crcs=True).records
+    """Yield schemas, channels and messages of an MCAP file, and a `Gap` for each damaged part.
+
+    Reading continues at the next chunk. If there is none and the file has no end, it is truncated, which is not a gap.
+    Raises OSError.
+    """
+    with _opened(path) as file, ExitStack() as stack:
+        if not path.stat().st_size:
+            return
+        data = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
+        at = MAGIC_SIZE
+        while at < len(data) - MAGIC_SIZE:
+            try:
+                records, end = _records_at(data, at)
+            except (*BROKEN, RecordingError):
+                end = next((m.start() for m in _CHUNK.finditer(data, at + 1) if _framed(data, m.start())), len(data))
+                if end == len(data) and data[-MAGIC_SIZE:] != MCAP0_MAGIC:
+                    return
+                with suppress(*BROKEN, OSError, RecordingError):  # schemas and channels are repeated there
+                    summary = make_reader(file).get_summary()
+                    yield from () if summary is None else (*summary.schemas.values(), *summary.channels.values())
+                yield Gap(at, end - at)
+            else:
+                yield from records
+            at = end
+
+
+def _records_at(data: mmap, at: int) -> tuple[list[McapRecord], int]:
+    """Return the schemas, channels and messages in the record at byte `at`, and where the next begins. Raises one of `BROKEN`."""
+    opcode, length = _FRAME.unpack_from(data, at)
+    begin, end = at + _FRAME.size, at + _FRAME.size + length
+    kind = Opcode(opcode)
+    if end > len(data):
+        raise EOFError
+    if kind is Opcode.MESSAGE_INDEX and length != 6 + struct.unpack_from("<I", data, begin + 2)[0]:
+        raise ValueError("a message index of another length than it states")
+    stream = ReadDataStream(BytesIO(data[begin:end]))
+    match kind:
+        case Opcode.CHUNK:
+            if not _framed(data, at):
+                raise ValueError("a chunk of another length than it states")
+            return breakup_chunk(Chunk.read(stream), validate_crc=True), end
+        case Opcode.SCHEMA:
+            return [Schema.read(stream)], end
+        case Opcode.CHANNEL:
+            return [Channel.read(stream)], end
+        case Opcode.MESSAGE:
+            return [Message.read(stream, length)], end
+        case _:
+            return [], end
+
+
+def _framed(data: mmap, at: int) -> bool:
+    """Return True if the lengths of a chunk at byte `at` agree."""
+    with suppress(*BROKEN):
+        _, length = _FRAME.unpack_from(data, at)
+        (name,) = struct.unpack_from("<I", data, at + _FRAME.size + 28)
+        (content,) = struct.unpack_from("<Q", data, at + _FRAME.size + 32 + name)
+        return bool(length == 40 + name + content)
+    return False

@@ -360,7 +360,7 @@ def interrupted_run(folder: Path) -> InterruptedRun:
 
 
 def _recording(run: Path) -> Recording:
-    """Return the recording of a run, which may be incomplete, or else its evidence."""
+    """Return the recording of a run, which may be incomplete or damaged, or else its evidence."""
     folder = run / RECORDING
     parts = sorted(folder.glob("*.mcap"))
     if not parts:
@@ -369,8 +369,6 @@ def _recording(run: Path) -> Recording:
         raise NothingRecordedError(f"{run}: nothing can be recovered: it has no recording and no {FILE}")
     while not (folder / "metadata.yaml").is_file() and time() - parts[-1].stat().st_mtime < _STILL_S:
         sleep(0.1)  # the recorder outlives the conductor by some seconds
-    if (folder / "metadata.yaml").is_file():
-        return open_recording(folder)
     try:
         return salvage(folder, [topic.name for role in ("conductor", "assessment") for topic, _ in contract().inputs(role)])
     except (OSError, ValueError) as error:

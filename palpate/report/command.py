@@ -13,7 +13,8 @@ import typer
 from rich.console import Console
 
 from palpate.console import print_line
-from palpate_errors import UserError
+from palpate_bus.runtime.failure import FailureCode
+from palpate_errors import RunError, UserError
 
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "google-chrome-stable", "chrome", "msedge")
 PRINT_TIMEOUT_S = 120
@@ -50,13 +51,14 @@ def report(
     from palpate.report.recovery import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
 
-    console = Console(stderr=True)
+    console, failure = Console(stderr=True), None
     with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
         if recover:
             scenario, result = recovered(folder)
             shown = Console(stderr=as_json)
             print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # first, since the truth takes longer
             print_scores(shown, write_results(folder, scenario, result))
+            failure = result.failure
         from palpate.report.page import write_page
 
         page = write_page(folder)
@@ -66,3 +68,5 @@ def report(
     elif not quiet:
         for path in paths.values():
             print(path)
+    if failure is not None and failure.code is FailureCode.DAMAGED:
+        raise RunError(failure.text)

@@ -73,6 +73,8 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
             note = f"; the assessment could not finish: {type(error).__name__}: {error}"
     why = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
     text = f"recovered from an unfinished run: the recording ends at {recording.last / NS:.3f} s"
+    text = "; ".join((text, *recording.damage))
+    code = FailureCode.DAMAGED if recording.damage else FailureCode.UNFINISHED
     return run.scenario, RunResult(
         runtime=RUNTIME,
         collected=collected,
@@ -83,7 +85,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         start_time_s=0.0,
         blame={},
         counters={},
-        failure=Failure(FailureCode.UNFINISHED, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
+        failure=Failure(code, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
         lost={"conductor": recording.last},
         earlier=earlier,
     )
@@ -118,12 +120,16 @@ class Resumption:
     checkpoint: Checkpoint
     earlier: tuple[Collected, ...]
     """Messages of the interrupted runs, oldest first."""
+    damage: tuple[str, ...] = ()
+    """Texts of what their recordings have lost."""
 
     @property
     def summary(self) -> str:
         """Text for the user: the run, its samples, its remaining targets."""
         left = "" if self.scenario.exam.searched else f", {len(self.checkpoint.left)} targets are left"
-        return f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples recorded{left}"
+        return "; ".join(
+            (f"continuing {self.folder.parent}: {len(self.checkpoint.felt.time)} samples recorded{left}", *self.damage)
+        )
 
 
 def resumption(folder: Path) -> Resumption:
@@ -141,7 +147,8 @@ def resumption(folder: Path) -> Resumption:
         raise EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
         raise EvidenceError(f"--resume {folder}: all targets were reached; palpate report {folder} --recover has its findings")
-    return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs))
+    lost = tuple(text for run in runs for text in run.recording.damage)
+    return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs), lost)
 
 
 def _holds_run(folder: Path) -> bool:

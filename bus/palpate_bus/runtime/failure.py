@@ -49,6 +49,8 @@ class FailureCode(StrEnum):
     """Planning aborted the examination."""
     UNFINISHED = "unfinished"
     """Recovered from a recording without an end."""
+    DAMAGED = "damaged"
+    """The same, and parts of the recording are lost."""
     INTERNAL = "internal"
     """An unexpected error in the conductor."""
 

@@ -1,9 +1,9 @@
-"""Repairs a recording that was truncated by a crash.
+"""Repairs a recording that was truncated by a crash, or is damaged.
 
     python -m palpate_recorder.recover DIR/recording_mcap
 
-writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken files, an index and `metadata.yaml`. It accepts
-recordings of other programs too, as a folder or a single MCAP file, and keeps their ROS 2 topics.
+writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken files, an index and `metadata.yaml`; damaged
+parts are listed, with status 1. It accepts recordings of other programs too, as a folder or a single file (its ROS 2 topics).
 """
 
 from __future__ import annotations
@@ -20,13 +20,14 @@ from typing import Any
 from mcap.records import Channel as ChannelRecord
 from mcap.records import Message, Schema
 
-from palpate_bus.recordings import RecordedMessage, RecordedType, Recording, complete_records, kept_every_ms, recorded_type
+from palpate_bus.messages.stamps import NS
+from palpate_bus.recordings import Gap, RecordedMessage, RecordedType, Recording, complete_records, kept_every_ms, recorded_type
 from palpate_inputs import InputError, parse_yaml
 from palpate_recorder.bag import BagWriter, Channel
 
 
-def recover(path: Path) -> Path:
-    """Write the complete chunks of the recording `path` to the folder `<path>_recovered`; return that folder.
+def recover(path: Path) -> tuple[Path, tuple[str, ...]]:
+    """Write the complete chunks of the recording `path` to the folder `<path>_recovered`; return that folder, and what is lost.
 
     Raises FileNotFoundError if there is no recording, ValueError if not even its first chunk is complete.
     """
@@ -37,7 +38,7 @@ def recover(path: Path) -> Path:
     for channel, message in broken.messages():
         bag.write(channel.topic, message.data, message.log_time, message.sequence)
     bag.close()
-    return bag.folder
+    return bag.folder, broken.damage
 
 
 @dataclass(frozen=True)
@@ -78,6 +79,7 @@ def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
         last=held[-1].stamp,
         scenario=None,
         held=tuple(held),
+        damage=broken.damage,
     )
 
 
@@ -90,6 +92,8 @@ class _Broken:
         if not self.files:
             raise FileNotFoundError(f"{path}: no recording there; give an .mcap file, or the folder that holds it")
         self._channels: dict[str, Channel] = {}
+        self.damage: tuple[str, ...] = ()
+        """Texts of the damaged parts, after `messages`."""
 
     def found(self) -> dict[str, Channel]:
         """Return the ROS 2 channels read so far, by topic: iterate over `messages` first. Raises ValueError if there are none."""
@@ -99,9 +103,11 @@ class _Broken:
 
     def messages(self) -> Iterator[tuple[Channel, Message]]:
         """Yield the complete ROS 2 messages with their channels, in file order."""
+        damage = []
         for file in self.files:
             schemas: dict[int, Schema] = {}
             channels: dict[int, Channel] = {}
+            reached = 0
             for record in complete_records(file):
                 if isinstance(record, Schema):
                     schemas[record.id] = record
@@ -109,7 +115,12 @@ class _Broken:
                     channel = _channel(record, schemas[record.schema_id])
                     channels[record.id] = self._channels.setdefault(channel.topic, channel)
                 elif isinstance(record, Message) and record.channel_id in channels:
+                    reached = max(reached, record.log_time)
                     yield channels[record.channel_id], record
+                elif isinstance(record, Gap):
+                    where = f"{file.name}, bytes {record.begin} to {record.begin + record.size}"
+                    damage.append(f"{where}: damaged; what was recorded next after {reached / NS:.1f} s is lost")
+        self.damage = tuple(damage)
 
 
 def _number(path: Path) -> tuple[int, str]:
@@ -144,6 +155,8 @@ if __name__ == "__main__":
     if len(sys.argv) != 2:
         sys.exit("usage: python -m palpate_recorder.recover FOLDER_OR_FILE")
     try:
-        print(recover(Path(sys.argv[1])))
+        folder, damage = recover(Path(sys.argv[1]))
     except (OSError, ValueError) as error:
         sys.exit(str(error))
+    print(folder)
+    sys.exit("\n".join(damage) or None)

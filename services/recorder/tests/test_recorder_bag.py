@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import yaml
 from mcap.reader import make_reader
+from mcap.records import Message
 from mcap.writer import CompressionType, Writer
 from mcap_ros2.decoder import DecoderFactory
 from rosbags.highlevel import AnyReader
@@ -21,7 +22,7 @@ from rosbags.rosbag2 import Reader
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, SurfaceMesh, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.recordings import RecordingError, open_recording
+from palpate_bus.recordings import Gap, RecordingError, complete_records, open_recording
 from palpate_bus.settings import RECORDING
 from palpate_models.scenario.schema import Scenario
 from palpate_recorder.recover import recover, salvage
@@ -119,7 +120,7 @@ def kill(service_folder: Path, to: Path, share: float = 1.0) -> Path:
 
 def test_a_crash_loses_at_most_the_last_simulated_second(service: RecorderService, tmp_path: Path) -> None:
     record(service, 3900)
-    recovered = recover(kill(tmp_path / RECORDING, tmp_path / "crashed"))
+    recovered = recover(kill(tmp_path / RECORDING, tmp_path / "crashed"))[0]
     with Reader(recovered) as reader:
         stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
     assert stamps == [i * MS for i in range(len(stamps))]
@@ -131,11 +132,29 @@ def test_a_file_cut_anywhere_is_recovered_up_to_there(service: RecorderService, 
     service.finish()
     counts = []
     for share in (0.3, 0.6, 0.9, 1.0):
-        recovered = recover(kill(tmp_path / RECORDING, tmp_path / f"cut_{share}", share))
+        recovered, _ = recover(kill(tmp_path / RECORDING, tmp_path / f"cut_{share}", share))
         with Reader(recovered) as reader:
             counts.append(len([None for _ in reader.messages()]))
             assert counts[-1] == reader.message_count
     assert 0 < counts[0] < counts[1] < counts[2] < counts[3] == 3978
+
+
+@pytest.mark.parametrize("share", [0.0001, 0.3, 0.33, 0.62, 0.9])
+def test_reading_continues_after_a_damaged_part(service: RecorderService, tmp_path: Path, share: float) -> None:
+    record(service, 3900)
+    service.finish()
+    spoiled = kill(tmp_path / RECORDING, tmp_path / "spoiled")
+    file = spoiled / "spoiled_0.mcap"
+    whole = list(complete_records(file))
+    data = bytearray(file.read_bytes())
+    at = int(len(data) * share)
+    data[at : at + 2000] = b"\xa5" * 2000
+    file.write_bytes(data)
+    left = list(complete_records(file))
+    gaps = [record for record in left if isinstance(record, Gap)]
+    assert len(whole) // 2 < sum(isinstance(record, Message) for record in left) < len(whole)
+    assert sum(gap.begin < at + 2000 and gap.begin + gap.size > at for gap in gaps) == len(gaps) in (1, 2)
+    assert len(recover(spoiled)[1]) == len(gaps)
 
 
 def test_salvage_returns_what_recover_writes(service: RecorderService, tmp_path: Path) -> None:
@@ -144,7 +163,7 @@ def test_salvage_returns_what_recover_writes(service: RecorderService, tmp_path:
     before = sorted(tmp_path.rglob("*"))
     salvaged = salvage(crashed, ["joint_states", "sim/surface"])
     assert sorted(tmp_path.rglob("*")) == before
-    recovered = open_recording(recover(crashed))
+    recovered = open_recording(recover(crashed)[0])
     topics = ["joint_states", "sim/surface"]
     assert list(salvaged.messages(topics)) == list(recovered.messages(topics))
     assert salvaged.types == recovered.types
@@ -173,7 +192,7 @@ def test_the_file_of_another_writer_is_recovered(tmp_path: Path, as_folder: bool
         writer.finish()
     whole = path.read_bytes()
     path.write_bytes(whole[: len(whole) // 2])
-    recovered = recover(path.parent if as_folder else path)
+    recovered, _ = recover(path.parent if as_folder else path)
     assert recovered.name == ("camera_recovered" if as_folder else "camera_0_recovered")
     recording = open_recording(recovered)
     recording.check(contract(), ["tf", "tf_static"])
@@ -243,7 +262,7 @@ def test_a_crash_of_a_split_recording_loses_at_most_the_last_second(tmp_path: Pa
     crashed.mkdir()
     for number, path in enumerate(sorted((tmp_path / RECORDING).glob("*.mcap"))):
         (crashed / f"crashed_{number}.mcap").write_bytes(path.read_bytes())
-    with Reader(recover(crashed)) as reader:
+    with Reader(recover(crashed)[0]) as reader:
         stamps = [stamp for c, stamp, _ in reader.messages() if c.topic == "/joint_states"]
     assert stamps == [i * MS for i in range(len(stamps))]
     assert len(stamps) >= 2900
