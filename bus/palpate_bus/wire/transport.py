@@ -5,7 +5,6 @@ Callbacks only put samples into the subscription's queue, which the service's th
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable
 from itertools import count
 from queue import Empty, SimpleQueue
@@ -281,16 +280,3 @@ def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
         return decode(payload)
     except CodecError:
         return None
-
-
-def json_object(text: bytes | str, limit: int) -> dict[str, Any]:
-    """Return the object in a JSON text from the bus. Raises ValueError if it is not one, too deep, or longer than `limit`."""
-    if len(text) > limit:
-        raise ValueError(f"{len(text)} bytes; allowed are {limit}")
-    try:
-        document = json.loads(text)
-    except RecursionError:
-        raise ValueError("nested too deeply") from None
-    if not isinstance(document, dict):
-        raise ValueError("not an object")
-    return document

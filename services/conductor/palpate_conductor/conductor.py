@@ -20,7 +20,6 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
-from palpate_bus.wire.transport import json_object
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import EXAM_SILENT_S, Grants
@@ -29,6 +28,7 @@ from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunOutcome, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
 from palpate_conductor.watchdog import FreezeWatch, RunWatchdog
+from palpate_inputs import InputError, parse_json
 
 log = logging.getLogger(__name__)
 
@@ -42,7 +42,7 @@ class ConductorTuning:
     after_loss_ns: int = NS
     """Simulated time that the others run after a loss, so that the safe reaction is simulated and recorded."""
     observers_finish_s: float = 60.0
-    report_bytes: int = 1 << 20
+    report_characters: int = 1 << 20
     """A service's report with longer details is dropped."""
     silent_s: float = 2.0
     """If all services are silent for longer, the connection to the conductor is at fault."""
@@ -126,9 +126,11 @@ class Conductor:
             while (sample := subscription.get(0)) is not None:
                 try:
                     message = self._decode(sample.payload)
-                    detail = json_object(message.detail or "{}", TUNING.report_bytes)
-                except (codec.CodecError, ValueError) as error:
-                    self._notify_once([f"palpate/report/{role}: dropping unreadable reports: {error}"])
+                    detail = parse_json(message.detail[: TUNING.report_characters] or "{}", f"palpate/report/{role}")
+                    if not isinstance(detail, dict):
+                        raise InputError(f"palpate/report/{role}: not an object")
+                except (codec.CodecError, InputError) as error:
+                    self._notify_once([f"a report is dropped: {error}"])
                     continue
                 self.watchdog.report(role, int(message.tick), message.waiting_for)
                 self._notify_once(detail.get("suspicions", ()))

@@ -17,8 +17,8 @@ import zenoh
 from palpate_bus.messages import SupervisorState
 from palpate_bus.runs.operator import CONFIRM_S, TAGGED, TIME_REQUESTS, WORDS, request_key
 from palpate_bus.wire.rmw import Tagger
-from palpate_bus.wire.transport import json_object
 from palpate_errors import UserError
+from palpate_inputs import parse_json
 
 REQUEST_BYTES = 4096
 """A longer request is refused."""
@@ -75,11 +75,11 @@ class OperatorRequestServer:
     def _take(self, query: Any, supervisor: Any | None) -> None:
         try:
             payload = bytes(query.payload.to_bytes())
-            asked = json_object(payload, REQUEST_BYTES)
+            asked = parse_json(payload if len(payload) <= REQUEST_BYTES else b"", self._key)
             reason = str(asked["reason"]).encode(errors="replace").decode()  # invalid bytes of a terminal must not prevent a stop
             word, ms, sent = asked["word"], int(asked.get("ms", 0)), int(asked.get("sent", 0))
             request = None if word in TIME_REQUESTS else WORDS[word]
-        except (AttributeError, KeyError, OverflowError, TypeError, ValueError, zenoh.ZError):
+        except (AttributeError, KeyError, OverflowError, TypeError, UserError, ValueError, zenoh.ZError):
             self._reply(query, False, f"no request: want one of {', '.join((*WORDS, *TIME_REQUESTS))} and a reason", 0.0)
             return
         if word in TAGGED and not self._authentic(query, payload, sent):
