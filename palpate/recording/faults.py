@@ -18,6 +18,7 @@ class FaultCode(StrEnum):
     FROZEN = "frozen"
     REPEATED = "repeated"
     CLOCK = "clock"
+    BACKWARD = "backward"
     NO_CONTACT = "no_contact"
     JUMP = "jump"
     DISAGREE = "disagree"
@@ -35,6 +36,7 @@ _TEXTS = {
     FaultCode.FROZEN: "{count} of {of} samples repeat a force while the tool moves: the sensor froze",
     FaultCode.REPEATED: "{count} of {of} rows are there twice",
     FaultCode.CLOCK: "force and position are {value:.3g} s apart",
+    FaultCode.BACKWARD: "time goes back at {count} of {of} rows",
     FaultCode.NO_CONTACT: "{count} of {of} contacts never touch",
     FaultCode.JUMP: "{count} of {of} positions jump by up to {value:.3g} m",
     FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
@@ -49,6 +51,7 @@ class Remedy(StrEnum):
     LEFT_OUT = "left out"
     KEPT = "kept as they are"
     CORRECTED = "corrected"
+    NOT_TARED = "the force is taken as it is, without a tare"
     REFUSED = "not assessed until it is mended"
 
 

@@ -6,12 +6,13 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from math import sqrt
-from typing import Final
+from typing import Final, Self
 
 import numpy as np
 
+from palpate.recording.cutting import windows
 from palpate.recording.faults import Fault
-from palpate_assessment.sampling import ContactState, ForceSample, Sampler
+from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 
 PROBES_APART_S: Final = 10.0
@@ -53,6 +54,26 @@ class Contact:
 
 
 @dataclass(frozen=True, eq=False)
+class Palpated:
+    """What was found in readings, in A."""
+
+    contacts: list[Contact]
+    surface: Array
+    """[m], shape (n, 3)."""
+    normals: Array
+    """Shape (n, 3)."""
+    exponent: float
+    """Power of depth that the force follows."""
+    untold: int
+    """Contacts whose depth is not known."""
+
+    @classmethod
+    def nothing(cls) -> Self:
+        """Return no contact."""
+        return cls([], np.empty((0, 3)), np.empty((0, 3)), 1.5, 0)
+
+
+@dataclass(frozen=True, eq=False)
 class Recording:
     """Contacts of one body."""
 
@@ -68,11 +89,13 @@ class Recording:
     faults: tuple[Fault, ...] = ()
     abdomen: bool = False
     """True if the body is an abdomen and A is at its umbilicus; else no anatomy is assumed."""
+    exponent: float = 1.5
+    """Power of depth that the force of its contacts follows."""
 
     @cached_property
     def depth_m(self) -> float:
-        """Nominal depth: the median of the contacts' greatest [m]."""
-        return float(np.median([touch.depth.max() for touch in self.touches]))
+        """Nominal depth: the median of the presses' greatest depth, of slides their usual one [m]."""
+        return float(np.median([t.depth.max() if t.kind is not ContactKind.SLIDE else np.median(t.depth) for t in self.touches]))
 
     def samples(self, depth_m: float | None = None) -> list[ForceSample]:
         """Return the forces at a depth [m], by default the nominal one: one per press or probe, one per footprint of a slide.
@@ -83,29 +106,37 @@ class Recording:
         samples: list[ForceSample] = []
         for number, touch in enumerate(self.touches, start=1):
             if touch.kind is ContactKind.SLIDE:
-                samples += _slid(touch, number, sqrt(self.indenter_radius_m * nominal))
+                samples += _slid(touch, number, 0.4 * sqrt(self.indenter_radius_m * nominal))
             elif touch.depth.max() > 0:
                 samples.append(_pressed(touch, number, nominal))
         return samples
 
 
-def _pressed(touch: Contact, number: int, nominal: float) -> ForceSample:
-    """Return the force of a press or probe at a depth [m], or at its greatest if that is smaller."""
+def force_at(touch: Contact, nominal: float) -> tuple[float, float, float, int]:
+    """Return the force of a press or probe [N] at a depth, its SE [N], that depth [m], and the index of its last reading.
+
+    The depth is the nominal one, or the greatest if that is smaller.
+    """
     depth = min(nominal, float(touch.depth.max()))
     near = np.flatnonzero((touch.depth >= LOADING_SHARE * depth) & (touch.depth <= 1.1 * depth))
-    design = np.column_stack((np.ones(len(near)), touch.depth[near] - depth))
-    fitted = np.linalg.pinv(design)
-    last = near[-1]
-    seconds = np.full(len(touch.depth), PROBES_APART_S * number) if touch.time is None else touch.time
+    near = near if len(near) else np.array([np.argmin(np.abs(touch.depth - depth))])
+    weights = np.linalg.pinv(np.column_stack((np.ones(len(near)), touch.depth[near] - depth)))[0]
+    return float(weights @ touch.force[near]), touch.force_noise * float(np.linalg.norm(weights)), depth, int(near[-1])
+
+
+def _pressed(touch: Contact, number: int, nominal: float) -> ForceSample:
+    """Return the sample of a press or probe."""
+    force, noise, depth, last = force_at(touch, nominal)
+    time = PROBES_APART_S * number if touch.time is None else float(touch.time[last])
     return ForceSample(
-        time=float(seconds[last]),
-        position=touch.position[near].mean(axis=0),
+        time=time,
+        position=touch.position[last],
         normal=touch.normal[last],
         velocity=np.zeros(3),
         depth=depth,
-        force=float(fitted[0] @ touch.force[near]),
-        force_noise=touch.force_noise * float(np.linalg.norm(fitted[0])),
-        time_in_contact=float(seconds[last] - seconds[0]),
+        force=force,
+        force_noise=noise,
+        time_in_contact=0.0 if touch.time is None else time - float(touch.time[0]),
         force_limited=False,
         stroke=number,
         depth_uncertainty=touch.depth_uncertainty,
@@ -113,9 +144,28 @@ def _pressed(touch: Contact, number: int, nominal: float) -> ForceSample:
 
 
 def _slid(touch: Contact, number: int, travel: float) -> list[ForceSample]:
-    """Return means of a slide over `travel` [m], as the assessment makes them of an examination."""
+    """Return a sample per `travel` [m] of a slide: the force at the mean depth, by regression over the depths there."""
     assert touch.time is not None
-    sampler = Sampler(travel)
-    rows = zip(touch.time.tolist(), touch.position, touch.normal, touch.depth.tolist(), touch.force.tolist(), strict=True)
-    states = [ContactState(*row, True, True, stroke=number, depth_uncertainty=touch.depth_uncertainty) for row in rows]
-    return [sample for state in states if (sample := sampler.add(state)) is not None]
+    samples = []
+    for part in windows(touch.position, travel):
+        time, depth, force = touch.time[part], touch.depth[part], touch.force[part]
+        off = depth - depth.mean()
+        slope = float(off @ force) / max(float(off @ off), 1e-18)
+        rest = force - force.mean() - slope * off
+        velocity = (touch.position[part[-1]] - touch.position[part[0]]) / max(float(time[-1] - time[0]), 1e-9)
+        samples.append(
+            ForceSample(
+                time=float(time.mean()),
+                position=touch.position[part].mean(axis=0),
+                normal=touch.normal[part[len(part) // 2]],
+                velocity=velocity,
+                depth=float(depth.mean()),
+                force=float(force.mean()),
+                force_noise=float(np.sqrt(rest @ rest / max(len(part) - 2, 1) / len(part))),
+                time_in_contact=float(time.mean() - touch.time[0]),
+                force_limited=False,
+                stroke=number,
+                depth_uncertainty=touch.depth_uncertainty,
+            )
+        )
+    return samples

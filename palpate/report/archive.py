@@ -210,6 +210,20 @@ def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
 
 def read_evidence(folder: Path) -> Evidence:
     """Return the evidence of the run in `folder`. Raises EvidenceError."""
+    collected, known = _read(folder)
+    nowhere = np.empty((0, 3))
+    touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
+    pressed = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
+    return evidence_of(collected, touched, Pressed(**pressed) if pressed else None, str(known["run"]))
+
+
+def read_collected(folder: Path) -> Collected:
+    """Return the messages of the run in `folder` that the conductor collected. Raises EvidenceError."""
+    return _read(folder)[0]
+
+
+def _read(folder: Path) -> tuple[Collected, dict[str, Any]]:
+    """Return messages and truth of a run."""
     path = folder / FILE
     if not path.is_file():
         raise EvidenceError(
@@ -226,10 +240,7 @@ def read_evidence(folder: Path) -> Evidence:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
     except (OSError, ValueError, EOFError, BadZipFile, McapError) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
-    nowhere = np.empty((0, 3))
-    touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
-    pressed = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
-    return evidence_of(collected, touched, Pressed(**pressed) if pressed else None, str(known["run"]))
+    return collected, known
 
 
 def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: str) -> Evidence:

@@ -1,0 +1,87 @@
+"""Leaves out rows that cannot be right, and counts them."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Final
+
+import numpy as np
+from scipy.ndimage import find_objects, label, median_filter
+
+from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.motion import Mask
+from palpate.recording.readings import Readings
+from palpate_models.numerics.frames import Array
+
+_RUN: Final = 10
+"""A value that repeats this much longer than usual is frozen."""
+_FEWEST: Final = 5
+"""Least number of readings of a clipped or frozen stretch."""
+
+
+def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
+    """Return the readings without invalid, repeated, frozen, clipped and displaced ones, and the faults."""
+    faults: list[Fault] = []
+
+    def drop(code: FaultCode, wrong: Mask, value: float = 0.0) -> None:
+        nonlocal readings
+        if wrong.any():
+            faults.append(Fault(code, int(wrong.sum()), len(wrong), Remedy.LEFT_OUT, value))
+            readings = readings.part(~wrong)
+
+    known = [readings.position, readings.force, readings.normal, readings.touch, readings.time, readings.probe]
+    valid = np.all([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in known if v is not None], axis=0)
+    if readings.normal is not None:
+        valid &= np.linalg.norm(readings.normal, axis=1) > 0.5
+    drop(FaultCode.INVALID, ~valid)
+    if readings.normal is not None:
+        readings = replace(readings, normal=readings.normal / np.linalg.norm(readings.normal, axis=1)[:, None])
+    if readings.time is None:
+        rows = np.column_stack((readings.position, readings.force))
+        drop(FaultCode.REPEATED, np.append(False, (np.diff(rows, axis=0) == 0).all(axis=1)))
+    else:
+        late = readings.time < np.maximum.accumulate(readings.time)
+        if late.any():
+            faults.append(Fault(FaultCode.BACKWARD, int(late.sum()), len(late), Remedy.CORRECTED))
+            readings = readings.part(np.argsort(readings.time, kind="stable"))
+        assert readings.time is not None
+        drop(FaultCode.REPEATED, np.append(False, np.diff(readings.time) == 0))
+        drop(FaultCode.FROZEN, _frozen(readings.force, readings.position))
+        away = np.linalg.norm(readings.position - median_filter(readings.position, (5, 1), mode="nearest"), axis=1)
+        usual = np.linalg.norm(np.diff(readings.position, axis=0), axis=1)
+        drop(FaultCode.JUMP, away > max(radius, 10 * float(np.quantile(usual, 0.99))), float(away.max(initial=0.0)))
+    clipped, limit = _clipped(readings.force)
+    drop(FaultCode.CLIPPED, clipped, limit)
+    return readings, faults
+
+
+def _runs(same: Mask) -> list[slice]:
+    """Return the stretches of equal neighbours, each with the reading that it repeats."""
+    found: list[slice] = [one[0] for one in find_objects(label(same)[0])]
+    return [slice(one.start - 1, one.stop) for one in found]
+
+
+def _frozen(values: Array, others: Array) -> Mask:
+    """Return True where a value repeats much longer than usual while the other one changes, shape (n,)."""
+    runs = _runs(np.append(False, (np.diff(values, axis=0) == 0).all(axis=1)))
+    frozen = np.zeros(len(values), bool)
+    if not runs:
+        return frozen
+    lengths = np.array([one.stop - one.start for one in runs])
+    usual = float(np.median(lengths)) if lengths.sum() > 0.5 * len(values) else 1.0  # slower than the rows
+    for one in runs:
+        changes = (np.diff(others[one], axis=0) != 0).any(axis=1).mean()
+        frozen[one] = one.stop - one.start > max(_RUN * usual, _FEWEST) and changes > 0.5
+    return frozen
+
+
+def _clipped(force: Array) -> tuple[Mask, float]:
+    """Return True where a component stays at its extreme, shape (n,), and that force [N]."""
+    clipped, limit = np.zeros(len(force), bool), 0.0
+    for column in force.T:
+        for end in (column.max(), column.min()):
+            runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == end)))
+            if sum(one.stop - one.start >= _FEWEST for one in runs):
+                clipped[column == end] = True
+                limit = abs(float(end))
+    return clipped, limit

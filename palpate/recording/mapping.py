@@ -1,0 +1,161 @@
+"""The mapping: what the columns or topics of a recording are, in which units and frames, and with which tool."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Final, Literal
+
+import yaml
+from pydantic import Field, ValidationError, model_validator
+
+from palpate_errors import UserError
+from palpate_models.section import Pose, Section, Vec3
+
+Triple = tuple[str, str, str]
+SCALES: Final = {"m": 1.0, "mm": 1e-3, "N": 1.0, "mN": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+"""Metres, newtons and seconds in a unit."""
+
+
+class MappingError(UserError):
+    """A mapping that cannot be used. Names file, field and what is allowed."""
+
+
+class Columns(Section):
+    """Columns of a CSV or Parquet table."""
+
+    position: Triple
+    """x, y, z of the tool."""
+    force: Triple | tuple[str]
+    """x, y, z of the force; or one column with the force along the normal."""
+    time: str | None = None
+    """Time. A table without it needs `probe`."""
+    probe: str | None = None
+    """Number of the probe: rows of equal number are one contact, in order, and time is not used."""
+    orientation: tuple[str, str, str, str] | None = None
+    """Quaternion of the tool."""
+    quaternion: Literal["xyzw", "wxyz"] = "xyzw"
+    """Order of its columns."""
+    normal: Triple | None = None
+    """Outward normal of the skin."""
+    touch: Triple | None = None
+    """Position of the tool at first contact of the probe."""
+
+    @model_validator(mode="after")
+    def _ordered(self) -> Columns:
+        if (self.time is None) == (self.probe is None):
+            raise ValueError("want one of time and probe")
+        return self
+
+
+class Transform(Section):
+    """A pose from tf."""
+
+    parent: str
+    """Frame of the positions."""
+    child: str
+    """Frame of the tool."""
+
+
+class Joints(Section):
+    """A pose from joint positions."""
+
+    topic: str
+    """sensor_msgs/JointState."""
+    urdf: Path
+    """The arm; a relative path begins at the mapping's folder."""
+    frame: str
+    """Frame of the tool in the URDF."""
+
+
+class Topics(Section):
+    """Topics of a rosbag2 folder or an MCAP file."""
+
+    wrench: str
+    """geometry_msgs/WrenchStamped."""
+    pose: str | Transform | Joints
+    """Topic of geometry_msgs/PoseStamped; or `parent` and `child` of tf; or `topic`, `urdf` and `frame` of an arm."""
+
+
+class Units(Section):
+    """Units of the table. Messages are in SI units."""
+
+    length: Literal["m", "mm"] = "m"
+    force: Literal["N", "mN"] = "N"
+    time: Literal["s", "ms", "us", "ns"] = "s"
+
+
+class ForceSource(Section):
+    """Sign, axes and zero of the force."""
+
+    on: Literal["tool", "body"] = "tool"
+    """Whose force it is: what the tool feels points outward when it presses; what the body feels points inward."""
+    axes: Literal["recording", "tool"] = "recording"
+    """Axes of the force: those of the positions, or those of the tool's pose."""
+    rpy_rad: Vec3 = (0.0, 0.0, 0.0)
+    """Orientation of the force's axes in those of the tool."""
+    tare: bool = True
+    """True to take the zero of the force from motion in free air; needs time."""
+    delay_s: float = 0.0
+    """Time by which the force's stamps are later than those of equal positions [s]."""
+
+
+class Tool(Section):
+    """The spherical tool."""
+
+    radius_m: Annotated[float, Field(ge=0.0005, le=0.1)]
+    """Radius of the sphere [m]."""
+    mass_kg: Annotated[float, Field(ge=0, le=20)] = 0.0
+    """Mass below the sensor [kg]; 0 if the driver compensates it."""
+    point: Literal["centre", "tip"] = "centre"
+    """Position is the sphere's centre, or its lowest point."""
+    offset_m: Vec3 = (0.0, 0.0, 0.0)
+    """That point in the frame of the tool's pose [m]."""
+
+
+class Body(Section):
+    """The body that is palpated."""
+
+    pose: Pose | None = None
+    """Pose of the body frame A in the frame of the positions: z outward, maps are of its xy plane. By default that frame
+    itself if its z points outward, else one is fitted to the contacts."""
+    anatomy: Literal["none", "abdomen"] = "none"
+    """`abdomen`: A has its origin at the umbilicus, x to the patient's left, y to the head; bone and muscle are expected."""
+    surface: Path | None = None
+    """Mesh of the unpressed skin (PLY, STL, OBJ) in the frame and unit of the positions; by default it is found from contacts."""
+
+
+class Mapping(Section):
+    """How a recording is read."""
+
+    table: Columns | None = None
+    topics: Topics | None = None
+    units: Units = Units()
+    force: ForceSource = ForceSource()
+    tool: Tool
+    gravity_mps2: Vec3 = (0.0, 0.0, -9.81)
+    """In the frame of the positions."""
+    body: Body = Body()
+
+    @model_validator(mode="after")
+    def _one_source(self) -> Mapping:
+        if (self.table is None) == (self.topics is None):
+            raise ValueError("want one of table and topics")
+        return self
+
+
+def read_mapping(path: Path) -> Mapping:
+    """Return the mapping of a YAML file, with its paths as seen from here. Raises MappingError."""
+    try:
+        mapping = Mapping.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise MappingError(f"{path}: cannot be read: {str(error).partition(chr(10))[0]}") from None
+    except ValidationError as error:
+        wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
+        raise MappingError(f"{path}: {'; '.join(wrong)}") from None
+    body, topics = mapping.body, mapping.topics
+    if body.surface is not None:
+        body = body.model_copy(update={"surface": path.parent / body.surface})
+    if topics is not None and isinstance(topics.pose, Joints):
+        arm = topics.pose.model_copy(update={"urdf": path.parent / topics.pose.urdf})
+        topics = topics.model_copy(update={"pose": arm})
+    return mapping.model_copy(update={"body": body, "topics": topics})

@@ -1,0 +1,77 @@
+"""Contacts of a table of probes, which has no time."""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+
+from palpate.recording import cutting
+from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.motion import Axis, noise
+from palpate.recording.readings import Readings
+from palpate.recording.recording import Contact, ContactKind, Palpated
+from palpate.recording.skin import fitted, grid_over
+from palpate.recording.timed import implausible_unit, normal_force
+from palpate_models.numerics.frames import Array
+
+_AWAY: Final = 3.0
+"""A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
+_TOUCHED: Final = 3.0
+"""Least force of a contact, in SD of the force."""
+
+
+def probes(readings: Readings) -> list[slice]:
+    """Return the rows of each probe."""
+    assert readings.probe is not None
+    ends = np.flatnonzero(np.diff(readings.probe)) + 1
+    return [slice(int(a), int(b)) for a, b in zip((0, *ends), (*ends, len(readings.probe)), strict=True)]
+
+
+def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list[slice], faults: list[Fault]) -> Palpated:
+    """Return the contacts of readings in A, and the skin; adds faults."""
+    p, normals = readings.position, readings.normal
+    n = np.tile(axis.outward, (len(p), 1)) if normals is None else normals
+    force = normal_force(readings.force, n)
+    start = p if readings.touch is None else readings.touch
+    travel = np.array([float(np.ptp(p[one] @ n[one][0])) for one in rows])
+    aside = np.array([float(np.linalg.norm(p[one] - start[one][0], axis=1).max()) for one in rows])
+    usual = float(np.median(travel))
+    faults += implausible_unit(usual, radius)
+    sigma = max(float(np.median([noise(force[one]) for one in rows])), 1e-4)
+    jumped = aside > max(_AWAY * usual, 1e-9)
+    empty = ~jumped & np.array([force[one].max() < _TOUCHED * sigma for one in rows])
+    for code, wrong, value in ((FaultCode.JUMP, jumped, aside), (FaultCode.NO_CONTACT, empty, force)):
+        if wrong.any():
+            faults.append(Fault(code, int(wrong.sum()), len(rows), Remedy.LEFT_OUT, float(value.max())))
+    kept = [one for one, wrong in zip(rows, jumped | empty, strict=True) if not wrong]
+    if not kept:
+        return Palpated.nothing()
+    inward = [-(p[one] @ n[one][0]) for one in kept]
+    loads = [(s[d], force[one][d]) for s, one in zip(inward, kept, strict=True) if (d := cutting.loading(s))]
+    power = cutting.power_of(loads, sigma)
+    onsets = [cutting.onset(s, F, power, sigma) for s, F in loads]
+    given = readings.touch is not None
+    zero = [-(start[one][0] @ n[one][0]) for one in kept]
+    off = np.array([begin.at - at if begin else np.nan for begin, at in zip(onsets, zero, strict=True)])
+    scatter = 1.4826 * float(np.nanmedian(np.abs(off - np.nanmedian(off)))) if np.isfinite(off).any() else 0.0
+    contacts = []
+    for one, s, at, begin in zip(kept, inward, zero, onsets, strict=True):
+        if begin is None and not given:
+            continue
+        sd = scatter if given or begin is None else begin.sd
+        contacts.append(
+            _contact(p[one], n[one], force[one], s - (at if given or begin is None else begin.at), (radius, sd, sigma))
+        )
+    points = np.array([contact.position[0] for contact in contacts]).reshape(-1, 3)
+    if normals is not None:
+        at = np.array([contact.normal[0] for contact in contacts]).reshape(-1, 3)
+        return Palpated(contacts, points, at, power, len(kept) - len(contacts))
+    reach = float(np.sqrt(radius * usual))
+    skin = fitted(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
+    return Palpated(contacts, *skin.points(), power, len(kept) - len(contacts))
+
+
+def _contact(p: Array, n: Array, force: Array, depth: Array, tool: tuple[float, float, float]) -> Contact:
+    radius, sd, sigma = tool
+    return Contact(ContactKind.PROBE, p + (depth - radius)[:, None] * n, n, depth, force, sd, sigma)

@@ -1,0 +1,139 @@
+"""Files to a `Recording`: reads, cleans, aligns, tares, cuts, finds the skin, and says what was wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+
+from palpate.recording.clean import cleaned
+from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.mapping import Mapping, MappingError, read_mapping
+from palpate.recording.motion import Axis, blocks, pressing_axis
+from palpate.recording.own import is_own, own_recording
+from palpate.recording.probes import contacts_of_probes, probes
+from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
+from palpate.recording.recording import Recording
+from palpate.recording.telling import telling
+from palpate.recording.timed import contacts_over_time
+from palpate_models.numerics.frames import Array, inverse, matrix
+
+_UPRIGHT: Final = 0.7
+"""Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
+_WRONG_FRAME_DEG: Final = 40.0
+
+
+def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None) -> Recording:
+    """Return the recording of a table, a bag, or the results folder of a run.
+
+    Parameters
+    ----------
+    path
+        CSV, Parquet, MCAP, a rosbag2 folder, or the results folder of `palpate run`.
+    mapping
+        What its columns or topics are, as an object or a YAML file; none for the results of a run.
+
+    Raises
+    ------
+    UserError
+        The file or the mapping cannot be used.
+    """
+    path = Path(path)
+    if not path.exists():
+        raise ReadingError(f"{path}: is not there")
+    if mapping is None:
+        if is_own(path):
+            return own_recording(path)
+        raise MappingError(f"{path}: --mapping is missing; palpate assess {path} --inspect --out mapping.yaml proposes one")
+    mapping = mapping if isinstance(mapping, Mapping) else read_mapping(Path(mapping))
+    if (mapping.table is not None) != (path.suffix in TABLES):
+        raise MappingError(f"{path}: the mapping has {'table' if mapping.table else 'topics'}, which does not fit this file")
+    raw = from_table(read_table(path), mapping, str(path)) if mapping.table else from_bag(path, mapping)
+    return recording_of(raw, mapping, path.stem)
+
+
+def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
+    """Return the recording of readings as a file has them. Raises UserError."""
+    readings, faults = cleaned(raw, mapping.tool.radius_m)
+    readings = moved(readings, mapping)
+    if len(readings.position) < 10:
+        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least 10")
+    parts = probes(readings) if readings.time is None else blocks(readings.time)
+    axis = pressing_axis(readings.position, readings.force, parts)
+    if axis is None:
+        raise ReadingError(
+            f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
+        )
+    known = None if readings.normal is None else readings.normal.mean(axis=0)
+    if known is not None and float(axis.outward @ known) < 0:
+        axis = replace(axis, outward=-axis.outward)
+    if axis.flipped:
+        faults.append(Fault(FaultCode.SIGN, len(parts), len(parts), Remedy.CORRECTED))
+        readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
+    if readings.force.shape[1] == 3 and axis.angle_deg > _WRONG_FRAME_DEG:
+        faults.append(Fault(FaultCode.FRAME, len(parts), len(parts), Remedy.REFUSED, axis.angle_deg))
+    elif readings.force.shape[1] == 3:
+        axis = replace(axis, outward=axis.force)  # more exact: sideways motion does not tilt it
+    X_WA = _body_frame(mapping, axis, readings.position)
+    in_A = _in_frame(readings, X_WA)
+    axis = replace(axis, outward=X_WA[:3, :3].T @ axis.outward)
+    lift = mapping.tool.radius_m if mapping.tool.point == "tip" else 0.0
+    touch = None if in_A.touch is None else in_A.touch + lift * axis.outward
+    in_A = replace(in_A, position=in_A.position + lift * axis.outward, touch=touch)
+    palpated = (
+        contacts_of_probes(in_A, axis, mapping.tool.radius_m, parts, faults)
+        if in_A.time is None
+        else contacts_over_time(in_A, axis, mapping, X_WA, faults)
+    )
+    touches = (
+        []
+        if any(fault.remedy is Remedy.REFUSED for fault in faults)
+        else telling(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
+    )
+    return Recording(
+        name=name,
+        indenter_radius_m=mapping.tool.radius_m,
+        touches=tuple(touches),
+        surface=palpated.surface,
+        normals=palpated.normals,
+        X_WA=X_WA,
+        faults=tuple(faults),
+        abdomen=mapping.body.anatomy == "abdomen",
+        exponent=palpated.exponent,
+    )
+
+
+def _body_frame(mapping: Mapping, axis: Axis, position: Array) -> Array:
+    """Return X_WA: as mapped, that of the positions if its z points outward, or fitted."""
+    X = np.eye(4)
+    if mapping.body.pose is not None:
+        X = matrix(mapping.body.pose)
+        if X[:3, 2] @ axis.outward <= 0:
+            raise MappingError(f"body.pose: its z axis points into the body; outward is {np.round(axis.outward, 2).tolist()}")
+    elif axis.outward[2] < _UPRIGHT:
+        side = np.eye(3)[np.argmin(np.abs(axis.outward))]
+        y = np.cross(axis.outward, side)
+        y /= np.linalg.norm(y)
+        X[:3, :3] = np.column_stack((np.cross(y, axis.outward), y, axis.outward))
+        X[:3, 3] = position.mean(axis=0)
+    return X
+
+
+def _in_frame(readings: Readings, X_WA: Array) -> Readings:
+    X_AW = inverse(X_WA)
+    R, p = X_AW[:3, :3], X_AW[:3, 3]
+
+    def turned(v: Array | None, by: Array | float = 0.0) -> Array | None:
+        return None if v is None or v.shape[1] == 1 else v @ R.T + by
+
+    force = readings.force if readings.force.shape[1] == 1 else readings.force @ R.T
+    return replace(
+        readings,
+        position=readings.position @ R.T + p,
+        force=force,
+        normal=turned(readings.normal),
+        touch=turned(readings.touch, p),
+        rotation=None,
+    )

@@ -1,0 +1,221 @@
+"""Reads files: tables by pandas, bags by rosbags; everything in metres, newtons and seconds, as force on the tool."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+import pandas as pd
+from numpy.typing import NDArray
+from rosbags.highlevel import AnyReader, AnyReaderError
+from scipy.spatial.transform import Rotation, Slerp
+
+from palpate.recording.mapping import SCALES, Columns, Joints, Mapping, Topics, Transform
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages.typestore import store
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
+from palpate_plugins import needs
+
+TABLES: Final = (".csv", ".tsv", ".txt", ".parquet")
+KINDS: Final = {
+    "wrench": "geometry_msgs/msg/WrenchStamped",
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "tf": "tf2_msgs/msg/TFMessage",
+    "joints": "sensor_msgs/msg/JointState",
+}
+_AXIS: Final = np.array((0.0, 0.0, 1.0))
+
+
+class ReadingError(UserError):
+    """A recording that cannot be read. Names the file and what is missing."""
+
+
+@dataclass(frozen=True, eq=False)
+class Readings:
+    """n readings of a tool, in the frame of the positions."""
+
+    position: Array
+    """Of the tool [m], shape (n, 3): of the mapped point once `moved`."""
+    force: Array
+    """On the tool [N], shape (n, 3), or (n, 1) along the normal."""
+    time: Array | None = None
+    """[s], shape (n,), increasing."""
+    probe: NDArray[Any] | None = None
+    """Number of the probe, shape (n,)."""
+    rotation: Rotation | None = None
+    normal: Array | None = None
+    """Outward, shape (n, 3)."""
+    touch: Array | None = None
+    """Position at first contact [m], shape (n, 3)."""
+
+    def part(self, chosen: NDArray[Any]) -> Readings:
+        """Return some of the readings."""
+        return Readings(**{name: None if kept is None else kept[chosen] for name, kept in vars(self).items()})
+
+
+def read_table(path: Path) -> pd.DataFrame:
+    """Return a table. Raises ReadingError."""
+    try:
+        if path.suffix == ".parquet":
+            return pd.read_parquet(path)
+        return pd.read_csv(path, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
+    except ImportError:
+        raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
+    except (OSError, ValueError, pd.errors.ParserError) as error:
+        raise ReadingError(f"{path}: is not a table: {str(error).partition(chr(10))[0]}") from None
+
+
+def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
+    """Return the readings of a table. Raises ReadingError for a missing column or one that has no numbers."""
+    columns, units = mapping.table, mapping.units
+    assert isinstance(columns, Columns)
+
+    def values(names: tuple[str, ...] | None, unit: str = "") -> Any:
+        if names is None:
+            return None
+        if missing := [one for one in names if one not in table]:
+            raise ReadingError(f"{name}: no column {missing[0]!r}; it has {', '.join(map(str, table.columns[:20]))}")
+        numbers = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(float)
+        if not np.isfinite(numbers).any():
+            raise ReadingError(f"{name}: columns {', '.join(names)} have no numbers")
+        return numbers * SCALES.get(unit, 1.0)
+
+    times = values(columns.time and (columns.time,), units.time)
+    quaternion = values(columns.orientation)
+    if quaternion is not None:
+        quaternion = np.roll(quaternion, -1, axis=1) if columns.quaternion == "wxyz" else quaternion
+        quaternion[~(np.linalg.norm(np.nan_to_num(quaternion), axis=1) > 0)] = (0, 0, 0, 1)
+    return Readings(
+        position=values(columns.position, units.length),
+        force=values(columns.force, units.force),
+        time=None if times is None else times[:, 0],
+        probe=None if columns.probe is None else values((columns.probe,))[:, 0],
+        rotation=None if quaternion is None else Rotation.from_quat(np.nan_to_num(quaternion)),
+        normal=values(columns.normal),
+        touch=values(columns.touch, units.length),
+    )
+
+
+def from_bag(path: Path, mapping: Mapping) -> Readings:
+    """Return the readings of a bag at the stamps of its wrenches. Raises ReadingError."""
+    topics = mapping.topics
+    assert isinstance(topics, Topics)
+    with opened(path) as bag:
+        wrenches = list(_messages(bag, path, topics.wrench, "wrench"))
+        times = np.array([t for t, _ in wrenches])
+        force = np.array([(w.wrench.force.x, w.wrench.force.y, w.wrench.force.z) for _, w in wrenches])
+        stamps, position, rotation = _poses(bag, path, topics.pose)
+    stamps, first = np.unique(stamps, return_index=True)
+    if len(stamps) < 2:
+        raise ReadingError(f"{path}: {len(stamps)} poses; want at least 2")
+    inside = (times >= stamps[0]) & (times <= stamps[-1])
+    if not inside.any():
+        raise ReadingError(
+            f"{path}: the wrenches are stamped {times.min():.3f} to {times.max():.3f} s, the poses {stamps[0]:.3f} to "
+            f"{stamps[-1]:.3f} s: they do not overlap"
+        )
+    times, force = times[inside], force[inside]
+    between = np.column_stack([np.interp(times, stamps, position[first, k]) for k in range(3)])
+    return Readings(between, force, times - times[0], rotation=Slerp(stamps, rotation[first])(times))
+
+
+def opened(path: Path) -> AnyReader:
+    """Return a reader of a bag, for a `with` block. Raises ReadingError."""
+    try:
+        return AnyReader([path], default_typestore=store)
+    except (AnyReaderError, OSError) as error:
+        raise ReadingError(f"{path}: {error}") from None
+
+
+def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tuple[float, Any]]:
+    """Yield stamp [s] and message of a topic: the header's stamp if it has one."""
+    chosen = [c for c in bag.connections if c.topic.strip("/") == topic.strip("/") and c.msgtype == KINDS[kind]]
+    if not chosen:
+        has = ", ".join(sorted({c.topic for c in bag.connections if c.msgtype == KINDS[kind]})) or "none"
+        raise ReadingError(f"{path}: no topic {topic} of type {KINDS[kind]}; topics of this type: {has}")
+    for connection, logged, data in bag.messages(chosen):
+        message = bag.deserialize(data, connection.msgtype)
+        stamp = nanoseconds(message.header.stamp) if hasattr(message, "header") else 0
+        yield (stamp or logged) / NS, message
+
+
+def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tuple[Array, Array, Rotation]:
+    """Return stamps [s], positions [m] and orientations of the tool."""
+    if isinstance(source, Transform):
+        return _transforms(bag, path, source)
+    if isinstance(source, Joints):
+        return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
+    poses = [(t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose")]
+    quaternions = np.array([(q.x, q.y, q.z, q.w) for _, _, q in poses])
+    return np.array([t for t, _, _ in poses]), np.array([(p.x, p.y, p.z) for _, p, _ in poses]), Rotation.from_quat(quaternions)
+
+
+def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, Array, Rotation]:
+    """Return the chain of tf from parent to child at the stamps of its fastest link."""
+    links: dict[str, tuple[str, list[tuple[float, ...]]]] = {}
+    for topic in ("tf_static", "tf"):
+        if topic == "tf_static" and not any(c.topic.strip("/") == topic for c in bag.connections):
+            continue
+        for _, message in _messages(bag, path, topic, "tf"):
+            for one in message.transforms:
+                p, q, name = one.transform.translation, one.transform.rotation, one.child_frame_id.strip("/")
+                links.setdefault(name, (one.header.frame_id.strip("/"), []))[1].append(
+                    (nanoseconds(one.header.stamp) / NS, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
+                )
+    chain, frame = [], source.child.strip("/")
+    while frame != source.parent.strip("/"):
+        if frame not in links or len(chain) > len(links):
+            raise ReadingError(f"{path}: tf has no way from {source.child} to {source.parent}; it has {', '.join(sorted(links))}")
+        frame, rows = links[frame]
+        chain.append(np.array(sorted(rows)))
+    stamps = np.unique(max(chain, key=len)[:, 0])
+    position, rotation = np.zeros((len(stamps), 3)), Rotation.identity(len(stamps))
+    for rows in chain:
+        known, first = np.unique(rows[:, 0], return_index=True)
+        turn = Rotation.from_quat(rows[first, 4:])
+        within = np.clip(stamps, known[0], known[-1])
+        turned = Slerp(known, turn)(within) if len(known) > 1 else turn[np.zeros(len(stamps), int)]
+        moved = np.column_stack([np.interp(within, known, rows[first, k]) for k in (1, 2, 3)])
+        position, rotation = moved + turned.apply(position), turned * rotation
+    return stamps, position, rotation
+
+
+def _kinematics(states: list[tuple[float, Any]], source: Joints) -> tuple[Array, Array, Rotation]:
+    """Return the poses of a frame of an arm by its joint positions."""
+    import pinocchio  # noqa: PLC0415 - only for joint positions
+
+    try:
+        model = pinocchio.buildModelFromUrdf(str(source.urdf))
+    except ValueError as error:
+        raise ReadingError(f"{source.urdf}: is not a URDF: {error}") from None
+    data, frame, first = model.createData(), model.getFrameId(source.frame), states[0][1].name
+    if frame >= model.nframes or (unknown := [name for name in first if not model.existJointName(name)]):
+        raise ReadingError(f"{source.urdf}: no {source.frame if frame >= model.nframes else 'joint ' + unknown[0]}")
+    at = [model.joints[model.getJointId(name)].idx_q for name in first]
+    q, poses = pinocchio.neutral(model), []
+    for _, state in states:
+        q[at] = state.position
+        pinocchio.forwardKinematics(model, data, q)
+        poses.append(pinocchio.updateFramePlacement(model, data, frame).homogeneous.copy())
+    X = np.array(poses)
+    return np.array([t for t, _ in states]), X[:, :3, 3], Rotation.from_matrix(X[:, :3, :3])
+
+
+def moved(readings: Readings, mapping: Mapping) -> Readings:
+    """Return the readings of the mapped point, with the force on the tool in the axes of the positions, without weight."""
+    force, turn, position = readings.force, readings.rotation, readings.position
+    if force.shape[1] == 3:
+        if mapping.force.axes == "tool":
+            if turn is None:
+                raise ReadingError("force.axes = tool: the recording has no orientation; want `recording`, or table.orientation")
+            force = (turn * Rotation.from_euler("xyz", mapping.force.rpy_rad)).apply(force)
+        force = (force if mapping.force.on == "tool" else -force) - mapping.tool.mass_kg * np.array(mapping.gravity_mps2)
+    if any(mapping.tool.offset_m):
+        if turn is None:
+            raise ReadingError("tool.offset_m: the recording has no orientation, so that the offset cannot be turned")
+        position = position + turn.apply(mapping.tool.offset_m)
+    return replace(readings, position=position, force=force)

@@ -1,0 +1,113 @@
+"""The unpressed skin: a smooth height field through the places where contacts begin, as a Gaussian process."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array, apply
+
+_MOST: Final = 300
+"""Points that the process is fitted to."""
+_NODES: Final = 40
+"""Nodes of its grid along the longer side."""
+_PLANE: Final = 4
+"""Least number of points that a plane is fitted to."""
+
+
+@dataclass(frozen=True)
+class Skin:
+    """Heights of the tool's centre at first contact over the xy plane of A, on a grid."""
+
+    x: Array
+    y: Array
+    """[m]"""
+    z: Array
+    """[m], shape (nx, ny)."""
+    sd: Array
+    """[m], shape (nx, ny)."""
+
+    def at(self, xy: Array) -> tuple[Array, Array, Array]:
+        """Return height [m] (k,), outward unit normal (k, 3) and SD of the height [m] (k,) at places [m], shape (k, 2)."""
+        surface = RectBivariateSpline(self.x, self.y, self.z, kx=3, ky=3)
+        slope = np.column_stack((surface.ev(*xy.T, dx=1), surface.ev(*xy.T, dy=1)))
+        normal = np.column_stack((-slope, np.ones(len(xy))))
+        spread = RectBivariateSpline(self.x, self.y, self.sd, kx=1, ky=1).ev(*xy.T)
+        return surface.ev(*xy.T), normal / np.linalg.norm(normal, axis=1)[:, None], spread
+
+    def points(self) -> tuple[Array, Array]:
+        """Return its nodes [m] and their normals, shape (n, 3) each."""
+        xy = np.stack(np.meshgrid(self.x, self.y, indexing="ij"), axis=-1).reshape(-1, 2)
+        z, normal, _ = self.at(xy)
+        return np.column_stack((xy, z)), normal
+
+    def through(self, points: Array, sd: Array) -> Skin:
+        """Return the skin moved outward or inward to points of standard deviation `sd` [m], by their weighted mean."""
+        off = points[:, 2] - self.at(points[:, :2])[0]
+        near = np.abs(off - np.median(off)) <= 5 * np.median(np.abs(off - np.median(off))) + 1e-9
+        return replace(self, z=self.z + float(np.average(off[near], weights=sd[near] ** -2)))
+
+
+def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> Skin:
+    """Return the skin of a mesh in the frame of the positions, in units of `scale` [m]. Raises UserError."""
+    import trimesh  # noqa: PLC0415 - only for a mesh
+
+    try:
+        mesh = trimesh.load(file, force="mesh")
+        centres = apply(X_AW, scale * mesh.vertices) + radius * mesh.vertex_normals @ X_AW[:3, :3].T
+    except Exception as error:  # trimesh raises whatever its parsers do
+        raise UserError(f"{file}: is not a mesh: {error}") from None
+    xy = np.stack(np.meshgrid(*stations, indexing="ij"), axis=-1)
+    z = LinearNDInterpolator(centres[:, :2], centres[:, 2])(xy)
+    z = np.where(np.isfinite(z), z, NearestNDInterpolator(centres[:, :2], centres[:, 2])(xy))
+    return Skin(*stations, z, np.full(z.shape, 0.0))
+
+
+def grid_over(xy: Array, margin: float) -> tuple[Array, Array]:
+    """Return the stations in x and y of a grid over places [m], shape (n, 2), and a margin [m]."""
+    low, high = xy.min(axis=0) - margin, xy.max(axis=0) + margin
+    step = float((high - low).max()) / _NODES
+    x, y = (np.linspace(a, b, max(5, round((b - a) / step) + 1)) for a, b in zip(low, high, strict=True))
+    return x, y
+
+
+def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> Skin:
+    """Return the skin through points [m], shape (n, 3), of standard deviation `sd` [m], shape (n,).
+
+    `least`: shortest length over which the skin varies [m].
+    """
+    chosen = np.argsort(sd, kind="stable")[:: max(1, len(sd) // _MOST)]
+    points, sd = points[chosen], sd[chosen]
+    centre = points.mean(axis=0)
+    terms = 3 if len(points) >= _PLANE else 1
+    plane = np.linalg.lstsq(_terms(points, centre, terms) / sd[:, None], (points[:, 2] - centre[2]) / sd, rcond=None)[0]
+    rest = points[:, 2] - centre[2] - _terms(points, centre, terms) @ plane
+    size = max(float(np.sqrt(np.mean(rest**2))), float(np.median(sd)), 1e-6)
+    extent = float(np.ptp(points[:, :2], axis=0).max()) + least
+    kernel = ConstantKernel(1.0, (0.05, 1e3)) * RBF(max(least, 0.5 * extent), (least, 10 * extent)) + WhiteKernel(
+        0.05, (1e-4, 1.0)
+    )
+    process = GaussianProcessRegressor(kernel, alpha=(sd / size) ** 2, random_state=0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        process.fit(points[:, :2], rest / size)
+    x, y = stations
+    xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
+    process.kernel_ = process.kernel_.k1  # the noise of the points is not the skin's
+    mean, spread = process.predict(xy, return_std=True)
+    z = centre[2] + _terms(xy, centre, terms) @ plane + size * mean
+    return Skin(x, y, z.reshape(len(x), len(y)), (size * spread).reshape(len(x), len(y)))
+
+
+def _terms(places: Array, centre: Array, count: int) -> Array:
+    """Return the terms of a plane, or of a level, at places [m], shape (n, count)."""
+    return np.column_stack((np.ones(len(places)), *(places[:, k] - centre[k] for k in (0, 1))))[:, :count]

@@ -1,0 +1,221 @@
+"""Contacts of a recording over time: aligned, tared, cut, and measured from the skin where they begin."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+
+from palpate.recording import cutting
+from palpate.recording.cutting import Onset
+from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.mapping import SCALES, Mapping
+from palpate.recording.motion import TUNING, Axis, delay, free_air, noise, shifted, tared
+from palpate.recording.readings import Readings
+from palpate.recording.recording import Contact, ContactKind, Palpated
+from palpate.recording.skin import Skin, fitted, grid_over, of_mesh
+from palpate_models.numerics.frames import Array, inverse
+
+_TRAVEL: Final = (0.005, 4.0)
+"""Plausible travel of a contact along the normal, in radii of the tool."""
+_DELAY_S: Final = 0.04
+"""Delay that is reported and corrected."""
+_DRIFT: Final = 0.05
+"""Drift that is reported, as a share of the usual force."""
+_HOMOGENEOUS: Final = 0.2
+"""SD of the depth over itself, where it is known only from the force and the stiffness elsewhere."""
+
+
+def normal_force(force: Array, normal: Array) -> Array:
+    """Return the force along the outward normal [N], shape (n,); `force` (n, 3), or (n, 1) if it is that already."""
+    return force[:, 0] if force.shape[1] == 1 else np.asarray((force * normal).sum(axis=-1))
+
+
+def implausible_unit(travel: float, radius: float) -> list[Fault]:
+    """Return the fault of lengths in another unit; `travel` of a contact and `radius` of the tool [m]."""
+    low, high = _TRAVEL
+    return [] if low * radius < travel < high * radius else [Fault(FaultCode.UNIT, 1, 1, Remedy.REFUSED, travel)]
+
+
+def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: Array, faults: list[Fault]) -> Palpated:
+    """Return the contacts of readings in A, and the skin; adds faults."""
+    readings, sigma = _prepared(readings, axis, mapping, faults)
+    assert readings.time is not None
+    height, force = readings.position @ axis.outward, normal_force(readings.force, axis.outward)
+    found = cutting.cut(readings.time, height, force, sigma)
+    if found.blind or not found.touching:
+        of = found.blind + len(found.touching)
+        faults.append(Fault(FaultCode.NO_CONTACT, found.blind, of, Remedy.LEFT_OUT if found.touching else Remedy.REFUSED))
+    if not found.touching:
+        return Palpated.nothing()
+    span = float(np.median([np.ptp(height[one]) for one in found.touching]))
+    faults += implausible_unit(span, mapping.tool.radius_m)
+    work = _Measured(readings, axis.outward, mapping.tool.radius_m, sigma, found.touching, span)
+    if mapping.body.surface is not None:
+        scale = SCALES[mapping.units.length]
+        work.skin = of_mesh(mapping.body.surface, scale, inverse(X_WA), mapping.tool.radius_m, work.stations)
+    return work.palpated()
+
+
+def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fault]) -> tuple[Readings, float]:
+    """Return the readings with force and position aligned and the force tared, and the SD of the force [N]."""
+    assert readings.time is not None
+    time = readings.time
+    if mapping.force.delay_s:
+        readings = shifted(readings, mapping.force.delay_s)
+    late = delay(time, readings.position @ axis.outward, normal_force(readings.force, axis.outward))
+    if abs(late) > max(_DELAY_S, 2 * float(np.median(np.diff(time)))):
+        faults.append(Fault(FaultCode.CLOCK, 1, 1, Remedy.CORRECTED, late))
+        readings = shifted(readings, late)
+    height, force = readings.position @ axis.outward, normal_force(readings.force, axis.outward)
+    if not mapping.force.tare:
+        return readings, max(noise(force), 1e-4)
+    free = free_air(time, height, force, axis.stiffness)
+    if not free.any():
+        faults.append(Fault(FaultCode.NO_FREE_AIR, 1, 1, Remedy.NOT_TARED))
+        return readings, max(noise(force), 1e-4)
+    level, drift, spread = tared(time, readings.force, free)
+    sigma = float(spread.max())
+    pressed = normal_force(level, axis.outward)
+    pressed = pressed[pressed > TUNING.sigmas * sigma]
+    if len(pressed) and np.abs(drift).max() > max(_DRIFT * float(np.median(pressed)), 2 * sigma):
+        faults.append(Fault(FaultCode.DRIFT, 1, 1, Remedy.CORRECTED, float(np.abs(drift).max())))
+    return replace(readings, force=level), sigma
+
+
+@dataclass(frozen=True)
+class _Loading:
+    """The first part of a contact, along one normal."""
+
+    normal: Array
+    inward: Array
+    """[m], shape (k,)."""
+    force: Array
+    """[N]"""
+    deepest: Array
+    """Position at its end [m], shape (3,)."""
+
+
+class _Measured:
+    """Contacts and skin of readings in A, each found from the other."""
+
+    def __init__(
+        self, readings: Readings, outward: Array, radius: float, sigma: float, touching: list[slice], span: float
+    ) -> None:
+        self.readings, self.outward, self.radius, self.sigma, self.touching = readings, outward, radius, sigma, touching
+        p = readings.position
+        self.reach = float(np.sqrt(radius * min(span, radius)))
+        """Radius of the footprint [m]."""
+        self.stations = grid_over(np.concatenate([p[one, :2] for one in touching]), self.reach)
+        self.slides = [cutting.lateral_travel(p[one], outward) > self.reach for one in touching]
+        self.skin: Skin | None = None
+        self.power = 1.0
+
+    def palpated(self) -> Palpated:
+        """Return the contacts and the skin."""
+        given = self.skin is not None
+        for _ in range(2):  # the second time with the normals of the first
+            loads = [self._loading(one, slide) for one, slide in zip(self.touching, self.slides, strict=True)]
+            self.power = cutting.power_of([(load.inward, load.force) for load in loads], self.sigma)
+            onsets = [cutting.onset(load.inward, load.force, self.power, self.sigma) for load in loads]
+            points, sd = self._skin_points(loads, onsets)
+            if not given:
+                self.skin = fitted(points, sd, self.stations, 2 * self.reach)
+        assert self.skin is not None
+        if given:
+            self.skin = self.skin.through(points, sd)
+        contacts: list[Contact] = []
+        for one, slide, load, begin in zip(self.touching, self.slides, loads, onsets, strict=True):
+            if slide:
+                contacts += self._slid(one)
+            elif begin is not None:
+                contacts.append(self._pressed(one, load, begin))
+        centres, normals = self.skin.points()
+        return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
+
+    def _loading(self, one: slice, slide: bool) -> _Loading:
+        p = self.readings.position[one]
+        normal = self.outward if self.skin is None else self.skin.at(p[:1, :2])[1][0]
+        inward = -(p @ normal)
+        if slide:
+            across = p - np.outer(p @ normal, normal)
+            still = np.linalg.norm(across - across[0], axis=1) < 0.5 * self.reach
+            p, inward = p[: max(3, int(np.argmin(still)))], inward[: max(3, int(np.argmin(still)))]
+        down = cutting.loading(inward)
+        force = normal_force(self.readings.force[one][: len(p)][down], normal)
+        return _Loading(normal, inward[down], force, p[down][-1])
+
+    def _skin_points(self, loads: list[_Loading], onsets: list[Onset | None]) -> tuple[Array, Array]:
+        """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
+
+        They are of onsets; of stretches of slides in which the depth changes; and, with little weight, of stretches where it
+        does not, by their force and the usual stiffness.
+        """
+        points, sd = [], []
+        for load, begin in zip(loads, onsets, strict=True):
+            if begin is not None:
+                points.append(load.deepest + (load.inward[-1] - begin.at) * load.normal)
+                sd.append(begin.sd)
+        usual = float(np.median([begin.stiffness for begin in onsets if begin is not None] or [np.nan]))
+        for one, slide in zip(self.touching, self.slides, strict=True):
+            if not slide:
+                continue
+            p, F = self.readings.position[one], self.readings.force[one]
+            normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
+            for part in cutting.windows(p - np.outer(p @ self.outward, self.outward), self.reach):
+                normal = normals[part].mean(axis=0)
+                force, inward = normal_force(F[part], normals[part]), -(p[part] @ normal)
+                begin = cutting.onset(inward, force, self.power, self.sigma)
+                middle, mean = p[part].mean(axis=0), float(force.mean())
+                if begin is not None and begin.sd <= self.reach:
+                    points.append(middle + (inward.mean() - begin.at) * normal)
+                    sd.append(begin.sd)
+                if (begin is None or begin.sd > self.reach) and np.isfinite(usual) and mean > 0:
+                    depth = (mean / usual) ** (1 / self.power)
+                    points.append(middle + depth * normal)
+                    sd.append(_HOMOGENEOUS * depth)
+        return np.array(points).reshape(-1, 3), np.array(sd)
+
+    def _pressed(self, one: slice, load: _Loading, begin: Onset) -> Contact:
+        p = self.readings.position[one]
+        kept = cutting.before_lift(-(p @ load.normal))
+        p, F, time = p[kept], self.readings.force[one][kept], self._time(one)[kept]
+        depth = -(p @ load.normal) - begin.at
+        return Contact(
+            kind=ContactKind.PRESS,
+            position=p + np.outer(depth - self.radius, load.normal),
+            normal=np.tile(load.normal, (len(p), 1)),
+            depth=depth,
+            force=normal_force(F, load.normal),
+            depth_uncertainty=begin.sd,
+            force_noise=self.sigma,
+            time=time,
+        )
+
+    def _slid(self, one: slice) -> list[Contact]:
+        """Return the part of a slide that is at depth; none if that is too short."""
+        assert self.skin is not None
+        p, F, time = self.readings.position[one], self.readings.force[one], self._time(one)
+        z, normal, sd = self.skin.at(p[:, :2])
+        depth = (z - p[:, 2]) * normal[:, 2]
+        deep = np.flatnonzero(depth > 0.5 * np.median(depth))
+        if len(deep) < 3:
+            return []
+        return [
+            Contact(
+                kind=ContactKind.SLIDE,
+                position=(p + (depth - self.radius)[:, None] * normal)[deep],
+                normal=normal[deep],
+                depth=depth[deep],
+                force=normal_force(F, normal)[deep],
+                depth_uncertainty=float(np.median(sd[deep])),
+                force_noise=self.sigma,
+                time=time[deep],
+            )
+        ]
+
+    def _time(self, one: slice) -> NDArray[np.float64]:
+        assert self.readings.time is not None
+        return self.readings.time[one]
