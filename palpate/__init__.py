@@ -24,6 +24,8 @@ if TYPE_CHECKING:
     from palpate.interface.scenarios import scenario
     from palpate.interface.studies import StudyResult, study
     from palpate.quick.patient import Patient, Touch
+    from palpate.recording.read import read_recording
+    from palpate.recording.recording import Recording
     from palpate_models.scenario.load import ScenarioError
     from palpate_models.scenario.schema import Scenario
 
@@ -31,12 +33,14 @@ __all__ = [
     "Assessment",
     "Examination",
     "Patient",
+    "Recording",
     "Scenario",
     "ScenarioError",
     "StiffnessMap",
     "StudyResult",
     "Touch",
     "assess",
+    "read_recording",
     "run",
     "scenario",
     "study",
@@ -46,12 +50,14 @@ _HOMES = {
     "Assessment": "palpate.interface.assessment",
     "Examination": "palpate.interface.examination",
     "Patient": "palpate.quick.patient",
+    "Recording": "palpate.recording.recording",
     "Scenario": "palpate_models.scenario.schema",
     "ScenarioError": "palpate_models.scenario.load",
     "StiffnessMap": "palpate.interface.assessment",
     "StudyResult": "palpate.interface.studies",
     "Touch": "palpate.quick.patient",
     "assess": "palpate.interface.assessment",
+    "read_recording": "palpate.recording.read",
     "run": "palpate.interface.examination",
     "scenario": "palpate.interface.scenarios",
     "study": "palpate.interface.studies",

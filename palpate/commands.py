@@ -35,6 +35,9 @@ GROUPS = {
         "resume": "palpate.live.operator:resume",
         "step": "palpate.live.operator:step",
     },
+    "Assess recordings of other robots": {
+        "assess": "palpate.recording.command:assess",
+    },
     "Look": {
         "dashboard": "palpate.live.dashboard:dashboard",
         "report": "palpate.report.command:report",
@@ -67,6 +70,7 @@ GROUPS = {
 }
 """Module and attribute of each command, by group: a function, or a Typer app of several commands."""
 EXTRAS = {
+    "assess": "library",
     "dashboard": "dashboard",
     "fmu": "fmu",
     "study": "study",

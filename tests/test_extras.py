@@ -32,6 +32,7 @@ NEEDS = {
     "palpate.interface": "library",
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
+    "palpate.recording": "library",
     "palpate.live.dashboard": "dashboard",
     "palpate.fuzz": "bench",
     "palpate.search": "library",

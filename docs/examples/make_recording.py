@@ -20,7 +20,7 @@ def recording(spacing=0.0125, depth=0.010, noise=0.02, seed=0):
     sides = np.arange(-0.105, 0.0, spacing)
     places, normals = patient.surface.points(np.array([(x, y) for x in sides for y in sides]))
     centres, forces = [], []
-    for place, normal in zip(places, normals):
+    for place, normal in zip(places, normals, strict=True):
         patient.rest(STEP_S)
         path = place + (RADIUS_M + heights[:, None]) * normal
         centres.append(path)

@@ -22,6 +22,8 @@ from palpate.apart import guarded
 from palpate.exam_state import exam_state
 from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
+from palpate.recording.assessed import collected
+from palpate.recording.recording import Recording
 from palpate.report.evidence import map_of, samples_of
 from palpate.report.results import finding_row, sample_columns
 from palpate.report.rows import FindingRow
@@ -122,7 +124,7 @@ class Assessment:
         return f"<p>{len(self.samples)} samples</p>{findings_html(self.findings)}{picture}"
 
 
-def assess(touches: Touch | Iterable[Touch]) -> Assessment:
+def assess(touches: Touch | Iterable[Touch] | Recording) -> Assessment:
     """Return map and findings of touches, computed by the assessment service of the scenario as in an examination.
 
     The service receives the same inputs as in an examination: the perceived surface, and force and depth over time.
@@ -131,7 +133,7 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
     ----------
     touches
         Results of `Patient.press` and `Patient.slide`, all of one patient, in any order. Only forces at depth count: a press
-        without a hold adds no sample.
+        without a hold adds no sample. Or a recording, see `read_recording`.
 
     Returns
     -------
@@ -156,6 +158,8 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
     >>> bool(found.findings.ratio[0] > 1.8)
     True
     """
+    if isinstance(touches, Recording):
+        return _assessment(collected(touches), {})
     felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
     if not felt:
         raise ValueError("touches: there are none; want the results of Patient.press and Patient.slide")
@@ -170,7 +174,10 @@ def assess(touches: Touch | Iterable[Touch]) -> Assessment:
             return gathered, have_assessed(service, gathered)
 
     foreign = "assessment" in foreign_roles(seen.scenario)
-    gathered, facts = guarded("services.assessment", work, math.inf) if foreign else work()
+    return _assessment(*(guarded("services.assessment", work, math.inf) if foreign else work()))
+
+
+def _assessment(gathered: Collected, facts: dict[str, Any]) -> Assessment:
     return Assessment(
         samples=samples_frame(gathered.samples),
         map=None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map),

@@ -5,10 +5,11 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
-import yaml
 from pydantic import Field, ValidationError, model_validator
 
 from palpate_errors import UserError
+from palpate_inputs import parse_yaml, read_text
+from palpate_models.scenario.load import explain
 from palpate_models.section import Pose, Section, Vec3
 
 Triple = tuple[str, str, str]
@@ -146,12 +147,13 @@ class Mapping(Section):
 def read_mapping(path: Path) -> Mapping:
     """Return the mapping of a YAML file, with its paths as seen from here. Raises MappingError."""
     try:
-        mapping = Mapping.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise MappingError(f"{path}: cannot be read: {str(error).partition(chr(10))[0]}") from None
+        text = read_text(path, MappingError)
+    except OSError as error:
+        raise MappingError(f"{path}: {error.strerror}") from None
+    try:
+        mapping = Mapping.model_validate(parse_yaml(text, str(path), MappingError))
     except ValidationError as error:
-        wrong = (f"{'.'.join(map(str, item['loc'])) or 'the file'}: {item['msg']}" for item in error.errors())
-        raise MappingError(f"{path}: {'; '.join(wrong)}") from None
+        raise MappingError(explain(str(path), text, (), Mapping, error)) from None
     body, topics = mapping.body, mapping.topics
     if body.surface is not None:
         body = body.model_copy(update={"surface": path.parent / body.surface})

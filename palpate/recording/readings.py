@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -17,6 +18,7 @@ from palpate.recording.mapping import SCALES, Columns, Joints, Mapping, Topics, 
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_errors import UserError
+from palpate_inputs import InputFile
 from palpate_models.numerics.frames import Array
 from palpate_plugins import needs
 
@@ -60,11 +62,14 @@ class Readings:
 def read_table(path: Path) -> pd.DataFrame:
     """Return a table. Raises ReadingError."""
     try:
-        if path.suffix == ".parquet":
-            return pd.read_parquet(path)
-        return pd.read_csv(path, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
+        with InputFile(path, ReadingError) as file:
+            if path.suffix == ".parquet":
+                return pd.read_parquet(io.BytesIO(file.read()))
+            return pd.read_csv(file, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
+    except UserError:
+        raise
     except (OSError, ValueError, pd.errors.ParserError) as error:
         raise ReadingError(f"{path}: is not a table: {str(error).partition(chr(10))[0]}") from None
 

@@ -15,6 +15,8 @@ from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply
+from palpate_models.patient.mesh import vertex_normals
+from palpate_models.patient.mesh_file import read_mesh
 
 _MOST: Final = 300
 """Points that the process is fitted to."""
@@ -59,13 +61,12 @@ class Skin:
 
 def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> Skin:
     """Return the skin of a mesh in the frame of the positions, in units of `scale` [m]. Raises UserError."""
-    import trimesh  # noqa: PLC0415 - only for a mesh
-
     try:
-        mesh = trimesh.load(file, force="mesh")
-        centres = apply(X_AW, scale * mesh.vertices) + radius * mesh.vertex_normals @ X_AW[:3, :3].T
-    except Exception as error:  # trimesh raises whatever its parsers do
-        raise UserError(f"{file}: is not a mesh: {error}") from None
+        vertices, triangles = read_mesh(file)
+    except UserError as error:
+        raise UserError(f"body.surface = {file}: {error}") from None
+    centres = apply(X_AW, scale * vertices)
+    centres += radius * vertex_normals(centres, triangles)
     xy = np.stack(np.meshgrid(*stations, indexing="ij"), axis=-1)
     z = LinearNDInterpolator(centres[:, :2], centres[:, 2])(xy)
     z = np.where(np.isfinite(z), z, NearestNDInterpolator(centres[:, :2], centres[:, 2])(xy))

@@ -53,7 +53,9 @@ class MapQuantity(NamedTuple):
 class Drawing:
     """Draws one map on axes, with triangulations of the scanned part in millimetres."""
 
-    def __init__(self, message: Any, findings: Any | None, truth: Truth | None) -> None:
+    def __init__(self, message: Any, findings: Any | None, truth: Truth | None, abdomen: bool = True) -> None:
+        """`abdomen`: False for another body, which has no quadrants."""
+        self.abdomen = abdomen
         self.map: Map = map_of(message)
         self.force = np.asarray(message.force, dtype=np.float64)
         self.depth = float(message.common_depth)
@@ -115,6 +117,19 @@ class Drawing:
         tri = Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles[known])
         image = axes.tripcolor(tri, np.nan_to_num(values), cmap=cmap, norm=norm, shading="gouraud", rasterized=True)
         low, high = self.xyz[self.triangles].reshape(-1, 3).min(axis=0), self.xyz[self.triangles].reshape(-1, 3).max(axis=0)
+        if self.abdomen:
+            self._quadrants(axes, low, high)
+        axes.set_aspect("equal")
+        axes.set_xlim(low[0], high[0])
+        axes.set_ylim(low[1], high[1])
+        for label, direction, text in ((axes.set_xlabel, "x", "to the patient's left"), (axes.set_ylabel, "y", "to the head")):
+            label(f"{direction}, {text} [mm]" if self.abdomen else f"{direction} [mm]", fontsize=_SMALL, color=INK)
+        axes.tick_params(labelsize=_SMALL, colors=INK)
+        return image
+
+    @staticmethod
+    def _quadrants(axes: Axes, low: Array, high: Array) -> None:
+        """Draw umbilicus, midline and names of quadrants; `low` and `high` corner of the view [mm]."""
         axes.axhline(0, color="white", lw=0.8, alpha=0.55)
         axes.axvline(0, color="white", lw=0.8, alpha=0.55)
         axes.plot(0, 0, "o", ms=5, mfc="none", mec="white", mew=1.1)
@@ -127,13 +142,6 @@ class Drawing:
             text.set_horizontalalignment("right" if x else "left")
             text.set_verticalalignment("top" if y else "bottom")
             text.set_path_effects([withStroke(linewidth=2, foreground=INK)])
-        axes.set_aspect("equal")
-        axes.set_xlim(low[0], high[0])
-        axes.set_ylim(low[1], high[1])
-        axes.set_xlabel("x, to the patient's left [mm]", fontsize=_SMALL, color=INK)
-        axes.set_ylabel("y, to the head [mm]", fontsize=_SMALL, color=INK)
-        axes.tick_params(labelsize=_SMALL, colors=INK)
-        return image
 
     def rounded(self, member: Array) -> Array:
         """Return membership averaged over neighbours, so that its half level is a smooth outline."""
@@ -196,7 +204,14 @@ class Drawing:
 
 
 def draw_map(
-    path: Path, message: Any, findings: Any | None, samples: Samples, truth: Truth | None, title: str, run: str = ""
+    path: Path,
+    message: Any,
+    findings: Any | None,
+    samples: Samples,
+    truth: Truth | None,
+    title: str,
+    run: str = "",
+    abdomen: bool = True,
 ) -> None:
     """Draw `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
 
@@ -204,7 +219,7 @@ def draw_map(
     """
     if not drawable(message):
         return
-    drawing = Drawing(message, findings, truth)
+    drawing = Drawing(message, findings, truth, abdomen)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
     grid = figure.add_gridspec(2, 3)
@@ -220,7 +235,7 @@ def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -
     flat = figure.add_subplot(grid[0, 0])
     flat.plot(samples.position[:, 0] * 1e3, samples.position[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
     depth_mm, count = drawing.depth * 1e3, len(samples.time)
-    drawing.panel(flat, layer, "a", f"Normal force at {depth_mm:.0f} mm depth", f"{count} samples (dots)")
+    drawing.panel(flat, layer, "a", f"Normal force at {depth_mm:.3g} mm depth", f"{count} samples (dots)")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
     drawing.space(solid, drawing.force, layer, layer.label)
     solid.set_box_aspect((1, 1, 0.72), zoom=1.0)
@@ -237,7 +252,7 @@ def _draw_stiffness(figure: Figure, grid: Any, drawing: Drawing) -> None:
     solid = figure.add_subplot(grid[1, 1], projection="3d")
     drawing.space(solid, drawing.xyz[:, 2], layer, "z [mm]")
     solid.set_box_aspect((1, 1, 0.45), zoom=1.0)
-    panel_title(solid, "e", "The same on the abdomen", "perceived surface")
+    panel_title(solid, "e", "The same on the surface", "of the abdomen as perceived" if drawing.abdomen else "the unpressed skin")
     true = figure.add_subplot(grid[1, 2])
     if drawing.true is None:
         true.set_axis_off()
@@ -274,7 +289,7 @@ def _summary(drawing: Drawing) -> str:
     if not drawing.findings:
         return "no finding"
     return "; ".join(
-        f"{f.quadrant}, {f.ratio:.1f} times as stiff "
+        f"{f.quadrant + ', ' if f.quadrant else ''}{f.ratio:.1f} times as stiff "
         f"({f.ratio_lower:.1f} to {f.ratio_upper:.1f}), confidence {rows.confidence(f)}"
         for f in drawing.findings
     )

@@ -88,7 +88,7 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
     environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
     skipped = _skipped(scenario, report, evidence)
     places = np.array([row["place"] for row in skipped if row["place"] is not None], dtype=np.float64).reshape(-1, 2)
-    solid = None if evidence.stiffness_map is None else page_figures.surface(evidence.stiffness_map)
+    solid = None if evidence.stiffness_map is None else page_figures.surface(evidence.stiffness_map, report.abdomen)
     template = environment.get_template("report.html.j2")
     return template.render(
         scenario=scenario,
@@ -104,8 +104,8 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         layers=None if solid is None else solid[0],
         surface=None if solid is None else Markup(json.dumps(solid[1])),
         viewer=Markup((Path(__file__).parent / "templates" / "surface.js").read_text(encoding="utf-8")),
-        maps=_image(page_figures.maps(evidence, samples_xy, places)),
-        record=_image(page_figures.record(evidence, scenario.limits.force_working_n)),
+        maps=_image(page_figures.maps(evidence, samples_xy, places, report.abdomen)),
+        record=_image(page_figures.record(evidence, None if report.recorded else scenario.limits.force_working_n)),
         force_depth=_image(page_figures.force_depth(evidence)),
         truth=_image(page_figures.truth(evidence, known_truth(scenario, evidence))),
         of_clean_world=clean_world_note(report),
@@ -124,6 +124,9 @@ def verdict(report: Report) -> str:
     """Return the result as a sentence."""
     if report.failure:
         return f"The examination did not complete: {report.failure}."
+    refused = [fault.text for fault in report.recorded.faults if fault.refused] if report.recorded else []
+    if refused:
+        return f"Not assessed: {'; '.join(refused)}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
     muscles = rows.tensed(report.candidates)
@@ -146,9 +149,11 @@ def _unreached(report: Report) -> str:
 
 def _finding_text(f: FindingRow) -> str:
     low, high = f.ratio_90
-    where, kind = QUADRANTS.get(f.quadrant, f.quadrant), "stiff" if f.ratio > 1 else "soft"
+    x, y = (f"{1e3 * value:+.0f}" for value in f.centroid_m[:2])
+    where = f"in the {QUADRANTS.get(f.quadrant, f.quadrant)}" if f.quadrant else f"about ({x}, {y}) mm"
+    kind = "stiff" if f.ratio > 1 else "soft"
     return (
-        f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² in the {where}, {f.ratio:.1f} times as stiff as its surroundings "
+        f"A {kind} area of {f.area_m2 * 1e4:.0f} cm² {where}, {f.ratio:.1f} times as stiff as its surroundings "
         f"(90 % band {low:.1f} to {high:.1f}), confidence {rows.confidence(f)}."
     )
 

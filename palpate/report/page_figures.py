@@ -78,7 +78,7 @@ def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
         axes.spines[side].set_visible(False)
 
 
-def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | None:
+def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool = True) -> bytes | None:
     """Return force, stiffness and uncertainty seen from the front, with samples and skipped targets in A [m].
 
     None if there is no map.
@@ -86,14 +86,14 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array) -> bytes | No
     message = evidence.stiffness_map
     if message is None or not drawable(message):
         return None
-    drawing = Drawing(message, evidence.findings, None)
+    drawing = Drawing(message, evidence.findings, None, abdomen)
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
     left.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
     left.plot(skipped_xy[:, 0] * 1e3, skipped_xy[:, 1] * 1e3, "x", ms=6, mew=1.6, color="#f43f5e")
     skipped = f", {len(skipped_xy)} targets skipped (crosses)" if len(skipped_xy) else ""
     small = f"{len(samples_xy)} samples (dots){skipped}"
-    drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.0f} mm", small)
+    drawing.panel(left, drawing.force_layer, "a", f"Normal force at {drawing.depth * 1e3:.3g} mm", small)
     small = "times the background; findings outlined"
     drawing.panel(middle, _ratio_layer(drawing), "b", "Apparent stiffness", small, labels=True)
     drawing.panel(right, drawing.spread_layer, "c", "Uncertainty", "half width of the 90 % band of the apparent stiffness")
@@ -107,7 +107,7 @@ def _ratio_layer(drawing: Drawing) -> MapQuantity:
     return MapQuantity(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
 
 
-def record(evidence: Evidence, limit_n: float) -> bytes | None:
+def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
     """Return force and depth over simulated time with the phases in the background; None without exam states."""
     if not len(evidence.time):
         return None
@@ -121,7 +121,8 @@ def record(evidence: Evidence, limit_n: float) -> bytes | None:
                 axes.axvspan(begin, end, color=tint, lw=0, label="_" if name in labelled or axes is depth else name)
             labelled.add(name)
     force.plot(evidence.time, evidence.force, color=MEASURED, lw=0.7, label="measured force")
-    force.axhline(limit_n, color=LIMIT, lw=1, ls="--", label=f"working limit {limit_n:g} N")
+    if limit_n is not None:
+        force.axhline(limit_n, color=LIMIT, lw=1, ls="--", label=f"working limit {limit_n:g} N")
     if evidence.force_limited.any():
         at = evidence.force_limited
         force.plot(evidence.time[at], evidence.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
@@ -207,7 +208,7 @@ class Layer:
     """Labels of the scale, evenly spaced from low to high."""
 
 
-def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
+def surface(message: Any, abdomen: bool = True) -> tuple[list[Layer], dict[str, Any]] | None:
     """Return layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None if there is nothing to show."""
     mapped = map_of(message)
     triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
@@ -243,7 +244,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     data = {
         "radius": radius,
         "triangles": _text(triangles.astype(np.uint16)),
-        **_labels(shape, known, middle),
+        **_labels(shape, known, middle, abdomen),
         "outline": _text((outline + ABOVE_SURFACE_M).astype(np.float32)),
         "layers": [
             {
@@ -259,7 +260,7 @@ def surface(message: Any) -> tuple[list[Layer], dict[str, Any]] | None:
     return [layer for layer, *_ in layers], data
 
 
-def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, Any]:
+def _labels(shape: Array, known: NDArray[np.bool_], middle: Array, abdomen: bool) -> dict[str, Any]:
     """Return the axes of the abdomen frame A at the corner of the scanned region, as segments, and labels with positions.
 
     `shape`: vertices about `middle`, which is a point in A, shape (n, 3) [m]; x points to the patient's left, y to the head.
@@ -273,15 +274,12 @@ def _labels(shape: Array, known: NDArray[np.bool_], middle: Array) -> dict[str, 
     x, y, _ = 0.16 * max(right - left, head - feet) * np.eye(3)
     corner = on_surface(left, feet) - 0.3 * (x + y)
     ends = corner + AXIS_M * np.eye(3)
-    words = {
-        "head": on_surface(0.0, head) + y,
-        "feet": on_surface(0.0, feet) - y,
-        "patient's right": on_surface(left, 0.0) - x,
-        "patient's left": on_surface(right, 0.0) + x,
-        **{f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)},
-    }
+    words = {f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)}
+    if abdomen:
+        words |= {"head": on_surface(0.0, head) + y, "feet": on_surface(0.0, feet) - y}
+        words |= {"patient's right": on_surface(left, 0.0) - x, "patient's left": on_surface(right, 0.0) + x}
     navel = -middle
-    if left <= navel[0] <= right and feet <= navel[1] <= head:
+    if abdomen and left <= navel[0] <= right and feet <= navel[1] <= head:
         words["navel"] = on_surface(navel[0], navel[1])
     axes = np.array([(corner, end) for end in ends], dtype=np.float32)
     return {"axes": _text(axes), "words": [[word, *(round(float(v), 4) for v in place)] for word, place in words.items()]}

@@ -31,7 +31,7 @@ from palpate.report.evidence import (
 )
 from palpate.report.files import write_text
 from palpate.report.platforms import fingerprint
-from palpate.report.rows import DepthRow, FindingRow, LumpRow, Report, TruthRow
+from palpate.report.rows import DepthRow, FindingRow, LumpRow, RecordedRow, Report, TruthRow
 from palpate.truth.pressed import Pressed, press_patient
 from palpate.truth.surface import TrueBody
 from palpate_bus import implementations
@@ -141,22 +141,25 @@ def _has_no_map(c: Collected) -> bool:
     return c.stiffness_map is None and not c.samples
 
 
-def write_results(folder: Path, scenario: Scenario, result: RunResult) -> Report:
-    """Write samples.csv, evidence.mcap, report.json and, if there is a map, map.png into a run's folder."""
+def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded: RecordedRow | None = None) -> Report:
+    """Write samples.csv, evidence.mcap, report.json and, if there is a map, map.png into a run's folder.
+
+    `recorded`: facts of a recording that was assessed instead of a run.
+    """
     c = result.collected
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
-    report = assemble(scenario, result, known).model_copy(update={"run": run})
+    report = assemble(scenario, result, known).model_copy(update={"run": run, "recorded": recorded})
     samples = samples_of(c.samples)
     write_samples(folder / "samples.csv", samples, run)
     touched, felt = None if known.contact is None else known.contact.touched, known.felt
     archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     if c.stiffness_map is not None:
-        title = f"{scenario.name}, seed {scenario.seed}"
+        title = f"{scenario.name}, seed {scenario.seed}" if recorded is None else scenario.name
         from palpate.report.figures import draw_map  # noqa: PLC0415 - findings are printed before anything is drawn
 
-        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, title, run)
+        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, title, run, report.abdomen)
     return report
 
 
@@ -209,7 +212,7 @@ def unassessed(report: Report) -> str:
 def _level(report: Report) -> str:
     """Return a warning if the whole region is unusually firm or soft."""
     level, (low, high) = report.background_N, USUAL_N
-    if level is None or low <= level <= high:
+    if not report.abdomen or level is None or low <= level <= high:
         return ""
     return (
         f"The whole region is unusually {'firm' if level > high else 'soft'}: {level:.1f} N; usual are {low:g} to {high:g} N. A "

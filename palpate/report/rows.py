@@ -73,6 +73,28 @@ class DepthRow(_Row):
     """Part of the steady time in which depth yielded to the force limit."""
 
 
+class FaultRow(_Row):
+    """A fault of a recording."""
+
+    code: str
+    count: int
+    """Affected rows, contacts or samples."""
+    of: int
+    """All of them."""
+    text: str
+    """What was found, and what was done."""
+    refused: bool
+    """True if nothing was assessed for it."""
+
+
+class RecordedRow(_Row):
+    """A recording that was assessed instead of a run."""
+
+    abdomen: bool
+    """True if A is at the umbilicus; else coordinates are in the body frame of the mapping."""
+    faults: list[FaultRow]
+
+
 class Report(_Row):
     """report.json."""
 
@@ -132,6 +154,13 @@ class Report(_Row):
     """Time budget of each service."""
     services: dict[str, Any]
     """Facts that each service reported at its end."""
+    recorded: RecordedRow | None = None
+    """Null for a run."""
+
+    @property
+    def abdomen(self) -> bool:
+        """True if places are those of an abdomen."""
+        return self.recorded is None or self.recorded.abdomen
 
 
 _SURE: Final = 0.99

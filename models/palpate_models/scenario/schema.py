@@ -87,9 +87,9 @@ class Exam(Section):
     breathing: Following = Following.FOLLOW
     """`follow`: the indenter follows the breathing motion; `gate`: it follows, with samples only at the end of expiration;
     `ignore`: it does not follow."""
-    depth_m: Annotated[float, Field(ge=0.002, le=0.02)] = 0.010
+    depth_m: Annotated[float, Field(ge=0.0002, le=0.05)] = 0.010
     """Indentation along the inward normal, from the touched skin."""
-    spacing_m: Annotated[float, Field(ge=0.004, le=0.05)] = 0.0125
+    spacing_m: Annotated[float, Field(ge=0.001, le=0.05)] = 0.0125
     """Distance between scan lines, and between points on a line."""
     speed_mps: Annotated[float, Field(ge=0.005, le=0.1)] = 0.03
     """Tangential speed in contact."""
@@ -150,7 +150,7 @@ class Robot(Section):
     """Robot, tool and its sensor."""
 
     lbr: LbrConnection = LbrConnection()
-    indenter_radius_m: Annotated[float, Field(ge=0.005, le=0.04)] = 0.015
+    indenter_radius_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.015
     """Radius of the spherical indenter."""
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Nominal mass below the F/T sensor: stand-off and indenter."""

@@ -1,0 +1,139 @@
+"""A recording through the assessment, as messages of a run: one way from evidence to map, findings and report."""
+
+from __future__ import annotations
+
+from itertools import chain
+from math import sqrt
+from pathlib import Path
+from typing import Any, Final
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from palpate.exam_state import exam_state
+from palpate.recording.faults import Remedy
+from palpate.recording.recording import Contact, ContactKind, Recording
+from palpate.report.page import write_page
+from palpate.report.results import write_results
+from palpate.report.rows import FaultRow, RecordedRow, Report
+from palpate_assessment.assess import assess
+from palpate_assessment.grid import map_grid
+from palpate_assessment.sampling import ForceSample
+from palpate_assessment.service import findings_message, map_message, sample_message
+from palpate_bus.messages import ExamState, SurfaceMesh
+from palpate_bus.messages.stamps import NS, header
+from palpate_bus.runs.run_name import name_run
+from palpate_conductor.collector import Collected
+from palpate_conductor.outcome import RunResult
+from palpate_models.scenario.load import dump_scenario
+from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
+
+RUNTIME: Final = "recording"
+_SHOWN: Final = 5000
+"""Readings in the figures of a report."""
+_FALSE_FINDINGS: Final = Exam().false_findings
+
+
+def collected(recording: Recording) -> Collected:
+    """Return samples, map and findings of a recording, and its readings, as a conductor collects them."""
+    samples = recording.samples()
+    gathered = Collected(exam_states=_states(recording), samples=[sample_message(sample) for sample in samples])
+    gathered.surface = SurfaceMesh(
+        header(0, "abdomen"),
+        recording.surface.astype(np.float32).ravel(),
+        recording.normals.astype(np.float32).ravel(),
+        np.empty(0, np.uint32),
+        np.empty(0, np.float32),
+    )
+    gathered.findings = findings_message(0, [], [])
+    if not samples:
+        return gathered
+    centre, size, spacing = region(samples)
+    reach = max(0.8 * spacing, sqrt(recording.indenter_radius_m * recording.depth_m))
+    grid = map_grid(recording.surface, centre, size, reach, reach / 3)
+    found = assess(samples, grid, reach, _FALSE_FINDINGS)
+    if found is not None:
+        gathered.stiffness_map = map_message(0, found, recording.depth_m)
+        gathered.findings = findings_message(0, found.findings, found.candidates)
+        if not recording.abdomen:
+            for one in chain(gathered.findings.findings, gathered.findings.candidates):
+                one.quadrant = ""
+    return gathered
+
+
+def region(samples: list[ForceSample]) -> tuple[tuple[float, float], tuple[float, float], float]:
+    """Return centre and size of the sampled region in A [m], and the usual distance of neighbouring samples [m]."""
+    xy = np.array([sample.position[:2] for sample in samples])
+    low, high = xy.min(axis=0), xy.max(axis=0)
+    spacing = float(np.median(cKDTree(xy).query(xy, 2)[0][:, 1])) if len(xy) > 1 else 0.0
+    (x, y), (width, height) = (0.5 * (low + high)).tolist(), (high - low).tolist()
+    return (x, y), (width, height), spacing
+
+
+def _states(recording: Recording) -> list[Any]:
+    """Return `exam/state` of some of the readings, in A."""
+    every = max(1, sum(len(touch.depth) for touch in recording.touches) // _SHOWN)
+    return [
+        _state(touch, k, number, recording.depth_m)
+        for number, touch in enumerate(recording.touches, start=1)
+        for k in range(0, len(touch.depth), every)
+    ]
+
+
+def _state(touch: Contact, k: int, number: int, setpoint: float) -> Any:
+    t = number + 0.05 * k if touch.time is None else float(touch.time[k])
+    return exam_state(
+        round(t * NS),
+        ExamState.PHASE_SCAN,
+        touch.position[k],
+        touch.normal[k],
+        in_contact=True,
+        steady=touch.kind is ContactKind.SLIDE or bool(touch.depth[k] > 0.95 * touch.depth.max()),
+        depth_setpoint=setpoint,
+        depth=float(touch.depth[k]),
+        normal_force=float(touch.force[k]),
+        depth_uncertainty=touch.depth_uncertainty,
+        stroke=number,
+    )
+
+
+def scenario_of(recording: Recording) -> Scenario:
+    """Return what a report says about an examination: name, region, depth, tool."""
+    samples = recording.samples()
+    centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
+    sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
+    low, high = 1e-3, 1.0
+    exam = Exam(
+        centre_m=centre,
+        region_m=tuple(np.clip(size, low, high).tolist()),
+        depth_m=recording.depth_m if samples else Exam().depth_m,
+        spacing_m=max(spacing, low),
+        mode=Mode.CONTINUOUS if sliding else Mode.POINT,
+    )
+    return Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
+
+
+def write_assessed(folder: Path, recording: Recording) -> tuple[Report, Path]:
+    """Write the results of a recording into a folder, as those of a run; return report and page."""
+    gathered, scenario = collected(recording), scenario_of(recording)
+    times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]
+    result = RunResult(
+        runtime=RUNTIME,
+        collected=gathered,
+        run_hash=None,
+        digests={},
+        sim_time_s=max(times, default=0.0),
+        wall_time_s=0.0,
+        start_time_s=0.0,
+        blame={},
+        counters={},
+        failure=None,
+        lost={},
+    )
+    faults = [
+        FaultRow(code=f.code, count=f.count, of=f.of, text=f.text, refused=f.remedy is Remedy.REFUSED) for f in recording.faults
+    ]
+    name_run(folder)
+    (folder / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
+    recorded = RecordedRow(abdomen=recording.abdomen, faults=faults)
+    return write_results(folder, scenario, result, recorded), write_page(folder)
