@@ -57,6 +57,11 @@ class Case(Section):
         """Population, number, method and errors, for messages."""
         return " ".join(filter(None, (self.population, str(self.number), self.method, self.errors)))
 
+    @property
+    def content_id(self) -> str:
+        """The id that belongs to its content."""
+        return content_id(self.scenario, self.files, self.tier, self.runtime, self.periods)
+
 
 class Request(NamedTuple):
     """The requested part of a study and its changes."""
@@ -95,7 +100,7 @@ def patient_seeds(study: str, population: str, split: Split, count: int, salt: s
         attempt = 0
         while True:
             words = [study, population, split, number, "" if split == "tune" else salt, *([attempt] if attempt else [])]
-            seed = first + int.from_bytes(hashlib.sha256(_canonical(words)).digest()[:8], "big") % room
+            seed = first + int.from_bytes(hashlib.sha256(canonical(words)).digest()[:8], "big") % room
             if seed not in found:
                 break
             attempt += 1
@@ -153,9 +158,9 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                     if where not in usable:  # the search for installed services takes 0.1 s
                         usable[where] = _usable(where, scenario)
                     scenario = scenario.model_copy(update={"services": usable[where].services, "search": usable[where].search})
-                    files = _files(scenario)
+                    files, content = _files(scenario), scenario.model_dump(mode="json")
                     yield Case(
-                        case_id=_case_id(scenario, files, study.tier, method),
+                        case_id=content_id(content, files, study.tier, method.runtime, method.periods),
                         population=name,
                         method=key,
                         errors=level or scenario.errors.level,
@@ -165,7 +170,7 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                         tier=study.tier,
                         runtime=method.runtime,
                         periods=method.periods,
-                        scenario=scenario.model_dump(mode="json"),
+                        scenario=content,
                         files=files,
                     )
 
@@ -216,15 +221,17 @@ def file_hash(path: str) -> str:
         raise StudyError(f"{path}: {error.strerror}") from error
 
 
-def _case_id(scenario: Scenario, files: Mapping[str, str], tier: Tier, method: Method) -> str:
+def content_id(
+    scenario: Mapping[str, Any], files: Mapping[str, str], tier: Tier, runtime: Runtime, periods: Mapping[str, int]
+) -> str:
     """Return the first digits of the SHA-256 over everything that the result depends on, files by their content."""
     content = {
-        "scenario": _by_content(scenario.model_dump(mode="json", exclude=set(IRRELEVANT)), files),
+        "scenario": _by_content({key: value for key, value in scenario.items() if key not in IRRELEVANT}, files),
         "tier": tier,
-        "runtime": method.runtime,
-        "periods": method.periods,
+        "runtime": runtime,
+        "periods": periods,
     }
-    return hashlib.sha256(_canonical(content)).hexdigest()[:ID_DIGITS]
+    return hashlib.sha256(canonical(content)).hexdigest()[:ID_DIGITS]
 
 
 def _by_content(value: Any, files: Mapping[str, str]) -> Any:
@@ -233,5 +240,6 @@ def _by_content(value: Any, files: Mapping[str, str]) -> Any:
     return files.get(value, value) if isinstance(value, str) else value
 
 
-def _canonical(value: Any) -> bytes:
+def canonical(value: Any) -> bytes:
+    """Return JSON that does not depend on the order of keys."""
     return json.dumps(value, sort_keys=True, separators=(",", ":"), ensure_ascii=False).encode()

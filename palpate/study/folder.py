@@ -20,12 +20,12 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
 
 from palpate.report.files import write_text
 from palpate.report.rows import Report
 from palpate.run.roles import WORKERS
-from palpate.study.cases import Case
+from palpate.study.cases import Case, canonical
 from palpate.study.spec import StudyError
 
 MANIFEST: Final = "manifest.json"
@@ -46,6 +46,9 @@ PACKAGES: Final = (
     *(f"palpate_{role}" for role in WORKERS),
 )
 """Packages whose code decides results."""
+HASH: Final = "sha256"
+"""Field of an outcome's file: SHA-256 over the other fields."""
+_CAUSES: Final = TypeAdapter(list[str])
 SUFFIXES: Final = (".py", ".yaml", ".csv", ".npz", ".c", ".h")
 
 
@@ -181,20 +184,33 @@ class Folder:
         return self.path / "cases" / f"{case_id}.json"
 
     def write(self, outcome: Outcome) -> None:
-        """Write the outcome of a case, atomically."""
-        write_text(self.case_file(outcome.case.case_id), outcome.model_dump_json() + "\n")
+        """Write the outcome of a case with the hash of its content, atomically."""
+        content = json.loads(outcome.model_dump_json())
+        write_text(self.case_file(outcome.case.case_id), json.dumps(content | {HASH: _hash(content)}) + "\n")
 
     def outcome(self, case_id: str) -> Outcome | None:
-        """Return the outcome of a case, or None if it has none yet. Raises StudyError for an unreadable file."""
+        """Return the outcome of a case, or None if it has none yet.
+
+        Raises StudyError for a file that cannot be read, that was changed, or that has another case.
+        """
         path = self.case_file(case_id)
         try:
-            return Outcome.model_validate_json(path.read_text(encoding="utf-8"))
+            content = json.loads(path.read_text(encoding="utf-8"))
+            known = content.pop(HASH, None) if isinstance(content, dict) else None
+            outcome = Outcome.model_validate(content)
+            if known != _hash(content):
+                raise ValueError(f"{HASH} is {known!r}, not the hash of its content: the file was changed")
+            if not case_id == outcome.case.case_id == outcome.case.content_id:
+                raise ValueError(f"it has the case {outcome.case.case_id}, whose content has the id {outcome.case.content_id}")
+            if outcome.status == "done" and not outcome.code:
+                raise ValueError("code is empty: want the SHA-256 of the code that made it")
         except FileNotFoundError:
             return None
-        except (OSError, ValueError) as error:
+        except (OSError, ValueError, RecursionError) as error:
             raise StudyError(
                 f"{path} is not an outcome of this version ({error}): remove it, and its case is run again"
             ) from error
+        return outcome
 
     def outcomes(self, manifest: Manifest) -> list[Outcome]:
         """Return the outcomes that exist, in the order of the manifest. Raises StudyError for an unreadable file."""
@@ -213,25 +229,51 @@ class Folder:
     def failures(self, case_id: str) -> list[str]:
         """Return the causes of failed attempts at a case."""
         path = self._failures_file(case_id)
-        return list(json.loads(path.read_text(encoding="utf-8"))) if path.is_file() else []
+        try:
+            return _CAUSES.validate_json(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return []
+        except (OSError, ValueError) as error:
+            raise StudyError(f"{path} is not a list of causes ({error}): remove it") from error
 
     def add_failure(self, case_id: str, why: str) -> None:
         """Append the cause of a failed attempt."""
-        write_text(self._failures_file(case_id), json.dumps([*self.failures(case_id), why]) + "\n")
+        self.write_failures(case_id, [*self.failures(case_id), why])
+
+    def write_failures(self, case_id: str, causes: Sequence[str]) -> None:
+        """Write the causes of all failed attempts at a case, atomically."""
+        write_text(self._failures_file(case_id), json.dumps(causes) + "\n")
 
     def sessions(self) -> list[Session]:
-        """Return all calls of the command."""
+        """Return all calls of the command, without a last one whose line a kill or a full disk cut.
+
+        Raises StudyError for any other line that cannot be read.
+        """
         path = self.path / SESSIONS
-        lines = path.read_text(encoding="utf-8").splitlines() if path.is_file() else []
-        return [Session.model_validate_json(line) for line in lines]
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
+        found = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                found.append(Session.model_validate_json(line))
+            except ValueError as error:
+                if number < len(lines):
+                    raise StudyError(f"{path}, line {number} is not a session ({error}): remove it") from error
+        return found
 
     def add_session(self, session: Session) -> None:
         """Append a call of the command."""
-        with (self.path / SESSIONS).open("a", encoding="utf-8") as file:
-            file.write(session.model_dump_json() + "\n")
+        self.write_sessions([*self.sessions(), session])
+
+    def write_sessions(self, sessions: Iterable[Session]) -> None:
+        """Write all calls of the command, atomically."""
+        write_text(self.path / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in sessions))
 
     def _failures_file(self, case_id: str) -> Path:
         return self.path / "failures" / f"{case_id}.json"
+
+
+def _hash(content: Any) -> str:
+    return hashlib.sha256(canonical(content)).hexdigest()
 
 
 def default_folder(study: str, split: str) -> Path:
@@ -259,7 +301,7 @@ def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bo
 
 
 def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
-    """Merge the parts of one study into a folder; repeated merges change nothing.
+    """Merge the parts of one study into a folder; repeated merges change nothing. All is read and checked before any is written.
 
     Raises StudyError if the parts are not of one study, or if a case has no outcome in any of them.
     """
@@ -273,18 +315,19 @@ def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
     for part, other in zip(parts, manifests, strict=True):
         if (other.study, other.cases) != (first.study, first.cases):
             raise StudyError(f"{part} holds another study, split or number of patients than {parts[0]}")
-    folder = Folder(path)
-    folder.open(first)
-    sessions = dict.fromkeys(session for part in (path, *parts) for session in Folder(part).sessions())
-    write_text(path / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in sessions))
-    for part in parts:
-        for outcome in Folder(part).outcomes(first):
-            folder.write(outcome)
-        for file in (part / "failures").glob("*.json"):
-            write_text(path / "failures" / file.name, file.read_text(encoding="utf-8"))
-    absent = [row.case_id for row in first.cases if not folder.case_file(row.case_id).is_file()]
+    folder, places = Folder(path), [Folder(place) for place in (path, *parts)]
+    outcomes = {outcome.case.case_id: outcome for place in places for outcome in place.outcomes(first)}
+    failures = {row.case_id: causes for place in places for row in first.cases if (causes := place.failures(row.case_id))}
+    sessions = dict.fromkeys(session for place in places for session in place.sessions())
+    absent = [row.case_id for row in first.cases if row.case_id not in outcomes]
     if absent:
         raise StudyError(f"{len(absent)} of {len(first.cases)} cases are in no part, {absent[0]} the first: run what is missing")
+    folder.open(first)
+    folder.write_sessions(sessions)
+    for outcome in outcomes.values():
+        folder.write(outcome)
+    for case_id, causes in failures.items():
+        folder.write_failures(case_id, causes)
     return folder, first
 
 

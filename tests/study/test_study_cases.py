@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import yaml
 from synthetic import TOY, study
 
-from palpate.study.cases import Request, cases_of, command_of, patient_seeds, secret_of
-from palpate.study.folder import Folder, manifest_of
+from palpate.study.case import Attempt
+from palpate.study.cases import Case, Request, cases_of, command_of, patient_seeds, secret_of
+from palpate.study.folder import SESSIONS, Folder, Outcome, Session, manifest_of, merge
 from palpate.study.spec import Grid, Lumps, StudyError, load_study, study_names
 
 PLAIN = "populations: {a: {scenario: person}}\n"
@@ -198,3 +201,66 @@ def test_a_folder_holds_the_cases_of_one_request(tmp_path: Path) -> None:
     poor = cases_of(study(), Request("test", 3, ("errors=poor",)))
     with pytest.raises(StudyError, match="other settings or patients: give this one another folder with -o"):
         Folder(tmp_path).open(manifest_of("toy", poor))
+
+
+@pytest.fixture(scope="module")
+def cases() -> list[Case]:
+    return cases_of(study())[:2]
+
+
+def folder_of(path: Path, cases: list[Case]) -> Folder:
+    folder = Folder(path)
+    folder.open(manifest_of("toy", cases))
+    for case in cases:
+        attempt = Attempt(case_id=case.case_id, report=None, why="killed", code="c")
+        rest = attempt.model_dump(exclude={"case_id"})
+        folder.write(Outcome(case=case, status="done", attempts=1, **rest))
+    return folder
+
+
+def edited(path: Path, **changes: object) -> str:
+    return json.dumps(json.loads(path.read_text()) | changes)
+
+
+@pytest.mark.parametrize(
+    ("damage", "words"),
+    [
+        (lambda own, other: other.read_text(), "it has the case"),
+        (lambda own, other: edited(own, case=json.loads(other.read_text())["case"]), "was changed"),
+        (lambda own, other: edited(own, wall_time_s=1.0), "was changed"),
+        (lambda own, other: edited(own, sha256=""), "was changed"),
+        (lambda own, other: own.read_text()[:-40], "not an outcome"),
+        (lambda own, other: "[" * 100_000, "not an outcome"),
+    ],
+)
+def test_a_changed_outcome_is_refused_before_anything_is_written(
+    tmp_path: Path, cases: list[Case], damage: Callable[[Path, Path], str], words: str
+) -> None:
+    part = folder_of(tmp_path / "part", cases)
+    own, other = (part.case_file(case.case_id) for case in cases)
+    own.write_text(damage(own, other))
+    with pytest.raises(StudyError, match=words):
+        merge([part.path], tmp_path / "whole")
+    assert not (tmp_path / "whole").exists()
+
+
+def test_an_outcome_needs_the_code_that_made_it(tmp_path: Path, cases: list[Case]) -> None:
+    folder = folder_of(tmp_path, cases)
+    outcome = folder.outcome(cases[0].case_id)
+    assert outcome is not None
+    folder.write(outcome.model_copy(update={"code": ""}))
+    with pytest.raises(StudyError, match="code is empty"):
+        folder.outcomes(manifest_of("toy", cases))
+
+
+def test_a_session_that_was_cut_is_left_out(tmp_path: Path, cases: list[Case]) -> None:
+    folder = folder_of(tmp_path, cases)
+    sessions = [Session(workers=1, cases=2, elapsed_s=k) for k in range(3)]
+    folder.write_sessions(sessions[:2])
+    path = tmp_path / SESSIONS
+    path.write_text(path.read_text()[:-9])
+    folder.add_session(sessions[2])
+    assert folder.sessions() == [sessions[0], sessions[2]]
+    path.write_text("{}\n" + path.read_text())
+    with pytest.raises(StudyError, match="line 1"):
+        folder.sessions()

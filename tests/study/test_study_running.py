@@ -232,7 +232,7 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
     path = own.case_file(CASES[0].case_id)
     outcome = Folder(folder).outcome(CASES[0].case_id)
     assert Folder(folder).of_other_code(CASES) == []
-    path.write_text(outcome.model_copy(update={"code": "0" * 64}).model_dump_json())
+    own.write(outcome.model_copy(update={"code": "0" * 64}))
     assert own.of_other_code(CASES) == [CASES[0]]
     with pytest.raises(StudyError, match="1 of its cases were made by other code"):
         opened(tmp_path, "toy", CASES, "palpate study toy.yaml")

@@ -18,12 +18,11 @@ from palpate_bus.contract import MS
 GC_THRESHOLD = 100_000
 """New objects before a garbage collection. Messages form no cycles: a run of 50 s leaves 2000 objects in cycles."""
 WORKER_NICENESS = 15
-"""Of a thread that computes for seconds: a planner must not take the core of the 1 kHz loop."""
-BACKGROUND_NICENESS = 15
-"""Of observers, and in lockstep of services slower than the 1 kHz loop.
+"""In wall-clock mode, of a thread that computes for seconds: a planner must not take the core of the 1 kHz loop."""
+BACKGROUND_NICENESS = 3
+"""Of observers, and in lockstep of services slower than the 1 kHz loop, which are batch work as well.
 
-Alternating short runs with recorder and viewer on two cores, times real time. Services at 0, observers at 10: 1.21, 1.14, 1.23;
-both at 15: 1.31, 1.24, 1.39. With services as batch work, too: 1.55, 1.55, 1.61; without: 1.50, 1.54, 1.51.
+The loop waits for them, so with a higher value a run starves beside other work: NICE_FIGURES
 """
 _NICENESS_BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
 STOPPED: Final = frozenset({psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP})

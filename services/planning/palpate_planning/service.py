@@ -69,7 +69,8 @@ class PlanningService(Service):
         roles = contract().roles
         self._known = known
         self._X_WA = np.array(known.X_WA)
-        _lower_worker_priority()
+        if not lockstep:
+            _lower_worker_priority()
         self._exam = ExaminationSequence(
             known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep
         )
