@@ -19,7 +19,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, reserve_output, say
+from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, lost_output, output, reserve_output, say
 from palpate_errors import UserError
 from palpate_plugins import missing_libraries, needs
 
@@ -90,6 +90,18 @@ COMMANDS = {name: where for group in GROUPS.values() for name, where in group.it
 
 def main() -> None:
     """Run the command of `sys.argv`."""
+    sys.stdout, sys.stderr = output(sys.stdout), output(sys.stderr)
+    try:
+        _run()
+        sys.exit()
+    except SystemExit as left:
+        if (why := lost_output()) and not left.code:
+            say(f"the output could not be written: {why}; all else was done")
+            sys.exit(EXIT_TROUBLE)
+        raise
+
+
+def _run() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if "--json" in sys.argv:
         reserve_output()

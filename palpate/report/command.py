@@ -50,8 +50,10 @@ def report(
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
     from palpate.report.recovery import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
+    from palpate.run.folder import bring_back
 
     console, failure = Console(stderr=True), None
+    bring_back(folder)
     with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
         if recover:
             scenario, result = recovered(folder)

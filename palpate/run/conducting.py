@@ -9,9 +9,11 @@ from pathlib import Path
 
 from palpate.console import SteadyConsole
 from palpate.run.conclusion import conclude
+from palpate.run.folder import locked
 from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
+from palpate_bus.runs.run_name import LOCK, in_use
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
@@ -31,11 +33,11 @@ def conduct_others(out: Path, observers: tuple[str, ...], realtime: bool, wallcl
     chosen = load_scenario(str(out / "scenario.yaml"))
     if chosen.services.tissue == NONE and not wallclock:
         raise UserError(NEEDS_WALLCLOCK)
-    if (out / "report.json").is_file():
+    if (out / "report.json").is_file() or ((out / LOCK).is_file() and not in_use(out)):
         raise UserError(f"--out {out}: it holds the results of a run; `palpate prepare --out {out}` moves them away")
     session = open_session()
     roles = (*workers(chosen), *observers)
-    with results_first():
+    with results_first(), locked(out):
         with RunDisplay(console, quiet, chosen.exam) as display:
             timing = Timing(wallclock, 1.0 if realtime else None)
             result = conduct(session, roles, display.show, timing=timing, tree=FrameTree(exam_input(chosen)))

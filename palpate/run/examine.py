@@ -17,7 +17,7 @@ from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import WatchedRoom, check_room, results_folder, unless_begun, usual_folder, what_it_takes
+from palpate.run.folder import WatchedRoom, bring_back, check_room, results_folder, unless_begun, usual_folder, what_it_takes
 from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
@@ -37,6 +37,7 @@ from palpate_plugins import PluginError
 def resume(options: RunOptions) -> None:
     """Continue the interrupted examination `options.resume`. Raises UserError if it cannot, typer.Exit if it failed."""
     assert options.resume is not None
+    bring_back(options.resume)
     before = resumption(options.resume)
     if not options.silent:
         say(before.summary)

@@ -11,9 +11,13 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
+from glob import escape
 from pathlib import Path
 from typing import Final
 
+import psutil
+
+from palpate.console import say
 from palpate.run.options import Record
 from palpate.run.outlook import Outlook, duration_text
 from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
@@ -50,8 +54,10 @@ def set_aside(path: Path) -> Path | None:
 
     Raises UserError if a run is writing into the folder.
     """
+    bring_back(path)
     if in_use(path):
         raise UserError(f"--out {path}: a run is writing into it; name another folder")
+    (path / LOCK).unlink(missing_ok=True)
     if not (run := run_of(path)):
         return None
     began = str(json.loads((path / FILE).read_text(encoding="utf-8")).get("began", ""))
@@ -70,13 +76,14 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     With `overwrite` the results of an earlier run are moved away, removed after this run, and restored if it leaves no folder,
     as a run that could not begin. Raises UserError if the folder is in use, not empty, or cannot be made.
     """
+    bring_back(path)
     earlier = _moved_away(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
     try:
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
-        with _locked(path):
+        with locked(path):
             if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
                 what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
                 raise UserError(f"--out {path}: it holds {what}; name another folder, or --overwrite to remove it first")
@@ -89,12 +96,23 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             (path / LOCK).unlink(missing_ok=True)
 
 
+def bring_back(path: Path) -> None:
+    """Restore the results that a killed run with --overwrite had moved away, or name them if their folder has others now."""
+    for aside in sorted(path.parent.glob(f".{escape(path.name)}.*")):
+        process = aside.suffix[1:]
+        if not process.isdecimal() or psutil.pid_exists(int(process)):
+            continue
+        place = path.with_name(f"{path.name}-before-{process}") if path.exists() else path
+        aside.rename(place)
+        say(f"{place}: earlier results of {path}, which a killed run with --overwrite had moved away")
+
+
 def _moved_away(path: Path) -> Path:
     """Move the results of an earlier run away and return their folder. Raises UserError if there are none."""
     if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
         raise UserError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with _locked(path):
+    with locked(path):
         try:
             return path.rename(aside)
         except OSError as error:
@@ -102,7 +120,8 @@ def _moved_away(path: Path) -> Path:
 
 
 @contextmanager
-def _locked(folder: Path) -> Iterator[None]:
+def locked(folder: Path) -> Iterator[None]:
+    """Lock a results folder. A killed run leaves the file of the lock. Raises UserError if another run holds it."""
     try:
         file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)
     except OSError as error:

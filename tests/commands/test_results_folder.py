@@ -15,21 +15,22 @@ from conductor_messages import SETTINGS, collected, result
 from PIL import Image
 from rich.console import Console
 
-from palpate.console import EXIT_FAILED
+from palpate.console import EXIT_FAILED, EXIT_TROUBLE
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_part, write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
-from palpate.run.folder import WatchedRoom, _locked, another_folder, check_room, results_folder, unless_begun, what_it_takes
+from palpate.run.conducting import conduct_others
+from palpate.run.folder import WatchedRoom, another_folder, check_room, locked, results_folder, unless_begun, what_it_takes
 from palpate.run.outlook import Outlook
 from palpate.run.roles import write_scenario_files
-from palpate_bus.runs.run_name import name_run, run_of
+from palpate_bus.runs.run_name import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.schema import Exam, Mode
+from palpate_models.scenario.schema import Exam, Mode, Scenario
 
 BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
@@ -58,7 +59,7 @@ def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Pa
     assert run_of(tmp_path) not in ("", run)
     assert {"notes.txt", "scenario.yaml"} <= {path.name for path in tmp_path.iterdir()}
     assert not (tmp_path / "report.json").exists()
-    with _locked(tmp_path):
+    with locked(tmp_path):
         assert subprocess.run(words, capture_output=True, check=False).returncode == 2
     assert len(list(tmp_path.glob("2*"))) == 1
 
@@ -83,6 +84,43 @@ def test_two_runs_cannot_have_one_folder_at_a_time(tmp_path: Path, overwrite: bo
         with pytest.raises(UserError, match="a run is writing into it"), results_folder(out, overwrite=overwrite):
             pass
         assert (out / "scenario.yaml").exists()
+
+
+def test_what_a_killed_overwrite_had_moved_is_restored_or_named(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, aside = tmp_path / "lump[1]", tmp_path / ".lump[1].999999999"
+    for other in (False, True):
+        aside.mkdir()
+        (aside / "report.json").write_text("earlier")
+        if other:
+            path.mkdir(exist_ok=True)
+        with pytest.raises(UserError, match="it holds report"), results_folder(path):
+            pass
+        assert not aside.exists()
+    assert (tmp_path / "lump[1]-before-999999999" / "report.json").read_text() == "earlier"
+    assert capsys.readouterr().err.count("earlier results of") == 2
+
+
+def test_a_killed_run_is_not_conducted_over(tmp_path: Path) -> None:
+    write_scenario_files(load_scenario("clean"), tmp_path)
+    (tmp_path / LOCK).write_text("1")  # as a kill leaves it
+    with pytest.raises(UserError, match="it holds the results of a run"):
+        conduct_others(tmp_path, (), realtime=False, wallclock=False, quiet=True)
+
+
+@pytest.mark.parametrize("words", [["scenarios"], ["scenarios", "--json"]])
+def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
+    with Path("/dev/full").open("w") as full:
+        done = subprocess.run(
+            [sys.executable, "-m", "palpate", *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
+        )
+    assert (done.returncode, done.stderr.count("\n")) == (EXIT_TROUBLE, 1)
+    assert "the output could not be written: No space left on device" in done.stderr
+
+
+@pytest.mark.parametrize("name", ["../../escape", "..", "a/b", "a\nb", "", "a" * 101])
+def test_a_scenario_cannot_place_its_results_elsewhere(name: str) -> None:
+    with pytest.raises(ValueError, match="want a file name"):
+        Scenario(name=name)
 
 
 def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_path: Path) -> None:

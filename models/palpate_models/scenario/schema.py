@@ -7,6 +7,7 @@ x to the patient's left, y to the head, z outward.
 
 from __future__ import annotations
 
+import re
 from enum import StrEnum
 from math import dist
 from typing import Annotated, Final, Literal
@@ -282,6 +283,14 @@ class Scenario(Section):
     limits: Limits = Limits()
     tissue: TissueChoice = TissueChoice()
     services: Annotated[Services, Field(validate_default=True)] = Services()
+
+    @field_validator("name")
+    @classmethod
+    def _one_file(cls, name: str) -> str:
+        """Refuse a name that would place results in another folder."""
+        if not re.fullmatch(r"[^./\\\x00-\x1f][^/\\\x00-\x1f]{0,99}", name):
+            raise ValueError("want a file name of at most 100 characters, without / and \\ and no dot at its beginning")
+        return name
 
     @field_validator("phantom")
     @classmethod
