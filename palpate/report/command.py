@@ -48,9 +48,9 @@ def report(
     as_json: Annotated[bool, typer.Option("--json", help="Print the paths as JSON.")] = False,
 ) -> None:
     """Rebuild report.html of a run: one self-contained page for a clinician or an engineer."""
+    from palpate.report.files import bring_back
     from palpate.report.recovery import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
-    from palpate.run.folder import bring_back
 
     console, failure = Console(stderr=True), None
     bring_back(folder)

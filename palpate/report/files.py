@@ -1,14 +1,18 @@
-"""Atomic writes of files that other programs read, and of marked parts of pages."""
+"""Atomic writes of files that other programs read and of marked parts of pages; results that a kill has left elsewhere."""
 
 from __future__ import annotations
 
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
+from glob import escape
 from pathlib import Path
 from typing import Any
 
+import psutil
 import typer
+
+from palpate.console import say
 
 
 @contextmanager
@@ -60,3 +64,14 @@ def _around(path: Path, name: str) -> tuple[str, str]:
     if not (first and last):
         raise typer.BadParameter(f"{path} has no part to replace: it needs the lines {begin.strip()} and {end.strip()}")
     return before + begin, end + after
+
+
+def bring_back(path: Path) -> None:
+    """Restore the results that a killed run with --overwrite had moved away, or name them if their folder has others now."""
+    for aside in sorted(path.parent.glob(f".{escape(path.name)}.*")):
+        process = aside.suffix[1:]
+        if not process.isdecimal() or psutil.pid_exists(int(process)):
+            continue
+        place = path.with_name(f"{path.name}-before-{process}") if path.exists() else path
+        aside.rename(place)
+        say(f"{place}: earlier results of {path}, which a killed run with --overwrite had moved away")

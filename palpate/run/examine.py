@@ -12,12 +12,13 @@ from rich.markup import escape
 
 from palpate.console import SteadyConsole, say
 from palpate.environment import given
+from palpate.report.files import bring_back
 from palpate.report.recovery import Resumption, checkpoint_given, resumption
 from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import WatchedRoom, bring_back, check_room, results_folder, unless_begun, usual_folder, what_it_takes
+from palpate.run.folder import WatchedRoom, check_room, results_folder, unless_begun, usual_folder, what_it_takes
 from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions

@@ -11,13 +11,10 @@ import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
-from glob import escape
 from pathlib import Path
 from typing import Final
 
-import psutil
-
-from palpate.console import say
+from palpate.report.files import bring_back
 from palpate.run.options import Record
 from palpate.run.outlook import Outlook, duration_text
 from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
@@ -94,17 +91,6 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
         elif earlier is not None:
             earlier.rename(path)
             (path / LOCK).unlink(missing_ok=True)
-
-
-def bring_back(path: Path) -> None:
-    """Restore the results that a killed run with --overwrite had moved away, or name them if their folder has others now."""
-    for aside in sorted(path.parent.glob(f".{escape(path.name)}.*")):
-        process = aside.suffix[1:]
-        if not process.isdecimal() or psutil.pid_exists(int(process)):
-            continue
-        place = path.with_name(f"{path.name}-before-{process}") if path.exists() else path
-        aside.rename(place)
-        say(f"{place}: earlier results of {path}, which a killed run with --overwrite had moved away")
 
 
 def _moved_away(path: Path) -> Path:

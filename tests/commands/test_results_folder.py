@@ -110,9 +110,8 @@ def test_a_killed_run_is_not_conducted_over(tmp_path: Path) -> None:
 @pytest.mark.parametrize("words", [["scenarios"], ["scenarios", "--json"]])
 def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "palpate", *words], stdout=full, stderr=subprocess.PIPE, text=True, check=False
-        )
+        command = [sys.executable, "-m", "palpate", *words]
+        done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
     assert (done.returncode, done.stderr.count("\n")) == (EXIT_TROUBLE, 1)
     assert "the output could not be written: No space left on device" in done.stderr
 
