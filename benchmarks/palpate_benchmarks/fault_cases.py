@@ -17,7 +17,8 @@ CHANGE_KINDS: Final = ("corrupt", "truncate", "nan", "stamp")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGE_KINDS)
 SCARCE_KINDS: Final = ("memory", "disk", "starve")
 """Shortages: of memory for a service, of disk space for the recorder, of processor time for all."""
-KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *SCARCE_KINDS, "partition")
+LIE: Final = "lie"
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *SCARCE_KINDS, "partition", LIE)
 """Process and message kinds apply to one service; `kill`, `freeze` and the last four apply to whole runs."""
 
 
@@ -29,6 +30,10 @@ class CampaignLimits:
     """Simulated time at depth before the fault."""
     force_n: float = 15.0
     """Largest true contact force."""
+    caused_force_n: float = 20.0
+    """The same where the liar makes the force: tissue or torque."""
+    causes_force: tuple[str, ...] = ("sim/", "control/joint_torque")
+    """Topics of such liars."""
     force_rise_n: float = 2.0
     """Largest rise above the peak before the fault, if the run ends early."""
     in_contact_n: float = 1.0
@@ -77,7 +82,7 @@ class FaultCase:
     def name(self) -> str:
         """File name."""
         moment = "" if self.at_s == LIMITS.at_depth_s else f"-{self.at_s:g}"
-        return f"{self.mode.replace(' ', '')}-{self.kind}-{self.where.replace('/', '_')}{moment}"
+        return f"{self.mode.replace(' ', '')}-{self.kind}-{self.where.replace('/', '_').replace(' ', '-')}{moment}"
 
 
 @dataclass
@@ -124,8 +129,10 @@ class FaultFinding:
         The cause must be named unless the examination was unharmed.
         """
         limit = LIMITS.force_n
+        if self.kind == LIE and self.where.startswith(LIMITS.causes_force):
+            limit = LIMITS.caused_force_n
         ended_early = self.outcome is CaseOutcome.ENDED  # otherwise later forces are those of the scan
-        if self.peak_force_before_n > LIMITS.in_contact_n and ended_early:
+        if self.kind != LIE and self.peak_force_before_n > LIMITS.in_contact_n and ended_early:
             limit = min(limit, self.peak_force_before_n + LIMITS.force_rise_n)
         return (
             self.injected_s is not None

@@ -5,6 +5,7 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
+from itertools import chain
 from pathlib import Path
 from statistics import median
 from typing import Annotated
@@ -16,7 +17,7 @@ from rich.table import Table
 
 from palpate.console import EXIT_FAILED, CaseDisplay, output_file, refuse
 from palpate.report.files import docs_option, write_part, write_text
-from palpate_benchmarks.fault_cases import KINDS, CaseOutcome, FaultFinding, csv_text, from_csv, in_order
+from palpate_benchmarks.fault_cases import KINDS, LIE, CaseOutcome, FaultFinding, csv_text, from_csv, in_order
 
 MODES = ("lockstep", "wallclock")
 WIDTH = 200
@@ -36,7 +37,7 @@ SUMMARY = (
 
 def faults(  # noqa: PLR0913 - the options of a command
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
-    kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all by default.")] = None,
+    kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
     out: Annotated[Path, output_file("File for the findings; cases in it are skipped.", "--out", "-o")] = Path("faults.csv"),
     docs: Annotated[Path | None, docs_option("faults")] = None,
@@ -45,18 +46,26 @@ def faults(  # noqa: PLR0913 - the options of a command
     random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
-    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the findings."""
+    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the findings.
+
+    `--kind lie`: services that send wrong values.
+    """
+    from palpate_benchmarks import lies
     from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
     console = Console(stderr=True, width=max(WIDTH, Console().width))
-    modes, kinds = mode or MODES, kind or KINDS
+    modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
     for name, given, known in (("--mode", modes, MODES), ("--kind", kinds, KINDS)):
         for value in given:
             if value not in known:
                 refuse(f"{name} {value}: allowed are {', '.join(known)}")
     found = _load(out)
-    todo = [*fixed(modes, kinds, only or ()), *cases(modes, kinds, only or ()), *drawn(random, seed, modes)]
+    todo = [*fixed(modes, kinds, only or ()), *cases(modes, kinds, only or ())]
+    if LIE in kinds:
+        todo += [*lies.cases(modes, only or ()), *lies.drawn(random, seed, modes)]
+    else:
+        todo += drawn(random, seed, modes)
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
     if not again:
@@ -66,12 +75,16 @@ def faults(  # noqa: PLR0913 - the options of a command
     started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
-        for number, case in enumerate(todo, 1):
-            finding = run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by)
+        others = (case for case in todo if case.kind != LIE)
+        findings = (
+            run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by) for case in others
+        )
+        lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
+        for number, finding in enumerate(chain(findings, lying), 1):
             found = [f for f in found if f.identity != finding.identity] + [finding]
             write_text(out, csv_text(found))
             mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
-            display.show(number, len(todo), f"{mark} {case.name}: {escape(finding.sign or finding.ended)}")
+            display.show(number, len(todo), f"{mark} {escape(finding.where)}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDTH, Console().width)).print(table(found))
     if docs is not None:
         write_part(docs, "faults", markdown(found))

@@ -16,7 +16,7 @@ from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
 from palpate_bus.messages import Vector3, Wrench, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import Packet, Stepper
@@ -38,7 +38,7 @@ def test_it_accepts_what_the_checker_finds_nothing_in(name: str, data: st.DataOb
         message.header.frame_id = topic.frame
     found = Checker(topic)(message)
     try:
-        PortCheck(topic)(message)
+        PortCheck(topic)(message, nanoseconds(message.header.stamp) if hasattr(message, "header") else 0)
     except RefusedMessage as refused:
         assert refused.violation == found[0]
     else:

@@ -61,7 +61,7 @@ def twist() -> Any:
 
 
 def wrench(x: float = 0.0) -> Any:
-    return Wrench(Vector3(x, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    return Wrench(Vector3(x, 0.0, 0.0), Vector3(0.01 * x, 0.0, 0.0))
 
 
 def misbehave(how: str) -> None:
@@ -90,24 +90,25 @@ class Robot(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         torque, contact = inbox.latest("control/joint_torque"), inbox.latest("sim/contact_wrench")
-        x = np.full(7, (torque.torque[0] if torque else 0.0) + 0.5 * (contact.wrench.force.x if contact else 0.0))
+        moved = (torque.torque[0] if torque else 0.0) + 0.5 * (contact.wrench.force.x if contact else 0.0)
+        x = np.full(7, 1e-3 * moved + 1e-12 * t)  # within the contract's rates, and never the same
         h = header(t, "world")
         out: dict[str, Any] = {
             "joint_states": JointState(h, NAMES, x, x, x),
             "sim/tool_state": ToolState(h, pose(x[0]), twist(), 0.015),
-            "ft/wrench": WrenchStamped(header(t, "ft_sensor"), wrench()),
+            "ft/wrench": WrenchStamped(header(t, "ft_sensor"), wrench(1e-9 * t)),
         }
         if t % (10 * MS) == 0:
-            out["robot/status"] = _status(h, x, inbox.lost("control"))
+            out["robot/status"] = _status(h, x, t, inbox.lost("control"))
         if t % (50 * MS) == 0:
             out["sim/link_poses"] = TFMessage([])
         return out
 
 
-def _status(h: Any, x: Any, lost: bool) -> Any:
+def _status(h: Any, x: Any, t: int, lost: bool) -> Any:
     fields = {name: x for name in ("applied_torque", "position", "velocity") if name in RobotStatus.__dataclass_fields__}
     if "wrench" in RobotStatus.__dataclass_fields__:
-        fields["wrench"] = wrench()
+        fields["wrench"] = wrench(1e-9 * t)
     return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", culprit="", commands_rejected=0, **fields)
 
 

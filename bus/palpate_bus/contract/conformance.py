@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from math import isfinite
+from math import inf, isfinite
 from operator import attrgetter
 from typing import Any
 
@@ -36,6 +36,10 @@ class ViolationKind(StrEnum):
     RANGE = "range"
     UNIT = "unit"
     GARBAGE = "garbage"
+    NAMES = "names"
+    NORM = "norm of a quaternion"
+    CHANGE = "rate of change"
+    FROZEN = "frozen"
 
 
 @dataclass(frozen=True)
@@ -49,6 +53,54 @@ class MessageViolation:
 
     def __str__(self) -> str:
         return f"{self.field or 'message'}: expected {self.expected}, got {self.got}"
+
+
+QUATERNION = "geometry_msgs/msg/Quaternion"
+NORM = (0.98, 1.02)
+"""Squared norm of a quaternion."""
+AHEAD_NS = 500_000_000
+"""Time [ns] by which a sender's stamp may be ahead of its own time."""
+
+
+@dataclass
+class PastMessages:
+    """The messages of one topic that passed at one port."""
+
+    repeats: list[int]
+    """Messages in a row in which each field of `varies` repeated."""
+    stamp: int = -1
+    since: int = 0
+    """Time at the port [ns] at which this stamp was first seen."""
+    message: Message | None = None
+
+
+def repeats(message: Message, before: Message, path: str) -> bool:
+    """Return True if all numbers of a field are as before."""
+    return bool(np.array_equal(numbers(message, path), numbers(before, path)))
+
+
+def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> Iterator[MessageViolation]:
+    """Yield how a message that is sent or received at `t` [ns] breaks the contract after those before it."""
+    stamp, age = nanoseconds(message.header.stamp), topic.max_age_ms or inf
+    got = f"{stamp / 1e6:g} ms at {t / 1e6:g} ms"
+    if stamp < past.stamp:
+        yield MessageViolation(
+            ViolationKind.STAMP, "header.stamp", f"at least {past.stamp / 1e6:g} ms, that of the message before", got
+        )
+    if (stamp == past.stamp and t - past.since > age * 1e6) or t - stamp > age * 1e6:
+        yield MessageViolation(ViolationKind.AGE, "header.stamp", f"at most {age:g} ms old", got)
+    if stamp - t > AHEAD_NS:
+        yield MessageViolation(ViolationKind.STAMP, "header.stamp", f"at most {AHEAD_NS / 1e6:g} ms ahead", got)
+    for path, rate in topic.rates.items() if past.message is not None else ():
+        now, before = numbers(message, path), numbers(past.message, path)
+        most, k = rate * (stamp - past.stamp) / 1e9, int(np.argmax(np.abs(now - before)))
+        if not abs(now[k] - before[k]) <= most:
+            text = f"{now[k]:g} after {before[k]:g}, {(stamp - past.stamp) / 1e6:g} ms apart"
+            yield MessageViolation(ViolationKind.CHANGE, path, f"a change of {rate:g} {topic.units[path]} per second", text)
+    for count, (path, most) in zip(past.repeats, topic.varies.items(), strict=True):
+        if count >= most and repeats(message, past.message, path):
+            text = f"{numbers(message, path).tolist()} in {count + 2} messages in a row"
+            yield MessageViolation(ViolationKind.FROZEN, path, f"at most {most + 1} equal ones: a live sensor has noise", text)
 
 
 _FEW = 16
@@ -74,6 +126,10 @@ class Checker:
             self._headers = _own_header
         elif any(name == "transforms" for name, _ in names):
             self._headers = _headers_of_transforms
+        self._names = topic.names
+        self._quaternions = [
+            leaf.path[:-2] for leaf in leaves(topic.type) if leaf.message == QUATERNION and leaf.path.endswith(".w")
+        ]
         self._ranges: list[tuple[str, _Reader, float, float, str]] = []
         seen: set[str] = set()
         for path, (least, most) in topic.ranges.items():
@@ -109,7 +165,20 @@ class Checker:
             if not reader.finite(message):
                 values = reader.values(message)
                 found.append(MessageViolation(ViolationKind.NAN, path, "finite numbers", f"{values[~np.isfinite(values)][0]:g}"))
-        return found
+        return found + list(self._forms(message))
+
+    def _forms(self, message: Message) -> Iterator[MessageViolation]:
+        """Yield what is wrong with names and quaternions."""
+        for path, names in self._names.items():
+            if getattr(message, path) != list(names):
+                yield MessageViolation(ViolationKind.NAMES, path, str(list(names)), str(getattr(message, path)))
+        for path in self._quaternions:
+            values = numbers(message, path).reshape(-1, 4)
+            square = (values**2).sum(axis=1)
+            wrong = values[~((square >= NORM[0]) & (square <= NORM[1]))]
+            if len(wrong):
+                got = f"{wrong[0].tolist()} with norm {np.linalg.norm(wrong[0]):g}"
+                yield MessageViolation(ViolationKind.NORM, path, "a norm of 1", got)
 
     def stamp(self, message: Message) -> int | None:
         """Return the stamp [ns] of the message's header or of its first transform; None without a header."""
@@ -158,6 +227,8 @@ class LeafField:
     """The field is an array."""
     repeated: bool
     """The path contains a sequence of messages."""
+    message: str = ""
+    """Type of the message that has the field."""
 
 
 def leaves(type_name: str, path: str = "") -> list[LeafField]:
@@ -182,7 +253,7 @@ def _leaves(type_name: str, path: str = "", repeated: bool = False) -> Iterator[
         if description[0] == Nodetype.NAME:
             yield from _leaves(description[1], here, repeated or array)
         else:
-            yield LeafField(here, description[1][0], array, repeated)
+            yield LeafField(here, description[1][0], array, repeated, type_name)
 
 
 def numbers(message: Message, path: str) -> np.ndarray[Any, Any]:

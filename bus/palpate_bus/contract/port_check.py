@@ -1,8 +1,9 @@
-"""The check of every message at a port, generated from the topic's row of the contract: type, frame, ranges, finite numbers.
+"""The check of every message at a port, generated from the topic's row of the contract.
 
-The runtimes hold one `PortCheck` per port, where a service sends and where messages of other processes are received. In lockstep
-a refused message ends the run. In wall-clock mode it is dropped and reported, so its readers act as on silence. No service needs
-a check of its own.
+A message is checked by itself (type, frame, names, ranges, finite numbers, unit quaternions) and against those before it at the
+same port (order and age of stamps, rates of change, values that repeat). The runtimes hold one `PortCheck` per port, where a
+service sends and where messages of other processes are received. In lockstep a refused message ends the run. In wall-clock mode
+it is dropped and reported, so its readers act as on silence. No service needs a check of its own.
 """
 
 from __future__ import annotations
@@ -15,7 +16,18 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.contract.conformance import Checker, MessageViolation, ViolationKind
+from palpate_bus.contract.conformance import (
+    AHEAD_NS,
+    NORM,
+    QUATERNION,
+    Checker,
+    MessageViolation,
+    PastMessages,
+    ViolationKind,
+    broken_past,
+    leaves,
+    repeats,
+)
 from palpate_bus.contract.rows import Topic
 from palpate_bus.messages.codec import Message, message_type, store
 from palpate_errors import RunError
@@ -40,48 +52,53 @@ class RefusedMessage(RunError):
 class PortCheck:
     """Check of the messages of one topic at one port."""
 
-    __slots__ = ("_conforms", "_topic")
+    __slots__ = ("_conforms", "_past", "_topic")
 
-    def __init__(self, topic: Topic) -> None:
+    def __init__(self, topic: Topic, sends: bool = False) -> None:
+        """`sends`: stamps must be of the sender's present."""
         self._topic = topic
-        self._conforms = conforms(topic.model_dump_json())
+        self._conforms = conforms(topic.model_dump_json(), sends)
+        self._past = PastMessages([0] * len(topic.varies))
 
-    def __call__(self, message: Message) -> None:
-        """Raise RefusedMessage if the message breaks the contract."""
-        if not self._conforms(message):
-            raise RefusedMessage(self._topic, self._violation(message), message)
+    def __call__(self, message: Message, t: int) -> None:
+        """Raise RefusedMessage if the message breaks the contract. `t`: time at the port [ns]."""
+        if not self._conforms(message, self._past, t):
+            raise RefusedMessage(self._topic, self._violation(message, t), message)
 
-    def _violation(self, message: Message) -> MessageViolation:
+    def _violation(self, message: Message, t: int) -> MessageViolation:
         try:
-            return Checker(self._topic)(message)[0]
+            return next(iter((*Checker(self._topic)(message), *broken_past(self._topic, self._past, message, t))))
         except Exception as error:  # a field has a value of another type
             return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error))
 
 
 @cache
-def conforms(row: str) -> Callable[[Message], bool]:
-    """Return a function that is True for a message that conforms to its topic, a row as JSON: `Checker` without the findings."""
+def conforms(row: str, sends: bool) -> Callable[[Message, PastMessages, int], bool]:
+    """Return a function that is True for a message that conforms to its topic, a row as JSON, and enters it into the past."""
     topic = Topic.model_validate_json(row)
-    body = list(_Source(topic).lines())
+    body = list(_Source(topic, sends).lines())
     text = "\n".join(
-        ("def conforms(m):", " try:", *(f"  {line}" for line in body), " except Exception: return False", " return True")
+        ("def conforms(m, past, t):", " try:", *(f"  {line}" for line in body), " except Exception: return False", " return True")
     )
     names: dict[str, Any] = {
         "Type": message_type(topic.type),
         "Array": np.ndarray,
         "array": np.asarray,
         "frame": topic.frame,
+        "repeats": repeats,
+        "names": {path: list(values) for path, values in topic.names.items()},
     }
     exec(compile(text, f"<check of {topic.name}>", "exec"), names)
-    check: Callable[[Message], bool] = names["conforms"]
+    check: Callable[[Message, PastMessages, int], bool] = names["conforms"]
     return check
 
 
 class _Source:
     """Writes the lines of a check."""
 
-    def __init__(self, topic: Topic) -> None:
+    def __init__(self, topic: Topic, sends: bool) -> None:
         self._topic = topic
+        self._sends = sends
         self._count = 0
 
     def lines(self) -> Iterator[str]:
@@ -92,7 +109,47 @@ class _Source:
         elif self._topic.frame is not None and "transforms" in names:
             yield "for one in m.transforms:"
             yield " if one.header.frame_id != frame: return False"
+        yield from (f"if m.{path} != names[{path!r}]: return False" for path in self._topic.names)
         yield from self._message(self._topic.type, "m", "")
+        if self._topic.periodic and "header" in names:
+            yield from self._past()
+
+    def _past(self) -> Iterator[str]:
+        """Yield the lines that compare a message with those before it."""
+        topic, age = self._topic, self._topic.max_age_ms
+        yield "stamp = m.header.stamp"
+        yield "stamp = stamp.sec * 1000000000 + stamp.nanosec"
+        yield "if stamp <= past.stamp:"
+        yield f" if stamp < past.stamp{f' or t - past.since > {topic.max_age}' if age else ''}: return False"
+        yield "else: past.since = t"
+        if self._sends:
+            yield f"if stamp - t > {AHEAD_NS}{f' or t - stamp > {topic.max_age}' if age else ''}: return False"
+        lines = [*self._rates(), *self._varies()]
+        if lines:
+            yield from ("before = past.message", "if before is not None:", *(f" {line}" for line in lines), "past.message = m")
+        yield "past.stamp = stamp"
+
+    def _rates(self) -> Iterator[str]:
+        """Yield the lines that compare fields with those of the message before."""
+        for path, rate in self._topic.rates.items():
+            yield f"most = {rate * 1e-9!r} * (stamp - past.stamp)"
+            for leaf in leaves(self._topic.type, path):
+                yield f"change = m.{leaf.path} - before.{leaf.path}"
+                if leaf.array:
+                    yield "if not change.dot(change) <= most * most:"
+                    yield " for one in change.tolist():"
+                    yield "  if not -most <= one <= most: return False"
+                else:
+                    yield "if not -most <= change <= most: return False"
+
+    def _varies(self) -> Iterator[str]:
+        """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
+        for k, (path, most) in enumerate(self._topic.varies.items()):
+            leaf = leaves(self._topic.type, path)[0]
+            first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
+            yield f"if m.{first} != before.{first} or not repeats(m, before, {path!r}): past.repeats[{k}] = 0"
+            yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
+            yield "else: return False"
 
     def _new(self) -> str:
         self._count += 1
@@ -115,6 +172,9 @@ class _Source:
             if kind == Nodetype.NAME:
                 inner = self._new()
                 checks = list(self._message(detail, inner, f"{prefix}{name}."))
+                if detail == QUATERNION:
+                    square = " + ".join(f"{inner}.{k} * {inner}.{k}" for k in "xyzw")
+                    checks.append(f"if not {NORM[0]} <= {square} <= {NORM[1]}: return False")
                 yield from (f"{inner} = {here}", *checks) if checks else ()
             elif kind == Nodetype.BASE:
                 limits = self._limits(prefix + name, detail[0])

@@ -93,6 +93,12 @@ class Topic(_Row):
     frame: str | None = None
     units: dict[str, str] = {}
     ranges: dict[str, tuple[float, float]] = {}
+    rates: dict[str, float] = {}
+    """Greatest change per second of each number."""
+    varies: dict[str, int] = {}
+    """Number of messages in a row whose field may repeat exactly."""
+    names: dict[str, tuple[str, ...]] = {}
+    """Fixed values of lists of texts."""
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0

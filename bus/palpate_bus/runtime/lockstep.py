@@ -214,7 +214,7 @@ class TickInbox:
         start = perf_counter_ns()
         message = packet.message = buffer.decode(packet.payload)
         if not packet.checked:
-            buffer.check(message)
+            buffer.check(message, packet.stamp)
         self._blame.decode += perf_counter_ns() - start
         return message
 
@@ -259,7 +259,7 @@ class OutputPort:
         self.event = topic.event
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
-        self.check = PortCheck(topic)
+        self.check = PortCheck(topic, sends=True)
         self._exact = codec.decodes_to_itself(topic.type)
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
@@ -268,7 +268,7 @@ class OutputPort:
 
     def pack(self, message: Message, t: int) -> Sent:
         """Check, encode and number a message that is sent at `t` [ns]. Raises RefusedMessage."""
-        self.check(message)
+        self.check(message, t)
         sequence = self.sequence = self.sequence + 1
         payload = self.encode(message)
         if self._digest is not None:

@@ -88,7 +88,7 @@ class _Feed:
                 self.garbage += 1
                 continue
             try:
-                self._check(message)
+                self._check(message, (sequence - 1) * self.topic.period)
             except RefusedMessage as refused:
                 self.refused += 1
                 self._refuse(refused)

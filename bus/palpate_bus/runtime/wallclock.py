@@ -254,7 +254,7 @@ class WallClockNode(Node):
                 try:
                     # decoded here, not in the service: invalid bytes must not end a driver whose arm is in contact
                     message = buffer.decode(sample.payload)
-                    buffer.check(message)
+                    buffer.check(message, t)
                 except RefusedMessage as refused:
                     self._refuse(refused)
                     continue

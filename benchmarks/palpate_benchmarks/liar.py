@@ -1,0 +1,211 @@
+"""A service that lies: it wraps the default one of a role and changes one field of one topic from a moment on.
+
+    PALPATE_LIE="ft/wrench wrench.force gain 0.3 12.5" palpate run clean --service robot=benchmarks/palpate_benchmarks/liar.py
+
+`palpate_benchmarks.lies` has the cases. The field `message` is the whole message. A sensor tells its lie in all its topics.
+
+| lie | what is sent |
+|---|---|
+| `frozen`, `zero`, `nan`, `infinite` | the value at the moment; 0; NaN; infinity |
+| `gain`, `sign` | times the amount; minus the value |
+| `bias`, `drift`, `spike` | plus the amount; plus the amount per second; plus the amount in one message per second |
+| `permuted` | the values of neighbouring joints |
+| `swapped`, `unnormalised` | a quaternion as w x y z; times the amount |
+| `late`, `delayed` | the message of the amount [ms] earlier, with its stamp; its field in a message with a new stamp |
+| `repeated`, `disordered`, `stale` | the message of the moment; every second one an older one; the stamp is the amount [s] old |
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, fields, is_dataclass, replace
+from itertools import islice
+from typing import Any, Final
+
+import numpy as np
+
+from palpate_bus.contract import contract
+from palpate_bus.contract.conformance import numbers
+from palpate_bus.implementations import create as create_service
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, nanoseconds, time_message
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_models.scenario.schema import Services
+
+VARIABLE: Final = "PALPATE_LIE"
+WHOLE: Final = "message"
+TWINS: Final = {"ft/wrench": "robot/status", "joint_states": "robot/status"}
+"""Topics whose fields another one repeats: a lie of the sensor is in both."""
+Array = np.ndarray[Any, Any]
+CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
+    "frozen": lambda x, first, amount, s: first if first.shape == x.shape else x,
+    "zero": lambda x, first, amount, s: 0 * x,
+    "nan": lambda x, first, amount, s: np.full_like(x, np.nan),
+    "infinite": lambda x, first, amount, s: np.full_like(x, np.inf),
+    "gain": lambda x, first, amount, s: amount * x,
+    "sign": lambda x, first, amount, s: -x,
+    "bias": lambda x, first, amount, s: x + amount,
+    "drift": lambda x, first, amount, s: x + amount * s,
+    "spike": lambda x, first, amount, s: x + amount if s % 1.0 < 1e-9 else x,
+    "permuted": lambda x, first, amount, s: np.roll(x.reshape(-1, 7), 1, axis=1).ravel(),
+    "swapped": lambda x, first, amount, s: np.roll(x.reshape(-1, 4), 1, axis=1).ravel(),
+    "unnormalised": lambda x, first, amount, s: amount * x,
+}
+"""Changed values from: the true ones, those at the moment, the amount, and the time since the moment [s]."""
+ORDER_KINDS: Final = ("late", "repeated", "disordered", "stale")
+KINDS: Final = (*CHANGES, "delayed", *ORDER_KINDS)
+
+
+@dataclass(frozen=True)
+class Lie:
+    """A lie in the messages of a topic."""
+
+    topic: str
+    field: str
+    kind: str
+    amount: float
+    at_s: float
+    """Simulated time from which on it is told."""
+
+    @classmethod
+    def parse(cls, text: str) -> Lie:
+        """Return the lie of a text with the values of the fields."""
+        topic, path, kind, amount, at_s = text.split()
+        return cls(topic, path, kind, float(amount), float(at_s))
+
+    def __str__(self) -> str:
+        return f"{self.topic} {self.field} {self.kind} {self.amount:g} {self.at_s:g}"
+
+    @property
+    def role(self) -> str:
+        """Role of the liar."""
+        return contract().topics[self.topic].producer
+
+    @property
+    def topics(self) -> tuple[str, ...]:
+        """Topics in which the lie is told."""
+        twin = TWINS.get(self.topic) if self.field not in (WHOLE, "effort") else None
+        return (self.topic,) if twin is None else (self.topic, twin)
+
+
+class _Told:
+    """The lie in one topic."""
+
+    def __init__(self, lie: Lie) -> None:
+        self._lie = lie
+        self._past: deque[tuple[int, Message]] = deque(maxlen=1000)
+        self._first: Message | None = None
+
+    def messages(self, t: int, sent: list[Message], event: bool) -> list[Message]:
+        """Return the messages to send at `t` [ns] instead of `sent`."""
+        lie = self._lie
+        if lie.kind not in (*ORDER_KINDS, "delayed"):
+            return sent if t < lie.at_s * NS else [self._changed(t, message) for message in sent]
+        self._past.extend((t, message) for message in sent)
+        if t < lie.at_s * NS:
+            return sent
+        if lie.kind == "late" and event:
+            late = t - round(lie.amount * 1e6)
+            due = [message for stamp, message in self._past if stamp <= late and stamp >= (self._sent_until or 0)]
+            self._sent_until = late + 1
+            return due
+        return [self._ordered(t, message) for message in sent]
+
+    _sent_until: int | None = None
+
+    def _ordered(self, t: int, message: Message) -> Message:
+        lie = self._lie
+        if lie.kind == "repeated":
+            self._first = self._first or message
+            return self._first
+        if lie.kind == "disordered":
+            self._odd = not self._odd
+            return self._past[-3][1] if self._odd and len(self._past) > 2 else message
+        if lie.kind == "stale":
+            return _stamped(message, -lie.amount)
+        old = [one for stamp, one in self._past if stamp <= t - lie.amount * 1e6] or [self._past[0][1]]
+        return old[-1] if lie.kind == "late" else _filled(message, lie.field, numbers(old[-1], lie.field))
+
+    _odd = False
+
+    def _changed(self, t: int, message: Message) -> Message:
+        lie = self._lie
+        self._first = self._first or message
+        if lie.field == "data":  # the pixels of an image
+            pixels, first = message.data.view(np.float32), self._first.data.view(np.float32)
+            changed = CHANGES[lie.kind](pixels, first, lie.amount, t / NS - lie.at_s)
+            return replace(message, data=np.asarray(changed, np.float32).view(np.uint8))
+        first = numbers(self._first, lie.field)
+        values = numbers(message, lie.field)
+        return _filled(message, lie.field, CHANGES[lie.kind](values, first, lie.amount, t / NS - lie.at_s))
+
+
+def _stamped(message: Message, seconds: float) -> Message:
+    """Return a copy whose stamp is changed by `seconds`."""
+    stamp = max(nanoseconds(message.header.stamp) + round(seconds * NS), 0)
+    return replace(message, header=replace(message.header, stamp=time_message(stamp)))
+
+
+def _filled(message: Message, path: str, values: Array) -> Message:
+    """Return a copy with other numbers at and below a field, in the order of `numbers`."""
+    return _with(message, path.split("."), iter(values.tolist()))
+
+
+def _with(value: Any, path: list[str], values: Iterator[float]) -> Any:
+    if isinstance(value, list):
+        return [_with(item, path, values) for item in value]
+    if path:
+        return replace(value, **{path[0]: _with(getattr(value, path[0]), path[1:], values)})
+    if is_dataclass(value) and not isinstance(value, type):
+        names = [field.name for field in fields(value) if not field.name.startswith("__")]
+        return replace(value, **{name: _with(getattr(value, name), [], values) for name in names})
+    if isinstance(value, np.ndarray):
+        return np.fromiter(islice(values, value.size), float, value.size).astype(value.dtype)
+    return value if isinstance(value, str) else type(value)(next(values))
+
+
+class Liar(Service):
+    """Wraps a service; see the module's description."""
+
+    def __init__(self, service: Service, lie: Lie) -> None:
+        self._service = service
+        self.role = service.role  # type: ignore[misc]  # that of the wrapped service
+        self.catches_up = service.catches_up  # type: ignore[misc]
+        self._told = {topic: _Told(replace(lie, topic=topic)) for topic in lie.topics}
+
+    def start(self) -> Outbox:
+        """Return the latched messages; a lie in them begins at once."""
+        return self._lied(round(1e18), self._service.start())
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Return the messages of the service's step, with the lie."""
+        return {topic: message for part in self.parts(t, inbox) for topic, message in part.items()}
+
+    def parts(self, t: int, inbox: Inbox) -> Iterator[Outbox]:
+        """Yield the parts of the service's step, with the lie."""
+        for outbox in self._service.parts(t, inbox):
+            yield self._lied(t, outbox)
+
+    def finish(self) -> Mapping[str, Any]:
+        """Finish the service."""
+        return self._service.finish()
+
+    def _lied(self, t: int, outbox: Outbox) -> Outbox:
+        lied = dict(outbox)
+        for topic, told in self._told.items():
+            event = contract().topics[topic].event
+            if topic in lied:
+                sent = lied[topic]
+                messages = told.messages(t, sent if isinstance(sent, list) else [sent], event)
+                lied[topic] = messages if event else messages[0]
+            elif event and (late := told.messages(t, [], event)):
+                lied[topic] = late
+        return lied
+
+
+def create(scenario: Any) -> Service:
+    """Return the liar of the environment's lie."""
+    lie = Lie.parse(os.environ[VARIABLE])
+    return Liar(create_service(lie.role, getattr(Services(), lie.role, "default"), scenario), lie)

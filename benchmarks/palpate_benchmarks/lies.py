@@ -1,0 +1,353 @@
+"""Campaign of lies: one short examination per lie of a service (`liar`), against its twin without the lie.
+
+Cases are made from the contract: each topic that a service reads, each field with a unit or a code, each kind of lie that fits
+it, at rest, in descent, at depth and in transfer. A case is good if the true force kept its limit, the examination did not call
+itself complete on less than its twin felt, and the liar was named, or did no harm, or tells what no other input contradicts
+(`UNTOLD`).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from itertools import cycle
+from pathlib import Path
+from random import Random
+from time import monotonic
+from typing import Final
+
+from palpate.apart import guarded
+from palpate.environment import given
+from palpate.report.evidence import peak_force
+from palpate.run.composed import load_services
+from palpate.run.distributed import run_distributed
+from palpate.run.roles import WORKERS, workers
+from palpate_benchmarks import liar
+from palpate_benchmarks.campaign import SETTINGS, Sign, _reaction, set_peaks, signs_of, with_producers
+from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
+from palpate_benchmarks.liar import WHOLE, Lie
+from palpate_benchmarks.struck import kept_rate
+from palpate_bus.contract import MS, Edge, Topic, contract
+from palpate_bus.contract.conformance import leaves
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.composed import Composed, ServiceFailed
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_conductor.collector import Collected, Collector, FrameTree
+from palpate_conductor.outcome import RunProgress, Timing, gave_up
+from palpate_errors import RunError
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_models.scenario.schema import Scenario
+
+MOMENTS: Final = ("rest", "descent", "depth", "transfer")
+BEFORE_STROKES: Final = frozenset(
+    {
+        "camera/depth/image_raw",
+        "camera/depth/camera_info",
+        "perception/surface",
+        "perception/targets",
+        "planning/camera_trigger",
+        "tf_static",
+    }
+)
+"""Topics that are sent before the first stroke alone: they lie from rest on."""
+SENSED: Final = ("ft/wrench", "joint_states", "robot/status", "control/joint_torque", "planning/setpoint", "sim/contact_wrench")
+"""Topics that lie at every moment; the others at one of them in turn."""
+CODES: Final = frozenset({"phase", "mode", "level", "state", "cause", "in_contact", "steady", "target_index", "final"})
+"""Fields without a unit that readers act on."""
+JOINTS: Final = frozenset({"position", "velocity", "effort", "applied_torque", "torque", "joint_position", "joint_velocity"})
+"""Fields with a number per joint."""
+AMOUNTS: Final = {"N": 5.0, "N m": 0.5, "rad": 0.05, "rad/s": 0.2, "m": 0.03, "m/s": 0.1, "1": 0.3, "px": 20.0, "N/m": 500.0}
+"""Bias by unit, a tenth of it per second for a drift, four times for a spike."""
+FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0.5}
+DELAYS_MS: Final = (20, 50, 200)
+LIVE_KINDS: Final = ("zero", "stale")
+"""Further kinds of the cases by the wall clock."""
+REST_S: Final = 0.5
+LEAST_SHARE: Final = 0.9
+"""Share of the twin's targets that a complete examination has felt."""
+SAME_BACKGROUND: Final = 0.25
+"""Relative change of the map's background that counts as harm."""
+LONGEST_NS: Final = 90 * NS
+"""Simulated time after which a case has hung."""
+CASE_S: Final = 300.0
+"""Wall time of a case at most."""
+HANGS: Final = "the examination did not end"
+BEFORE_S: Final = 0.25
+"""A case is forked this long before its lie, so that the liar has earlier messages to repeat."""
+SIGNS_EVERY: Final = 10 * MS
+NEVER_NS: Final = 10**18
+LEFT_OUT: Final = {
+    "assessment/samples": "only a search reads it",
+    "exam/request": "only a search sends it",
+    "assessment/findings": "planning reads only whether they are final",
+}
+"""Topics without cases, or of which only the codes have some, and why."""
+UNTOLD: Final[tuple[tuple[str, str, str], ...]] = ()
+"""Lies that no other input contradicts: topic, kinds (empty: all), and the reason."""
+
+
+@dataclass(frozen=True)
+class Healthy:
+    """The twin: the same examination without a lie."""
+
+    moments_s: dict[str, float]
+    felt: int
+    """Number of targets."""
+    findings: int
+    background: float
+    """Of the map [N]."""
+    length_s: float
+
+
+def cells() -> Iterator[tuple[Topic, str, str, float]]:
+    """Yield topic, field, kind and amount of every lie that fits the contract."""
+    for topic in contract().topics.values():
+        why = left_out(topic)
+        if why and not _codes(topic):
+            continue
+        for path in (*(() if why else (*topic.units, *_quaternions(topic))), *_codes(topic)):
+            yield from ((topic, path, kind, amount) for kind, amount in _kinds(topic, path))
+        if not topic.latched and not why:
+            yield from ((topic, WHOLE, "late", float(delay)) for delay in DELAYS_MS)
+            kinds = ("repeated", "disordered", *(("stale",) if _has(topic, "header") else ()))
+            yield from ((topic, WHOLE, kind, FACTORS.get(kind, 0.0)) for kind in kinds)
+
+
+def left_out(topic: Topic) -> str:
+    """Return why the fields of a topic have no cases; empty if they have."""
+    if topic.producer not in WORKERS:
+        return "its sender is no service of every examination"
+    read = any(edge.blocking or edge is Edge.LATCHED for edge in topic.readers.values()) or topic.name in liar.TWINS
+    return LEFT_OUT.get(topic.name, "") if read else "no service reads it"
+
+
+def _has(topic: Topic, name: str) -> bool:
+    return any(leaf.path.split(".")[0] == name for leaf in leaves(topic.type))
+
+
+def _quaternions(topic: Topic) -> list[str]:
+    return list(
+        dict.fromkeys(leaf.path[:-2] for leaf in leaves(topic.type) if leaf.path.endswith(("orientation.w", "rotation.w")))
+    )
+
+
+def _codes(topic: Topic) -> list[str]:
+    read = topic.producer in WORKERS and any(edge.blocking for edge in topic.readers.values())
+    return [] if not read else [leaf.path for leaf in leaves(topic.type) if leaf.path in CODES and leaf.path not in topic.units]
+
+
+def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
+    if path.endswith(("orientation", "rotation")):
+        yield from (("frozen", 0.0), ("nan", 0.0), ("swapped", 0.0), ("unnormalised", FACTORS["unnormalised"]))
+        return
+    if path in CODES or path == "end_tick":
+        yield from (("frozen", 0.0), ("zero", 0.0))
+        return
+    bias = AMOUNTS.get(topic.units[path].split(",")[0], 0.3)
+    varied = (("drift", bias / 10), ("spike", 4 * bias), ("delayed", FACTORS["delayed"]), ("frozen", 0.0))
+    for kind, amount in (
+        ("zero", 0.0),
+        ("nan", 0.0),
+        ("infinite", 0.0),
+        ("gain", FACTORS["gain"]),
+        ("sign", 0.0),
+        ("bias", bias),
+        *varied,
+    ):
+        if not (topic.latched and kind in dict(varied)):
+            yield kind, amount
+    if path in JOINTS:
+        yield "permuted", 0.0
+
+
+def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
+    """Yield a lockstep case per cell, then the other moments of the topics in `SENSED`; and the cases by the wall clock."""
+    turn = cycle(MOMENTS)
+    chosen = [(topic, path, kind, f"{topic.name} {path} {kind} {amount:g}") for topic, path, kind, amount in cells()]
+    chosen = [cell for cell in chosen if not only or {cell[0].name, cell[0].producer, cell[2]} & set(only)]
+    first = [(*cell, "rest" if cell[0].name in BEFORE_STROKES else next(turn)) for cell in chosen]
+    if "lockstep" in modes:
+        yield from (FaultCase(LIE, f"{where} {moment}", wallclock=False) for *_, where, moment in first)
+        for topic, _, _, where, done in first:
+            others = [moment for moment in MOMENTS if moment != done and topic.name in SENSED]
+            yield from (FaultCase(LIE, f"{where} {moment}", wallclock=False) for moment in others)
+    if "wallclock" in modes:
+        for topic, _, kind, where in chosen:
+            if topic.name not in BEFORE_STROKES and (
+                kind in ("frozen", "repeated") or (topic.name in SENSED and kind in LIVE_KINDS)
+            ):
+                yield FaultCase(LIE, f"{where} depth", wallclock=True)
+
+
+def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
+    """Yield `count` random lies: a cell, an amount of 0.1 to 3 times its own, and a share of the twin's time."""
+    draw, known = Random(seed), list(cells())
+    for _ in range(count):
+        topic, path, kind, amount = draw.choice(known)
+        amount = float(f"{amount * 10 ** draw.uniform(-1, 0.5):.2g}")
+        yield FaultCase(
+            LIE, f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}", draw.choice(modes) == "wallclock"
+        )
+
+
+def lie_of(where: str, healthy: Healthy) -> Lie:
+    """Return the lie of a case: the moment is a name, or a share of the twin's simulated time."""
+    topic, path, kind, amount, moment = where.split()
+    at_s = healthy.moments_s.get(moment)
+    return Lie(topic, path, kind, float(amount), float(moment) * healthy.length_s if at_s is None else at_s)
+
+
+def untold(lie: Lie) -> str:
+    """Return why no other input contradicts the lie; empty if one does."""
+    return next((why for topic, kinds, why in UNTOLD if lie.topic == topic and (not kinds or lie.kind in kinds.split())), "")
+
+
+def _scenario() -> Scenario:
+    return load_scenario("clean", SETTINGS)
+
+
+@dataclass
+class Outcome:
+    """What a run with a lie shows."""
+
+    collected: Collected
+    failure: Failure | None
+    t: int
+    """Last tick [ns]."""
+    signs: list[Sign]
+    first: int | None = None
+    """Simulated time of the first sign [ns]."""
+
+
+class Lockstep:
+    """One examination without a lie, from which the cases are forked at their moments: all share what came before."""
+
+    def __init__(self) -> None:
+        scenario = _scenario()
+        self._collector = Collector(tree=FrameTree(exam_input(scenario)))
+        self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
+        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None)), CASE_S)
+
+    def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
+        """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
+        start = round(max(lie.at_s - BEFORE_S, 0.0) * 1e3) * MS
+        if start > self._run.t and not contract().topics[lie.topic].latched:
+            self._run.run(lambda: None, start)
+        return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
+
+    def _finished(self, lie: Lie | None) -> Outcome:
+        """Run to the end, in a child process."""
+        run, collected, outcome = self._run, self._collector.collected, Outcome(self._collector.collected, None, 0, [])
+        since = NEVER_NS if lie is None else lie.at_s * NS
+        if lie is not None:
+            stepper = run.steppers[lie.role]
+            stepper.service = liar.Liar(stepper.service, lie)
+
+        def end() -> int | None:
+            if run.t >= since and not run.t % SIGNS_EVERY:
+                watch(outcome, RunProgress(run.t, 1.0, collected, ()))
+            return collected.end_tick
+
+        try:
+            run.run(end, LONGEST_NS)
+            outcome.failure = gave_up(collected)
+            if outcome.failure is None and collected.end_tick is None:
+                outcome.failure = Failure(FailureCode.BLOCKED, HANGS)
+        except ServiceFailed as error:
+            outcome.failure = error.failure
+        outcome.t = run.t
+        return outcome
+
+
+def watch(outcome: Outcome, progress: RunProgress) -> None:
+    """Add the new signs."""
+    new = [sign for sign in signs_of(progress) if sign not in outcome.signs]
+    if new and outcome.first is None:
+        outcome.first = progress.t
+    outcome.signs += new
+
+
+def by_wall_clock(lie: Lie | None, folder: Path) -> Outcome:
+    """Return the outcome of an examination by the wall clock, at the rate that this machine keeps."""
+    settings = () if lie is None else (f"services.{lie.role}={liar.__file__}",)
+    outcome = Outcome(Collected(), None, 0, [])
+
+    def tell(progress: RunProgress) -> None:
+        if lie is not None and progress.t >= lie.at_s * NS:
+            watch(outcome, progress)
+
+    with given({liar.VARIABLE: str(lie)}):
+        scenario = load_scenario("clean", (*SETTINGS, *settings))
+        result = run_distributed(scenario, folder, tell, (), Timing(wallclock=True, rate=kept_rate()))
+    outcome.collected, outcome.failure, outcome.t = result.collected, result.failure, round(result.sim_time_s * NS)
+    return outcome
+
+
+def healthy(outcome: Outcome) -> Healthy:
+    """Return what is compared with. Raises RunError if the run failed."""
+    if outcome.failure is not None:
+        raise RunError(f"the examination without a lie failed: {outcome.failure}")
+    states = [(nanoseconds(s.header.stamp) / NS, s) for s in outcome.collected.exam_states]
+
+    def begin(phase: int) -> float:
+        return next(t for t, s in states if s.phase == phase)
+
+    touched = next(t for t, s in states if s.in_contact)
+    moments = {
+        "rest": REST_S,
+        "descent": (begin(ExamState.PHASE_INDENT) + touched) / 2,
+        "depth": begin(ExamState.PHASE_SCAN) + LIMITS.at_depth_s,
+        "transfer": begin(ExamState.PHASE_RETRACT) + LIMITS.at_depth_s,
+    }
+    felt, findings, background = _felt(outcome.collected)
+    return Healthy(moments, felt, findings, background, states[-1][0])
+
+
+def _felt(c: Collected) -> tuple[int, int, float]:
+    """Return the number of targets felt, of findings, and the background of the map [N]."""
+    felt = 0 if c.exam is None else int(c.exam.target_count - c.exam.targets_skipped)
+    background = 0.0 if c.stiffness_map is None else float(c.stiffness_map.background)
+    return felt, 0 if c.findings is None else len(c.findings.findings), background
+
+
+def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
+    """Yield the findings of the cases, those in lockstep in the order of their times."""
+    lockstep = Lockstep()
+    twin = lockstep.twin
+    for case in sorted(todo, key=lambda case: (case.wallclock, lie_of(case.where, twin).at_s)):
+        begin, lie = monotonic(), lie_of(case.where, twin)
+        finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
+        if case.wallclock:
+            finding = _judged(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+        else:
+            finding = lockstep.judged(finding, lie)
+        finding.wall_s = round(monotonic() - begin, 1)
+        yield finding
+
+
+def _judged(finding: FaultFinding, lie: Lie, outcome: Outcome, twin: Healthy) -> FaultFinding:
+    """Return the finding with forces, signs and outcome."""
+    c, failure = outcome.collected, outcome.failure
+    set_peaks(finding, [(nanoseconds(m.header.stamp), peak_force(m)) for m in c.indentation], lie.at_s * NS)
+    finding.hung = failure is not None and failure.text == HANGS
+    felt, findings, background = _felt(c)
+    if outcome.signs or failure is not None:
+        finding.sign = str(outcome.signs[0] if outcome.signs else failure)
+        finding.detected_ms = round(((outcome.first or outcome.t) - lie.at_s * NS) / 1e6, 1)
+    blamed = {sign.culprit for sign in outcome.signs} | {state.culprit for state in c.exam_states}
+    finding.outcome = CaseOutcome.ENDED
+    if failure is not None:
+        blamed |= {*failure.roles, *failure.topics}
+        finding.ended = str(failure)
+    elif felt < LEAST_SHARE * twin.felt:
+        finding.ended, finding.kept = f"complete, {felt} of {twin.felt} targets felt", False
+    elif findings == twin.findings and abs(background - twin.background) <= SAME_BACKGROUND * twin.background:
+        finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
+    else:
+        finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
+    if reason := untold(lie):
+        finding.sign = finding.sign or f"cannot be told: {reason}"
+    finding.named = bool(reason) or not with_producers(blamed).isdisjoint(with_producers(lie.topics))
+    finding.reaction = _reaction(c, finding.outcome)
+    return finding
