@@ -50,7 +50,7 @@ def faults(  # noqa: PLR0913 - the options of a command
 
     `--kind lie`: services that send wrong values.
     """
-    from palpate_benchmarks import lies
+    from palpate_benchmarks import lies, lies_report
     from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
@@ -87,7 +87,11 @@ def faults(  # noqa: PLR0913 - the options of a command
             display.show(number, len(todo), f"{mark} {escape(finding.where)}: {escape(finding.sign or finding.ended)}")
     Console(width=max(WIDTH, Console().width)).print(table(found))
     if docs is not None:
-        write_part(docs, "faults", markdown(found))
+        if LIE in kinds:
+            write_part(docs, "lies", lies_report.markdown(found))
+            lies_report.figure(found, docs.parent / "images" / "lies.png")
+        else:
+            write_part(docs, "faults", markdown(found))
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 

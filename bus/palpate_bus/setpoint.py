@@ -7,7 +7,6 @@ from enum import IntEnum
 from functools import cache
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.conformance import Checker
 from palpate_bus.messages import Duration, ImpedanceSetpoint
 from palpate_bus.messages.geometry import Array, pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
@@ -69,19 +68,11 @@ class Setpoint:
 
     @classmethod
     def from_message(cls, message: ImpedanceSetpoint) -> Setpoint:
-        """Return the set-point in a message. Raises ValueError that names the field, its value and what is allowed."""
-        for wrong in _checker()(message):
-            raise ValueError(f"{TOPIC}: {wrong.field} = {wrong.got}: must be {wrong.expected}")
-        if message.mode not in tuple(ControlMode):
-            raise ValueError(f"{TOPIC}: mode = {message.mode}: must be one of {list(map(int, ControlMode))}")
-        try:
-            R_WD = rotation(message.pose.orientation)
-        except ValueError as error:
-            raise ValueError(f"{TOPIC}: pose.{error}") from None
+        """Return the set-point in a message, which the port has checked."""
         return cls(
             stamp=nanoseconds(message.header.stamp),
             mode=ControlMode(message.mode),
-            R_WD=R_WD,
+            R_WD=rotation(message.pose.orientation),
             p_WD=vector(message.pose.position),
             V_WD=twist(message.twist),
             F_W=wrench(message.wrench),
@@ -91,11 +82,6 @@ class Setpoint:
             qd=message.joint_velocity,
             joint_stiffness=message.joint_stiffness,
         )
-
-
-@cache
-def _checker() -> Checker:
-    return Checker(contract().topics[TOPIC])
 
 
 @cache

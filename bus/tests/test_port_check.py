@@ -15,8 +15,8 @@ from toy_services import TOYS, Robot
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import Checker
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
-from palpate_bus.messages import Vector3, Wrench, codec
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
+from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import Packet, Stepper
@@ -67,6 +67,11 @@ LIES: dict[str, tuple[str, Callable[[Any], Any], tuple[str, ...]]] = {
     ),
     "another type": ("ft/wrench", lambda _: Vector3(0.0, 0.0, 0.0), ("geometry_msgs/msg/WrenchStamped",)),
     "a field without a range": ("sim/tool_state", lambda m: _turned(m, NAN), ("pose.orientation.y = nan", "finite")),
+    "a quaternion that is no rotation": ("sim/tool_state", lambda m: _turned(m, 0.5), ("with norm 1.118", "a norm of 1")),
+    "permuted joints": ("joint_states", lambda m: dataclasses.replace(m, name=m.name[::-1]), ("name = ['lbr_A7'", "['lbr_A1'")),
+    "old stamp": ("joint_states", lambda m: dataclasses.replace(m, header=header(0)), ("header.stamp = 0 ms at 20 ms", "19 ms")),
+    "stamp of later": ("joint_states", lambda m: dataclasses.replace(m, header=header(NS)), ("1000 ms at 20 ms", "500 ms ahead")),
+    "spike": ("joint_states", lambda m: joints(m, "position", 0.1), ("position = 0.1 after", "a change of 4 rad per second")),
     "text for a number": ("ft/wrench", force("much"), ("ft/wrench",)),  # type: ignore[arg-type]
 }
 
@@ -102,7 +107,10 @@ def test_in_lockstep_the_run_ends_with_the_first_message_that_breaks_the_contrac
         assert word in str(caught.value)
 
 
-@pytest.mark.parametrize("lie", [name for name in LIES if name not in ("another type", "text for a number")])
+BY_PAST = ("old stamp", "stamp of later", "spike")
+
+
+@pytest.mark.parametrize("lie", [name for name in LIES if name not in ("another type", "text for a number", *BY_PAST)])
 def test_a_reader_refuses_what_a_foreign_sender_puts_on_the_bus(lie: str) -> None:
     """The bytes of a sender that has no such check."""
     topic, change, words = LIES[lie]
@@ -143,3 +151,34 @@ def test_a_message_is_held_against_the_contract_once() -> None:
     stepper = Stepper(Liar("force is NaN", 10**18), RULES, strict=False)
     assert all(packet.checked for _, packet in stepper.step(0))
     assert not Packet(b"", 0, 1).checked
+
+
+def status(t: int, force: float, stamp: int | None = None) -> Any:
+    q = np.full(7, 1e-9 * t)
+    wrench = Wrench(Vector3(force, 0.0, 0.0), Vector3(1e-9 * t, 0.0, 0.0))
+    return RobotStatus(header(t if stamp is None else stamp), 1, 0, "", q, q, wrench, q, 0, "")
+
+
+def test_a_frozen_value_is_refused_until_it_changes() -> None:
+    check = PortCheck(RULES.topics["robot/status"])
+    for t in range(0, 70 * MS, 10 * MS):
+        check(status(t, 5.0 if t else 4.0), t)
+    with pytest.raises(RefusedMessage, match="7 messages in a row"):
+        check(status(70 * MS, 5.0), 70 * MS)
+    check(status(80 * MS, 5.1), 80 * MS)
+
+
+def test_a_refused_spike_leaves_the_messages_after_it_alone() -> None:
+    check = PortCheck(RULES.topics["robot/status"])
+    check(status(0, 5.0), 0)
+    with pytest.raises(RefusedMessage, match=r"wrench\.force = 20 after 5, 10 ms apart"):
+        check(status(10 * MS, 20.0), 10 * MS)
+    check(status(20 * MS, 5.1), 20 * MS)
+
+
+def test_a_repeated_stamp_is_refused_at_the_age_of_the_contract() -> None:
+    check = PortCheck(RULES.topics["robot/status"])
+    for t in (0, 50 * MS, 100 * MS):
+        check(status(0, 0.0), t)
+    with pytest.raises(RefusedMessage, match="100 ms old"):
+        check(status(0, 0.0), 110 * MS)

@@ -23,7 +23,6 @@ few milliseconds then makes the arm oscillate.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import isfinite
 from typing import NamedTuple
 
 import numpy as np
@@ -112,13 +111,8 @@ class ImpedanceController:
         self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Return the torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s].
-
-        Raises ValueError if `q` or `qd` is not finite or not of shape (7,).
-        """
+        """Return the torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s]."""
         q, qd = np.array(q, dtype=float), np.array(qd, dtype=float)
-        if not (q.shape == qd.shape == (DOF,) and isfinite(q.dot(q) + qd.dot(qd))):
-            raise ValueError(f"joint_states: position = {q}, velocity = {qd}: must be {DOF} finite values each")
         law = self._cartesian if reference.setpoint.mode is ControlMode.CARTESIAN else self._joint
         return self._net.torque(law(q, qd, reference), q, self.model.gravity)
 

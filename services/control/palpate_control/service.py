@@ -18,11 +18,9 @@ from palpate_control.impedance import ImpedanceController
 from palpate_control.model import DOF, ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.lbr import HOME, JOINT_NAMES, urdf
+from palpate_models.robot.lbr import HOME, urdf
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
-
-_NAMES = list(JOINT_NAMES)
 
 
 class Problem(NamedTuple):
@@ -39,8 +37,8 @@ class ControlService(Service):
     """Follows set-points by impedance control.
 
     Before the first set-point it commands zero torque, so the driver keeps the arm gravity-compensated. After a set-point has
-    expired, or on joint states that are not finite, it sends commands with zero validity and the reason: the driver then enters
-    its safe hold. While joint states are stale it repeats the last torque until that torque's own expiry.
+    expired it sends commands with zero validity and the reason: the driver then enters its safe hold. While joint states are
+    stale it repeats the last torque until that torque's own expiry.
 
     Set-points are applied in measurement time: a set-point stamped later than the newest measurement waits for it.
     """
@@ -59,9 +57,7 @@ class ControlService(Service):
         self._no_validity = duration_message(0)
         self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
-        self._facts = dict.fromkeys(
-            ("setpoints", "setpoints_rejected", "joint_states_rejected", "ticks_without_joint_states", "ticks_without_command"), 0
-        )
+        self._facts = dict.fromkeys(("setpoints", "setpoints_rejected", "ticks_without_joint_states", "ticks_without_command"), 0)
         self._peak = np.zeros(DOF)
         self._torque = np.zeros(DOF)
         self._torque_expires = -1
@@ -120,13 +116,7 @@ class ControlService(Service):
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
-        if joints.name != _NAMES:
-            return self._reject_joints(t, f"joint_states: name = {joints.name}: must be {_NAMES}")
-        try:
-            reference = self._reference.at(followed)
-            torque = self._controller.torque(joints.position, joints.velocity, reference)
-        except ValueError as error:
-            return self._reject_joints(t, str(error))
+        torque = self._controller.torque(joints.position, joints.velocity, self._reference.at(followed))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
         self._torque, self._torque_expires = torque, t + self._torque_expiry
         return self._command(t, torque, self._full_validity)
@@ -137,11 +127,7 @@ class ControlService(Service):
 
     def _accept(self, message: Message, t: int) -> None:
         """Check a set-point and queue it until joint states as late as its stamp arrive; the first one is applied at once."""
-        try:
-            setpoint = Setpoint.from_message(message)
-        except ValueError as error:
-            self._refuse(t, str(error).removeprefix(f"{TOPIC}: "))
-            return
+        setpoint = Setpoint.from_message(message)
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS
             self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {limit:.0f} ms")
@@ -179,10 +165,6 @@ class ControlService(Service):
         self._reference.clear()
         self._pending.clear()
         return self._command(t, np.zeros(DOF), self._no_validity, problem)
-
-    def _reject_joints(self, t: int, problem: str) -> Outbox:
-        self._facts["joint_states_rejected"] += 1
-        return self._stop_commands(t, Problem("joint_states", problem))
 
     @staticmethod
     def _command(t: int, torque: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:

@@ -124,43 +124,6 @@ def test_commands_own_their_arrays(rig: Rig) -> None:
     np.testing.assert_array_equal(first, kept)
 
 
-@pytest.mark.parametrize(
-    ("changes", "named"),
-    [
-        ({"joint_position": np.full(7, np.nan)}, "joint_position = nan: must be"),
-        ({"stiffness": np.full(6, -1.0)}, "stiffness"),
-        ({"mode": 7}, "mode = 7"),
-        ({"pose": Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 0.0))}, "pose.orientation = ("),
-        ({"pose": Pose(Point(np.inf, 0.0, 0.0), Quaternion(1.0, 0.0, 0.0, 0.0))}, "pose.position = inf"),
-        ({"joint_velocity": np.full(7, 9.0)}, "joint_velocity = 9"),
-    ],
-)
-def test_bad_setpoint_is_refused_and_the_one_before_goes_on(rig: Rig, changes: dict[str, Any], named: str) -> None:
-    rig.send(setpoint(0))
-    rig.tick(10)
-    rig.send(setpoint(10 * MS, **changes))
-    command = rig.tick()
-    assert valid_for(command) == EXPIRY
-    assert np.isfinite(command.torque).all() and np.abs(command.torque).max() > 1
-    facts = rig.service.finish()
-    assert facts["setpoints_rejected"] == 1 and named in facts["problem"]
-    command = rig.tick(250)
-    assert valid_for(command) == 0
-    assert command.problem.startswith("planning/setpoint refused: ") and named in command.problem
-
-
-@pytest.mark.parametrize("broken", ["nan", "names"])
-def test_bad_joint_states_leave_the_arm_to_the_driver(rig: Rig, broken: str) -> None:
-    rig.send(setpoint(0))
-    rig.tick(10)
-    bad = joints(rig.t, np.full(7, np.nan)) if broken == "nan" else joints(rig.t, names=JOINT_NAMES[::-1])
-    command = rig.tick(message=bad)
-    assert valid_for(command) == 0
-    assert command.problem.startswith("joint_states: ")
-    np.testing.assert_array_equal(command.torque, 0.0)
-    assert rig.service.finish()["joint_states_rejected"] == 1
-
-
 def test_while_joint_states_are_stale_the_last_torque_stands_no_longer_than_it_was_valid(rig: Rig) -> None:
     rig.send(setpoint(0))
     rig.tick(10)

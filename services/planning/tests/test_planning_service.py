@@ -18,7 +18,6 @@ from palpate_bus.messages import (
     RobotStatus,
     SupervisorState,
     SurfaceMesh,
-    SurfaceMotion,
     Vector3,
     Wrench,
     codec,
@@ -201,15 +200,12 @@ def test_a_damaged_surface_causes_a_new_scan() -> None:
     def damage(mesh: Any) -> None:
         if not damaged:
             mesh.triangles[7] = 4294967269
-        elif len(damaged) == 1:
-            mesh.vertices[3] = np.nan
         damaged.append(mesh)
 
     world.seen = damage
     world.run()
     assert world.exam.status.phase is Phase.DONE
-    assert len(damaged) == 3
-    assert world.service.finish()["refused_messages"] == 1
+    assert len(damaged) == 2
 
 
 def test_coincident_targets_cause_a_new_scan() -> None:
@@ -224,29 +220,3 @@ def test_coincident_targets_cause_a_new_scan() -> None:
     world.run()
     assert world.exam.status.phase is Phase.DONE
     assert len(looks) == 2
-
-
-def test_a_damaged_motion_message_is_skipped() -> None:
-    service = create(Scenario(robot=BASE))
-    inbox = HandInbox()
-    inbox.put("robot/status", status(0, np.array(lbr.HOME), np.zeros(6)))
-    forecast = np.zeros(11)
-    for damaged, refused in ((0.001, 0), (np.nan, 1), (-1e300, 2)):
-        forecast[3] = damaged
-        inbox.put("perception/motion", SurfaceMotion(header(0, "abdomen"), 0, 0.0, forecast, 1e-4, Vector3(0.0, 0.0, 0.0)))
-        service.step(0, inbox)
-        assert service.finish()["refused_messages"] == refused
-        inbox.events = {}
-
-
-def test_values_that_are_not_finite_are_skipped() -> None:
-    service = create(Scenario(robot=BASE))
-    inbox = HandInbox()
-    q = np.array(lbr.HOME)
-    inbox.put("robot/status", status(0, q, np.zeros(6)))
-    service.step(0, inbox)
-    for broken in (status(10_000_000, np.full(7, np.nan), np.zeros(6)), status(10_000_000, q, np.full(6, np.inf))):
-        inbox.put("robot/status", broken)
-        out = sent(service.step(10_000_000, inbox))
-        assert np.isfinite(np.array(out["planning/setpoint"].joint_position)).all()
-    assert service.finish()["unreadable_statuses"] == 2

@@ -1,0 +1,103 @@
+"""The campaign of lies: what a liar sends, which cases there are, and the judgement of a case."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conductor_messages import collected
+from toy_services import Robot
+
+from palpate_benchmarks.fault_cases import LIE, FaultCase, FaultFinding
+from palpate_benchmarks.liar import KINDS, Liar, Lie
+from palpate_benchmarks.lies import Healthy, Outcome, _judged, cases, cells, left_out, run_lies
+from palpate_benchmarks.lies_report import LieVerdict, verdict
+from palpate_bus.contract import MS, Edge, contract
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.runtime.lockstep import Stepper
+
+MOMENT = 5 * MS
+
+
+def told(lie: str, ticks: int = 12) -> list[Any]:
+    topic = lie.split(maxsplit=1)[0]
+    service, inbox = Liar(Robot(), Lie.parse(f"{lie} {MOMENT / NS}")), Stepper(Robot(), contract()).inbox
+    return [dict(service.step(t * MS, inbox))[topic] for t in range(ticks)]
+
+
+@pytest.mark.parametrize(
+    ("lie", "expected"),
+    [
+        ("frozen 0", 5e6), ("zero 0", 0.0), ("gain 0.3", 3e6), ("sign 0", -10e6), ("bias 2", 2 + 10e-3), ("delayed 2", 8e6),
+        ("drift 1000", 5.0 + 10e-3), ("spike 2", 10e6),
+    ],
+)  # fmt: skip
+def test_a_lie_begins_at_its_moment(lie: str, expected: float) -> None:
+    forces = [message.wrench.force.x for message in told(f"ft/wrench wrench.force {lie}")]
+    assert forces[:5] == [1e-9 * t * MS for t in range(5)]
+    assert forces[10] == pytest.approx(expected * (1e-9 if expected > 1e3 or expected < -1 else 1))
+
+
+def test_messages_come_late_twice_and_out_of_order() -> None:
+    def stamps(lie: str) -> list[float]:
+        return [nanoseconds(message.header.stamp) / MS for message in told(f"ft/wrench message {lie}")]
+
+    assert stamps("late 2")[4:9] == [4, 3, 4, 5, 6]
+    assert stamps("repeated 0")[4:9] == [4, 5, 5, 5, 5]
+    assert stamps("stale 0.002")[4:9] == [4, 3, 4, 5, 6]
+    assert stamps("disordered 0")[4:9] == [4, 3, 6, 5, 8]
+
+
+def test_joints_and_quaternions_change_places() -> None:
+    assert told("sim/tool_state pose.orientation swapped 0")[10].pose.orientation.x == 1.0
+    joints = told("joint_states position bias 0.5")[10]
+    assert joints.position == pytest.approx(np.full(7, 0.5), abs=1e-3)
+    assert np.array_equal(
+        told("joint_states position permuted 0")[10].velocity, told("joint_states position permuted 0")[10].effort
+    )
+
+
+def test_every_topic_that_a_service_reads_has_cases_or_a_reason() -> None:
+    lying = {topic.name for topic, *_ in cells()}
+    for topic in contract().topics.values():
+        if any(edge.blocking or edge is Edge.LATCHED for edge in topic.readers.values()):
+            assert topic.name in lying or left_out(topic)
+    assert {kind for _, _, kind, _ in cells()} == set(KINDS)
+    assert len({case.name for case in cases(("lockstep", "wallclock"), ())}) > 400
+
+
+@pytest.mark.parametrize(
+    ("skipped", "force", "failure", "judged"),
+    [
+        (0, 9.0, None, LieVerdict.HARMLESS),
+        (3, 9.0, None, LieVerdict.BAD),
+        (3, 9.0, "ft/wrench", LieVerdict.NAMED),
+        (3, 9.0, "perception/motion", LieVerdict.BAD),
+        (0, 15.1, "ft/wrench", LieVerdict.BAD),
+    ],
+)
+def test_a_case_is_judged_by_force_completeness_and_name(skipped: int, force: float, failure: str | None, judged: str) -> None:
+    seen = collected()
+    seen.exam.targets_skipped = skipped
+    for message in seen.indentation:
+        message.normal_force, message.tangential_force, message.peak_force = force, 0.0, force
+    outcome = Outcome(seen, None, 10 * NS, [])
+    twin = Healthy({}, int(seen.exam.target_count), len(seen.findings.findings), float(seen.stiffness_map.background), 10.0)
+    if failure is not None:
+        outcome.failure = Failure(FailureCode.GAVE_UP, "held", topics=(failure,))
+    finding = FaultFinding(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
+    assert verdict(_judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), outcome, twin)) is judged
+
+
+@pytest.mark.slow
+def test_ten_lies(tmp_path: Path) -> None:
+    chosen = [case for case in cases(("lockstep",), ("ft/wrench",)) if case.where.endswith(("descent", "depth"))][:10]
+    bad = [finding.where for finding in run_lies(chosen, tmp_path) if not finding.good]
+    assert bad == []
+
+
+def test_names_of_cases_are_names_of_files() -> None:
+    assert "/" not in FaultCase(LIE, "ft/wrench wrench.force gain 0.3 depth", wallclock=False).name
