@@ -68,7 +68,7 @@ class PastMessages:
 
     repeats: list[int]
     """Messages in a row in which each field of `varies` repeated."""
-    stamp: int = -1
+    stamp: int = -(2**63)
     since: int = 0
     """Time at the port [ns] at which this stamp was first seen."""
     message: Message | None = None

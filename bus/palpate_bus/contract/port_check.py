@@ -67,7 +67,8 @@ class PortCheck:
 
     def _violation(self, message: Message, t: int) -> MessageViolation:
         try:
-            return next(iter((*Checker(self._topic)(message), *broken_past(self._topic, self._past, message, t))))
+            alone = Checker(self._topic)(message)
+            return alone[0] if alone else next(broken_past(self._topic, self._past, message, t))
         except Exception as error:  # a field has a value of another type
             return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error))
 
