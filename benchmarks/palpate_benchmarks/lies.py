@@ -162,21 +162,25 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
 
 
 def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield a lockstep case per cell, then the other moments of the topics in `SENSED`; and the cases by the wall clock."""
+    """Yield lockstep cases: one per topic and kind, then the other fields, then the other moments; and those by the wall clock."""
     turn = cycle(MOMENTS)
-    chosen = [(topic, path, kind, f"{topic.name} {path} {kind} {amount:g}") for topic, path, kind, amount in cells()]
-    chosen = [cell for cell in chosen if not only or {cell[0].name, cell[0].producer, cell[2]} & set(only)]
-    first = [(*cell, "rest" if cell[0].name in BEFORE_STROKES else next(turn)) for cell in chosen]
+    chosen = [
+        (topic.name, kind, f"{topic.name} {path} {kind} {amount:g}", topic.producer) for topic, path, kind, amount in cells()
+    ]
+    chosen = [cell for cell in chosen if not only or {cell[0], cell[1], cell[3]} & set(only)]
+    ranked: list[tuple[int, str]] = []
+    seen: set[tuple[str, str]] = set()
+    for topic, kind, where, _ in chosen:
+        moments = ["rest"] if topic in BEFORE_STROKES else [next(turn)]
+        ranked.append(((topic, kind) in seen, f"{where} {moments[0]}"))
+        seen.add((topic, kind))
+        if topic in SENSED:
+            ranked += [(2, f"{where} {moment}") for moment in MOMENTS if moment not in moments]
     if "lockstep" in modes:
-        yield from (FaultCase(LIE, f"{where} {moment}", wallclock=False) for *_, where, moment in first)
-        for topic, _, _, where, done in first:
-            others = [moment for moment in MOMENTS if moment != done and topic.name in SENSED]
-            yield from (FaultCase(LIE, f"{where} {moment}", wallclock=False) for moment in others)
+        yield from (FaultCase(LIE, where, wallclock=False) for _, where in sorted(ranked, key=lambda case: case[0]))
     if "wallclock" in modes:
-        for topic, _, kind, where in chosen:
-            if topic.name not in BEFORE_STROKES and (
-                kind in ("frozen", "repeated") or (topic.name in SENSED and kind in LIVE_KINDS)
-            ):
+        for topic, kind, where, _ in chosen:
+            if topic not in BEFORE_STROKES and (kind in ("frozen", "repeated") or (topic in SENSED and kind in LIVE_KINDS)):
                 yield FaultCase(LIE, f"{where} depth", wallclock=True)
 
 

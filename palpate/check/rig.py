@@ -11,6 +11,8 @@ from collections.abc import Callable, Mapping, MutableSequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import codec
@@ -23,6 +25,11 @@ Source = Callable[[int], "Message | None"]
 """The message of a topic at a time [ns] on the rig's clock; None for silence."""
 Feed = Mapping[str, Source]
 """Messages that the suite sends, by topic; other topics are silent."""
+
+
+def sensed(values: Any, t: int) -> Any:
+    """Return the values as a live sensor reads them at `t` [ns]: ports refuse what repeats."""
+    return np.asarray(values, dtype=float) + 1e-15 * t
 
 
 class ReceivedMessage(NamedTuple):

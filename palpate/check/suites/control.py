@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
+from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, sensed
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
@@ -23,7 +23,7 @@ VALID = contract().topics["planning/setpoint"].expiry
 def joints(q: Any = lbr.HOME, names: tuple[str, ...] = lbr.JOINT_NAMES) -> Source:
     """Return the source of an arm at rest at `q` [rad]."""
     position = np.asarray(q, dtype=float)
-    return lambda t: JointState(header(t), list(names), position, np.zeros(7), np.zeros(7))
+    return lambda t: JointState(header(t), list(names), sensed(position, t), sensed(np.zeros(7), t), np.zeros(7))
 
 
 def joint_target(q: Any, stiffness: float) -> Source:

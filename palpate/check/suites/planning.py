@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, ReceivedMessage, Rig
+from palpate.check.rig import Feed, ReceivedMessage, Rig, sensed
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -36,10 +36,12 @@ class PerfectFollower:
         velocity = np.zeros(7)
         if setpoint is not None and setpoint.mode == ImpedanceSetpoint.MODE_JOINT and self.mode == RobotStatus.MODE_ACTIVE:
             self.q, velocity = np.array(setpoint.joint_position), np.array(setpoint.joint_velocity)
-        weight = Wrench(Vector3(0.0, 0.0, WEIGHT_N), Vector3(0.0, 0.0, 0.0))
+        weight = Wrench(Vector3(*sensed((0.0, 0.0, WEIGHT_N), t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
-        return RobotStatus(header(t), self.mode, cause, reason, self.q, velocity, weight, np.zeros(7), 0, "")
+        return RobotStatus(
+            header(t), self.mode, cause, reason, sensed(self.q, t), sensed(velocity, t), weight, np.zeros(7), 0, ""
+        )
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, ReceivedMessage, Rig
+from palpate.check.rig import Feed, ReceivedMessage, Rig, sensed
 from palpate.check.shapes import level
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
@@ -66,9 +66,11 @@ class PlayedArm:
     def _status(self, t: int) -> Any:
         R_WS = tool_pose(np.nan_to_num(self.q), self.robot)[:3, :3]
         force = R_WS.T @ np.array((0.0, 0.0, self.push_N - self.robot.tool_mass_kg * GRAVITY))
-        wrench = Wrench(Vector3(*force.tolist()), Vector3(0.0, 0.0, 0.0))
+        wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
         cause = RobotStatus.CAUSE_COMMAND_EXPIRED if self.reason else RobotStatus.CAUSE_NONE
-        return RobotStatus(header(t), self.mode, cause, self.reason, self.q, self.qd, wrench, np.zeros(7), 0, "")
+        return RobotStatus(
+            header(t), self.mode, cause, self.reason, sensed(self.q, t), sensed(self.qd, t), wrench, np.zeros(7), 0, ""
+        )
 
     def _exam(self, t: int) -> Any:
         return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
