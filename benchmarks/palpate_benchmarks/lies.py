@@ -162,7 +162,7 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
 
 
 def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield lockstep cases: one per topic and kind, then the other fields, then the other moments; and those by the wall clock."""
+    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those by the wall clock."""
     turn = cycle(MOMENTS)
     chosen = [
         (topic.name, kind, f"{topic.name} {path} {kind} {amount:g}", topic.producer) for topic, path, kind, amount in cells()
