@@ -117,14 +117,13 @@ class _Source:
 
     def _past(self) -> Iterator[str]:
         """Yield the lines that compare a message with those before it."""
-        topic, age = self._topic, self._topic.max_age_ms
+        topic = self._topic
         yield "stamp = m.header.stamp"
         yield "stamp = stamp.sec * 1000000000 + stamp.nanosec"
-        yield "if stamp <= past.stamp:"
-        yield f" if stamp < past.stamp{f' or t - past.since > {topic.max_age}' if age else ''}: return False"
-        yield "else: past.since = t"
+        old = f"t - stamp > {topic.max_age}" if topic.max_age_ms else "False"
+        yield f"if stamp <= past.stamp and (stamp < past.stamp or {old}): return False"
         if self._sends:
-            yield f"if stamp - t > {AHEAD_NS}{f' or t - stamp > {topic.max_age}' if age else ''}: return False"
+            yield f"if stamp != t and (stamp > t + {AHEAD_NS} or {old}): return False"
         lines = [*self._rates(), *self._varies()]
         if lines:
             yield from ("before = past.message", "if before is not None:", *(f" {line}" for line in lines), "past.message = m")
