@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from math import inf, isfinite
+from math import hypot, inf, isfinite
 from operator import attrgetter
 from typing import Any
 
@@ -172,10 +172,10 @@ class Checker:
                 yield MessageViolation(ViolationKind.NAMES, path, str(list(names)), str(getattr(message, path)))
         for path in self._quaternions:
             values = numbers(message, path).reshape(-1, 4)
-            square = (values**2).sum(axis=1)
-            wrong = values[~((square >= NORM[0]) & (square <= NORM[1]))]
-            if len(wrong):
-                got = f"{wrong[0].tolist()} with norm {np.linalg.norm(wrong[0]):g}"
+            norm = [hypot(*one) for one in values.tolist()]
+            wrong = [k for k, one in enumerate(norm) if not NORM[0] <= one * one <= NORM[1]]
+            if wrong:
+                got = f"{values[wrong[0]].tolist()} with norm {norm[wrong[0]]:g}"
                 yield MessageViolation(ViolationKind.NORM, path, "a norm of 1", got)
 
     def stamp(self, message: Message) -> int | None:

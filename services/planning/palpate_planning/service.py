@@ -48,6 +48,7 @@ PERCEPTION_TOPICS = ("perception/surface", "perception/targets", "perception/mot
 """Topics of perception that move the arm: messages that violate the contract are dropped."""
 CULPRITS = {
     PalpationTargets.NONE: "perception",
+    PalpationTargets.NO_DEPTH: "camera/depth/image_raw",
     PalpationTargets.NO_FRAMES: "camera/depth/image_raw",
     PalpationTargets.NO_CAMERA: "camera",
     PalpationTargets.NO_CALIBRATION: "camera/depth/camera_info",
