@@ -2,7 +2,7 @@
 
     PALPATE_LIE="ft/wrench wrench.force gain 0.3 12.5" palpate run clean --service robot=benchmarks/palpate_benchmarks/liar.py
 
-`palpate_benchmarks.lies` has the cases. The field `message` is the whole message. A sensor tells its lie in all its topics.
+`palpate_benchmarks.lies` has the cases. The field `message` is the whole message. A sensor lies in all its topics.
 
 | lie | what is sent |
 |---|---|
@@ -67,7 +67,7 @@ class Lie:
     kind: str
     amount: float
     at_s: float
-    """Simulated time from which on it is told."""
+    """Simulated time from which on it is sent."""
 
     @classmethod
     def parse(cls, text: str) -> Lie:
@@ -85,12 +85,12 @@ class Lie:
 
     @property
     def topics(self) -> tuple[str, ...]:
-        """Topics in which the lie is told."""
+        """Topics in which the lie is sent."""
         twin = TWINS.get(self.topic) if self.field not in (WHOLE, "effort") else None
         return (self.topic,) if twin is None else (self.topic, twin)
 
 
-class _Told:
+class _LyingTopic:
     """The lie in one topic."""
 
     def __init__(self, lie: Lie) -> None:
@@ -173,7 +173,7 @@ class Liar(Service):
         self._service = service
         self.role = service.role  # type: ignore[misc]  # that of the wrapped service
         self.catches_up = service.catches_up  # type: ignore[misc]
-        self._told = {topic: _Told(replace(lie, topic=topic)) for topic in lie.topics}
+        self._lying = {topic: _LyingTopic(replace(lie, topic=topic)) for topic in lie.topics}
 
     def start(self) -> Outbox:
         """Return the latched messages; a lie in them begins at once."""
@@ -194,13 +194,13 @@ class Liar(Service):
 
     def _lied(self, t: int, outbox: Outbox) -> Outbox:
         lied = dict(outbox)
-        for topic, told in self._told.items():
+        for topic, lying in self._lying.items():
             event = contract().topics[topic].event
             if topic in lied:
                 sent = lied[topic]
-                messages = told.messages(t, sent if isinstance(sent, list) else [sent], event)
+                messages = lying.messages(t, sent if isinstance(sent, list) else [sent], event)
                 lied[topic] = messages if event else messages[0]
-            elif event and (late := told.messages(t, [], event)):
+            elif event and (late := lying.messages(t, [], event)):
                 lied[topic] = late
         return lied
 

@@ -2,8 +2,8 @@
 
 Cases are made from the contract: each topic that a service reads, each field with a unit or a code, each kind of lie that fits
 it, at rest, in descent, at depth and in transfer. A case is good if the true force kept its limit, the examination did not call
-itself complete on less than its twin felt, and the liar was named, or did no harm, or tells what no other input contradicts
-(`UNTOLD`).
+itself complete on less than its twin felt, and the liar was named, or did no harm, or sends what no other input contradicts
+(`UNDETECTABLE`).
 """
 
 from __future__ import annotations
@@ -62,7 +62,7 @@ AMOUNTS: Final = {"N": 5.0, "N m": 0.5, "rad": 0.05, "rad/s": 0.2, "m": 0.03, "m
 FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0.5}
 DELAYS_MS: Final = (20, 50, 200)
 LIVE_KINDS: Final = ("zero", "stale")
-"""Further kinds of the cases by the wall clock."""
+"""Further kinds of the cases in wall-clock mode."""
 REST_S: Final = 0.5
 LEAST_SHARE: Final = 0.9
 """Share of the twin's targets that a complete examination has felt."""
@@ -83,7 +83,7 @@ LEFT_OUT: Final = {
     "assessment/findings": "planning reads only whether they are final",
 }
 """Topics without cases, or of which only the codes have some, and why."""
-UNTOLD: Final[tuple[tuple[str, str, str], ...]] = ()
+UNDETECTABLE: Final[tuple[tuple[str, str, str], ...]] = ()
 """Lies that no other input contradicts: topic, kinds (empty: all), and the reason."""
 
 
@@ -117,7 +117,7 @@ def cells() -> Iterator[tuple[Topic, str, str, float]]:
 def left_out(topic: Topic) -> str:
     """Return why the fields of a topic have no cases; empty if they have."""
     if topic.producer not in WORKERS:
-        return "its sender is no service of every examination"
+        return "its sender takes part in some runs only, or observes"
     read = any(edge.blocking or edge is Edge.LATCHED for edge in topic.readers.values()) or topic.name in liar.TWINS
     return LEFT_OUT.get(topic.name, "") if read else "no service reads it"
 
@@ -162,7 +162,7 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
 
 
 def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those by the wall clock."""
+    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those in wall-clock mode."""
     turn = cycle(MOMENTS)
     chosen = [
         (topic.name, kind, f"{topic.name} {path} {kind} {amount:g}", topic.producer) for topic, path, kind, amount in cells()
@@ -202,9 +202,11 @@ def lie_of(where: str, healthy: Healthy) -> Lie:
     return Lie(topic, path, kind, float(amount), float(moment) * healthy.length_s if at_s is None else at_s)
 
 
-def untold(lie: Lie) -> str:
+def undetectable(lie: Lie) -> str:
     """Return why no other input contradicts the lie; empty if one does."""
-    return next((why for topic, kinds, why in UNTOLD if lie.topic == topic and (not kinds or lie.kind in kinds.split())), "")
+    return next(
+        (why for topic, kinds, why in UNDETECTABLE if lie.topic == topic and (not kinds or lie.kind in kinds.split())), ""
+    )
 
 
 def _scenario() -> Scenario:
@@ -212,8 +214,8 @@ def _scenario() -> Scenario:
 
 
 @dataclass
-class Outcome:
-    """What a run with a lie shows."""
+class LieOutcome:
+    """LieOutcome of a run with a lie."""
 
     collected: Collected
     failure: Failure | None
@@ -240,9 +242,9 @@ class Lockstep:
             self._run.run(lambda: None, start)
         return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
 
-    def _finished(self, lie: Lie | None) -> Outcome:
+    def _finished(self, lie: Lie | None) -> LieOutcome:
         """Run to the end, in a child process."""
-        run, collected, outcome = self._run, self._collector.collected, Outcome(self._collector.collected, None, 0, [])
+        run, collected, outcome = self._run, self._collector.collected, LieOutcome(self._collector.collected, None, 0, [])
         since = NEVER_NS if lie is None else lie.at_s * NS
         if lie is not None:
             stepper = run.steppers[lie.role]
@@ -264,7 +266,7 @@ class Lockstep:
         return outcome
 
 
-def watch(outcome: Outcome, progress: RunProgress) -> None:
+def watch(outcome: LieOutcome, progress: RunProgress) -> None:
     """Add the new signs."""
     new = [sign for sign in signs_of(progress) if sign not in outcome.signs]
     if new and outcome.first is None:
@@ -272,23 +274,23 @@ def watch(outcome: Outcome, progress: RunProgress) -> None:
     outcome.signs += new
 
 
-def by_wall_clock(lie: Lie | None, folder: Path) -> Outcome:
-    """Return the outcome of an examination by the wall clock, at the rate that this machine keeps."""
+def by_wall_clock(lie: Lie | None, folder: Path) -> LieOutcome:
+    """Return the outcome of an examination in wall-clock mode, at the rate that this machine keeps."""
     settings = () if lie is None else (f"services.{lie.role}={liar.__file__}",)
-    outcome = Outcome(Collected(), None, 0, [])
+    outcome = LieOutcome(Collected(), None, 0, [])
 
-    def tell(progress: RunProgress) -> None:
+    def on_progress(progress: RunProgress) -> None:
         if lie is not None and progress.t >= lie.at_s * NS:
             watch(outcome, progress)
 
     with given({liar.VARIABLE: str(lie)}):
         scenario = load_scenario("clean", (*SETTINGS, *settings))
-        result = run_distributed(scenario, folder, tell, (), Timing(wallclock=True, rate=kept_rate()))
+        result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=kept_rate()))
     outcome.collected, outcome.failure, outcome.t = result.collected, result.failure, round(result.sim_time_s * NS)
     return outcome
 
 
-def healthy(outcome: Outcome) -> Healthy:
+def healthy(outcome: LieOutcome) -> Healthy:
     """Return what is compared with. Raises RunError if the run failed."""
     if outcome.failure is not None:
         raise RunError(f"the examination without a lie failed: {outcome.failure}")
@@ -330,7 +332,7 @@ def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
         yield finding
 
 
-def _judged(finding: FaultFinding, lie: Lie, outcome: Outcome, twin: Healthy) -> FaultFinding:
+def _judged(finding: FaultFinding, lie: Lie, outcome: LieOutcome, twin: Healthy) -> FaultFinding:
     """Return the finding with forces, signs and outcome."""
     c, failure = outcome.collected, outcome.failure
     set_peaks(finding, [(nanoseconds(m.header.stamp), peak_force(m)) for m in c.indentation], lie.at_s * NS)
@@ -350,8 +352,8 @@ def _judged(finding: FaultFinding, lie: Lie, outcome: Outcome, twin: Healthy) ->
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
         finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
-    if reason := untold(lie):
-        finding.sign = finding.sign or f"cannot be told: {reason}"
+    if reason := undetectable(lie):
+        finding.sign = finding.sign or f"not detectable: {reason}"
     finding.named = bool(reason) or not with_producers(blamed).isdisjoint(with_producers(lie.topics))
     finding.reaction = _reaction(c, finding.outcome)
     return finding

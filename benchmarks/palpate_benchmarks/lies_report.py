@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 
 from palpate_benchmarks.fault_cases import FaultFinding
 from palpate_benchmarks.liar import KINDS
-from palpate_benchmarks.lies import LEFT_OUT, UNTOLD, left_out
+from palpate_benchmarks.lies import LEFT_OUT, UNDETECTABLE, left_out
 from palpate_bus.contract import contract
 
 
@@ -23,7 +23,7 @@ class LieVerdict(StrEnum):
     REFUSED = "refused at the port"
     NAMED = "named by a service"
     HARMLESS = "no harm"
-    UNTOLD = "cannot be told"
+    UNDETECTABLE = "not detectable"
     BAD = "bad"
 
 
@@ -31,7 +31,7 @@ COLOURS = {
     LieVerdict.REFUSED: "#1b7837",
     LieVerdict.NAMED: "#7fbf7b",
     LieVerdict.HARMLESS: "#d9f0d3",
-    LieVerdict.UNTOLD: "#fee08b",
+    LieVerdict.UNDETECTABLE: "#fee08b",
     LieVerdict.BAD: "#c51b7d",
 }
 RANKS = tuple(LieVerdict)
@@ -45,7 +45,7 @@ def verdict(finding: FaultFinding) -> LieVerdict:
         return LieVerdict.REFUSED
     if finding.outcome.unharmed:
         return LieVerdict.HARMLESS
-    return LieVerdict.UNTOLD if finding.sign.startswith("cannot be told") else LieVerdict.NAMED
+    return LieVerdict.UNDETECTABLE if finding.sign.startswith("not detectable") else LieVerdict.NAMED
 
 
 def figure(findings: Sequence[FaultFinding], path: Path) -> None:
@@ -71,7 +71,7 @@ def figure(findings: Sequence[FaultFinding], path: Path) -> None:
 
 
 def markdown(findings: Sequence[FaultFinding]) -> str:
-    """Return the table by kind of lie, the bad cases, and what was left out or cannot be told."""
+    """Return the table by kind of lie, the bad cases, and what was left out or cannot be detected."""
     head = ("lie", "cases", *RANKS, "largest force [N]")
     lines = [f"| {' | '.join(head)} |", "|---" * len(head) + "|"]
     for kind in KINDS:
@@ -82,8 +82,8 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
             lines.append(f"| {kind} | {len(mine)} | {' | '.join(str(counts[one]) for one in RANKS)} | {force:.1f} |")
     good = sum(f.good for f in findings)
     wallclock = sum(f.mode == "wall clock" for f in findings)
-    lines = [f"{good} of {len(findings)} cases passed, {wallclock} of them by the wall clock.", "", *lines, ""]
-    lines += [f"- cannot be told: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNTOLD]
+    lines = [f"{good} of {len(findings)} cases passed, {wallclock} of them in wall-clock mode.", "", *lines, ""]
+    lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]
     out = {topic.name: left_out(topic) for topic in contract().topics.values() if left_out(topic)} | LEFT_OUT
     reasons = {why: [name for name in out if out[name] == why] for why in out.values()}
     lines += [f"- left out, {why}: {', '.join(names)}" for why, names in reasons.items()]

@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 from conductor_messages import collected
-from toy_services import Robot
+from toy_runs import toy_services
 
 from palpate_benchmarks.fault_cases import LIE, FaultCase, FaultFinding
 from palpate_benchmarks.liar import KINDS, Liar, Lie
-from palpate_benchmarks.lies import Healthy, Outcome, _judged, cases, cells, left_out, run_lies
+from palpate_benchmarks.lies import Healthy, LieOutcome, _judged, cases, cells, left_out, run_lies
 from palpate_benchmarks.lies_report import LieVerdict, verdict
 from palpate_bus.contract import MS, Edge, contract
 from palpate_bus.messages.stamps import NS, nanoseconds
@@ -22,9 +22,12 @@ from palpate_bus.runtime.lockstep import Stepper
 MOMENT = 5 * MS
 
 
-def told(lie: str, ticks: int = 12) -> list[Any]:
+def sent(lie: str, ticks: int = 12) -> list[Any]:
     topic = lie.split(maxsplit=1)[0]
-    service, inbox = Liar(Robot(), Lie.parse(f"{lie} {MOMENT / NS}")), Stepper(Robot(), contract()).inbox
+    service, inbox = (
+        Liar(toy_services.Robot(), Lie.parse(f"{lie} {MOMENT / NS}")),
+        Stepper(toy_services.Robot(), contract()).inbox,
+    )
     return [dict(service.step(t * MS, inbox))[topic] for t in range(ticks)]
 
 
@@ -36,14 +39,14 @@ def told(lie: str, ticks: int = 12) -> list[Any]:
     ],
 )  # fmt: skip
 def test_a_lie_begins_at_its_moment(lie: str, expected: float) -> None:
-    forces = [message.wrench.force.x for message in told(f"ft/wrench wrench.force {lie}")]
+    forces = [message.wrench.force.x for message in sent(f"ft/wrench wrench.force {lie}")]
     assert forces[:5] == pytest.approx([1e-3 * t for t in range(5)])
     assert forces[10] == pytest.approx(expected)
 
 
 def test_messages_come_late_twice_and_out_of_order() -> None:
     def stamps(lie: str) -> list[float]:
-        return [nanoseconds(message.header.stamp) / MS for message in told(f"ft/wrench message {lie}")]
+        return [nanoseconds(message.header.stamp) / MS for message in sent(f"ft/wrench message {lie}")]
 
     assert stamps("late 2")[4:9] == [4, 3, 4, 5, 6]
     assert stamps("repeated 0")[4:9] == [4, 5, 5, 5, 5]
@@ -52,11 +55,11 @@ def test_messages_come_late_twice_and_out_of_order() -> None:
 
 
 def test_joints_and_quaternions_change_places() -> None:
-    assert told("sim/tool_state pose.orientation swapped 0")[10].pose.orientation.x == 1.0
-    joints = told("joint_states position bias 0.5")[10]
+    assert sent("sim/tool_state pose.orientation swapped 0")[10].pose.orientation.x == 1.0
+    joints = sent("joint_states position bias 0.5")[10]
     assert joints.position == pytest.approx(np.full(7, 0.5), abs=1e-3)
     assert np.array_equal(
-        told("joint_states position permuted 0")[10].velocity, told("joint_states position permuted 0")[10].effort
+        sent("joint_states position permuted 0")[10].velocity, sent("joint_states position permuted 0")[10].effort
     )
 
 
@@ -84,7 +87,7 @@ def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float
     seen.exam.targets_skipped = lost * seen.exam.target_count
     for message in seen.indentation:
         message.normal_force, message.tangential_force, message.peak_force = force, 0.0, force
-    outcome = Outcome(seen, None, 10 * NS, [])
+    outcome = LieOutcome(seen, None, 10 * NS, [])
     twin = Healthy({}, int(seen.exam.target_count), len(seen.findings.findings), float(seen.stiffness_map.background), 10.0)
     if failure is not None:
         outcome.failure = Failure(FailureCode.GAVE_UP, "held", topics=(failure,))
