@@ -20,7 +20,7 @@ _FEWEST: Final = 5
 
 
 def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
-    """Return the readings without invalid, repeated, frozen, clipped and displaced ones, and the faults."""
+    """Return the readings without invalid, repeated, frozen and displaced ones, clipped ones marked, and the faults."""
     faults: list[Fault] = []
 
     def drop(code: FaultCode, wrong: Mask, value: float = 0.0) -> None:
@@ -49,10 +49,11 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
         drop(FaultCode.FROZEN, _frozen(readings.force, readings.position))
         away = np.linalg.norm(readings.position - median_filter(readings.position, (5, 1), mode="nearest"), axis=1)
         usual = np.linalg.norm(np.diff(readings.position, axis=0), axis=1)
-        drop(FaultCode.JUMP, away > max(radius, 10 * float(np.quantile(usual, 0.99))), float(away.max(initial=0.0)))
+        drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * float(np.median(usual))), float(away.max(initial=0.0)))
     clipped, limit = _clipped(readings.force)
-    drop(FaultCode.CLIPPED, clipped, limit)
-    return readings, faults
+    if clipped.any():
+        faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
+    return replace(readings, clipped=clipped), faults
 
 
 def _runs(same: Mask) -> list[slice]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Final
 
 import numpy as np
@@ -81,7 +82,8 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
     limit = TUNING.sigmas * sigma
     smooth = median_filter(force, size=min(few, 9) | 1)
     numbered, _ = label(binary_closing(np.pad(smooth > limit, few), np.ones(few))[few:-few])
-    found: list[slice] = [one[0] for one in find_objects(numbered)]
+    gaps = np.flatnonzero(np.diff(time) > max(TUNING.block_s, 5 * step)) + 1
+    found = [part for one in find_objects(numbered) for part in _split(one[0], gaps)]
     touching = [one for one in found if one.stop - one.start >= few and smooth[one].max() > 2 * limit]
     if not touching:
         return Cut([], 0)
@@ -92,6 +94,12 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
         near[max(0, one.start - few) : one.stop + few] = True
     usual = float(np.median(shape["prominences"][near[lowest]])) if near[lowest].any() else np.inf
     return Cut(touching, int((~near[lowest] & (shape["prominences"] > 0.5 * usual)).sum()))
+
+
+def _split(one: slice, at: NDArray[np.intp]) -> list[slice]:
+    """Return the parts of a slice between indices."""
+    ends = [one.start, *(int(k) for k in at if one.start < k < one.stop), one.stop]
+    return [slice(a, b) for a, b in pairwise(ends)]
 
 
 def loading(inward: Array) -> slice:

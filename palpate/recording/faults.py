@@ -27,9 +27,9 @@ class FaultCode(StrEnum):
 
 
 _TEXTS = {
-    FaultCode.SIGN: "{count} of {of} contacts have a force that pulls where the tool presses: the sign of the force is wrong",
-    FaultCode.UNIT: "lengths are implausible by a factor of 1000: the contacts span {value:.3g} m; check units.length",
-    FaultCode.FRAME: "the force of {count} of {of} contacts is not along the normal (median angle {value:.0f} deg): wrong frame",
+    FaultCode.SIGN: "the force pulls where the tool presses: its sign is wrong, see force.on of the mapping",
+    FaultCode.UNIT: "a contact travels {value:.3g} m, which does not suit the tool's radius: see units.length of the mapping",
+    FaultCode.FRAME: "the force is {value:.0f} deg off the direction of pressing: wrong frame, see force.axes of the mapping",
     FaultCode.NO_FREE_AIR: "no part of the recording is free of contact, so that the force cannot be tared",
     FaultCode.DRIFT: "the force drifts by {value:.2g} N between the first and the last free motion",
     FaultCode.CLIPPED: "{count} of {of} samples are at the end of the sensor's range ({value:.3g} N)",

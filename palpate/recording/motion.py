@@ -12,7 +12,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter
+from scipy.ndimage import median_filter, percentile_filter
 from scipy.signal import correlate, correlation_lags
 
 from palpate.recording.readings import Readings
@@ -31,6 +31,8 @@ class MotionTuning:
     """Readings of a block."""
     free_share: float = 0.05
     """Slope of force against motion in free air, as a share of that in contact."""
+    free_around: int = 31
+    """Blocks of free air whose level is compared."""
     sigmas: float = 5.0
     """Force that counts as contact, in SD of the force in free air."""
     delay_s: float = 1.0
@@ -80,11 +82,11 @@ def blocks(time: Array) -> list[slice]:
     return [slice(k, k + size) for k in range(0, len(time) - size + 1, size)]
 
 
-def pressing_axis(position: Array, force: Array, parts: Sequence[slice]) -> Axis | None:
+def pressing_axis(position: Array, force: Array, parts: Sequence[slice], outward: Array | None = None) -> Axis | None:
     """Return the pressing axis; None if force and motion are unrelated. Position (n, 3) [m], force (n, 3) or (n, 1) [N].
 
-    It is the first pair of singular vectors of the regression of force on motion within `parts`. Outward is where motion changes
-    no force; without such motion, where the force is small.
+    It is the first pair of singular vectors of the regression of force on motion within `parts`. Its side is that of `outward`,
+    if that is known; else where motion changes no force; without such motion, where the force is small.
     """
     covariance, motion = np.zeros((force.shape[1], 3)), np.zeros((3, 3))
     for one in parts:
@@ -102,8 +104,11 @@ def pressing_axis(position: Array, force: Array, parts: Sequence[slice]) -> Axis
     middle = np.array([z[one].mean() for one in parts])
     moving = spans > 0.2 * np.median(spans[slopes > 0.5 * k])
     free = moving & (np.abs(slopes) < 0.1 * k)
-    if free.sum() >= max(3, 0.05 * moving.sum()):
-        side = middle[free].mean() - middle[moving & (slopes > 0.5 * k)].mean()
+    pressing = moving & (slopes > 0.5 * k)
+    if outward is not None:
+        side = float(along @ outward)
+    elif pressing.any() and free.sum() >= max(3, 0.05 * moving.sum()):
+        side = middle[free].mean() - middle[pressing].mean()
     else:
         size = np.linalg.norm(force, axis=1)
         side = np.median(z[size <= np.quantile(size, 0.3)]) - np.median(z[size >= np.quantile(size, 0.9)])
@@ -156,11 +161,12 @@ def free_air(time: Array, height: Array, force: Array, stiffness: float) -> Mask
         return free
     levels = np.array(level)
     width = max(4 * sigma, 0.03 * float(np.quantile(force, 0.98) - levels.min()))
-    lowest = float(np.quantile(levels, 0.05))
-    for _ in range(3):
-        lowest = float(np.median(levels[np.abs(levels - lowest) <= width]))
+    around = min(TUNING.free_around, len(levels))
+    lowest = percentile_filter(levels, 10, around, mode="nearest")  # it may drift
+    lowest = median_filter(np.where(levels <= lowest + width, levels, lowest), around, mode="nearest")
     within, above = np.abs(levels - lowest) <= width, (levels > lowest + width) & (levels <= lowest + 3 * width)
-    outside = np.mean(height[force > lowest + 2 * width]) if (force > lowest + 2 * width).any() else -np.inf
+    pressed = force - np.interp(time, [time[one].mean() for one in moves], lowest) > 2 * width
+    outside = float(np.mean(height[pressed])) if pressed.any() else -np.inf
     chosen = [one for one, free_one in zip(moves, within, strict=True) if free_one and height[one].mean() > outside]
     if len(chosen) < 3 or len(chosen) <= 2 * above.sum():
         return free

@@ -61,20 +61,19 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
     if len(readings.position) < 10:
         raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least 10")
     parts = probes(readings) if readings.time is None else blocks(readings.time)
-    axis = pressing_axis(readings.position, readings.force, parts)
+    known = None if readings.normal is None else readings.normal.mean(axis=0)
+    axis = pressing_axis(readings.position, readings.force, parts, known)
     if axis is None:
         raise ReadingError(
             f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
         )
-    known = None if readings.normal is None else readings.normal.mean(axis=0)
-    if known is not None and float(axis.outward @ known) < 0:
-        axis = replace(axis, outward=-axis.outward)
+    if axis.angle_deg > _WRONG_FRAME_DEG:
+        faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg))
+        return Recording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
     if axis.flipped:
-        faults.append(Fault(FaultCode.SIGN, len(parts), len(parts), Remedy.CORRECTED))
+        faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
         readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
-    if readings.force.shape[1] == 3 and axis.angle_deg > _WRONG_FRAME_DEG:
-        faults.append(Fault(FaultCode.FRAME, len(parts), len(parts), Remedy.REFUSED, axis.angle_deg))
-    elif readings.force.shape[1] == 3:
+    if readings.force.shape[1] == 3:
         axis = replace(axis, outward=axis.force)  # more exact: sideways motion does not tilt it
     X_WA = _body_frame(mapping, axis, readings.position)
     in_A = _in_frame(readings, X_WA)

@@ -53,6 +53,13 @@ class Readings:
     """Outward, shape (n, 3)."""
     touch: Array | None = None
     """Position at first contact [m], shape (n, 3)."""
+    clipped: NDArray[np.bool_] | None = None
+    """True where the force is at the end of the sensor's range, shape (n,)."""
+
+    @property
+    def whole(self) -> NDArray[np.bool_]:
+        """True where the force is within the sensor's range, shape (n,)."""
+        return np.ones(len(self.position), bool) if self.clipped is None else ~self.clipped
 
     def part(self, chosen: NDArray[Any]) -> Readings:
         """Return some of the readings."""

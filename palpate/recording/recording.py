@@ -102,6 +102,8 @@ class Recording:
 
         A contact that does not reach the depth gives its force at the depth that it reaches.
         """
+        if not self.touches:
+            return []
         nominal = self.depth_m if depth_m is None else depth_m
         samples: list[ForceSample] = []
         for number, touch in enumerate(self.touches, start=1):

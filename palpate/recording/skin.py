@@ -12,6 +12,7 @@ from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectB
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
+from threadpoolctl import threadpool_limits
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply
@@ -98,7 +99,7 @@ def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float
         0.05, (1e-4, 1.0)
     )
     process = GaussianProcessRegressor(kernel, alpha=(sd / size) ** 2, random_state=0)
-    with warnings.catch_warnings():
+    with warnings.catch_warnings(), threadpool_limits(1):
         warnings.simplefilter("ignore", ConvergenceWarning)
         process.fit(points[:, :2], rest / size)
     x, y = stations

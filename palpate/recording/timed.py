@@ -96,6 +96,8 @@ class _Loading:
     """[N]"""
     deepest: Array
     """Position at its end [m], shape (3,)."""
+    end: float
+    """Inward coordinate there [m]."""
 
 
 class _Measured:
@@ -130,7 +132,7 @@ class _Measured:
         for one, slide, load, begin in zip(self.touching, self.slides, loads, onsets, strict=True):
             if slide:
                 contacts += self._slid(one)
-            elif begin is not None:
+            elif begin is not None and self.readings.whole[one].any():
                 contacts.append(self._pressed(one, load, begin))
         centres, normals = self.skin.points()
         return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
@@ -144,8 +146,9 @@ class _Measured:
             still = np.linalg.norm(across - across[0], axis=1) < 0.5 * self.reach
             p, inward = p[: max(3, int(np.argmin(still)))], inward[: max(3, int(np.argmin(still)))]
         down = cutting.loading(inward)
+        whole = self.readings.whole[one][: len(p)][down]
         force = normal_force(self.readings.force[one][: len(p)][down], normal)
-        return _Loading(normal, inward[down], force, p[down][-1])
+        return _Loading(normal, inward[down][whole], force[whole], p[down][-1], float(inward[down][-1]))
 
     def _skin_points(self, loads: list[_Loading], onsets: list[Onset | None]) -> tuple[Array, Array]:
         """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
@@ -156,13 +159,14 @@ class _Measured:
         points, sd = [], []
         for load, begin in zip(loads, onsets, strict=True):
             if begin is not None:
-                points.append(load.deepest + (load.inward[-1] - begin.at) * load.normal)
+                points.append(load.deepest + (load.end - begin.at) * load.normal)
                 sd.append(begin.sd)
         usual = float(np.median([begin.stiffness for begin in onsets if begin is not None] or [np.nan]))
         for one, slide in zip(self.touching, self.slides, strict=True):
             if not slide:
                 continue
-            p, F = self.readings.position[one], self.readings.force[one]
+            whole = self.readings.whole[one]
+            p, F = self.readings.position[one][whole], self.readings.force[one][whole]
             normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
             for part in cutting.windows(p - np.outer(p @ self.outward, self.outward), self.reach):
                 normal = normals[part].mean(axis=0)
@@ -181,7 +185,8 @@ class _Measured:
     def _pressed(self, one: slice, load: _Loading, begin: Onset) -> Contact:
         p = self.readings.position[one]
         kept = cutting.before_lift(-(p @ load.normal))
-        p, F, time = p[kept], self.readings.force[one][kept], self._time(one)[kept]
+        whole = self.readings.whole[one][kept]
+        p, F, time = p[kept][whole], self.readings.force[one][kept][whole], self._time(one)[kept][whole]
         depth = -(p @ load.normal) - begin.at
         return Contact(
             kind=ContactKind.PRESS,
@@ -200,7 +205,7 @@ class _Measured:
         p, F, time = self.readings.position[one], self.readings.force[one], self._time(one)
         z, normal, sd = self.skin.at(p[:, :2])
         depth = (z - p[:, 2]) * normal[:, 2]
-        deep = np.flatnonzero(depth > 0.5 * np.median(depth))
+        deep = np.flatnonzero(self.readings.whole[one] & (depth > 0.5 * np.median(depth)))
         if len(deep) < 3:
             return []
         return [

@@ -1,0 +1,176 @@
+"""Twenty recordings, each spoiled in one way: each fault is named, and none of them makes a finding."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+
+from palpate.interface.assessment import assess
+from palpate.recording.faults import FaultCode
+from palpate.recording.mapping import Columns, Mapping, Tool, Units
+from palpate.recording.read import recording_of
+from palpate.recording.readings import from_table
+from palpate.recording.recording import Recording
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
+ZERO = np.array((0.4, -0.2, 1.1))
+P, F, N = ["x", "y", "z"], ["fx", "fy", "fz"], ["nx", "ny", "nz"]
+OVER_TIME = Mapping(table=Columns(position=tuple(P), force=tuple(F), time="t"), tool=Tool(radius_m=0.015))
+PROBES = Mapping(table=Columns(position=tuple(P), force=tuple(F), normal=tuple(N), probe="probe"), tool=Tool(radius_m=0.015))
+
+
+@pytest.fixture(scope="module")
+def pressed() -> pd.DataFrame:
+    """A raster of presses over a lump, over time, with the number of the press."""
+    table = runpy.run_path(str(EXAMPLE))["recording"]()
+    return table.assign(press=np.arange(len(table)) // (len(table) // 81))
+
+
+def probed(table: pd.DataFrame) -> pd.DataFrame:
+    """The same as a table of probes: ten steps of each, without time and without a zero of the force."""
+    rows = []
+    for number, press in table.groupby("press"):
+        down = press.iloc[: int(press.z.argmin()) + 1]
+        deep = down[down.z < press.z.iloc[0] - 0.015].iloc[:: max(1, len(down) // 20)].iloc[:10]
+        n = (press[P].iloc[0] - press[P].iloc[30]).to_numpy()
+        rows.append(deep.assign(probe=number, **dict(zip(N, n / np.linalg.norm(n), strict=True))))
+    found = pd.concat(rows, ignore_index=True)
+    found[F] -= ZERO
+    return found
+
+
+def read(table: pd.DataFrame, mapping: Mapping) -> Recording:
+    return recording_of(from_table(table, mapping, "spoiled"), mapping, "spoiled")
+
+
+def some(table: pd.DataFrame, every: int = 7) -> pd.Series:
+    return table.press % every == 3
+
+
+def flipped(t):
+    return t.assign(**{name: -t[name] for name in F})
+
+
+def in_mm(t):
+    return t.assign(**{name: 1e3 * t[name] for name in P})
+
+
+def turned(t):
+    return t.assign(fx=t.fz, fz=t.fx)
+
+
+def only_contact(t):
+    return t[np.linalg.norm(t[F] - ZERO, axis=1) > 0.5]
+
+
+def drifting(t):
+    return t.assign(fz=t.fz + np.linspace(0, 2, len(t)))
+
+
+def clipped(t):
+    return t.assign(fz=t.fz.clip(upper=5.0))
+
+
+def frozen(t):
+    held = t.assign(at=np.arange(len(t)) // 60)
+    return t.assign(**{name: held.groupby("at")[name].transform("first").where(held["at"] % 9 == 4, t[name]) for name in F})
+
+
+def twice(t):
+    return pd.concat((t, t.iloc[1000:1200])).sort_values("t", kind="stable")
+
+
+def late(t):
+    return t.assign(**{name: t[name].shift(20, fill_value=t[name].iloc[0]) for name in F})
+
+
+def backward(t):
+    return pd.concat((t.iloc[:500], t.iloc[800:1000], t.iloc[500:800], t.iloc[1000:]))
+
+
+def in_air(t):
+    lifted = some(t)
+    free = ZERO + np.random.default_rng(1).normal(0.0, 0.02, (len(t), 3))
+    return t.assign(z=t.z + 0.02 * lifted, **{name: t[name].where(~lifted, free[:, k]) for k, name in enumerate(F)})
+
+
+def jumping(t):
+    return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 400 == 50))
+
+
+def unlike(t):
+    again = t[some(t)]
+    again = again.assign(t=again.t + t.t.max() + 1.0, **{name: 1.8 * again[name] - 0.8 * ZERO[k] for k, name in enumerate(F)})
+    return pd.concat((t, again))
+
+
+def grazing(t):
+    deep = some(t) & (t.z < t.groupby("press").z.transform("min") + 0.0080)
+    return t.assign(**{name: t[name].where(~deep).ffill() for name in P + F})
+
+
+def holes(t):
+    return t.assign(fz=t.fz.where(np.arange(len(t)) % 50 != 7))
+
+
+def no_normal(t):
+    return t.assign(**{name: t[name].where(~some(t), 0.0) for name in N})
+
+
+def no_force(t):
+    return t.assign(**{name: t[name].where(~some(t), 0.0) for name in F})
+
+
+def shifted(t):
+    return t.assign(x=t.x + 0.06 * (some(t) & (np.arange(len(t)) % 10 > 5)))
+
+
+C = FaultCode
+SPOILED = {
+    "flipped": (flipped, OVER_TIME, C.SIGN),
+    "millimetres": (in_mm, OVER_TIME, C.UNIT),
+    "metres": (lambda t: t, OVER_TIME.model_copy(update={"units": Units(length="mm")}), C.UNIT),
+    "turned": (turned, OVER_TIME, C.FRAME),
+    "only-contact": (only_contact, OVER_TIME, C.NO_FREE_AIR),
+    "drifting": (drifting, OVER_TIME, C.DRIFT),
+    "clipped": (clipped, OVER_TIME, C.CLIPPED),
+    "frozen": (frozen, OVER_TIME, C.FROZEN),
+    "twice": (twice, OVER_TIME, C.REPEATED),
+    "late": (late, OVER_TIME, C.CLOCK),
+    "backward": (backward, OVER_TIME, C.BACKWARD),
+    "in-air": (in_air, OVER_TIME, C.NO_CONTACT),
+    "jumping": (jumping, OVER_TIME, C.JUMP),
+    "unlike": (unlike, OVER_TIME, C.DISAGREE),
+    "grazing": (grazing, OVER_TIME, C.SHALLOW),
+    "holes": (holes, OVER_TIME, C.INVALID),
+    "probes-flipped": (flipped, PROBES, C.SIGN),
+    "probes-turned": (turned, PROBES, C.FRAME),
+    "probes-no-normal": (no_normal, PROBES, C.INVALID),
+    "probes-no-force": (no_force, PROBES, C.NO_CONTACT),
+    "probes-shifted": (shifted, PROBES, C.JUMP),
+    "probes-millimetres": (in_mm, PROBES, C.UNIT),
+}
+
+
+@pytest.mark.parametrize("mapping", [OVER_TIME, PROBES], ids=["over-time", "probes"])
+def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, mapping: Mapping) -> None:
+    recording = read(probed(pressed) if mapping is PROBES else pressed, mapping)
+    assert not recording.faults
+    assert len(recording.touches) == 81
+    assert abs(recording.depth_m - 0.010) < 0.0005
+    (place,) = assess(recording).findings[["x_m", "y_m"]].to_numpy()
+    assert np.linalg.norm(place - (-0.055, -0.055)) < 0.008
+
+
+@pytest.mark.parametrize(("spoil", "mapping", "code"), SPOILED.values(), ids=SPOILED)
+def test_a_fault_is_named_and_makes_no_finding(pressed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode) -> None:
+    recording = read(spoil(probed(pressed) if mapping is PROBES else pressed), mapping)
+    fault = next(one for one in recording.faults if one.code is code)
+    assert fault.count > 0
+    assert fault.text
+    places = assess(recording).findings[["x_m", "y_m"]].to_numpy()
+    assert np.all(np.linalg.norm(places - (-0.055, -0.055), axis=1) < 0.015)
