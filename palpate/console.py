@@ -6,13 +6,12 @@ import io
 import json
 import os
 import sys
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 import typer
-from rich.console import Console, RenderableType
-from rich.markup import escape
+from rich.console import Console, ConsoleOptions, RenderableType
 from rich.progress import (
     BarColumn,
     MofNCompleteColumn,
@@ -22,10 +21,13 @@ from rich.progress import (
     TextColumn,
     TimeRemainingColumn,
 )
+from rich.segment import Segment
 from rich.table import Table
+from rich.text import Text
 from typer.core import TyperGroup
 
 from palpate_errors import RunError, UserError
+from palpate_inputs import printable
 
 EXIT_TROUBLE = 1
 """A check found something wrong, or the output could not be written."""
@@ -38,7 +40,15 @@ WIDE_COLUMNS = 140
 
 
 class SteadyConsole(Console):
-    """Console that tolerates a closed pipe."""
+    """Console of every command. Shows foreign text as it is: no markup, control characters escaped. Tolerates a closed pipe."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(markup=False, emoji=False, **options)
+
+    def render(self, renderable: RenderableType, options: ConsoleOptions | None = None) -> Iterator[Segment]:
+        """Yield the segments of whatever is printed, without control characters in its texts."""
+        for segment in super().render(renderable, options):
+            yield segment if segment.control else Segment(printable(segment.text), segment.style)
 
     def on_broken_pipe(self) -> None:
         """Discard further output."""
@@ -96,8 +106,8 @@ class CommandGroup(TyperGroup):
 
 
 def say(why: object) -> None:
-    """Print a message to standard error, without markup."""
-    SteadyConsole(stderr=True).print(f"[bold red]palpate:[/] {escape(str(why))}", highlight=False, soft_wrap=True)
+    """Print a message to standard error."""
+    SteadyConsole(stderr=True).print(Text.assemble(("palpate:", "bold red"), f" {why}"), highlight=False, soft_wrap=True)
 
 
 def refuse(why: object) -> NoReturn:
@@ -155,8 +165,8 @@ def _option(text: str, check: Callable[[Path | None], Path | None], *names: str)
 
 def wide_console() -> Console:
     """Return a console on standard output, wide if that is not a terminal, so that tables stay whole in a pipe."""
-    plain = Console(highlight=False)
-    return plain if plain.is_terminal else Console(highlight=False, width=max(WIDE_COLUMNS, plain.width))
+    plain = SteadyConsole(highlight=False)
+    return plain if plain.is_terminal else SteadyConsole(highlight=False, width=max(WIDE_COLUMNS, plain.width))
 
 
 _DOCUMENT: TextIO | None = None
@@ -210,7 +220,7 @@ class CaseDisplay(Progress):
         self._lines = not (quiet or console.is_terminal)
         columns = (SpinnerColumn(), TextColumn(unit), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn())
         super().__init__(
-            *(*columns, TextColumn("{task.fields[last]}")),
+            *(*columns, TextColumn("{task.fields[last]}", markup=False)),
             console=console,
             transient=True,
             disable=quiet or self._lines,
@@ -229,7 +239,7 @@ class TimeLeft(Progress):
     """A bar from `begin` to `end`, in any unit, for a `with` block; nothing if standard error is not a terminal."""
 
     def __init__(self, description: str, begin: float, end: float) -> None:
-        console = Console(stderr=True)
+        console = SteadyConsole(stderr=True)
         columns = (TextColumn(description), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=10.0)
         self._begin = self._reached = begin

@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
+from rich.text import Text
 
 from palpate.apart import guarded
-from palpate.console import refuse
+from palpate.console import SteadyConsole, refuse
 
 if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
@@ -65,7 +65,7 @@ def build(
     from palpate_models.patient.mesh_file import MeshError
     from palpate_models.scenario.load import ScenarioError
 
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
     try:
         chosen = platforms(fmi, only)
@@ -104,18 +104,17 @@ def _states(count: int) -> str:
 def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     """Show an FMU's interface, variables and platforms."""
     import fmpy
-    from fmpy.model_description import ValidationError
 
     from palpate_fmu.reading import FmuError, binary_folders, read_description, read_variables
 
-    console = Console()
+    console = SteadyConsole()
     try:
         description, findings = read_description(file)
         platforms = binary_folders(file)
     except FmuError as error:
         refuse(error)
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
-    console.print(f"[bold]{description.modelName}[/] FMI {description.fmiVersion}, {', '.join(kinds)}", highlight=False)
+    console.print(Text.assemble((description.modelName, "bold"), f" FMI {description.fmiVersion}, {', '.join(kinds)}"))
     console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}", highlight=False)
     console.print(_states(int(description.numberOfContinuousStates or 0)), highlight=False, soft_wrap=True)
     table = Table("variable", "shape", "type", "causality", "unit", "range", "description", box=None)
@@ -123,14 +122,14 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
         bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"
         shape = " x ".join(map(str, v.shape))
         table.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
-    Console(width=max(150, console.width)).print(table)
+    SteadyConsole(width=max(150, console.width)).print(table)
     names = len(description.modelVariables) <= NAMES_CHECKED
     verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
     try:
         if not findings:
             fmpy.read_model_description(str(file), validate_variable_names=names, validate_model_structure=True)
-    except ValidationError as error:
-        findings = error.problems
+    except Exception as error:  # FMPy raises many kinds for an FMU with findings
+        findings = getattr(error, "problems", (str(error),))
     verdict = "\n".join(("findings of the validator, which do not prevent its use:", *findings)) if findings else verdict
     console.print(verdict, highlight=False)
 
@@ -154,7 +153,7 @@ def simulate(
     from palpate_fmu.reading import FmuError
     from palpate_fmu.running import run_and_plot
 
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
 
     def perform() -> tuple[Probing | None, Sequence[str]]:
         with FmuInstance(file) as fmu:

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
-from palpate.console import print_line
+from palpate.console import SteadyConsole, print_line
 
 WIDE = 160
 """Columns of the table of topics, where the terminal has fewer or there is none."""
@@ -25,7 +25,7 @@ def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them a
     for name in scenario_names():
         scenario = load_scenario(name)
         table.add_row(name, str(len(scenario.phantom.lesions)), scenario.description)
-    Console().print(table)
+    SteadyConsole().print(table)
 
 
 def topics() -> None:
@@ -35,7 +35,7 @@ def topics() -> None:
     table = Table("topic", "type", "producer", "period", "QoS", "hashed", "readers", box=None)
     for topic in contract().topics.values():
         table.add_row(
-            topic.name if topic.visibility == "public" else f"{topic.name} [dim]({topic.visibility})[/]",
+            topic.name if topic.visibility == "public" else Text.assemble(topic.name, (f" ({topic.visibility})", "dim")),
             topic.type.replace("/msg/", "/"),
             topic.producer,
             "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}",
@@ -43,4 +43,4 @@ def topics() -> None:
             "yes" if topic.hashed else "",
             ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking),
         )
-    Console(width=max(WIDE, Console().width)).print(table)
+    SteadyConsole(width=max(WIDE, SteadyConsole().width)).print(table)

@@ -6,9 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
+from palpate.console import SteadyConsole
 from palpate_errors import UserError
 
 app = typer.Typer(help="Certificates for the secure mode (`palpate run --secure`).", no_args_is_help=True)
@@ -29,7 +30,7 @@ def make(
     """Make a certificate authority and a certificate for each role; valid ones are kept."""
     from palpate_bus.security.keys import CA, CA_KEY, CERTIFICATE, DAYS, KEY, init, members
 
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = SteadyConsole(stderr=True, highlight=False, soft_wrap=True)
     for known in name or ():
         if known not in members():
             raise UserError(f"--name {known}: members are {', '.join(members())}")
@@ -47,9 +48,9 @@ def show(folder: Folder = DEFAULT) -> None:
 
     table = Table("name", "valid until", "SHA-256", box=None)
     for certificate in certificates(folder):
-        until = f"{certificate.until:%Y-%m-%d}" + (" [red]expired[/]" if certificate.expired else "")
+        until = Text.assemble(f"{certificate.until:%Y-%m-%d}", (" expired" if certificate.expired else "", "red"))
         table.add_row(certificate.name, until, certificate.fingerprint[:32])
-    Console().print(table)
+    SteadyConsole().print(table)
 
 
 SECURE_ENDPOINT = "tls/[::]:7447"
@@ -66,7 +67,7 @@ def router(
     from palpate_bus.security.access import access_control
     from palpate_bus.wire.router import DEFAULT_ENDPOINT, serve
 
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     if keys is not None:
         serve(listen or (SECURE_ENDPOINT,), console.print, keys, access_control(contract()))
     else:

@@ -45,6 +45,7 @@ NEEDS = {
     "palpate_bus.security.keys": "conductor group",
     "palpate_bus.testing.strategies": "bench",
     "palpate_errors": BARE,
+    "palpate_inputs": BARE,
     "palpate_plugins": BARE,
     "palpate_models": "models group",
     "palpate_planning.placement": "planning group",

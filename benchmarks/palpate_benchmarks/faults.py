@@ -11,11 +11,9 @@ from statistics import median
 from typing import Annotated
 
 import typer
-from rich.console import Console
-from rich.markup import escape
 from rich.table import Table
 
-from palpate.console import EXIT_FAILED, CaseDisplay, output_file, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, output_file, refuse
 from palpate.report.files import docs_option, write_part, write_text
 from palpate_benchmarks.fault_cases import KINDS, LIE, CaseOutcome, FaultFinding, csv_text, from_csv, in_order
 
@@ -54,7 +52,7 @@ def faults(  # noqa: PLR0913 - the options of a command
     from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
-    console = Console(stderr=True, width=max(WIDTH, Console().width))
+    console = SteadyConsole(stderr=True, width=max(WIDTH, SteadyConsole().width))
     modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
     for name, given, known in (("--mode", modes, MODES), ("--kind", kinds, KINDS)):
         for value in given:
@@ -83,9 +81,8 @@ def faults(  # noqa: PLR0913 - the options of a command
         for number, finding in enumerate(chain(findings, lying), 1):
             found = [f for f in found if f.identity != finding.identity] + [finding]
             write_text(out, csv_text(found))
-            mark = "[green]ok[/]" if finding.good else "[bold red]bad[/]"
-            display.show(number, len(todo), f"{mark} {escape(finding.where)}: {escape(finding.sign or finding.ended)}")
-    Console(width=max(WIDTH, Console().width)).print(table(found))
+            display.show(number, len(todo), f"{'ok' if finding.good else 'bad'} {finding.where}: {finding.sign or finding.ended}")
+    SteadyConsole(width=max(WIDTH, SteadyConsole().width)).print(table(found))
     if docs is not None:
         if LIE in kinds:
             write_part(docs, "lies", lies_report.markdown(found))
@@ -111,7 +108,7 @@ def table(findings: Sequence[FaultFinding]) -> Table:
     """Return the table for a terminal, one row per case."""
     shown = Table(*COLUMNS, box=None)
     for finding in in_order(findings):
-        shown.add_row(*map(escape, _row(finding)), style=None if finding.good else "bold red")
+        shown.add_row(*_row(finding), style=None if finding.good else "bold red")
     return shown
 
 

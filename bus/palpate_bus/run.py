@@ -33,6 +33,7 @@ from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 from palpate_errors import UserError
+from palpate_inputs import PrintableFormatter
 
 EXIT_FAILED = 3
 
@@ -99,7 +100,9 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
     log = logging.getLogger(name)
     try:
         settings = Settings.read()
-        logging.basicConfig(level=settings.log, format=f"%(asctime)s {name} %(levelname)s %(message)s", stream=sys.stderr)
+        handler = logging.StreamHandler()
+        handler.setFormatter(PrintableFormatter(f"%(asctime)s {name} %(levelname)s %(message)s"))
+        logging.basicConfig(level=settings.log, handlers=[handler])
         rules = contract()
         members_of_process = hosted()
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that open files are closed

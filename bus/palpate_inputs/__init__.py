@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import logging
 import os
 import re
 import stat
@@ -254,6 +255,14 @@ def read_arrays(file: Path | bytes, name: object, error: type[UserError] = Input
 def printable(text: str) -> str:
     """Return text for a terminal: control characters, which could command it, as escapes in hexadecimal."""
     return _CONTROL.sub(lambda found: ascii(found[0])[1:-1], text)
+
+
+class PrintableFormatter(logging.Formatter):
+    """Formatter of logs, which may be read in a terminal."""
+
+    def format(self, record: logging.LogRecord) -> str:
+        """Return a record as text without control characters."""
+        return printable(super().format(record))
 
 
 _BRIEF = Repr()

@@ -189,3 +189,23 @@ def test_bounds_are_set_by_name() -> None:
     for wrong in ("depth", "depth=0", "deep=7", "depth=1e3"):
         with pytest.raises(ValueError, match="is not NAME=NUMBER"):
             Bounds.parse(wrong)
+
+
+def test_the_console_shows_foreign_text_as_it_is() -> None:
+    from rich.text import Text
+
+    from palpate.console import CaseDisplay, SteadyConsole, table
+
+    file = io.StringIO()
+    console = SteadyConsole(file=file, force_terminal=True, color_system="standard", width=200)
+    foreign = "force[left] [/nope] \x1b]0;title\x07 :smile:"
+    rows = table("", "")
+    rows.add_row(foreign, Text(foreign, "red"))
+    with CaseDisplay(console, False) as display:
+        display.show(1, 2, foreign)
+        display.refresh()
+        display.console.print(foreign, rows, highlight=False)
+    shown = file.getvalue()
+    assert shown.count(r"force[left] [/nope] \x1b]0;title") >= 4
+    assert "\x1b]0" not in shown
+    assert "\x1b[31m" in shown, "its own colours are still there"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_bus.messages import ExamState, StiffnessMap
 from palpate_bus.messages.codec import Message
+from palpate_inputs import printable
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.motion import BodyMotion
@@ -97,6 +99,11 @@ class Health:
         return LEVELS[self.level] if 0 <= self.level < len(LEVELS) else str(self.level)
 
 
+def plain(text: str) -> str:
+    """Return text for a cell of a table, without the characters of Markdown's links, images, code and HTML."""
+    return re.sub(r"([\\`\[\]<>|!])", r"\\\1", printable(text).replace("\n", " "))
+
+
 def services(rows: Sequence[Health], waits: Iterable[tuple[str, float]] = ()) -> str:
     """Return the services page: health of services, shares of waits [1], then topics, the worst first."""
     lines = ["| service | state | | at | silent for |", "|---|---|---|---|---|"]
@@ -104,7 +111,7 @@ def services(rows: Sequence[Health], waits: Iterable[tuple[str, float]] = ()) ->
         if not row.is_topic:
             tick = f"{row.values['tick_s']} s" if "tick_s" in row.values else ""
             age = f"{row.values['report_age_s']} s" if "report_age_s" in row.values else ""
-            lines.append(f"| {row.name} | {row.word} | {row.message} | {tick} | {age} |")
+            lines.append(f"| {row.name} | {row.word} | {plain(row.message)} | {tick} | {age} |")
     waited = [f"{role} {100 * share:.0f} %" for role, share in waits if share > 0]
     if waited:
         lines += ["", f"**Waited for**: {', '.join(waited)}"]
@@ -113,7 +120,7 @@ def services(rows: Sequence[Health], waits: Iterable[tuple[str, float]] = ()) ->
         lines += ["", "| topic | state | | Hz, simulated | missing |", "|---|---|---|---|---|"]
     for row in topics:
         rate, missing = row.values.get("bus_rate_hz", ""), row.values.get("missing", "")
-        lines.append(f"| {row.name} | {row.word} | {row.message} | {rate} | {missing if missing != '0' else ''} |")
+        lines.append(f"| {row.name} | {row.word} | {plain(row.message)} | {rate} | {missing if missing != '0' else ''} |")
     return "\n".join(lines)
 
 

@@ -12,15 +12,16 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import typer
-from rich.console import Console, RenderableType
+from rich.console import RenderableType
 from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
+from rich.text import Text
 
 from palpate.apart import guarded, shared_numbers
 from palpate.check.live_rig import LiveRig
 from palpate.check.report import ConformanceReport, Verdict
 from palpate.check.rig import Rig, RigSettings, ServiceRig
 from palpate.check.suites import DURATION_S, check
-from palpate.console import table, wide_console
+from palpate.console import SteadyConsole, table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.announcement import NoBus
@@ -66,7 +67,7 @@ class CheckDisplay(Progress):
 
     def __init__(self, rig: Rig, report: ConformanceReport) -> None:
         """Read rig and report about ten times a second while the suite runs."""
-        console = Console(stderr=True)
+        console = SteadyConsole(stderr=True)
         text = TextColumn("{task.description}, {task.fields[checks]} checks")
         columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
@@ -132,16 +133,16 @@ def print_report(report: ConformanceReport, failures: bool) -> None:
             continue
         if result.group != group:
             group = result.group
-            rows.add_row("", f"[bold]{group}[/]", "", "")
-        texts = (text.replace("[", r"\[") for text in (result.name, result.expected, result.got))
-        rows.add_row(f"[{_COLOURS[result.verdict]}]{result.verdict}[/]", *texts)
+            rows.add_row("", Text(group, "bold"), "", "")
+        rows.add_row(Text(result.verdict, _COLOURS[result.verdict]), result.name, result.expected, result.got)
     out.print(rows)
     counts = {kind: sum(result.verdict is kind for result in report.results) for kind in Verdict}
     summary = ", ".join(f"{count} {kind}" for kind, count in counts.items())
-    verdict = "[green]conforms[/]" if report.passed else "[bold red]does not conform[/]"
+    verdict = ("conforms", "green") if report.passed else ("does not conform", "bold red")
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     if not report.passed and load > 1:
         out.print(
-            f"\n[yellow]this machine is overloaded (load {load:.1f} per processor): rates and reaction times are unreliable[/]"
+            f"\nthis machine is overloaded (load {load:.1f} per processor): rates and reaction times are unreliable",
+            style="yellow",
         )
-    out.print(f"\n{report.role}: {verdict}, {summary}")
+    out.print(Text.assemble(f"\n{report.role}: ", verdict, f", {summary}"))

@@ -28,6 +28,7 @@ from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.settings import RECORDING
 from palpate_errors import RunError
+from palpate_inputs import printable
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
 
@@ -202,7 +203,7 @@ def _palpate(*arguments: str, quiet: bool) -> tuple[int, list[str]]:
             for line in process.stderr:
                 lines.append(line.rstrip())
                 if not quiet:
-                    print(lines[-1], file=sys.stderr)
+                    print(printable(lines[-1]), file=sys.stderr)
         except KeyboardInterrupt:
             process.send_signal(signal.SIGINT)
             process.communicate()

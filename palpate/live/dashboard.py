@@ -17,6 +17,7 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
+from palpate.console import SteadyConsole
 from palpate.live.bus import ChosenRun
 from palpate_errors import UserError
 from palpate_plugins import needs
@@ -55,7 +56,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     from palpate_bus.runs.announcement import named_runs
     from palpate_dashboard.picture import film, take
 
-    console = Console(stderr=True, highlight=False, soft_wrap=True)
+    console = SteadyConsole(stderr=True, highlight=False, soft_wrap=True)
     try:
         if picture or film_file:
             if source is None:
@@ -93,7 +94,7 @@ def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console:
     try:
         with OperatorKeys() as keys:
             if keys.attached:
-                console.print(f"[dim]{HINT}[/]")
+                console.print(HINT, style="dim")
             console.print(follow(run, service, console.print, keys))
         if not leave:
             console.print("its picture stays until Ctrl+C")

@@ -11,10 +11,9 @@ from time import monotonic, sleep
 from typing import Annotated, Any, NoReturn
 
 import typer
-from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
-from palpate.console import EXIT_TROUBLE, bandwidth, number, print_json, print_line, table, wide_console
+from palpate.console import EXIT_TROUBLE, SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import Contract, contract
@@ -230,7 +229,7 @@ def doctor(
     with joined(ChosenBus(connect, run, domain)) as bus:
         if watch:
             _watch(_monitor(bus), as_json)
-        with Console(stderr=True).status(f"listening for {seconds:g} s"):
+        with SteadyConsole(stderr=True).status(f"listening for {seconds:g} s"):
             diagnosis = examine(bus, seconds)
     if as_json:
         print_json(diagnosis.as_json())
@@ -254,7 +253,8 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
                 if as_json:
                     print_line({"after_s": round(after_s, 3), **_facts(violation)})
                 else:
-                    wide_console().print(f"[dim]{after_s:8.2f} s[/]  [red]{escape(str(violation))}[/]", soft_wrap=True)
+                    line = Text.assemble((f"{after_s:8.2f} s", "dim"), "  ", (str(violation), "red"))
+                    wide_console().print(line, soft_wrap=True)
             sleep(POLL_S)
     finally:
         live.close()
@@ -274,7 +274,7 @@ def _print(diagnosis: Diagnosis) -> None:
     for finding in diagnosis.findings:
         about = "" if finding.about == said else finding.about
         said = finding.about
-        listed.add_row(f"[bold]{about}[/]", f"[{_COLOURS[finding.level]}]{finding.level}[/]", escape(finding.text))
+        listed.add_row(Text(about, "bold"), Text(finding.level, _COLOURS[finding.level]), finding.text)
     listed.show_header = False
     out.print(listed)
     out.print()
@@ -285,18 +285,18 @@ def _print(diagnosis: Diagnosis) -> None:
     out.print()
     for violation, count in diagnosis.violations:
         times = f" ({count} times)" if count > 1 else ""
-        out.print(f"[bold red]violation[/]  {escape(str(violation))}{times}", soft_wrap=True)
+        out.print(Text.assemble(("violation", "bold red"), f"  {violation}{times}"), soft_wrap=True)
     if not diagnosis.violations:
-        out.print("[green]no violation of the contract[/]")
+        out.print("no violation of the contract", style="green")
 
 
-def _row(health: TopicHealth) -> tuple[str, ...]:
+def _row(health: TopicHealth) -> tuple[str | Text, ...]:
     topic = health.topic
-    state = {None: "[dim]rests[/]", True: "[green]alive[/]", False: "[red]silent[/]"}[health.alive]
+    state = {None: Text("rests", "dim"), True: Text("alive", "green"), False: Text("silent", "red")}[health.alive]
     if health.violations:
-        state = "[bold red]violates[/]"
+        state = Text("violates", "bold red")
     elif not health.senders:
-        state = "[dim]no sender[/]"
+        state = Text("no sender", "dim")
     wanted = "latched" if topic.latched else "event" if topic.event else f"{1000 / topic.period_ms:g}"
     periodic = topic.periodic and health.messages
     return (

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from time import monotonic
 
 import typer
+from rich.text import Text
 
 from palpate.console import print_json, table, wide_console
 from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
@@ -140,8 +141,8 @@ def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = 
     out = table("node", "what", ">publishes", ">subscribes", "session")
     for node in rows:
         role = rules.roles.get(node.name)
-        what = role.doc if role is not None else "[dim]not a role of the contract[/]"
+        what = role.doc if role is not None else Text("not a role of the contract", "dim")
         out.add_row(node.name, what, str(len(node.publishes)), str(len(node.subscribes)), " ".join(sorted(node.zids)))
     wide_console().print(out)
     if absent:
-        wide_console().print(f"[dim]not there: {', '.join(absent)}[/]")
+        wide_console().print(f"not there: {', '.join(absent)}", style="dim")

@@ -7,10 +7,8 @@ from typing import Annotated
 
 import typer
 import zenoh
-from rich.console import Console
-from rich.markup import escape
 
-from palpate.console import EXIT_FAILED, say
+from palpate.console import EXIT_FAILED, SteadyConsole, say
 from palpate.live.bus import ChosenRun
 from palpate_bus.runs.announcement import BusTarget, find, find_all
 from palpate_bus.runs.operator import NoConductorError, ask
@@ -63,7 +61,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
 
     Raises UserError if there is no such run, typer.Exit if a run does not answer.
     """
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     failed = False
     for bus in find_all(chosen=name) if everyone else [find(chosen=name)]:
         try:
@@ -74,7 +72,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
             say(f"{bus.title}: {error}")
         else:
             text = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
-            console.print(escape(text), highlight=False, soft_wrap=True)
+            console.print(text, highlight=False, soft_wrap=True)
     if failed:
         raise typer.Exit(EXIT_FAILED)
 

@@ -15,9 +15,9 @@ import numpy as np
 import typer
 import yaml
 import zenoh
-from rich.console import Console
+from rich.text import Text
 
-from palpate.console import bandwidth, print_json, print_line, say, table, wide_console
+from palpate.console import SteadyConsole, bandwidth, print_json, print_line, say, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import Topic, contract
@@ -53,11 +53,11 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
     out = table("topic", "type", "published by", "subscribed by", "in the contract")
     for topic in found.values():
         row = rules.get(topic.name)
-        known = "[yellow]no[/]" if row is None else _period(row)
+        known = Text("no", "yellow") if row is None else Text(_period(row))
         if row is not None and {(row.type, row.type_hash)} != topic.types:
-            known = "[bold red]other type or hash[/]"
+            known = Text("other type or hash", "bold red")
         types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
-        publishers = ", ".join(sorted(topic.publishers)) or "[yellow]none[/]"
+        publishers = ", ".join(sorted(topic.publishers)) or Text("none", "yellow")
         out.add_row(topic.name, types, publishers, ", ".join(sorted(topic.subscribers)), known)
     wide_console().print(out)
 
@@ -82,11 +82,11 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
     out = table("", "")
     out.show_header = False
     for key, value in _contract_rows(row):
-        out.add_row(f"[bold]{key}[/]", value)
+        out.add_row(Text(key, "bold"), value)
     ends_table = table("node", "", "type", "hash")
     for entity, end in ends:
         same = row is None or (end.type, end.type_hash) == (row.type, row.type_hash)
-        shown = end.type_hash[:24] + "…" if same else f"[bold red]{end.type_hash[:24]}… differs[/]"
+        shown = Text(f"{end.type_hash[:24]}…") if same else Text(f"{end.type_hash[:24]}… differs", "bold red")
         ends_table.add_row(entity.node, entity.kind.name.lower(), end.type, shown)
     for part in (out, "", ends_table):
         wide_console().print(part)
@@ -331,7 +331,7 @@ def _print_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = Fal
         print_line({"topic": topic.name, "contract_hz": contract_hz, **facts})
         return
     if facts["messages"] < 2:
-        Console(highlight=False).print("[dim]no messages[/]")
+        SteadyConsole(highlight=False).print("no messages", style="dim")
         return
     text = "in all: " if whole else ""
     text += f"{facts['wall_hz']:.4g} Hz"
@@ -348,7 +348,7 @@ def _print_bandwidth(window: Collection[list[int]], topic: Topic, as_json: bool)
     if as_json:
         print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
     elif not sizes:
-        Console(highlight=False).print("[dim]no messages[/]")
+        SteadyConsole(highlight=False).print("no messages", style="dim")
     else:
         size = f"{mean:.0f} B per message, {min(sizes)} to {max(sizes)}"
         print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
@@ -366,7 +366,7 @@ def _contract_rows(row: Topic | None) -> list[tuple[str, str]]:
     facts += [("frame", row.frame)] if row.frame else []
     for path in dict.fromkeys([*row.units, *row.ranges]):
         low, high = row.ranges.get(path, (None, None))
-        unit = f"[{row.units.get(path, '1')}]".replace("[", r"\[")
+        unit = f"[{row.units.get(path, '1')}]"
         facts.append((path, unit + ("" if low is None else f" {low:g} .. {high:g}")))
     facts += [("stale after", f"{row.max_age_ms} ms")] if row.max_age_ms else []
     facts += [("expires after", f"{row.expiry_ms} ms")] if row.expiry_ms else []

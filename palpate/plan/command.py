@@ -9,6 +9,7 @@ from typing import Annotated
 
 import typer
 
+from palpate.console import SteadyConsole
 from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 
@@ -32,8 +33,6 @@ def plan(
 
       palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
     """
-    from rich.console import Console
-
     from palpate.apart import guarded
     from palpate.console import refuse
     from palpate.plan.prospect import check_tissue, draw, prospect, summary
@@ -46,14 +45,14 @@ def plan(
         refuse(f"--out {out}: want the name of a .png file")
     chosen = usable(scenario, settings, seed)
     try:
-        with Console(stderr=True).status("planning: about ten seconds"):
+        with SteadyConsole(stderr=True).status("planning: about ten seconds"):
             phantom = build_phantom(chosen.phantom, chosen.seed)
             check_tissue(chosen, phantom)
             planned = guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
             draw(out, chosen, phantom, planned)
     except (NoPathError, PluginError, OSError) as error:
         refuse(error)
-    console = Console()
+    console = SteadyConsole()
     console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
     for why, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
         console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)

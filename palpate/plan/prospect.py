@@ -137,5 +137,5 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     else:
         strokes = "1 stroke" if len(planned.strokes) == 1 else f"{len(planned.strokes)} strokes"
         how = f"{Path(exam.pattern).stem}, {exam.mode}, {strokes}, about"
-    axes.set_title(f"{scenario.name}: {how} {planned.duration_s:.0f} s")
+    axes.set_title(f"{scenario.name}: {how} {planned.duration_s:.0f} s", parse_math=False)
     figure.savefig(path)

@@ -18,10 +18,9 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
-from rich.console import Console
 
 from palpate.apart import guarded, shared_numbers
-from palpate.console import TimeLeft, fail, print_json
+from palpate.console import SteadyConsole, TimeLeft, fail, print_json
 from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
 from palpate.replay.rerun import rerun
 from palpate_bus import implementations
@@ -228,7 +227,7 @@ def write_reference(file: Path, service: str, scenario: Path | None, start: int,
         make_reference(case, target, start, case.end if end is None else end)
 
     guarded(f"--service {service}", write, math.inf)
-    Console(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
+    SteadyConsole(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
 
 
 def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[str], as_json: bool) -> None:
@@ -250,6 +249,6 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
     if as_json:
         print_json({name: as_dict(result) for name, result in results.items()})
     else:
-        Console(width=max(140, Console().width)).print(result_table(results))
+        SteadyConsole(width=max(140, SteadyConsole().width)).print(result_table(results))
     if not all(result.agrees for result in results.values()):
         fail(f"the messages of {role} differ from {file}; if this is intended, renew it with --update-refs")

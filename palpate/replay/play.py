@@ -9,9 +9,7 @@ from time import monotonic_ns, sleep
 from types import TracebackType
 from typing import Self
 
-from rich.console import Console
-
-from palpate.console import TimeLeft
+from palpate.console import SteadyConsole, TimeLeft
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.messages import Clock, codec
 from palpate_bus.messages.stamps import NS, time_message
@@ -222,7 +220,7 @@ def play(
 ) -> None:
     """Play a recording on the bus from `start` to `end` [ns] or Ctrl-C; with `hold` until Ctrl-C. Raises UserError."""
     logging.basicConfig(level=logging.WARNING, format="%(levelname)s %(message)s")
-    console = Console(stderr=True)
+    console = SteadyConsole(stderr=True)
     recording = open_recording(file)
     with Player(recording, rate, topics, listen, drive) as player:
         console.print(f"playing {file} at {rate:g} x {player.where}; Ctrl-C ends", highlight=False)

@@ -10,9 +10,8 @@ from pathlib import Path
 from typing import Annotated
 
 import typer
-from rich.console import Console
 
-from palpate.console import print_line
+from palpate.console import SteadyConsole, print_line
 from palpate_bus.runtime.failure import FailureCode
 from palpate_errors import RunError, UserError
 
@@ -52,12 +51,12 @@ def report(
     from palpate.report.recovery import recovered
     from palpate.report.results import Known, assemble, print_findings, print_scores, write_results
 
-    console, failure = Console(stderr=True), None
+    console, failure = SteadyConsole(stderr=True), None
     bring_back(folder)
     with nullcontext() if quiet or as_json else console.status("writing the report: about ten seconds"):
         if recover:
             scenario, result = recovered(folder)
-            shown = Console(stderr=as_json)
+            shown = SteadyConsole(stderr=as_json)
             print_findings(shown, assemble(scenario, result, Known(None, None, None)))  # first, since the truth takes longer
             print_scores(shown, write_results(folder, scenario, result))
             failure = result.failure

@@ -8,7 +8,7 @@ from functools import partial
 from pathlib import Path
 
 from rich.console import Console
-from rich.markup import escape
+from rich.text import Text
 
 from palpate.console import SteadyConsole, say
 from palpate.environment import given
@@ -90,14 +90,14 @@ def _missing_for_dashboard(scenario: Scenario) -> str:
 
 
 def _announce(console: Console, scenario: Scenario, options: RunOptions, folder: Path) -> None:
-    console.print(f"[bold]{scenario.name}[/] seed {scenario.seed}, results in {folder}", highlight=False)
+    console.print(Text.assemble((scenario.name, "bold"), f" seed {scenario.seed}, results in {folder}"))
     hints = [what_it_takes(scenario.exam, options.record)]
     if not options.composed:
         hints.append("to look at it from another terminal: palpate doctor, palpate topic list")
     if options.record != "none" and (why := _missing_for_dashboard(scenario)):
         hints.append(f"for palpate dashboard, now or of the finished run, {why}")
     for hint in hints:
-        console.print(f"[dim]{escape(hint)}[/]", highlight=False, soft_wrap=True)
+        console.print(hint, style="dim", highlight=False, soft_wrap=True)
 
 
 def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:

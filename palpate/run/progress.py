@@ -6,8 +6,8 @@ from types import TracebackType
 from typing import Any, Final, Self
 
 from rich.console import Console
-from rich.markup import escape
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
+from rich.text import Text
 
 from palpate.run.outlook import Outlook, duration_text
 from palpate_bus.messages import ExamState
@@ -118,10 +118,10 @@ class RunDisplay:
         self._keys = OperatorKeys()
         self._bar = Progress(
             SpinnerColumn(),
-            TextColumn("[bold]{task.fields[phase]:<9}"),
+            TextColumn("{task.fields[phase]:<9}", style="bold", markup=False),
             BarColumn(bar_width=20),
             TaskProgressColumn(),
-            TextColumn("{task.fields[facts]}"),
+            TextColumn("{task.fields[facts]}", markup=False),
             TimeElapsedColumn(),
             console=console,
             transient=True,
@@ -145,7 +145,7 @@ class RunDisplay:
     def show(self, progress: RunProgress) -> None:
         """Show the state of the run."""
         for sentence in progress.trouble[self._troubles_shown :]:
-            self._console.print(f"[bold red]{escape(sentence)}[/]", highlight=False, soft_wrap=True)
+            self._console.print(sentence, style="bold red", highlight=False, soft_wrap=True)
         self._troubles_shown = len(progress.trouble)
         self._pass_requests(progress)
         exam = progress.collected.exam
@@ -167,7 +167,8 @@ class RunDisplay:
             self._say(progress, part, f"{self._printed:.0%} done, {left}")
 
     def _say(self, progress: RunProgress, part: str, sentence: str) -> None:
-        self._console.print(f"[dim]{progress.t / NS:8.2f} s[/dim]  {part:<9} {escape(sentence)}", highlight=False, soft_wrap=True)
+        line = Text.assemble((f"{progress.t / NS:8.2f} s", "dim"), f"  {part:<9} {sentence}")
+        self._console.print(line, soft_wrap=True)
 
     def _left(self, progress: RunProgress) -> str:
         """Return about how long the run still takes, in wall-clock time."""
@@ -181,7 +182,7 @@ class RunDisplay:
         if self._bar.disable or progress.request is None:
             return
         if not self.begun and not self._keys.attached and self._keys.__enter__().attached:
-            self._console.print(f"[dim]{HINT}[/]", highlight=False)
+            self._console.print(HINT, style="dim", highlight=False)
         for word in self._keys.pressed():
             progress.request(WORDS[word], "a key of palpate run")
             self._console.print(f"{word}: passed on", highlight=False)
@@ -190,5 +191,5 @@ class RunDisplay:
         if stopped != self._stopped:
             self._stopped = stopped
             self._console.print(
-                f"[bold red]stopped: {escape(stopped)}[/]" if stopped else "released", highlight=False, soft_wrap=True
+                Text(f"stopped: {stopped}", "bold red") if stopped else "released", highlight=False, soft_wrap=True
             )

@@ -11,7 +11,7 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.console import EXIT_FAILED, CaseDisplay, fail, output_folder, refuse
+from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, fail, output_folder, refuse
 from palpate.run.options import ServiceChoices, Settings
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ def list_studies() -> None:
         study = load_study(name)
         patients = sum(population.number.test for population in study.populations.values())
         table.add_row(name, study.tier, str(patients * len(study.methods) * len(study.error_levels())), study.description)
-    Console().print(table)
+    SteadyConsole().print(table)
 
 
 @app.command()
@@ -101,7 +101,7 @@ def run(  # noqa: PLR0913 - the options of a command
     from palpate.study.spec import load_study
     from palpate_errors import UserError
 
-    console = Console(stderr=True, quiet=quiet)
+    console = SteadyConsole(stderr=True, quiet=quiet)
     try:
         study = _chosen(load_study(name), method, services)
         secret = None if seeds_file is None else secret_of(seeds_file, study)
@@ -190,7 +190,7 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
             count = workers.count
             console.print(f"{todo} cases, {count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
             if workers.client.dashboard_link:
-                console.print(f"[dim]workers: {workers.client.dashboard_link}[/]", highlight=False, soft_wrap=True)
+                console.print(f"workers: {workers.client.dashboard_link}", style="dim", highlight=False, soft_wrap=True)
             display.show(0, todo, "")
 
             def done(outcome: Outcome) -> None:
@@ -216,14 +216,14 @@ def _conclude(folder: Folder, manifest: Manifest) -> None:
         found, outcomes = conclude(folder, manifest)
     except UserError as error:
         fail(error)
-    out = Console()
+    out = SteadyConsole()
     out.print(_result(found), highlight=False, soft_wrap=True)
     incomplete = [outcome for outcome in outcomes if not outcome.completed]
     for outcome in incomplete[:SHOWN]:
         failures = folder.failures(outcome.case.case_id) if outcome.status == "failed" else ()
         tried = f" (attempts: {'; '.join(failures)})" if failures else ""
         why = outcome.why or "nothing was assessed"
-        out.print(f"{outcome.case.label}: {why}{tried}", highlight=False, markup=False, soft_wrap=True)
+        out.print(f"{outcome.case.label}: {why}{tried}", highlight=False, soft_wrap=True)
     if len(incomplete) > SHOWN:
         out.print(f"... and {len(incomplete) - SHOWN} more that did not complete", highlight=False)
     out.print(f"page: {folder.path / 'study.html'}", highlight=False, soft_wrap=True)

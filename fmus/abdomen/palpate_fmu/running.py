@@ -35,10 +35,10 @@ def run_and_plot(file: Path, out: Path) -> tuple[str, ...]:
     axes = np.atleast_1d(figure.subplots(min(len(names), 12), 1, sharex=True))
     for axis, name in zip(axes, names, strict=False):
         axis.plot(result["time"], result[name], color="#1f5fa8")
-        axis.set_ylabel(name, fontsize=8)
+        axis.set_ylabel(name, fontsize=8, parse_math=False)
         axis.spines[["top", "right"]].set_visible(False)
     axes[-1].set_xlabel("time [s]")
-    figure.suptitle(description.modelName)
+    figure.suptitle(description.modelName, parse_math=False)
     figure.savefig(out, dpi=130)
     columns = np.column_stack([result[name] for name in ("time", *names)])
     np.savetxt(out.with_suffix(".csv"), columns, fmt="%.17g", delimiter=",", header=",".join(("time", *names)), comments="")
