@@ -1,13 +1,16 @@
 """Fuzzing in small, and every input that a campaign broke something with."""
 
 import math
+import os
 import random
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from palpate.fuzz.fuzz import Broken, FuzzTarget, all_targets, attempt, campaign, choose, mutate
+from palpate.fuzz.fuzz import Find, FuzzPlan, all_targets, attempt, campaign, choose, mutate
+from palpate.fuzz.target import Broken, FuzzTarget
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_models.scenario.load import ScenarioError, load_scenario
@@ -15,8 +18,10 @@ from palpate_models.scenario.load import ScenarioError, load_scenario
 
 @pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
 def test_no_input_of_a_small_campaign_breaks_anything(target: FuzzTarget) -> None:
-    done = campaign([target], 60, seed=20, slow_s=math.inf)
+    done = campaign([target], FuzzPlan(30, seed=20, slow_s=math.inf))
     assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
+    result = done.targets[target.name]
+    assert 0 < result.refused < result.inputs, "some inputs are valid, and some are not"
 
 
 def test_the_same_seed_gives_the_same_inputs() -> None:
@@ -25,13 +30,35 @@ def test_the_same_seed_gives_the_same_inputs() -> None:
 
 
 def test_a_broken_target_is_found() -> None:
-    def check(data: bytes) -> None:
+    def check(data: bytes) -> bool:
         if len(data) > 8:
             raise Broken("too long")
+        return True
 
-    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], 500)
+    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], FuzzPlan(500))
     assert [find.error for find in done.finds] == ["Broken: too long"]
     assert len(done.finds[0].data) > 8
+
+
+def _outside(_: bytes) -> bool:
+    Path("../outside-of-its-folder").write_bytes(b"")
+    return True
+
+
+def _large(_: bytes) -> bool:
+    return bool(bytearray(2 << 30))
+
+
+def _ending(_: bytes) -> bool:
+    os._exit(7)
+
+
+@pytest.mark.parametrize(
+    ("check", "sign"), [(_outside, "opens for writing"), (_large, "MemoryError"), (_ending, "the process left with status 7")]
+)
+def test_what_leaves_its_confines_is_found(check: Callable[[bytes], bool], sign: str) -> None:
+    done = campaign([FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, most=1))
+    assert [sign in find.error for find in done.finds] == [True]
 
 
 def test_choosing_targets() -> None:
@@ -83,6 +110,6 @@ def test_a_setting_of_rubbish_is_refused_with_its_words(tmp_path: Path, setting:
 
 
 def test_an_input_that_takes_long_is_a_find() -> None:
-    find = attempt(FuzzTarget("slow", lambda _: None, lambda _: [b""]), b"x", slow_s=-1.0)
-    assert find is not None
+    find = attempt(FuzzTarget("slow", lambda _: True, lambda _: [b""]), b"x", slow_s=-1.0)
+    assert isinstance(find, Find)
     assert "took" in find.error

@@ -1,242 +1,56 @@
-"""Fuzzes everything that reads bytes or text from other processes and users.
+"""Fuzzes everything that reads bytes, text or files from other processes and users.
 
-    palpate fuzz --inputs 1000000     mutations of valid inputs, divided among the targets; equal seeds give equal inputs
+    palpate fuzz --inputs 100000     mutations of valid inputs, for each target; equal seeds give equal inputs
 
 A target is a callable on bytes. It returns if the input was refused with the documented error, or accepted consistently; any
 exception is a find, which is printed with its input in hexadecimal. Write a test with it, then fix the cause.
+Each target runs in a child process with bounded memory and a temporary working folder. A file that is opened for writing
+elsewhere is a find, and so is the end of the process.
 """
 
 from __future__ import annotations
 
+import os
 import random
-import struct
+import resource
+import sys
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, MutableSequence, Sequence
 from dataclasses import dataclass, field
 from fnmatch import fnmatch
-from functools import partial
-from importlib import resources
 from pathlib import Path
-from time import perf_counter, thread_time
-from typing import Any
+from time import perf_counter, process_time, thread_time
+from typing import Any, Final
 
-import numpy as np
-from rosbags.interfaces import Nodetype
-
-from palpate_bus.contract import contract
-from palpate_bus.messages import codec
-from palpate_bus.messages.typestore import array_dtype
-from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
-from palpate_bus.settings import Settings
-from palpate_bus.wire.liveliness import parse_token
-from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
-from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
-from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
-
-
-@dataclass(frozen=True)
-class FuzzTarget:
-    """A function under test and its valid inputs."""
-
-    name: str
-    check: Callable[[bytes], None]
-    seeds: Callable[[random.Random], Sequence[bytes]]
-
-
-class Broken(AssertionError):
-    """A property does not hold for an accepted input."""
-
-
-# -- messages
-
-
-def _codecs() -> Iterator[FuzzTarget]:
-    rules = contract()
-    names = sorted({row.type for row in rules.topics.values()} | {row.type for row in rules.internal.values()})
-    for name in names:
-        yield FuzzTarget(f"codec:{name}", _codec_check(name), partial(_payloads, name))
-
-
-def _codec_check(name: str) -> Callable[[bytes], None]:
-    decode, encode = codec.decoder(name), codec.encoder(name)
-
-    def check(data: bytes) -> None:
-        """Check that data is refused with CodecError, or that its canonical bytes are a fixed point, also for rosbags."""
-        try:
-            message = decode(data)
-        except codec.CodecError:
-            return
-        canonical = encode(message)
-        if encode(decode(canonical)) != canonical:
-            raise Broken(f"{name}: encoding the decoded message changes it")
-        if bytes(codec.store.serialize_cdr(codec.store.deserialize_cdr(canonical, name), name)) != canonical:
-            raise Broken(f"{name}: rosbags returns other bytes")
-
-    return check
-
-
-def _payloads(name: str, rng: random.Random) -> list[bytes]:
-    return [random_payload(name, rng) for _ in range(8)]
-
-
-def random_payload(name: str, rng: random.Random) -> bytes:
-    """Return a valid message of a type with random content, in CDR."""
-    return codec.encode(_message(name, rng), name)
-
-
-def _message(name: str, rng: random.Random) -> Any:
-    definition = codec.store.get_msgdef(name)
-    return definition.cls(**{field: _field(description, rng) for field, description in definition.fields})
-
-
-def _field(description: Any, rng: random.Random) -> Any:
-    kind, detail = description
-    if kind == Nodetype.NAME:
-        return _message(detail, rng)
-    if kind == Nodetype.BASE:
-        return _scalar(detail[0], rng)
-    size = detail[1] if kind == Nodetype.ARRAY else rng.randrange(4)
-    item_kind, item = detail[0]
-    if item_kind == Nodetype.BASE and item[0] != "string":
-        dtype = array_dtype(item[0])
-        if item[0] == "bool":
-            return np.array([rng.random() < 0.5 for _ in range(size)], dtype)
-        return np.frombuffer(rng.randbytes(size * dtype.itemsize), dtype)
-    return [_field(detail[0], rng) for _ in range(size)]
-
-
-def _scalar(base: str, rng: random.Random) -> Any:
-    if base == "string":
-        return "".join(rng.choice("aZ09/_ -.äß€") for _ in range(rng.randrange(9)))
-    if base == "bool":
-        return rng.random() < 0.5
-    if base in ("float32", "float64"):
-        code = "<f" if base == "float32" else "<d"
-        return float(struct.unpack(code, rng.randbytes(struct.calcsize(code)))[0])
-    limits = np.iinfo({"byte": "int8", "char": "uint8"}.get(base, base))
-    return rng.randint(int(limits.min), int(limits.max))
-
-
-# -- attachment, keys, tokens, chunks, options
-
-
-def _attachment(data: bytes) -> None:
-    try:
-        sequence, sent, gid = unpack(data)
-    except WireError:
-        return
-    if len(data) != ATTACHMENT_SIZE or AttachmentWriter(gid).pack(sequence, sent) != data:
-        raise Broken("attachment: packing the unpacked values changes it")
-
-
-ATTACHMENT = FuzzTarget(
-    "attachment", _attachment, lambda rng: [AttachmentWriter(rng.randbytes(16)).pack(rng.randrange(2**62), rng.randrange(2**62))]
-)
-
-
-def _key(data: bytes) -> None:
-    text = data.decode("utf-8", "surrogateescape")
-    try:
-        key = parse_key(text)
-    except WireError:
-        return
-    if parse_key(str(key)) != key:
-        raise Broken("key: parsing the written text changes it")
-
-
-KEY = FuzzTarget("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
-
-
-def _token(data: bytes) -> None:
-    try:
-        entity = parse_token(data.decode("utf-8", "surrogateescape"))
-    except WireError:
-        return
-    if parse_token(entity.token) != entity:
-        raise Broken("token: parsing the written text changes it")
-
-
-_ENDPOINT = (
-    "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
-)
-TOKEN = FuzzTarget("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
-
-
-def _chunk(data: bytes) -> None:
-    try:
-        _, messages = unpack_chunk(data)
-        list(messages)
-    except codec.CodecError:
-        return
-
-
-CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
-
-
-_VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
-
-
-def _options(data: bytes) -> None:
-    words = data.decode("utf-8", "surrogateescape").split("\n")
-    try:
-        options = BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, words, strict=False))))
-    except BusConfigError:
-        return
-    if BusOptions.from_settings(Settings.read(options.to_env())) != options:
-        raise Broken("options: their environment yields other options")
-
-
-OPTIONS = FuzzTarget(
-    "options",
-    _options,
-    lambda _: [b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k"],
-)
-
-
-_FOLDER = tempfile.TemporaryDirectory(prefix="palpate-fuzz-")
-
-
-def _texts(_: random.Random) -> list[bytes]:
-    folder = resources.files("palpate_models").joinpath("scenarios")
-    return [folder.joinpath(f"{name}.yaml").read_bytes() for name in scenario_names()]
-
-
-def _scenario(data: bytes) -> None:
-    """Check that data is refused with ScenarioError, or that a scenario is equal after writing and reading it."""
-    file = Path(_FOLDER.name) / "fuzz.yaml"
-    file.write_bytes(data)
-    try:
-        scenario = load_scenario(str(file))
-    except ScenarioError:
-        return
-    file.write_text(dump_scenario(scenario), encoding="utf-8")
-    if load_scenario(str(file)) != scenario:
-        raise AssertionError("scenario: reading the written file changes it")
-
-
-def _setting(data: bytes) -> None:
-    try:
-        load_scenario("healthy", data.decode("utf-8", "replace").split("\n"))
-    except ScenarioError:
-        return
-
-
-_SETTINGS = (
-    b"exam.depth_m=0.008", b"exam.region_m=[0.06, 0.06]", b"phantom.lesions=[{centre_m: [0, 0], radii_m: [0.02, 0.02]}]",
-    b"phantom.lesions.0.contrast=3", b"exam.region_m.1=0.1\nseed=4", b"camera.frames=10", b"errors=poor\nerrors.force.tare_n=0.3",
-    b"phantom.breathing={kind: held, coughs_per_min: 2}", b"phantom.motion={kind: turn, at_s: 20}",
-)  # fmt: skip
-
-
-SCENARIO = FuzzTarget("scenario", _scenario, _texts)
-SETTING = FuzzTarget("setting", _setting, lambda _: _SETTINGS)
-
+from palpate.apart import ChildLost, TimeLimit, run_apart, shared_numbers
+from palpate.fuzz.bus_readers import bus_targets
+from palpate.fuzz.file_readers import file_targets
+from palpate.fuzz.target import FuzzTarget
 
 SLOW_S = 1.0
 """Processor time above which an input is a find, since it would delay a service."""
+HANGING_S = 60.0
+"""Wall-clock time after which an input that does not return is a find, and ends its target."""
+MEMORY_BYTES: Final = 1 << 30
+"""Memory that a target may allocate beyond that of its libraries."""
+_WRITES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+_CHANGES: Final = frozenset(("os.mkdir", "os.rename", "os.link", "os.symlink", "os.remove", "os.rmdir", "os.truncate"))
 KEPT = 64
 """Inputs per target that are kept for splicing."""
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
+
+
+@dataclass(frozen=True)
+class FuzzPlan:
+    """Extent of a campaign, for each target."""
+
+    inputs: int
+    seed: int = 0
+    seconds: float = 3600.0
+    """Processor time [s]."""
+    most: int = 100
+    """Finds after which it stops."""
+    slow_s: float = SLOW_S
 
 
 @dataclass
@@ -249,13 +63,32 @@ class Find:
 
 
 @dataclass
+class TargetResult:
+    """Result of one target."""
+
+    inputs: int = 0
+    refused: int = 0
+    finds: list[Find] = field(default_factory=list)
+    """One of each kind."""
+    found: int = 0
+    seconds: float = 0.0
+    """Processor time [s]."""
+    peak_mb: int = 0
+    """Greatest resident memory of the process."""
+
+
+@dataclass
 class FuzzCampaign:
-    """Results of a campaign."""
+    """Results of a campaign by target."""
 
     seed: int
-    inputs: dict[str, int] = field(default_factory=dict)
-    finds: list[Find] = field(default_factory=list)
+    targets: dict[str, TargetResult] = field(default_factory=dict)
     seconds: float = 0.0
+
+    @property
+    def finds(self) -> list[Find]:
+        """All finds."""
+        return [find for result in self.targets.values() for find in result.finds]
 
 
 def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
@@ -285,60 +118,102 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
     return bytes(changed)
 
 
-def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | None:
-    """Run one input; return a find or None."""
+def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | bool:
+    """Run one input; return a find, else True if it was accepted."""
     begin = thread_time()
     try:
-        target.check(data)
-    except Exception as error:
+        accepted = target.check(data)
+    except (Exception, SystemExit) as error:
         return Find(target.name, data, f"{type(error).__name__}: {error}")
     took = thread_time() - begin
-    return Find(target.name, data, f"took {took:.1f} s of processor time") if took > slow_s else None
+    return Find(target.name, data, f"took {took:.1f} s of processor time") if took > slow_s else accepted
+
+
+def _confine(target: FuzzTarget, seeds: Sequence[bytes], written: list[str]) -> None:
+    """Bound the memory of this process, and collect the files that it opens for writing outside its working folder."""
+    for data in seeds:  # first, since they import libraries
+        attempt(target, data)
+    pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
+    most = pages * resource.getpagesize() + MEMORY_BYTES
+    resource.setrlimit(resource.RLIMIT_AS, (most, most))
+    inside = f"{Path.cwd()}{os.sep}"
+
+    def watch(event: str, arguments: tuple[Any, ...]) -> None:
+        writes = event in _CHANGES or (event == "open" and isinstance(arguments[2], int) and arguments[2] & _WRITES)
+        if writes and isinstance(arguments[0], str | bytes | os.PathLike):
+            path = os.path.realpath(os.fsdecode(arguments[0]))
+            if not f"{path}{os.sep}".startswith(inside) and path != os.devnull:
+                written.append(path)
+
+    sys.addaudithook(watch)
+
+
+def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> TargetResult:
+    """Run one target in this process."""
+    rng, result, written = random.Random(f"{plan.seed} {target.name}"), TargetResult(), list[str]()
+    pool = list(target.seeds(rng))
+    _confine(target, pool, written)
+    begin = process_time()
+    while result.inputs < plan.inputs and result.found < plan.most and process_time() - begin < plan.seconds:
+        number = place[0] = result.inputs
+        data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
+        if number % 997 == 0:
+            pool[rng.randrange(len(pool))] = data  # so that changes accumulate
+            pool += target.seeds(rng)[: max(KEPT - len(pool), 0)]
+        outcome = attempt(target, data, plan.slow_s)
+        if written:
+            outcome = Find(target.name, data, f"opens for writing: {written[0]}")
+            written.clear()
+        result.inputs += 1
+        result.refused += outcome is False
+        if isinstance(outcome, Find):
+            result.found += 1
+            if outcome.error.partition(":")[0] not in {other.error.partition(":")[0] for other in result.finds}:
+                result.finds.append(outcome)
+    result.seconds = process_time() - begin
+    result.peak_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
+    return result
 
 
 def campaign(
-    chosen: Sequence[FuzzTarget],
-    inputs: int,
-    seed: int = 0,
-    progress: Callable[[int, int, str], None] = lambda *_: None,
-    most: int = 100,
-    slow_s: float = SLOW_S,
+    chosen: Sequence[FuzzTarget], plan: FuzzPlan, progress: Callable[[int, int, str], None] = lambda *_: None
 ) -> FuzzCampaign:
-    """Run `inputs` inputs, divided among the targets. A target stops after `most` finds; one of each kind is kept.
+    """Run each target in a child process. A target stops after `plan.most` finds.
 
     Calls `progress` after each target with the number of finished targets, the number of all, and the result as text.
     """
-    done = FuzzCampaign(seed)
+    done = FuzzCampaign(plan.seed)
     begin = perf_counter()
     for index, target in enumerate(chosen):
-        rng = random.Random(f"{seed} {target.name}")
-        pool = list(target.seeds(rng))
-        share = inputs // len(chosen) + (index < inputs % len(chosen))
-        found = 0
-        mine: list[Find] = []
-        for number in range(share):
-            data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
-            if number % 997 == 0:
-                pool[rng.randrange(len(pool))] = data  # so that changes accumulate
-                pool += target.seeds(rng)[: max(KEPT - len(pool), 0)]
-            find = attempt(target, data, slow_s)
-            if find is None:
-                continue
-            found += 1
-            if find.error.partition(":")[0] not in {other.error.partition(":")[0] for other in mine}:
-                mine.append(find)
-            if found >= most:
-                break
-        done.finds += mine
-        done.inputs[target.name] = share
-        progress(index + 1, len(chosen), f"{target.name}: {share} inputs, {found} finds")
+        place = shared_numbers()
+
+        def work(_: object, target: FuzzTarget = target, place: MutableSequence[int] = place) -> TargetResult:
+            with tempfile.TemporaryDirectory(prefix="palpate-fuzz-") as folder:
+                os.chdir(folder)
+                tempfile.tempdir = str(Path.cwd())
+                sys.dont_write_bytecode = True
+                return _fuzz(target, plan, place)
+
+        try:
+            limit = TimeLimit(lambda place=place: (place[0],), lambda: HANGING_S)  # type: ignore[misc]
+            result = run_apart(work, check=limit.check)
+        except ChildLost as lost:
+            find = Find(target.name, b"", f"input {place[0]} of seed {plan.seed}: the process {lost}")
+            result = TargetResult(place[0] + 1, finds=[find], found=1)
+        done.targets[target.name] = result
+        progress(index + 1, len(chosen), f"{target.name}: {summary(result)}")
     done.seconds = perf_counter() - begin
     return done
 
 
+def summary(result: TargetResult) -> str:
+    """Return the figures of a target as text."""
+    return f"{result.inputs} inputs, {result.refused} refused, {result.found} finds, {result.seconds:.0f} s, {result.peak_mb} MB"
+
+
 def all_targets() -> list[FuzzTarget]:
-    """Return all targets: readers of the bus and of scenarios."""
-    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS, SCENARIO, SETTING]
+    """Return all targets."""
+    return [*bus_targets(), *file_targets()]
 
 
 def choose(patterns: Sequence[str]) -> list[FuzzTarget]:

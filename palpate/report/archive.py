@@ -16,10 +16,8 @@ from operator import attrgetter
 from pathlib import Path
 from time import sleep, time
 from typing import Any, Final
-from zipfile import BadZipFile
 
 import numpy as np
-from mcap.exceptions import McapError
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
@@ -33,7 +31,7 @@ from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
+from palpate_bus.recordings import BROKEN, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.runs.announcement import live
 from palpate_bus.runs.run_name import in_use
 from palpate_bus.settings import RECORDING
@@ -238,7 +236,7 @@ def _read(folder: Path) -> tuple[Collected, dict[str, Any]]:
         collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
     except KeyError as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
-    except (OSError, ValueError, EOFError, BadZipFile, McapError) as error:
+    except (OSError, *BROKEN) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
     return collected, known
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import logging
 import re
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -37,6 +38,7 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     """
     import trimesh  # noqa: PLC0415 - only user meshes need it, and it takes 0.3 s to import
 
+    logging.getLogger("trimesh").setLevel(logging.CRITICAL + 1)  # it logs tracebacks of files that are refused here
     if path.suffix.lower() not in SUFFIXES:
         raise MeshError(f"want a file in {', '.join(SUFFIXES)}")
     if not path.is_file():

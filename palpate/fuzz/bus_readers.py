@@ -1,0 +1,219 @@
+"""Readers of the bus and of text: messages, attachments, keys, tokens, chunks, options, scenarios, settings."""
+
+from __future__ import annotations
+
+import random
+import struct
+from collections.abc import Callable, Iterator
+from functools import partial
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from rosbags.interfaces import Nodetype
+
+from palpate.fuzz.target import Broken, FuzzTarget
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.typestore import array_dtype
+from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
+from palpate_bus.settings import Settings
+from palpate_bus.wire.liveliness import parse_token
+from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
+from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
+from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+
+# -- messages
+
+
+def _codecs() -> Iterator[FuzzTarget]:
+    rules = contract()
+    names = sorted({row.type for row in rules.topics.values()} | {row.type for row in rules.internal.values()})
+    for name in names:
+        yield FuzzTarget(f"codec:{name}", _codec_check(name), partial(_payloads, name))
+
+
+def _codec_check(name: str) -> Callable[[bytes], bool]:
+    decode, encode = codec.decoder(name), codec.encoder(name)
+
+    def check(data: bytes) -> bool:
+        """Check that data is refused with CodecError, or that its canonical bytes are a fixed point, also for rosbags."""
+        try:
+            message = decode(data)
+        except codec.CodecError:
+            return False
+        canonical = encode(message)
+        if encode(decode(canonical)) != canonical:
+            raise Broken(f"{name}: encoding the decoded message changes it")
+        if bytes(codec.store.serialize_cdr(codec.store.deserialize_cdr(canonical, name), name)) != canonical:
+            raise Broken(f"{name}: rosbags returns other bytes")
+        return True
+
+    return check
+
+
+def _payloads(name: str, rng: random.Random) -> list[bytes]:
+    return [random_payload(name, rng) for _ in range(8)]
+
+
+def random_payload(name: str, rng: random.Random) -> bytes:
+    """Return a valid message of a type with random content, in CDR."""
+    return codec.encode(_message(name, rng), name)
+
+
+def _message(name: str, rng: random.Random) -> Any:
+    definition = codec.store.get_msgdef(name)
+    return definition.cls(**{field: _field(description, rng) for field, description in definition.fields})
+
+
+def _field(description: Any, rng: random.Random) -> Any:
+    kind, detail = description
+    if kind == Nodetype.NAME:
+        return _message(detail, rng)
+    if kind == Nodetype.BASE:
+        return _scalar(detail[0], rng)
+    size = detail[1] if kind == Nodetype.ARRAY else rng.randrange(4)
+    item_kind, item = detail[0]
+    if item_kind == Nodetype.BASE and item[0] != "string":
+        dtype = array_dtype(item[0])
+        if item[0] == "bool":
+            return np.array([rng.random() < 0.5 for _ in range(size)], dtype)
+        return np.frombuffer(rng.randbytes(size * dtype.itemsize), dtype)
+    return [_field(detail[0], rng) for _ in range(size)]
+
+
+def _scalar(base: str, rng: random.Random) -> Any:
+    if base == "string":
+        return "".join(rng.choice("aZ09/_ -.äß€") for _ in range(rng.randrange(9)))
+    if base == "bool":
+        return rng.random() < 0.5
+    if base in ("float32", "float64"):
+        code = "<f" if base == "float32" else "<d"
+        return float(struct.unpack(code, rng.randbytes(struct.calcsize(code)))[0])
+    limits = np.iinfo({"byte": "int8", "char": "uint8"}.get(base, base))
+    return rng.randint(int(limits.min), int(limits.max))
+
+
+# -- attachment, keys, tokens, chunks, options
+
+
+def _attachment(data: bytes) -> bool:
+    try:
+        sequence, sent, gid = unpack(data)
+    except WireError:
+        return False
+    if AttachmentWriter(gid).pack(sequence, sent) != data[:ATTACHMENT_SIZE]:
+        raise Broken("attachment: packing the unpacked values changes it")
+    return True
+
+
+ATTACHMENT = FuzzTarget(
+    "attachment", _attachment, lambda rng: [AttachmentWriter(rng.randbytes(16)).pack(rng.randrange(2**62), rng.randrange(2**62))]
+)
+
+
+def _key(data: bytes) -> bool:
+    text = data.decode("utf-8", "surrogateescape")
+    try:
+        key = parse_key(text)
+    except WireError:
+        return False
+    if parse_key(str(key)) != key:
+        raise Broken("key: parsing the written text changes it")
+    return True
+
+
+KEY = FuzzTarget("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
+
+
+def _token(data: bytes) -> bool:
+    try:
+        entity = parse_token(data.decode("utf-8", "surrogateescape"))
+    except WireError:
+        return False
+    if parse_token(entity.token) != entity:
+        raise Broken("token: parsing the written text changes it")
+    return True
+
+
+_ENDPOINT = (
+    "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
+)
+TOKEN = FuzzTarget("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
+
+
+def _chunk(data: bytes) -> bool:
+    try:
+        _, messages = unpack_chunk(data)
+        list(messages)
+    except codec.CodecError:
+        return False
+    return True
+
+
+CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
+
+
+_VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
+
+
+def _options(data: bytes) -> bool:
+    words = data.decode("utf-8", "surrogateescape").split("\n")
+    try:
+        options = BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, words, strict=False))))
+    except BusConfigError:
+        return False
+    if BusOptions.from_settings(Settings.read(options.to_env())) != options:
+        raise Broken("options: their environment yields other options")
+    return True
+
+
+OPTIONS = FuzzTarget(
+    "options",
+    _options,
+    lambda _: [b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k"],
+)
+
+
+def _texts(_: random.Random) -> list[bytes]:
+    folder = resources.files("palpate_models").joinpath("scenarios")
+    return [folder.joinpath(f"{name}.yaml").read_bytes() for name in scenario_names()]
+
+
+def _scenario(data: bytes) -> bool:
+    """Check that data is refused with ScenarioError, or that a scenario is equal after writing and reading it."""
+    file = Path("fuzz.yaml")
+    file.write_bytes(data)
+    try:
+        scenario = load_scenario(str(file))
+    except ScenarioError:
+        return False
+    file.write_text(dump_scenario(scenario), encoding="utf-8")
+    if load_scenario(str(file)) != scenario:
+        raise AssertionError("scenario: reading the written file changes it")
+    return True
+
+
+def _setting(data: bytes) -> bool:
+    try:
+        load_scenario("healthy", data.decode("utf-8", "replace").split("\n"))
+    except ScenarioError:
+        return False
+    return True
+
+
+_SETTINGS = (
+    b"exam.depth_m=0.008", b"exam.region_m=[0.06, 0.06]", b"phantom.lesions=[{centre_m: [0, 0], radii_m: [0.02, 0.02]}]",
+    b"phantom.lesions.0.contrast=3", b"exam.region_m.1=0.1\nseed=4", b"camera.frames=10", b"errors=poor\nerrors.force.tare_n=0.3",
+    b"phantom.breathing={kind: held, coughs_per_min: 2}", b"phantom.motion={kind: turn, at_s: 20}",
+)  # fmt: skip
+
+
+SCENARIO = FuzzTarget("scenario", _scenario, _texts)
+SETTING = FuzzTarget("setting", _setting, lambda _: _SETTINGS)
+
+
+def bus_targets() -> list[FuzzTarget]:
+    """Return a target for each reader of bytes from the bus, of options and of scenarios."""
+    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS, SCENARIO, SETTING]

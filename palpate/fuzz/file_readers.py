@@ -1,0 +1,263 @@
+"""Readers of files: each target writes its input to the working folder, which is a temporary one, and reads it."""
+
+from __future__ import annotations
+
+import io
+import json
+import random
+import shutil
+import zipfile
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+from mcap.writer import CompressionType, Writer
+
+from palpate.fuzz.bus_readers import random_payload
+from palpate.fuzz.target import FuzzTarget
+from palpate.report.archive import FILE, read_evidence, write_evidence
+from palpate.report.page import read_report
+from palpate.report.rows import DepthRow, Report
+from palpate.run.processes import read_processes
+from palpate.study.spec import load_study
+from palpate_bus import implementations
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.typestore import CodecError, definition_hash
+from palpate_bus.recordings import KEPT_EVERY, SCENARIO, open_recording
+from palpate_conductor.collector import Collected
+from palpate_errors import UserError
+from palpate_fmu.reading import DESCRIPTION, binary_folders, read_description, read_variables
+from palpate_inputs import parse_json
+from palpate_models.patient.mesh import load_mesh
+from palpate_models.scenario.checkpoint import Checkpoint, FeltSoFar, read_checkpoint
+from palpate_recorder.recover import recover
+from palpate_tissue.backends.fmu.mapping import load_map
+
+TOPIC = "joint_states"
+
+
+def _target(
+    name: str, file: str, read: Callable[[Path], object], seeds: Sequence[bytes], *, refused: type[Exception] = UserError
+) -> FuzzTarget:
+    def check(data: bytes) -> bool:
+        path = Path(file)
+        path.parent.mkdir(exist_ok=True)
+        path.write_bytes(data)
+        try:
+            read(path)
+        except refused:
+            return False
+        return True
+
+    return FuzzTarget(name, check, lambda _: seeds)
+
+
+# -- meshes
+
+_CORNERS = ((-0.2, -0.3, 0.0), (0.2, -0.3, 0.0), (0.2, 0.3, 0.0), (-0.2, 0.3, 0.0))
+_FACES = ((0, 1, 2), (0, 2, 3))
+
+
+def _obj() -> bytes:
+    lines = [f"v {x} {y} {z}" for x, y, z in _CORNERS] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in _FACES]
+    return "\n".join(["# plate", "o plate", *lines]).encode()
+
+
+def _stl(text: bool) -> bytes:
+    corners = np.array(_CORNERS)[np.array(_FACES)]
+    if text:
+        facets = [
+            "facet normal 0 0 1\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in face) + "endloop\nendfacet\n"
+            for face in corners
+        ]
+        return f"solid plate\n{''.join(facets)}endsolid plate\n".encode()
+    rows = b"".join(np.concatenate(([0, 0, 1], face.ravel())).astype("<f4").tobytes() + b"\0\0" for face in corners)
+    return bytes(80) + len(corners).to_bytes(4, "little") + rows
+
+
+def _ply(text: bool) -> bytes:
+    kind = "ascii" if text else "binary_little_endian"
+    header = (
+        f"ply\nformat {kind} 1.0\ncomment plate\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
+        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
+    )
+    if text:
+        rows = [*(" ".join(map(str, corner)) for corner in _CORNERS), *("3 " + " ".join(map(str, face)) for face in _FACES)]
+        return (header + "\n".join(rows) + "\n").encode()
+    faces = b"".join(b"\3" + np.array(face, "<i4").tobytes() for face in _FACES)
+    return header.encode() + np.array(_CORNERS, "<f4").tobytes() + faces
+
+
+# -- FMUs
+
+_ARRAY = (
+    '<?xml version="1.0"?><fmiModelDescription fmiVersion="3.0" modelName="m" instantiationToken="g">'
+    '<CoSimulation modelIdentifier="m"/><DefaultExperiment startTime="0"/><ModelVariables>'
+    '<Float64 name="time" valueReference="0" causality="independent" variability="continuous"/>'
+    '<UInt64 name="n" valueReference="1" causality="structuralParameter" variability="fixed" start="3"/>'
+    '<Float64 name="x" valueReference="2" causality="output" variability="continuous" unit="m" min="0">'
+    '<Dimension valueReference="1"/><Dimension start="2"/></Float64></ModelVariables>'
+    '<ModelStructure><Output valueReference="2"/></ModelStructure></fmiModelDescription>'
+)
+_SCALARS = (
+    '<?xml version="1.0"?><fmiModelDescription fmiVersion="2.0" modelName="m" guid="g"><CoSimulation modelIdentifier="m"/>'
+    '<ModelVariables><ScalarVariable name="x[1,1]" valueReference="0" causality="output"><Real start="1"/></ScalarVariable>'
+    '<ScalarVariable name="x[1,2]" valueReference="1" causality="output"><Real unit="m"/></ScalarVariable></ModelVariables>'
+    '<ModelStructure><Outputs><Unknown index="1" dependencies="2"/></Outputs></ModelStructure></fmiModelDescription>'
+)
+
+
+def _fmu(description: bytes) -> bytes:
+    file = io.BytesIO()
+    with zipfile.ZipFile(file, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr(DESCRIPTION, description)
+        archive.writestr("binaries/x86_64-linux/m.so", b"library")
+    return file.getvalue()
+
+
+def _read_fmu(path: Path) -> None:
+    description, _ = read_description(path)
+    read_variables(description)
+    binary_folders(path)
+
+
+def _read_described(path: Path) -> None:
+    packed = Path("described.fmu")
+    packed.write_bytes(_fmu(path.read_bytes()))
+    _read_fmu(packed)
+
+
+_MAP = b"""role: tissue
+frame: abdomen
+inputs: {sim/tool_state: {indenter_position: {field: pose.position, kind: point}, indenter_radius: radius}}
+outputs: {sim/contact_wrench: {wrench.force: {variable: contact_force, kind: vector}, area: {value: 1.0}}}
+parameters: {phantom: [1, 2]}
+start_s: 0.5
+"""
+
+# -- recordings
+
+
+def recording_bytes(compression: CompressionType, whole: bool) -> bytes:
+    """Return a small recording; one that is not `whole` has neither checksums nor an index."""
+    file, row, rng = io.BytesIO(), contract().topics[TOPIC], random.Random(1)
+    writer = Writer(
+        file, chunk_size=400, compression=compression, enable_crcs=whole, use_statistics=whole, use_summary_offsets=whole
+    )
+    writer.start(profile="ros2")
+    definition = codec.store.generate_msgdef(row.type, ros_version=2)[0].encode()
+    schema = writer.register_schema(row.type, "ros2msg", definition)
+    qos = "- history: keep_last\n  depth: 5\n  durability: volatile\n"
+    known = {"offered_qos_profiles": qos, "topic_type_hash": row.type_hash, KEPT_EVERY: "10"}
+    channel = writer.register_channel(f"/{TOPIC}", "cdr", schema, known)
+    for number in range(4):
+        writer.add_message(channel, 1_000_000 * number, random_payload(row.type, rng), 0, number)
+    writer.add_attachment(0, 0, SCENARIO, "text/yaml", b"name: a\n")
+    writer.finish()
+    return file.getvalue()
+
+
+_RECORDINGS = tuple(
+    recording_bytes(compression, whole)
+    for compression in (CompressionType.NONE, CompressionType.ZSTD, CompressionType.LZ4)
+    for whole in (True, False)
+)
+
+
+def _read_recording(path: Path) -> None:
+    recording = open_recording(path)
+    for name, kind in recording.types.items():
+        kind.difference(contract().topics.get(name, contract().topics[TOPIC]))
+    for _ in recording.messages(list(recording.types)):
+        pass
+
+
+def _read_bag(path: Path) -> None:
+    (path.parent / "a.mcap").write_bytes(_RECORDINGS[0])
+    open_recording(path.parent)
+
+
+def _recover(path: Path) -> None:
+    shutil.rmtree("input_recovered", ignore_errors=True)
+    recover(path)
+
+
+def _define(path: Path) -> None:
+    definition_hash("palpation_msgs/msg/Fuzzed", path.read_text(encoding="utf-8", errors="replace"))
+
+
+def _evidence() -> bytes:
+    write_evidence(Path(FILE), Collected(), run="fuzz")
+    content = Path(FILE).read_bytes()
+    Path(FILE).unlink()
+    return content
+
+
+# -- arrays and text
+
+
+def _checkpoint(stored: bool) -> bytes:
+    rows = {
+        name: np.zeros((2, 3) if name in ("position", "normal", "velocity") else 2) for name in FeltSoFar.__dataclass_fields__
+    }
+    made = Checkpoint(FeltSoFar(**rows), np.zeros((1, 2)), np.zeros((3, 3)), 1)
+    if not stored:
+        return made.bytes()
+    file = io.BytesIO()
+    np.savez(file, left=made.left, surface=made.surface, strokes=np.array(1), **rows)
+    return file.getvalue()
+
+
+_STUDY = b"""name: mine
+populations:
+  healthy: {scenario: person, number: {test: 20}}
+  lumps: {scenario: person, number: {test: 20}, lumps: {radius_m: [0.008, 0.020], contrast: {grid: [2, 4, 8]}}}
+errors: {typical: typical}
+methods: {palpate: {}, mine: {services: {assessment: mine.py}}}
+"""
+_SERVICE = b"""from palpate_bus.service import Service
+
+
+def create(scenario):
+    return Service()
+"""
+_COMPOSE = b"""services:
+  robot: {image: palpate, command: [python, -m, palpate.service, robot], environment: {PALPATE_MODE: peer}}
+  tissue:
+    command: [python]
+"""
+_DEPTHS = dict.fromkeys(DepthRow.model_fields, 0.001)
+_REPORT = json.dumps({
+    **dict.fromkeys(Report.model_fields, 1), "run": "a", "scenario": "lump", "clean_world": False, "runtime": "composed",
+    "platform": {}, "run_hash": None, "digests": {}, "failure": None, "failure_code": None, "lost": {"camera": 3.5},
+    "depth": _DEPTHS, "assessed": True, "findings": [], "candidates": [], "unassessed_m2": {}, "truth": None, "scores": None,
+    "blame": {}, "services": {"search": {"facts": {"presses": 3}}},
+}).encode()  # fmt: skip
+
+
+def file_targets() -> Iterator[FuzzTarget]:
+    """Yield a target for each reader of files."""
+    for name, seed in (("obj", _obj()), ("stl", _stl(False)), ("stl", _stl(True)), ("ply", _ply(False)), ("ply", _ply(True))):
+        kind = "text" if seed.isascii() and b"\0" not in seed else "binary"
+        yield _target(f"mesh:{name}-{kind}", f"input.{name}", lambda path: load_mesh(path, 0.1), (seed,))
+    described = (_ARRAY.encode(), _SCALARS.encode())
+    yield _target("fmu:archive", "input.fmu", _read_fmu, tuple(map(_fmu, described)))
+    yield _target("fmu:description", "input.xml", _read_described, described)
+    yield _target("fmu:map", "input.yaml", load_map, (_MAP,))
+    yield _target("recording:mcap", "input.mcap", _read_recording, _RECORDINGS)
+    yield _target("recording:recover", "input.mcap", _recover, _RECORDINGS, refused=ValueError)
+    listed = b"rosbag2_bagfile_information: {version: 5, compression_mode: '', relative_file_paths: [a.mcap]}\n"
+    yield _target("recording:bag", "bag/metadata.yaml", _read_bag, (listed,))
+    definitions = [codec.store.generate_msgdef(row.type, ros_version=2)[0].encode() for row in contract().topics.values()]
+    yield _target("recording:definition", "input.msg", _define, definitions, refused=CodecError)
+    yield FuzzTarget(
+        "results:evidence", _target("", FILE, lambda path: read_evidence(path.parent), ()).check, lambda _: [_evidence()]
+    )
+    yield _target("results:report", "report.json", lambda path: read_report(path.parent), (_REPORT,))
+    yield _target("results:checkpoint", "input.npz", read_checkpoint, (_checkpoint(True), _checkpoint(False)))
+    yield _target("json", "input.json", lambda path: parse_json(path.read_bytes(), "input"), (_REPORT,))
+    yield _target("study", "input.yaml", lambda path: load_study(str(path)).error_levels(), (_STUDY,))
+    yield _target("service-file", "input.py", lambda path: implementations.check("assessment", f"./{path}"), (_SERVICE,))
+    yield _target("compose", "input.yaml", partial(read_processes, roles=("robot", "tissue")), (_COMPOSE,))
