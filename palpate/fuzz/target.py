@@ -1,4 +1,4 @@
-"""What is fuzzed: a reader, and valid inputs to mutate."""
+"""Fuzz targets: a reader, and valid inputs to mutate."""
 
 from __future__ import annotations
 

@@ -208,11 +208,7 @@ def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
 
 def read_evidence(folder: Path) -> Evidence:
     """Return the evidence of the run in `folder`. Raises EvidenceError."""
-    collected, known = _read(folder)
-    nowhere = np.empty((0, 3))
-    touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
-    pressed = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
-    return evidence_of(collected, touched, Pressed(**pressed) if pressed else None, str(known["run"]))
+    return evidence_of(*_read(folder))
 
 
 def read_collected(folder: Path) -> Collected:
@@ -220,8 +216,8 @@ def read_collected(folder: Path) -> Collected:
     return _read(folder)[0]
 
 
-def _read(folder: Path) -> tuple[Collected, dict[str, Any]]:
-    """Return messages and truth of a run."""
+def _read(folder: Path) -> tuple[Collected, Touched, Pressed | None, str]:
+    """Return messages, truth and name of a run."""
     path = folder / FILE
     if not path.is_file():
         raise EvidenceError(
@@ -234,11 +230,14 @@ def _read(folder: Path) -> tuple[Collected, dict[str, Any]]:
             summary = reader.get_summary()
         known = read_arrays(attached[_TRUTH], path, EvidenceError)
         collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
-    except KeyError as error:
+        nowhere = np.empty((0, 3))
+        touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
+        named = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
+        return collected, touched, Pressed(**named) if named else None, str(known["run"])
+    except (KeyError, TypeError) as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
     except (OSError, *BROKEN) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
-    return collected, known
 
 
 def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: str) -> Evidence:
