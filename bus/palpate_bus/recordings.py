@@ -17,7 +17,6 @@ from pathlib import Path, PurePath
 from typing import IO, NamedTuple
 
 import zstandard
-from mcap import stream_reader
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -26,11 +25,12 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
 
+from palpate_bus import decompression  # noqa: F401 - bounds what the libraries decompress
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import RECORDING
 from palpate_errors import UserError
-from palpate_inputs import MB, InputFile, bounds, over, read_yaml
+from palpate_inputs import MB, InputFile, bounds, read_yaml
 
 KEPT_EVERY = "kept_every_ms"
 """Metadata of a channel: period [ms] in which one message was kept."""
@@ -54,38 +54,6 @@ BROKEN = (
 
 class RecordingError(UserError):
     """A recording that cannot be used. Names file, topic, what was found and what is needed."""
-
-
-class _Decompressor:
-    """Decompresses a chunk within `chunk_mb`. The library believes the size that a chunk states, up to any memory."""
-
-    _lz4 = stream_reader.lz4
-
-    def __init__(self, method: str) -> None:
-        self.decompress = getattr(self, method)
-
-    def zstd(self, data: bytes, size: int) -> bytes:
-        """Return the content of a zstd frame."""
-        stated = zstandard.get_frame_parameters(data).content_size
-        self._check(size if stated == zstandard.CONTENTSIZE_UNKNOWN else max(size, stated))
-        return bytes(zstandard.decompress(data, size))
-
-    def lz4(self, data: bytes) -> bytes:
-        """Return the content of an lz4 frame."""
-        frame = self._lz4.LZ4FrameDecompressor()
-        content = bytes(frame.decompress(data, max_length=bounds().chunk_mb * MB + 1))
-        self._check(len(content))
-        if not frame.eof:
-            raise EOFError("an lz4 chunk that is not whole")
-        return content
-
-    @staticmethod
-    def _check(size: int) -> None:
-        if size > bounds().chunk_mb * MB:
-            raise over("a chunk of the recording", f"{size / MB:.0f} MB decompressed", "chunk_mb", RecordingError)
-
-
-stream_reader.zstandard, stream_reader.lz4 = _Decompressor("zstd"), _Decompressor("lz4")
 
 
 class RecordedMessage(NamedTuple):
@@ -172,7 +140,7 @@ class Recording:
             ]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
-            except RecordingError as error:
+            except UserError as error:
                 raise RecordingError(f"{self.path}: {error}") from error
             except BROKEN as error:
                 broken = self.path if self.path.is_file() else self.files[0].parent
@@ -232,7 +200,7 @@ def _unreadable(file: Path, path: Path) -> RecordingError:
     return RecordingError(f"{file}: is unfinished: still being written, cut off, or its recorder was killed; {_recover(path)}")
 
 
-def _files(path: Path) -> tuple[Path, tuple[Path, ...]]:
+def recorded_files(path: Path) -> tuple[Path, tuple[Path, ...]]:
     """Return the file or folder of a recording and its files."""
     if path.is_file():
         return path, (path,)
@@ -315,7 +283,7 @@ def _contents(file: Path) -> _Contents:
 
 def open_recording(path: Path) -> Recording:
     """Open a recording and read its metadata. Raises RecordingError."""
-    where, files = _files(path)
+    where, files = recorded_files(path)
     types: dict[str, RecordedType] = {}
     counts: Counter[str] = Counter()
     thinned: dict[str, int] = {}
@@ -329,7 +297,7 @@ def open_recording(path: Path) -> Recording:
             if not file.stat().st_size or error.filename is None:  # too short for its footer
                 raise _unreadable(file, where) from error
             raise RecordingError(f"{file}: {error.strerror}") from error
-        except RecordingError as error:
+        except UserError as error:
             raise RecordingError(f"{file}: {error}") from error
         except BROKEN as error:
             raise _unreadable(file, where) from error

@@ -14,6 +14,7 @@ from functools import cache
 from pathlib import Path, PurePosixPath
 from reprlib import Repr
 from typing import Any, TypeVar
+from xml.parsers import expat
 from zipfile import ZipFile
 
 import yaml
@@ -58,7 +59,7 @@ class Bounds:
     elements: int = 2_000_000
     """Vertices or faces of a mesh, elements of an FMU's array."""
     depth: int = 50
-    """Nesting of YAML."""
+    """Nesting of YAML and XML."""
 
     @classmethod
     def parse(cls, text: str) -> Bounds:
@@ -215,6 +216,34 @@ def parse_yaml(text: str, name: str, error: type[UserError] = InputError) -> Any
     except Exception as problem:  # a value that does not suit its tag raises many kinds: ValueError for 2001-13-45
         why = str(problem) if isinstance(problem, ValueError) else f"a value does not suit its tag ({type(problem).__name__})"
         raise error(f"{name}: not YAML: {why}") from problem
+
+
+_TextT = TypeVar("_TextT", str, bytes)
+
+
+def checked_xml(content: _TextT, name: object, error: type[UserError] = InputError) -> _TextT:
+    """Return XML that is well formed, not too deep, and without a document type, whose entities may name files."""
+    parser, depth = expat.ParserCreate(), 0
+
+    def refuse(*_: object) -> None:
+        raise error(f"{name} has a document type; want none")
+
+    def begin(*_: object) -> None:
+        nonlocal depth
+        depth += 1
+        if depth > bounds().depth:
+            raise over(name, f"nested {depth} deep", "depth", error)
+
+    def end(_: str) -> None:
+        nonlocal depth
+        depth -= 1
+
+    parser.StartDoctypeDeclHandler, parser.StartElementHandler, parser.EndElementHandler = refuse, begin, end
+    try:
+        parser.Parse(content, True)
+    except expat.ExpatError as problem:
+        raise error(f"{name}: not XML: {problem}") from problem
+    return content
 
 
 _ArchiveT = TypeVar("_ArchiveT", bound=ZipFile)

@@ -10,12 +10,14 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from palpate.fuzz.bus_readers import random_payload
 from palpate.fuzz.target import FuzzTarget
+from palpate.recording.read import read_recording
 from palpate.report.archive import FILE, read_evidence, write_evidence
 from palpate.report.page import read_report
 from palpate.report.rows import DepthRow, Report
@@ -30,6 +32,7 @@ from palpate_conductor.collector import Collected
 from palpate_errors import UserError
 from palpate_fmu.reading import DESCRIPTION, binary_folders, read_description, read_variables
 from palpate_inputs import parse_json
+from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh import load_mesh
 from palpate_models.scenario.checkpoint import Checkpoint, FeltSoFar, read_checkpoint
 from palpate_recorder.recover import recover
@@ -195,13 +198,85 @@ def _evidence() -> bytes:
     return content
 
 
+# -- recordings of other robots
+
+_TABLE_MAPPING = b"""table: {time: t, position: [x, y, z], force: [fx, fy, fz]}
+units: {length: mm}
+tool: {radius_m: 0.01, point: tip}
+body: {anatomy: none, pose: {xyz_m: [0, 0, 0.1]}}
+"""
+_BAG_MAPPING = b"""topics: {wrench: wrench, pose: {topic: joints, urdf: arm.urdf, frame: tip}}
+tool: {radius_m: 0.01}
+"""
+_ARM = b"""<robot name="arm"><link name="base"/><link name="tip"/>
+<joint name="j" type="prismatic"><parent link="base"/><child link="tip"/><axis xyz="0 0 1"/>
+<limit effort="1" velocity="1" lower="-1" upper="1"/></joint></robot>
+"""
+
+
+def _presses() -> Iterator[tuple[float, Array, Array]]:
+    """Yield time [s], position of the tool [m] and force on it [N] of two presses."""
+    rng = np.random.default_rng(1)
+    for k in range(120):
+        phase = k % 60 / 30 - 1
+        depth = 0.008 * (1 - abs(phase)) - 0.003
+        force = np.array([0.0, 0.0, max(depth, 0.0) * 800])
+        yield 0.02 * k, np.array([0.02 * (k // 60), 0.0, -depth]), force + rng.normal(0, 0.01, 3)
+
+
+def _table() -> bytes:
+    rows = (
+        f"{t:.2f},{x * 1e3:.2f},{y:.0f},{z * 1e3:.3f},{fx:.3f},{fy:.3f},{fz:.3f}" for t, (x, y, z), (fx, fy, fz) in _presses()
+    )
+    return "\n".join(("t,x,y,z,fx,fy,fz", *rows)).encode()
+
+
+def _bag() -> bytes:
+    """Return a recording of wrenches and joint states of a prismatic joint along z."""
+    file, make = io.BytesIO(), codec.store.types
+    writer = Writer(file, chunk_size=4000, compression=CompressionType.NONE, enable_crcs=False)
+    writer.start(profile="ros2")
+    channels = {}
+    for topic, kind in (("wrench", "geometry_msgs/msg/WrenchStamped"), ("joints", "sensor_msgs/msg/JointState")):
+        definition = codec.store.generate_msgdef(kind, ros_version=2)[0].encode()
+        channels[topic] = writer.register_channel(f"/{topic}", "cdr", writer.register_schema(kind, "ros2msg", definition))
+    vector, none = make["geometry_msgs/msg/Vector3"], np.empty(0)
+    for t, (_, _, z), force in _presses():
+        header = make["std_msgs/msg/Header"](make["builtin_interfaces/msg/Time"](int(t), int(t % 1 * 1e9)), "tip")
+        wrench = make["geometry_msgs/msg/Wrench"](vector(*force.tolist()), vector(0.0, 0.0, 0.0))
+        sent = {
+            "wrench": make["geometry_msgs/msg/WrenchStamped"](header, wrench),
+            "joints": make["sensor_msgs/msg/JointState"](header, ["j"], np.array([z]), none, none),
+        }
+        for topic, message in sent.items():
+            payload = bytes(codec.store.serialize_cdr(message, message.__msgtype__))
+            writer.add_message(channels[topic], int(t * 1e9), payload, int(t * 1e9))
+    writer.finish()
+    return file.getvalue()
+
+
+def _foreign(path: Path, *, table: bool) -> None:
+    """Read a table or a bag, or either with this mapping or arm."""
+    files = {"input.csv" if table else "input.mcap": _table() if table else _bag(), "arm.urdf": _ARM}
+    files["mapping.yaml"] = (
+        _TABLE_MAPPING
+        if table
+        else b"""topics: {wrench: wrench, pose: {topic: joints, urdf: arm.urdf, frame: tip}}
+tool: {radius_m: 0.01}
+"""
+    )
+    for name, content in files.items():
+        if name != path.name:
+            Path(name).write_bytes(content)
+    read_recording(next(iter(files)), "mapping.yaml")
+
+
 # -- arrays and text
 
 
 def _checkpoint(stored: bool) -> bytes:
-    rows = {
-        name: np.zeros((2, 3) if name in ("position", "normal", "velocity") else 2) for name in FeltSoFar.__dataclass_fields__
-    }
+    names = FeltSoFar.__dataclass_fields__
+    rows: dict[str, Any] = {name: np.zeros((2, 3) if name in ("position", "normal", "velocity") else 2) for name in names}
     made = Checkpoint(FeltSoFar(**rows), np.zeros((1, 2)), np.zeros((3, 3)), 1)
     if not stored:
         return made.bytes()
@@ -252,6 +327,10 @@ def file_targets() -> Iterator[FuzzTarget]:
     yield _target("recording:bag", "bag/metadata.yaml", _read_bag, (listed,))
     definitions = [codec.store.generate_msgdef(row.type, ros_version=2)[0].encode() for row in contract().topics.values()]
     yield _target("recording:definition", "input.msg", _define, definitions, refused=CodecError)
+    yield _target("foreign:table", "input.csv", partial(_foreign, table=True), (_table(),))
+    yield _target("foreign:bag", "input.mcap", partial(_foreign, table=False), (_bag(),))
+    yield _target("foreign:mapping", "mapping.yaml", partial(_foreign, table=True), (_TABLE_MAPPING,))
+    yield _target("foreign:urdf", "arm.urdf", partial(_foreign, table=False), (_ARM,))
     yield FuzzTarget(
         "results:evidence", _target("", FILE, lambda path: read_evidence(path.parent), ()).check, lambda _: [_evidence()]
     )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final
@@ -11,14 +12,15 @@ from typing import Any, Final
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
-from rosbags.highlevel import AnyReader, AnyReaderError
+from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
 from palpate.recording.mapping import SCALES, Columns, Joints, Mapping, Topics, Transform
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.messages.typestore import store
+from palpate_bus.recordings import recorded_files
 from palpate_errors import UserError
-from palpate_inputs import InputFile
+from palpate_inputs import KB, InputFile, bounds, checked_xml, read_text
 from palpate_models.numerics.frames import Array
 from palpate_plugins import needs
 
@@ -135,12 +137,18 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     return Readings(between, force, times - times[0], rotation=Slerp(stamps, rotation[first])(times))
 
 
-def opened(path: Path) -> AnyReader:
-    """Return a reader of a bag, for a `with` block. Raises ReadingError."""
+@contextmanager
+def opened(path: Path) -> Iterator[AnyReader]:
+    """Open a bag. Raises ReadingError, also for what is found while it is read."""
+    for file in recorded_files(path)[1]:
+        InputFile(file, ReadingError).close()
     try:
-        return AnyReader([path], default_typestore=store)
-    except (AnyReaderError, OSError) as error:
+        with AnyReader([path], default_typestore=store) as bag:
+            yield bag
+    except UserError as error:
         raise ReadingError(f"{path}: {error}") from None
+    except Exception as error:  # damaged bags raise many kinds
+        raise ReadingError(f"{path}: cannot be read: {str(error) or type(error).__name__}") from error
 
 
 def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tuple[float, Any]]:
@@ -201,7 +209,8 @@ def _kinematics(states: list[tuple[float, Any]], source: Joints) -> tuple[Array,
     import pinocchio  # noqa: PLC0415 - only for joint positions
 
     try:
-        model = pinocchio.buildModelFromUrdf(str(source.urdf))
+        text = read_text(source.urdf, ReadingError, bounds().text_kb * KB)
+        model = pinocchio.buildModelFromXML(checked_xml(text, source.urdf))
     except ValueError as error:
         raise ReadingError(f"{source.urdf}: is not a URDF: {error}") from None
     data, frame, first = model.createData(), model.getFrameId(source.frame), states[0][1].name
