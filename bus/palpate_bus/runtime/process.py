@@ -22,7 +22,7 @@ WORKER_NICENESS = 15
 BACKGROUND_NICENESS = 3
 """Of observers, and in lockstep of services slower than the 1 kHz loop, which are batch work as well.
 
-The loop waits for them, so with a higher value a run starves beside other work: NICE_FIGURES
+The loop waits for them, so with a higher value a run starves beside other work.
 """
 _NICENESS_BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
 STOPPED: Final = frozenset({psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP})
