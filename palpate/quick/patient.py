@@ -21,8 +21,11 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
+from palpate.apart import guarded
 from palpate.truth.surface import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
+from palpate_bus.implementations import kind
+from palpate_bus.settings import Settings
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, inverse, matrix
 from palpate_models.patient.motion import BodyMotion
@@ -31,6 +34,7 @@ from palpate_models.scenario.patterns import stations
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_perception.pipeline import PIPELINE
 from palpate_planning.interruptions import WALL
+from palpate_plugins import PluginError
 
 PERIOD_S: Final = 0.010
 """Period of the force readings, as of exam/state."""
@@ -90,6 +94,10 @@ class Patient:
         body that cannot be built, NoTissueError for a tissue without a copy.
         """
         scenario = whole_scenario(scenario, seed)
+        choice = scenario.services.tissue
+        if kind("tissue").foreign(choice):
+            part = f"services.tissue = {choice!r}"
+            guarded(part, lambda: _try_tissue(scenario), Settings.read().start_limit_s, PluginError)
         tissue = true_tissue(scenario)
         if tissue is None:
             raise NoTissueError(
@@ -173,8 +181,15 @@ class Patient:
     def move(self, p: Array) -> Array:
         """Move the sphere's centre straight to `p` [m], shape (3,), in the initial frame A, within PERIOD_S.
 
-        Returns the mean force on the sphere during this time [N], shape (3,). After a rest the motion begins at `p`.
+        Returns the mean force on the sphere during this time [N], shape (3,). After a rest the motion begins at `p`. Raises
+        PluginError if a tissue of a user's file wants to end the program.
         """
+        try:
+            return self._moved(p)
+        except SystemExit as left:
+            raise kind("tissue").failure(self.scenario.services.tissue, left) from left
+
+    def _moved(self, p: Array) -> Array:
         self._tick()
         if self._motion.moves and self.time > self._motion.at_s:
             X = inverse(self._motion.pose(self.time))
@@ -226,6 +241,13 @@ class Patient:
         if self.scenario.exam.breathing is Following.GATE:
             there &= np.abs(lifted) < WALL.gate_m
         return Touch(times, places, normals, depths, force, there, self.seen)
+
+
+def _try_tissue(scenario: Scenario) -> None:
+    """Make the tissue of a user's file and step it once, without contact."""
+    tissue = true_tissue(scenario)
+    if tissue is not None:
+        tissue.in_steps_of(PERIOD_S).step(0.0, np.array((0.0, 0.0, 1.0)), np.zeros(3), scenario.robot.indenter_radius_m)
 
 
 def seen_lattice(exam: Exam) -> Array:

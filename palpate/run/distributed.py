@@ -21,6 +21,7 @@ from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, Ti
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import is_file
 
 
 def run_distributed(
@@ -55,6 +56,11 @@ def run_distributed(
     local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
     begun = False
 
+    def ended() -> dict[str, str]:
+        """Return how processes ended, with the user's file."""
+        files = {role: file for role in roles if is_file(file := choice(scenario, role))}
+        return {role: f"{how} ({files[role]})" if role in files else how for role, how in local.ended().items()}
+
     def report_progress(progress: RunProgress) -> None:
         nonlocal begun
         begun = True
@@ -84,7 +90,7 @@ def run_distributed(
         try:
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, report_progress, local.ended, timing, patience, begin, tree)
+                result = conduct(session, roles, report_progress, ended, timing, patience, begin, tree)
                 all_is_measured()
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
