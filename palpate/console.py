@@ -76,7 +76,7 @@ class _Output(io.FileIO):
 def output(stream: TextIO) -> TextIO:
     """Return a stream to the same output that does not end a command if it cannot be written; see `lost_output`."""
     buffer = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
-    return io.TextIOWrapper(buffer, stream.encoding, stream.errors, line_buffering=stream.line_buffering)
+    return io.TextIOWrapper(buffer, stream.encoding, stream.errors, line_buffering=bool(stream.line_buffering))
 
 
 def lost_output() -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -15,6 +16,7 @@ from palpate.quick.patient import NoTissueError, Patient, Touch
 from palpate.quick.study import renewed
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
+from palpate_plugins import PluginError
 
 SMALL = ("exam.region_m=[0.06, 0.05]", "exam.centre_m=[-0.05, -0.05]")
 ALONE = """
@@ -147,6 +149,14 @@ def test_a_tissue_without_a_copy_is_refused() -> None:
     real = scenario(1).model_copy(update={"services": scenario(1).services.model_copy(update={"tissue": "none"})})
     with pytest.raises(NoTissueError, match=r"services\.tissue"):
         Patient(real)
+
+
+@pytest.mark.parametrize("leave", ["raise SystemExit(0)", "__import__('os')._exit(0)"])
+def test_a_tissue_that_ends_its_process_is_named(tmp_path: Path, leave: str) -> None:
+    file = tmp_path / "leaves.py"
+    file.write_text(f"def create(scenario):\n    {leave}\n")
+    with pytest.raises(PluginError, match=f"services.tissue = '{file}'"):
+        Patient(load_scenario("clean", [f"services.tissue={file}"]))
 
 
 def test_a_row_of_the_loop_is_not_replaced_by_one_of_fewer_examinations() -> None:

@@ -35,17 +35,17 @@ def compiled(function: _F) -> _F:
     except RuntimeError:  # numba found no writable cache folder
         return cast("_F", numba.njit(error_model="numpy")(function))
     if dispatcher is not function:  # the same object if NUMBA_DISABLE_JIT is set
-        dispatcher._cache._cache_file.__class__ = _CheckedFile
+        cast("Any", dispatcher)._cache._cache_file.__class__ = _CheckedFile
         with suppress(OSError):
             _renew(_package(Path(function.__code__.co_filename)), Path(str(dispatcher.stats.cache_path)))
     return cast("_F", dispatcher)
 
 
-class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
+class _CheckedFile(IndexDataCacheFile):
     """Index and code of a function on the disk, each with its SHA-256. A damaged file is compiled again."""
 
     def _dump(self, obj: object) -> bytes:
-        content: bytes = super()._dump(obj)
+        content: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
         return sha256(content).digest() + content
 
     def _load_index(self) -> dict[Any, str]:
@@ -56,7 +56,7 @@ class _CheckedFile(IndexDataCacheFile):  # type: ignore[misc]
         return {}
 
     def _load_data(self, name: str) -> Any:
-        return _loaded(Path(self._data_path(name)).read_bytes())
+        return _loaded(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
 
 
 def _loaded(stored: bytes) -> Any:
