@@ -206,7 +206,7 @@ def _usable(where: str, scenario: Scenario) -> Scenario:
 
 def _files(scenario: Scenario) -> dict[str, str]:
     """Return the SHA-256 of each file that a result depends on, by path."""
-    named = [scenario.phantom.mesh, scenario.tissue.fmu, scenario.tissue.fmu_map]
+    named = [scenario.phantom.mesh, scenario.phantom.grid, scenario.tissue.fmu, scenario.tissue.fmu_map]
     functions = (*scenario.services.model_dump().values(), scenario.exam.pattern, scenario.search.policy)
     named += [word for word in functions if is_file(word)]
     return {path: file_hash(path) for path in named if path is not None}

@@ -15,6 +15,7 @@ from scipy.spatial import Delaunay
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.abdomen import lattice, parametric_surface
 from palpate_models.patient.field import background_factor, lesion_field
+from palpate_models.patient.grid import read_grid
 from palpate_models.patient.healthy import healthy_wall
 from palpate_models.patient.mesh import boundary_vertices, load_mesh, vertex_normals
 from palpate_models.patient.mesh_file import MeshError
@@ -56,6 +57,8 @@ class PhantomModel:
     """Vertices that do not move: the border of the examined body, and its back on the table; shape (n,)."""
     breathing: Array
     """Part of the breathing excursion at each vertex, 1 about the umbilicus, 0 where fixed; shape (n,)."""
+    young: Array | None = None
+    """Instantaneous Young's modulus without lesions [Pa], shape (n,); None if it is proportional to `background`."""
     voluntary: bool = False
     """The tension fades under gentle pressure: see `palpate_models.patient.guarding.Activation`."""
 
@@ -63,9 +66,10 @@ class PhantomModel:
 def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     """Return the phantom of a scenario; a person is drawn first. Equal seeds give equal walls at any mesh resolution.
 
-    Raises MeshError if a user's mesh or a lesion cannot be used.
+    Raises MeshError or GridError if a user's file or a lesion cannot be used.
     """
     phantom = drawn(phantom, seed)
+    grid = None if phantom.grid is None else read_grid(Path(phantom.grid))
     if phantom.mesh is not None:
         surface = load_mesh(Path(phantom.mesh), phantom.edge_m)
         vertices, triangles = surface.vertices, surface.triangles
@@ -76,14 +80,23 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         if fixed.all():
             raise MeshError(f"phantom.mesh = {phantom.mesh}: all of its vertices are on its border or its back, none can move")
     else:
-        shape = parametric_surface(phantom.size_m, phantom.edge_m, phantom.anatomy)
+        if grid is not None:
+            shape = grid.surface(phantom.edge_m)
+        else:
+            shape = parametric_surface(phantom.size_m, phantom.edge_m, phantom.anatomy)
         vertices, triangles, normals, fixed = shape.vertices, shape.triangles, shape.normals, shape.fixed
     laplacian, mass = robust_laplacian.mesh_laplacian(vertices, triangles)
     laplacian = sparse.csr_array(laplacian)
     laplacian.sort_indices()
     half_length = float(np.ptp(vertices[:, 1])) / 2
-    background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
-    stiffening = np.full(len(vertices), phantom.stiffness.stiffening_per_m)
+    young = None
+    if grid is not None:
+        background, young, stiffening = (
+            grid.at(name, vertices[:, :2]) for name in ("k_w_n_per_m3", "young_pa", "stiffening_per_m")
+        )
+    else:
+        background = phantom.stiffness.k_w_n_per_m3 * background_factor(vertices, phantom.background, half_length, seed)
+        stiffening = np.full(len(vertices), phantom.stiffness.stiffening_per_m)
     if phantom.anatomy is not None:
         wall = healthy_wall(vertices, phantom.size_m, phantom.anatomy, phantom.stiffness.stiffening_per_m, seed)
         background, stiffening = background * wall.stiffness, wall.stiffening
@@ -108,6 +121,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         lesion=lesion,
         fixed=fixed,
         breathing=_breathing_profile(vertices, normals, half_length, fixed),
+        young=young,
         voluntary=any(area.kind == "voluntary" for area in phantom.guarding),
     )
 

@@ -199,9 +199,9 @@ class Stiffness(Section):
 class Phantom(Section):
     """The abdomen. Only the tissue and scoring get this section."""
 
-    kind: Literal["parametric", "person", "mesh"] = "parametric"
+    kind: Literal["parametric", "person", "mesh", "grid"] = "parametric"
     """`parametric`: set below. `person`: size, wall and anatomy are drawn from the seed by the statistics of living people.
-    `mesh`: the surface is read from a file."""
+    `mesh`: the surface is read from a file. `grid`: surface, modulus and stiffening are read from a file."""
     build: Build = Build.DRAWN
     """Build of the person (kind: person)."""
     draw: Draw = Draw()
@@ -210,9 +210,12 @@ class Phantom(Section):
     """The drawn anatomy (kind: person). If it is set, nothing is drawn."""
     mesh: str | None = None
     """OBJ, STL or PLY file in metres, in the abdomen frame (kind: mesh)."""
+    grid: str | None = None
+    """CSV file of `palpate_models.patient.grid` (kind: grid), relative to the scenario's file. It replaces `background` and, of
+    `stiffness`, `k_w_n_per_m3` and `stiffening_per_m`."""
     size_m: tuple[Length, Length, Length] = (0.36, 0.46, 0.20)
-    """Width, length and height of the parametric abdomen."""
-    edge_m: Annotated[float, Field(ge=0.0025, le=0.02)] = 0.005
+    """Width, length and height of the parametric abdomen; of `kind: grid`, the height is the thickness of the elastic tier."""
+    edge_m: Annotated[float, Field(ge=0.001, le=0.02)] = 0.005
     """Longest mesh edge in the examined region."""
     stiffness: Stiffness = Stiffness()
     background: Background = Background()
@@ -231,8 +234,9 @@ class Phantom(Section):
 
     @model_validator(mode="after")
     def _mesh(self) -> Self:
-        if (self.kind == "mesh") != (self.mesh is not None):
-            raise ValueError("kind: mesh needs mesh: FILE, and mesh: FILE needs kind: mesh")
+        for kind in ("mesh", "grid"):
+            if (self.kind == kind) != (getattr(self, kind) is not None):
+                raise ValueError(f"kind: {kind} needs {kind}: FILE, and {kind}: FILE needs kind: {kind}")
         return self
 
     @model_validator(mode="after")

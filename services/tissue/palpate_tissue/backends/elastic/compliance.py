@@ -110,6 +110,11 @@ YOUNG_OVER_K_W = REFERENCE_E / REFERENCE_K_W
 """Young's modulus over the foundation modulus of an equally stiff wall at 10 mm depth [m]."""
 
 
+def healthy_young(model: PhantomModel) -> Array:
+    """Return Young's modulus without lesions at the vertices [Pa], shape (n,)."""
+    return YOUNG_OVER_K_W * model.background if model.young is None else model.young
+
+
 class ModulusField:
     """Instantaneous Young's modulus [Pa] at (x, y) of A and depth below the skin.
 
@@ -120,7 +125,7 @@ class ModulusField:
     def __init__(self, model: PhantomModel, lesions: Sequence[Lesion] = ()) -> None:
         front = model.normals[:, 2] > 0
         self._front = front
-        self._skin = YOUNG_OVER_K_W * model.background
+        self._skin = healthy_young(model)
         log_young = np.log(self._skin[front])
         self._inside = LinearNDInterpolator(model.vertices[front, :2], log_young)
         self._outside = NearestNDInterpolator(model.vertices[front, :2], log_young)
@@ -243,11 +248,12 @@ class _Body:
     def matrix(self, lesions: tuple[Lesion, ...]) -> Array32:
         """Return S with these lesions, shape (f, f)."""
         model = self.model
-        if not lesions and np.ptp(model.background) <= 1e-9 * model.background.mean():
+        young = healthy_young(model)
+        if not lesions and np.ptp(young) <= 1e-9 * young.mean():
             return self.layer().astype(np.float32)
         if not math.isfinite(self.thickness):
             raise UserError("a half-space must be uniform: use a finite thickness_m")
-        arrays = (model.vertices, model.normals, model.areas, model.background, model.fixed)
+        arrays = (model.vertices, model.normals, model.areas, young, model.fixed)
         key = content_key("compliance", _CODE, *arrays, lesions, self.thickness, self.poisson, self.pitch)
         return remembered(key, lambda: self._changed(lesions))
 
@@ -281,7 +287,7 @@ class _Body:
 
     def uniform(self) -> float:
         """Return Young's modulus of the initial uniform layer [Pa]."""
-        return YOUNG_OVER_K_W * float(np.median(self.model.background))
+        return float(np.median(healthy_young(self.model)))
 
     def layer(self) -> Array:
         """Return S of the uniform layer, shape (f, f)."""

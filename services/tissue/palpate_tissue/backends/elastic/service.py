@@ -16,6 +16,9 @@ from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
 
+LEAST_LAYERS = 5
+"""Layers of finite elements in a body from a grid file."""
+
 
 def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
     """Return the elastic tissue of a scenario. The first time takes half a minute; the compliance is cached.
@@ -24,8 +27,12 @@ def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
     """
     phantom = scenario.phantom
     model = build_phantom(phantom, scenario.seed)
+    thickness = None
+    if phantom.grid is not None:  # it may be thinner than an abdomen, and its surface does not show how thick it is
+        thickness = phantom.size_m[2]
+        pitch_m = min(pitch_m, thickness / LEAST_LAYERS)
     try:
-        body = compliance(model, phantom.lesions, pitch_m=pitch_m)
+        body = compliance(model, phantom.lesions, thickness, pitch_m=pitch_m)
     except UserError as error:
         raise PluginError(str(error)) from error
     tissue = ElasticTissue(

@@ -11,6 +11,7 @@ muscle depends only on its depth and speed, so it is the same for all presses.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from math import exp, sqrt
 from typing import Final, NamedTuple
 
@@ -40,12 +41,12 @@ MOST_SWEEPS: Final = 200
 
 
 class Course(NamedTuple):
-    """Schedule common to all presses."""
+    """Schedule of a press."""
 
     radius: float
     """Radius of the sphere [m]."""
     ends: Array
-    """Lengths of the steps [s], shape (n,)."""
+    """Ends of the steps from the touch [s], shape (n,)."""
     depths: Array
     """Depth at the ends of the steps [m], shape (n,)."""
     contracted: Array
@@ -69,19 +70,35 @@ def standard_presses(
     """Return the result of `TissueBackend.press` at `places` [m] with `normals`, shapes (k, 3), for a sphere of `radius` [m]."""
     ends = np.array(ENDS_S)
     depths = press.depths(ends)
-    prony = np.column_stack((stiffness.prony_g, stiffness.prony_tau_s))
-    course = Course(radius, ends, depths, contracted(model.voluntary, ends, depths), prony)
-    reached = cKDTree(model.vertices).query_ball_point(places, radius + REACH_LENGTHS * stiffness.length_m)
+    course = Course(radius, ends, depths, contracted(model.voluntary, ends, depths), prony_table(stiffness))
+    forces = np.array(press_forces(model, stiffness, places, normals, [course] * len(places))).reshape(-1, len(ends))
+    limited = forces.max(axis=1, initial=0.0) >= press.LIMIT_N
+    return np.where(limited, press.LIMIT_N, forces[:, -1]), limited
+
+
+def prony_table(stiffness: Stiffness) -> Array:
+    """Return g and tau [s] of each branch, shape (b, 2)."""
+    return np.column_stack((stiffness.prony_g, stiffness.prony_tau_s))
+
+
+def press_forces(
+    model: PhantomModel, stiffness: Stiffness, places: Array, normals: Array, courses: Sequence[Course]
+) -> list[Array]:
+    """Return the forces along the normal [N] of presses at `places` [m] with `normals`, shapes (k, 3), each into a wall at rest.
+
+    Each press has its course of n steps; its forces, shape (n,), are those at their ends.
+    """
+    reach = REACH_LENGTHS * stiffness.length_m + max((course.radius for course in courses), default=0.0)
+    reached = cKDTree(model.vertices).query_ball_point(places, reach)
     wall = implicit_wall(model, stiffness, 1.0, 1)
     skin = Skin(model.vertices, model.normals)
-    forces = np.empty((len(places), len(ends)))
-    for place, normal, vertices, felt in zip(places, normals, reached, forces, strict=True):
+    forces = [np.empty(len(course.ends)) for course in courses]
+    for place, normal, vertices, course, felt in zip(places, normals, reached, courses, forces, strict=True):
         part = np.sort(np.array(vertices, dtype=np.intp))
         part = part[~model.fixed[part]]
         part = np.concatenate([part[k :: TUNING.interleave] for k in range(TUNING.interleave)])
         press_once(wall, skin, part, np.stack((place, normal)), course, felt)
-    limited = forces.max(axis=1, initial=0.0) >= press.LIMIT_N
-    return np.where(limited, press.LIMIT_N, forces[:, -1]), limited
+    return forces
 
 
 def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
