@@ -42,6 +42,7 @@ GROUPS = {
         "dashboard": "palpate.live.dashboard:dashboard",
         "report": "palpate.report.command:report",
         "replay": "palpate.replay.command:replay",
+        "perceive": "palpate.perceive.command:perceive",
         "doctor": "palpate.live.doctor:doctor",
         "topics": "palpate.listings:topics",
         "topic": "palpate.live.topic:app",

@@ -17,12 +17,14 @@ from typing import Any, ClassVar, Final, NamedTuple
 from palpate_bus.contract import contract
 from palpate_bus.messages import TFMessage, TransformStamped
 from palpate_bus.messages.codec import CodecError, Message, decode
+from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.recordings import RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
 from palpate_camera.inputs import CameraError, CameraInput, Frame, StaticTransforms
 from palpate_camera.messages import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Scenario
 
 POSE: Final = "tf_static"
@@ -34,11 +36,14 @@ class ReplayedCamera(Service):
 
     role: ClassVar[str] = "camera"
 
-    def __init__(self, recording: Recording) -> None:
-        """Read and check the frames, about 1 MB each. Raises RecordingError without a usable frame whose camera pose is known."""
+    def __init__(self, recording: Recording, whole: bool = True) -> None:
+        """Read and check the frames, about 1 MB each; with `whole`, all must have been kept.
+
+        Raises RecordingError without a usable frame whose camera pose is known.
+        """
         rules = contract()
         recorded: dict[str, list[RecordedMessage]] = {topic: [] for topic in (IMAGE, INFO, SMALL_IMAGE, SMALL_INFO, POSE)}
-        recording.check(rules, recorded)
+        recording.check(rules, recorded, whole=whole)
         for message in recording.messages(recorded):
             recorded[message.topic].append(message)
         for topic in (IMAGE, INFO, POSE):
@@ -59,6 +64,16 @@ class ReplayedCamera(Service):
         self._path = recording.path
         self._wanted = 0
         self._shown = self._ticks = 0
+
+    @property
+    def frames(self) -> Sequence[Frame]:
+        """Whole images with their intrinsics, in the order of their stamps."""
+        return self._frames
+
+    @property
+    def X_WC(self) -> Array:
+        """Recorded pose of the optical frame in world, shape (4, 4)."""
+        return transform_matrix(self._pose)
 
     def start(self) -> Outbox:
         """Return the recorded pose X_WC of the optical frame in world, latched."""

@@ -1,0 +1,1 @@
+"""Perception of a depth recording, without a run."""

@@ -1,0 +1,82 @@
+"""The perceived surface of a depth recording: the perception pipeline on all its images."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import trimesh
+from matplotlib.figure import Figure
+
+from palpate_camera.backends.replay.service import ReplayedCamera
+from palpate_errors import RunError
+from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
+from palpate_perception.cloud import Intrinsics
+from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline
+
+
+@dataclass(frozen=True)
+class SurfaceFigures:
+    """Figures of a perceived surface."""
+
+    frames: int
+    coverage: float
+    """Share of the region that is in view."""
+    noise_mm: float
+    """SD of the surface."""
+    vertices: int
+    area_cm2: float
+    steepest_deg: float
+    """Largest angle between a normal and z of the abdomen frame."""
+
+
+def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
+    """Return what perception makes of all images of a recording. Raises RunError if there is no surface."""
+    pinhole = camera.frames[0].pinhole
+    K = np.array(((pinhole.fx, 0.0, pinhole.cx), (0.0, pinhole.fy, pinhole.cy), (0.0, 0.0, 1.0)))
+    intrinsics = Intrinsics(K, camera.X_WC, (pinhole.height, pinhole.width))
+    pipeline = Pipeline(scenario.exam, np.array(exam_input(scenario).X_WA))
+    fusion = pipeline.fusion(intrinsics)
+    for frame in camera.frames:
+        fusion.add(frame.depth)
+    found = pipeline.perceive(fusion, intrinsics)
+    if found.mesh is None:
+        raise RunError(f"no surface: {found.message}")
+    return found
+
+
+def write(folder: Path, found: Perceived, scenario: Scenario) -> SurfaceFigures:
+    """Write surface.ply and surface.png, in the abdomen frame, and return the figures."""
+    assert isinstance(found.mesh, PerceivedMesh)
+    X_AW = inverse(np.array(exam_input(scenario).X_WA))
+    vertices, normals = apply(X_AW, found.mesh.p_W), found.mesh.n_W @ X_AW[:3, :3].T
+    mesh = trimesh.Trimesh(vertices, found.mesh.triangles.astype(np.int64), vertex_normals=normals, process=False)
+    mesh.export(folder / "surface.ply", vertex_normal=True)
+    _draw(folder / "surface.png", vertices, normals)
+    return SurfaceFigures(
+        frames=found.frames,
+        coverage=found.coverage,
+        noise_mm=1e3 * found.sigma,
+        vertices=len(vertices),
+        area_cm2=1e4 * float(mesh.area),
+        steepest_deg=float(np.degrees(np.arccos(np.clip(normals[:, 2].min(), -1, 1)))),
+    )
+
+
+def _draw(path: Path, vertices: Array, normals: Array) -> None:
+    """Draw heights and normals over the plane of the abdomen frame."""
+    x, y, z = 1e3 * vertices.T
+    figure = Figure(figsize=(10.5, 4.6), layout="constrained")
+    left, right = figure.subplots(1, 2)
+    shown = left.tricontourf(x, y, z, 24)
+    figure.colorbar(shown, ax=left, label="height [mm]")
+    some = slice(None, None, max(1, len(x) // 500))
+    left.quiver(x[some], y[some], *(normals[some, :2].T), angles="xy", width=0.002)
+    shown = right.tricontourf(x, y, np.degrees(np.arccos(np.clip(normals[:, 2], -1, 1))), 24, cmap="magma")
+    figure.colorbar(shown, ax=right, label="slope [deg]")
+    for axes, title in ((left, "surface and normals"), (right, "slope")):
+        axes.set(title=title, xlabel="x [mm], to the left", ylabel="y [mm], to the head", aspect="equal")
+    figure.savefig(path, dpi=110)
