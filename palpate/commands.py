@@ -42,6 +42,8 @@ GROUPS = {
         "dashboard": "palpate.live.dashboard:dashboard",
         "report": "palpate.report.command:report",
         "replay": "palpate.replay.command:replay",
+        "compare": "palpate.comparison.command:compare",
+        "fit": "palpate.twin.command:fit",
         "perceive": "palpate.perceive.command:perceive",
         "doctor": "palpate.live.doctor:doctor",
         "topics": "palpate.listings:topics",

@@ -34,10 +34,9 @@ class SurfaceFigures:
 
 
 def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
-    """Return what perception makes of all images of a recording. Raises RunError if there is no surface."""
+    """Return the result of perception from all images of a recording. Raises RunError if there is no surface."""
     pinhole = camera.frames[0].pinhole
-    K = np.array(((pinhole.fx, 0.0, pinhole.cx), (0.0, pinhole.fy, pinhole.cy), (0.0, 0.0, 1.0)))
-    intrinsics = Intrinsics(K, camera.X_WC, (pinhole.height, pinhole.width))
+    intrinsics = Intrinsics(pinhole.matrix, camera.X_WC, (pinhole.height, pinhole.width))
     pipeline = Pipeline(scenario.exam, np.array(exam_input(scenario).X_WA))
     fusion = pipeline.fusion(intrinsics)
     for frame in camera.frames:

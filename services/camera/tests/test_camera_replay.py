@@ -6,10 +6,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 
 from palpate.check.rig import ReceivedMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
+from palpate.perceive.perceive import perceived, write
 from palpate.run.roles import checked
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger
@@ -98,6 +100,19 @@ def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(
     camera = ReplayedCamera(open_recording(folder))
     assert camera.start()[POSE] == pose.message
     assert camera.finish()["frames_recorded"] == FRAMES
+
+
+def test_perception_alone_sees_the_recorded_surface(recording: Path, tmp_path: Path) -> None:
+    scenario = load_scenario("clean", ["exam.region_m=[0.1,0.1]"])
+    found = perceived(ReplayedCamera(open_recording(recording)), scenario)
+    figures = write(tmp_path, found, scenario)
+    mesh = trimesh.load(tmp_path / "surface.ply", process=False)
+    height = SCENARIO.camera.look_at_m[2] - SCENARIO.exam.pose.xyz_m[2]
+    np.testing.assert_allclose(mesh.vertices[:, 2], height, atol=2e-3)
+    np.testing.assert_allclose(mesh.vertex_normals, np.broadcast_to((0, 0, 1), mesh.vertices.shape), atol=0.05)
+    assert figures.frames == FRAMES
+    assert figures.coverage > 0.95
+    assert (tmp_path / "surface.png").stat().st_size > 10_000
 
 
 def restamped(received: list[ReceivedMessage], stamp: Callable[[int], int]) -> list[ReceivedMessage]:

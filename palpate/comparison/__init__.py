@@ -1,0 +1,1 @@
+"""Comparison of palpations of one body, and of outcomes of several bodies."""

@@ -1,0 +1,177 @@
+"""Two palpations of one body, map against map, at the places where the second one was measured."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.interpolate import LinearNDInterpolator
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
+from scipy.stats import bootstrap, spearmanr
+
+from palpate.comparison.palpated import Palpated
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
+
+
+@dataclass(frozen=True)
+class CompareTuning:
+    """Settings of the registration and the intervals."""
+
+    surface_m: float = 0.001
+    """Distance of surfaces that counts as much as `log_force`."""
+    log_force: float = 0.1
+    near_m: float = 0.002
+    """Surfaces with a smaller RMS distance in the same frame are not registered."""
+    least_places: int = 10
+    confidence: float = 0.9
+    resamples: int = 2000
+
+
+TUNING: Final = CompareTuning()
+Interval = tuple[float, float]
+
+
+@dataclass(frozen=True)
+class Agreement:
+    """Figures of a comparison; ratios are of B over A."""
+
+    places: int
+    """Places of B on the map of A."""
+    registered: bool
+    X_AB: list[list[float]]
+    """Pose of the frame of B in that of A."""
+    level: float
+    """Median ratio of the maps: B's level over A's."""
+    bias: float
+    """Mean of the logarithm of the ratio of the maps."""
+    spread: float
+    """Its SD."""
+    rank_correlation: float
+    """Spearman's, of the maps."""
+    inside_band: float
+    """Share of places at which the map of B is inside the 90 % band of A."""
+    inside_band_90: Interval
+    """Bootstrap interval over places."""
+    force_inside_band: float
+    """Share of places at which the measured force of B is inside that band, each side divided by its level."""
+    force_inside_band_90: Interval
+    dice: float | None
+    """Overlap of the findings; null if neither has one."""
+
+
+@dataclass(frozen=True, eq=False)
+class Compared:
+    """A comparison and its values at k places, for the figure."""
+
+    figures: Agreement
+    a: Palpated
+    b: Palpated
+    """In the frame of A."""
+    of_a: Array
+    """Map of A at the places [N], shape (k,)."""
+    of_b: Array
+
+
+def compare(a: Palpated, b: Palpated, register: bool | None = None) -> Compared:
+    """Compare two palpations. `register`: True to move B onto A, False not to, None to do it where the surfaces disagree.
+
+    Raises UserError if they overlap at too few places.
+    """
+    X = np.eye(4)
+    wanted = _apart(a, b) > TUNING.near_m if register is None else register
+    if wanted:
+        X = _registration(a, b)
+    moved = b.moved(X)
+    xy = moved.places[:, :2]
+    of_a, lower, upper = (_on(a, values)(xy) for values in (a.map.apparent, a.map.lower, a.map.upper))
+    of_b = _on(moved, b.map.apparent)(xy)
+    there = np.isfinite(of_a) & np.isfinite(of_b) & (b.force > 0)
+    if there.sum() < TUNING.least_places:
+        raise UserError(f"{a.name}, {b.name}: {there.sum()} places in common, at least {TUNING.least_places} are needed")
+    of_a, of_b, lower, upper, force = (values[there] for values in (of_a, of_b, lower, upper, b.force))
+    ratio = np.log(of_b / of_a)
+    level = float(np.exp(np.median(ratio)))
+    inside = (of_b >= lower) & (of_b <= upper)
+    levelled = force * float(np.exp(-np.median(np.log(force / of_a))))
+    felt_inside = (levelled >= lower) & (levelled <= upper)
+    figures = Agreement(
+        places=int(there.sum()),
+        registered=bool(wanted),
+        X_AB=X.tolist(),
+        level=level,
+        bias=float(ratio.mean()),
+        spread=float(ratio.std()),
+        rank_correlation=float(spearmanr(of_a, of_b).statistic),
+        inside_band=float(inside.mean()),
+        inside_band_90=_interval(inside),
+        force_inside_band=float(felt_inside.mean()),
+        force_inside_band_90=_interval(felt_inside),
+        dice=_dice(a, moved),
+    )
+    return Compared(figures, a, moved, of_a, of_b)
+
+
+def _on(palpated: Palpated, values: Array) -> Callable[[Array], Array]:
+    """Return values of the map's nodes as a function of xy in A [m], shape (p, 2) -> (p,); NaN where it is not scanned."""
+    nodes, scanned = palpated.map.vertices[:, :2], palpated.map.scanned
+    between = LinearNDInterpolator(nodes, np.where(scanned, values, np.nan))
+    return lambda xy: np.asarray(between(xy))
+
+
+def _apart(a: Palpated, b: Palpated) -> float:
+    """Return the RMS distance of the surfaces along z [m]; infinite if they do not overlap."""
+    height = LinearNDInterpolator(a.map.vertices[:, :2], a.map.vertices[:, 2])
+    apart = np.asarray(height(b.map.vertices[:, :2])) - b.map.vertices[:, 2]
+    there = np.isfinite(apart)
+    return float(np.sqrt(np.mean(apart[there] ** 2))) if there.mean() > 0.5 else float("inf")
+
+
+def _registration(a: Palpated, b: Palpated) -> Array:
+    """Return the pose of the frame of B in that of A, shape (4, 4), at which surfaces and maps agree best."""
+    height = LinearNDInterpolator(a.map.vertices[:, :2], a.map.vertices[:, 2])
+    force = _on(a, np.log(a.map.apparent))
+    scanned = b.map.scanned
+    points, felt = b.map.vertices[scanned], np.log(b.map.apparent[scanned])
+    felt = felt - np.median(felt) + np.median(np.log(a.map.apparent[a.map.scanned]))
+    middle = points.mean(axis=0)
+    start = np.concatenate((a.map.vertices[a.map.scanned].mean(axis=0) - middle, np.zeros(3)))
+
+    def placed(motion: Array) -> Array:
+        return Rotation.from_rotvec(motion[3:]).apply(points - middle) + middle + motion[:3]
+
+    def misfit(motion: Array) -> Array:
+        p = placed(motion)
+        rows = (height(p[:, :2]) - p[:, 2]) / TUNING.surface_m, (force(p[:, :2]) - felt) / TUNING.log_force
+        return np.nan_to_num(np.clip(np.concatenate(rows), -3, 3), nan=1.0)  # a place off the map costs one SD
+
+    motion = least_squares(misfit, start, x_scale=[0.002] * 3 + [0.05] * 3).x
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
+    X[:3, 3] = middle + motion[:3] - X[:3, :3] @ middle
+    return X
+
+
+def _interval(inside: NDArray[np.bool_]) -> Interval:
+    """Return the bootstrap interval of a share over places."""
+    if inside.all() or not inside.any():
+        return float(inside.mean()), float(inside.mean())
+    found = bootstrap(
+        (inside,), np.mean, confidence_level=TUNING.confidence, n_resamples=TUNING.resamples, method="percentile", rng=0
+    )
+    return float(found.confidence_interval.low), float(found.confidence_interval.high)
+
+
+def _dice(a: Palpated, b: Palpated) -> float | None:
+    """Return the overlap of the findings on the nodes of A that both have scanned."""
+    apart, nearest = cKDTree(b.map.vertices[:, :2]).query(a.map.vertices[:, :2])
+    pitch = float(np.median(cKDTree(b.map.vertices[:, :2]).query(b.map.vertices[:, :2], 2)[0][:, 1]))
+    both = a.map.scanned & b.map.scanned[nearest] & (apart <= pitch)
+    mine, other = (a.map.finding >= 0)[both], (b.map.finding[nearest] >= 0)[both]
+    total = int(mine.sum() + other.sum())
+    return 2 * int((mine & other).sum()) / total if total else None

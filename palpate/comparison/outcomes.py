@@ -1,0 +1,112 @@
+"""Sim-to-real figures from paired outcomes of several bodies, such as levels, detections or errors of findings.
+
+R_i is the outcome of body i on hardware and S_i in simulation. Mean maximum rank violation: the mean over i of the largest
+|R_i - R_j| of a pair whose order the simulation reverses (Li et al., Evaluating Real-World Robot Manipulation Policies in
+Simulation, arXiv 2405.05941). Prediction-powered mean of the outcome on hardware, with bodies that were only simulated, as in
+SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S of the pairs), with the lambda of least variance
+(Angelopoulos, Duchi and Zrnic, PPI++, arXiv 2311.01453).
+"""
+
+from __future__ import annotations
+
+import csv
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from scipy.stats import pearsonr, t
+
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
+
+COLUMNS = ("body", "real", "simulated")
+LEAST_PAIRS = 3
+
+
+@dataclass(frozen=True)
+class SimToReal:
+    """Agreement of outcomes."""
+
+    pairs: int
+    simulated_only: int
+    pearson: float
+    pearson_90: tuple[float, float]
+    rank_violation: float
+    """Mean maximum rank violation, in the unit of the outcome."""
+    bias: float
+    """Mean of simulated minus real."""
+    mean_90: tuple[float, float]
+    """Interval of the mean outcome on hardware, from hardware alone (Student's t)."""
+    prediction_powered_90: tuple[float, float]
+    """The same with the simulated bodies."""
+    weight: float
+    """lambda [1]: 0 if the simulation predicts nothing."""
+
+
+def read_outcomes(path: Path) -> tuple[Array, Array, Array]:
+    """Return real and simulated outcomes of the pairs, shapes (n,), and those of bodies that were only simulated, shape (m,).
+
+    The file is CSV with the columns `body`, `real` and `simulated`; `real` is empty without hardware. Raises UserError.
+    """
+    try:
+        with path.open(encoding="utf-8", newline="") as file:
+            rows = list(csv.DictReader(file))
+    except (OSError, UnicodeDecodeError, csv.Error) as error:
+        raise UserError(f"{path}: cannot be read as CSV: {error}") from error
+    real, simulated = (_column(path, rows, name) for name in COLUMNS[1:])
+    if not np.isfinite(simulated).all():
+        raise UserError(f"{path}: column simulated has gaps; want a number for each body")
+    paired = np.isfinite(real)
+    if paired.sum() < LEAST_PAIRS:
+        raise UserError(f"{path}: {paired.sum()} bodies with real and simulated; at least {LEAST_PAIRS} are needed")
+    return real[paired], simulated[paired], simulated[~paired]
+
+
+def _column(path: Path, rows: list[dict[str, str]], name: str) -> Array:
+    """Return a column, NaN where it is empty. Raises UserError."""
+    values = []
+    for line, row in enumerate(rows, start=2):
+        if row.get(name) is None:
+            raise UserError(f"{path}, line {line}: lacks the column {name}; want {', '.join(COLUMNS)}")
+        try:
+            values.append(float(row[name] or "nan"))
+        except ValueError:
+            raise UserError(f"{path}, line {line}: {name} = {row[name]!r}: want a number") from None
+    return np.array(values)
+
+
+def sim_to_real(real: Array, simulated: Array, more: Array, confidence: float = 0.9) -> SimToReal:
+    """Return the figures of pairs, shapes (n,), and of outcomes that were simulated only, shape (m,)."""
+    correlation = pearsonr(simulated, real)
+    band = correlation.confidence_interval(confidence)
+    swapped = (np.sign(simulated[:, None] - simulated) != np.sign(real[:, None] - real)) & ~np.eye(len(real), dtype=bool)
+    violation = np.where(swapped, np.abs(real[:, None] - real), 0.0).max(axis=1).mean()
+    weight = _weight(real, simulated, more)
+    n, m = len(real), max(len(more), 1)
+    rest = real - weight * simulated
+    powered = rest.mean() + weight * (more.mean() if len(more) else 0.0)
+    variance = rest.var(ddof=1) / n + weight**2 * (more.var(ddof=1) / m if len(more) > 1 else 0.0)
+    return SimToReal(
+        pairs=n,
+        simulated_only=len(more),
+        pearson=float(correlation.statistic),
+        pearson_90=(float(band.low), float(band.high)),
+        rank_violation=float(violation),
+        bias=float((simulated - real).mean()),
+        mean_90=_around(float(real.mean()), float(real.var(ddof=1) / n), n, confidence),
+        prediction_powered_90=_around(float(powered), float(variance), n, confidence),
+        weight=weight,
+    )
+
+
+def _weight(real: Array, simulated: Array, more: Array) -> float:
+    """Return the lambda of least variance, in [0, 1]; 0 without bodies that were simulated only."""
+    if len(more) < 2 or np.ptp(simulated) == 0:
+        return 0.0
+    variance = np.concatenate((simulated, more)).var(ddof=1) * (1 + len(real) / len(more))
+    return float(np.clip(np.cov(real, simulated)[0, 1] / variance, 0.0, 1.0))
+
+
+def _around(middle: float, variance: float, n: int, confidence: float) -> tuple[float, float]:
+    half = float(t.ppf(0.5 + confidence / 2, n - 1)) * variance**0.5
+    return middle - half, middle + half

@@ -1,0 +1,1 @@
+"""Twins: patients fitted to what was felt."""

@@ -1,0 +1,189 @@
+"""The fit of a wall to presses.
+
+First the form of the force over depth and time, which no scale of the modulus changes: Pasternak length, stiffening, onset of
+contact and relaxation, by least squares on single presses of a flat wall. Then the field of the modulus: the presses are
+simulated on the body, and the logarithms of measured over simulated force are the observations of a Gaussian process over the
+surface, in a few rounds. A tenth of the presses is held out.
+"""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Final
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.optimize import least_squares
+from scipy.spatial import cKDTree
+from sklearn.exceptions import ConvergenceWarning
+from sklearn.gaussian_process import GaussianProcessRegressor
+from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
+
+from palpate.recording.recording import Recording
+from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.twin.presses import Press, amplitude, presses_of, simulated
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.grid import BodyGrid
+from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
+from palpate_models.patient.schema import Phantom, Stiffness
+from palpate_perception.surface import fit as fit_surface
+from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W
+
+
+@dataclass(frozen=True)
+class FitTuning:
+    """Settings of the fit."""
+
+    form_presses: int = 12
+    """Presses from which the form is fitted, spread over all."""
+    rounds: int = 5
+    """Simulations of all presses."""
+    held_out: int = 10
+    """One press of this many is held out."""
+    edge_radii: float = 0.3
+    """Pitch of the grid and the mesh, in radii of the indenter."""
+    largest_edge_m: float = 0.005
+    margin_radii: float = 3.0
+    """The body extends this far beyond the presses, in radii of the indenter."""
+    surface_sd_m: float = 3e-4
+    """SD of a point of the surface."""
+
+
+TUNING: Final = FitTuning()
+
+
+_ROUNDING_M = 1e-6
+
+
+@dataclass(frozen=True, eq=False)
+class Wall:
+    """A fitted wall; n presses."""
+
+    grid: BodyGrid
+    stiffness: Stiffness
+    edge_m: float
+    onset_m: float
+    """Depth at which the recording noticed the contact [m]."""
+    presses: list[Press]
+    held_out: NDArray[np.bool_]
+    """True for presses that were not fitted, shape (n,)."""
+
+
+def fit_wall(recording: Recording, draft: Path) -> Wall:
+    """Return the wall that reproduces the presses of a recording; the file `draft` is overwritten with its surface.
+
+    Raises UserError if there are too few presses.
+    """
+    radius, presses = recording.indenter_radius_m, presses_of(recording)
+    stiffness, level, onset = _form(presses, radius)
+    edge = min(TUNING.edge_radii * radius, TUNING.largest_edge_m)
+    held_out = np.zeros(len(presses), dtype=bool)
+    held_out[np.random.default_rng(0).permutation(len(presses))[:: TUNING.held_out]] = True
+    grid = _surface(recording, stiffness, edge, onset, level)
+    grid.write(draft)
+    model = build_phantom(Phantom(kind="grid", grid=str(draft), edge_m=edge), 0)
+    at = skin_at(model, presses)
+    field = _Field(at[0][~held_out, :2], level)
+    for _ in range(TUNING.rounds):
+        k_w = field(model.vertices[:, :2])
+        forces = simulated(replace(model, stiffness=k_w, background=k_w), stiffness, presses, at, radius, onset)
+        ratio = np.array([amplitude(press.force, force) for press, force in zip(presses, forces, strict=True)])
+        field.correct(ratio[~held_out])
+    nodes = np.column_stack((grid.x_m, grid.y_m))
+    return Wall(replace(grid, k_w_n_per_m3=field(nodes)), stiffness, edge, onset, presses, held_out)
+
+
+def skin_at(model: PhantomModel, presses: Sequence[Press]) -> tuple[Array, Array]:
+    """Return the points of the model's surface under the presses [m] and its normals there, shapes (n, 3)."""
+    surface = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
+    return surface.points(np.array([press.place[:2] for press in presses]))
+
+
+class _Field:
+    """A smooth modulus [N/m^3] over the surface, corrected by ratios of measured to simulated force at n places."""
+
+    def __init__(self, places: Array, level: float) -> None:
+        """`places` [m], shape (n, 2); `level` [N/m^3]: value before the first correction."""
+        self._scale = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+        self._places, self._level = places, np.log(level)
+        self._process: GaussianProcessRegressor | None = None
+
+    def correct(self, ratio: Array) -> None:
+        """Take the ratios of a simulation with the present field [1], shape (n,)."""
+        values = self._log(self._places) + np.log(np.maximum(ratio, 1e-3))
+        if self._process is None:  # its lengths are those of the first observations
+            kernel = ConstantKernel(0.05) * Matern(3.0, (1.0, 100.0), nu=1.5) + WhiteKernel(0.01, (1e-5, 1.0))
+            process = GaussianProcessRegressor(kernel)
+        else:
+            process = GaussianProcessRegressor(self._process.kernel_, optimizer=None)
+        self._level = float(np.median(values))
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", ConvergenceWarning)  # noise at its lower bound: the places hardly disagree
+            self._process = process.fit(self._places / self._scale, values - self._level)
+
+    def __call__(self, xy: Array) -> Array:
+        """Return the modulus at points [m], shape (p, 2) -> (p,)."""
+        return np.exp(self._log(xy))
+
+    def _log(self, xy: Array) -> Array:
+        rest = 0.0 if self._process is None else self._process.predict(xy / self._scale)
+        return np.asarray(np.full(len(xy), self._level) + rest)
+
+
+def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, float]:
+    """Return the wall's stiffness without its level, the level k_w [N/m^3], and the onset of contact [m]."""
+    curved = [press for press in presses if np.isfinite(press.force).sum() > 2]
+    depth = float(np.median([press.depth.max() for press in presses]))
+    usual = Stiffness()
+    sample = curved or presses
+    sample = [sample[k] for k in np.linspace(0, len(sample) - 1, min(TUNING.form_presses, len(sample))).astype(int)]
+    timed = sample[0].timed
+    at = np.zeros((len(sample), 3)), np.tile((0.0, 0.0, 1.0), (len(sample), 1))
+    flat = flat_phantom(7 * radius, 0.4 * radius, usual.k_w_n_per_m3)
+
+    def wall(form: Array) -> tuple[Stiffness, list[Array]]:
+        relaxing = tuple(float(form[3]) * g for g in usual.prony_g) if timed else ()
+        made = usual.model_copy(
+            update={
+                "length_m": radius * float(np.exp(form[0])),
+                "stiffening_per_m": float(form[1]) / depth,
+                "prony_g": relaxing,
+                "prony_tau_s": usual.prony_tau_s if timed else (),
+            }
+        )
+        model = replace(flat, stiffening=np.full(len(flat.vertices), made.stiffening_per_m))
+        return made, simulated(model, made, sample, at, radius, float(form[2]) * depth)
+
+    def misfit(form: Array) -> Array:
+        rows = []
+        for press, force in zip(sample, wall(form)[1], strict=True):
+            there = np.isfinite(press.force)
+            rows.append((press.force - amplitude(press.force, force) * force)[there] / np.nanmax(press.force))
+        prior = 0.02 * (np.asarray(form) - start) / (1.0, 1.0, 0.1, 0.3)
+        return np.concatenate((*rows, prior))
+
+    start = np.array((0.0, 0.8, 0.02, 1.0 if timed else 0.0))
+    form = np.array((np.log(usual.length_m / radius), usual.stiffening_per_m * depth, 0.0, 1.0))
+    if curved:  # else one depth only, which shows no form
+        bounds = (-2.0, 0.0, 0.0, 0.0), (1.0, 4.0, 0.3, 1.9)
+        form = least_squares(misfit, start, bounds=bounds, loss="soft_l1", f_scale=0.05, diff_step=0.02, max_nfev=12).x
+    stiffness, forces = wall(form)
+    level = np.median([amplitude(press.force, force) for press, force in zip(sample, forces, strict=True)])
+    return stiffness, float(level) * usual.k_w_n_per_m3, float(form[2]) * depth
+
+
+def _surface(recording: Recording, stiffness: Stiffness, edge: float, onset: float, level: float) -> BodyGrid:
+    """Return a grid with the surface of the recording, moved outward by the onset [m], and a uniform modulus [N/m^3]."""
+    radius = recording.indenter_radius_m
+    p = recording.surface + onset * recording.normals
+    low, high = p[:, :2].min(axis=0) - _ROUNDING_M, p[:, :2].max(axis=0) + _ROUNDING_M
+    spacing = float(np.median(cKDTree(p[:, :2]).query(p[:, :2], 2)[0][:, 1]))
+    height = fit_surface(p, np.full(len(p), TUNING.surface_sd_m), tuple(low), tuple(high), max(4 * spacing, 2 * radius))
+    margin = TUNING.margin_radii * radius
+    axes = [np.linspace(a, b, int(np.ceil((b - a) / edge)) + 1) for a, b in zip(low - margin, high + margin, strict=True)]
+    x, y = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))
+    ones = np.ones(len(x))
+    return BodyGrid(x, y, height.height(x, y), level * ones, YOUNG_OVER_K_W * level * ones, stiffness.stiffening_per_m * ones)

@@ -1,0 +1,103 @@
+"""Comparison of two palpations of one body, and of outcomes of several."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from palpate.comparison.compare import compare
+from palpate.comparison.figures import draw
+from palpate.comparison.outcomes import read_outcomes, sim_to_real
+from palpate.comparison.palpated import Palpated
+from palpate.report.scoring import Map
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array, matrix
+from palpate_models.section import Pose
+
+
+def _body(xy: Array) -> tuple[Array, Array]:
+    """Return height [m] and force [N] of a domed body with a stiff ridge."""
+    x, y = xy.T
+    return -4.0 * (x**2 + 2 * y**2), 2.0 + 2.0 * np.exp(-((y - 0.004) ** 2 + (0.3 * x) ** 2) / 5e-5) + 10 * x
+
+
+def _palpated(name: str, scale: float, sd: float, seed: int) -> Palpated:
+    axis = np.arange(-0.03, 0.0301, 0.002)
+    xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
+    height, force = _body(xy)
+    rng = np.random.default_rng(seed)
+    apparent = scale * force * np.exp(sd * rng.standard_normal(len(xy)))
+    band = np.exp(1.645 * sd)
+    finding = np.where(force - 10 * xy[:, 0] > 3.0, 0, -1).astype(np.int32)
+    found = Map(np.column_stack((xy, height)), apparent, apparent / band, apparent * band, np.ones(len(xy), bool), finding)
+    places = rng.uniform(-0.025, 0.025, (300, 2))
+    height, force = _body(places)
+    return Palpated(name, found, 0.01, np.column_stack((places, height)), scale * force)
+
+
+def test_same_body_agrees_within_its_band(tmp_path: Path) -> None:
+    compared = compare(_palpated("a", 1.0, 0.03, 0), _palpated("b", 1.5, 0.0, 1))
+    found = compared.figures
+    assert not found.registered
+    assert found.level == pytest.approx(1.5, rel=0.02)
+    assert found.bias == pytest.approx(np.log(1.5), abs=0.01)
+    assert found.rank_correlation > 0.95
+    assert found.inside_band == 0.0
+    assert 0.85 < found.force_inside_band_90[0] < found.force_inside_band < found.force_inside_band_90[1]
+    assert found.dice == pytest.approx(1.0)
+    draw(tmp_path / "compare.png", compared)
+    assert (tmp_path / "compare.png").stat().st_size > 10_000
+
+
+def test_moved_body_is_registered() -> None:
+    X = matrix(Pose(xyz_m=(0.02, -0.01, 0.3), rpy_rad=(0.05, -0.03, 0.2)))
+    a, b = _palpated("a", 1.0, 0.02, 0), _palpated("b", 1.0, 0.0, 1).moved(X)
+    found = compare(a, b).figures
+    assert found.registered
+    apart = np.array(found.X_AB) @ X - np.eye(4)
+    assert np.abs(apart[:3, 3]).max() < 2e-3
+    assert np.abs(apart[:3, :3]).max() < 0.06
+    assert found.dice is not None
+    assert found.dice > 0.8
+    assert found.rank_correlation > 0.9
+
+
+def test_bodies_without_common_places_are_refused() -> None:
+    a, b = _palpated("a", 1.0, 0.02, 0), _palpated("b", 1.0, 0.0, 1)
+    with pytest.raises(UserError, match="0 places"):
+        compare(a, b.moved(matrix(Pose(xyz_m=(0.5, 0.0, 0.0)))), register=False)
+
+
+def test_simulation_narrows_the_interval_of_outcomes(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    true = rng.normal(size=220)
+    rows = [f"{k},{true[k] + 0.2 * rng.normal() if k < 20 else ''},{true[k]}" for k in range(220)]
+    path = tmp_path / "outcomes.csv"
+    path.write_text("\n".join(("body,real,simulated", *rows)))
+    found = sim_to_real(*read_outcomes(path))
+    assert (found.pairs, found.simulated_only) == (20, 200)
+    assert found.pearson > 0.9
+    assert np.diff(found.prediction_powered_90) < 0.7 * np.diff(found.mean_90)
+
+
+def test_rank_violation_of_a_reversed_order() -> None:
+    found = sim_to_real(np.array((1.0, 2.0, 3.0)), np.array((3.0, 2.0, 1.0)), np.empty(0))
+    assert found.rank_violation == pytest.approx(5 / 3)
+    assert found.prediction_powered_90 == found.mean_90
+
+
+@pytest.mark.parametrize(
+    ("text", "named"),
+    [
+        ("body,real\na,1", "simulated"),
+        ("body,real,simulated\na,x,1\nb,2,2", "'x'"),
+        ("body,real,simulated\na,,1\nb,2,2", "1 bodies"),
+    ],
+)
+def test_unusable_outcomes_are_named(tmp_path: Path, text: str, named: str) -> None:
+    path = tmp_path / "outcomes.csv"
+    path.write_text(text)
+    with pytest.raises(UserError, match=named):
+        read_outcomes(path)
