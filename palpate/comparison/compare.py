@@ -26,8 +26,8 @@ class CompareTuning:
     surface_m: float = 0.001
     """Distance of surfaces that counts as much as `log_force`."""
     log_force: float = 0.1
-    near_m: float = 0.002
-    """Surfaces with a smaller RMS distance in the same frame are not registered."""
+    near_m: float = 0.005
+    """Surfaces with a smaller RMS distance in the same frame are not registered: equipment has such errors."""
     least_places: int = 10
     confidence: float = 0.9
     resamples: int = 2000

@@ -25,9 +25,7 @@ def draw(path: Path, compared: Compared) -> None:
     middle, half = 100 * float(ratio.mean()), 196 * float(ratio.std())
     for at, style in ((middle, "-"), (middle - half, "--"), (middle + half, "--")):
         maps[2].axhline(at, ls=style, color="tab:red", lw=1)
-    maps[2].set(
-        title="Bland-Altman: bias and 95 % limits of agreement", xlabel="geometric mean of both [N]", ylabel="B over A [log %]"
-    )
+    maps[2].set(title="Bland-Altman, 95 % limits", xlabel="geometric mean of both [N]", ylabel="B over A [log %]")
     figure.savefig(path, dpi=110)
 
 
@@ -50,7 +48,7 @@ def _map(axes: Axes, side: Palpated) -> None:
     level = float(np.median(side.map.apparent[scanned]))
     ratio = side.map.apparent[scanned] / level
     low, high = np.quantile(ratio, (0.01, 0.99))
-    shown = axes.scatter(x[scanned], y[scanned], c=ratio, s=10, marker="s", vmin=low, vmax=high)
+    shown = axes.scatter(x[scanned], y[scanned], c=ratio, s=14, marker="s", vmin=low, vmax=high)
     inside = scanned & (side.map.finding >= 0)
     axes.plot(x[inside], y[inside], "x", ms=3, color="tab:red", label="finding")
     axes.set(title=f"{side.name}: apparent stiffness over {level:.3g} N", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")

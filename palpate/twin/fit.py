@@ -107,7 +107,7 @@ class _Field:
 
     def __init__(self, places: Array, level: float) -> None:
         """`places` [m], shape (n, 2); `level` [N/m^3]: value before the first correction."""
-        self._scale = float(np.median(cKDTree(places).query(places, 2)[0][:, 1]))
+        self._scale = _spacing(places)
         self._places, self._level = places, np.log(level)
         self._process: GaussianProcessRegressor | None = None
 
@@ -133,6 +133,11 @@ class _Field:
         return np.asarray(np.full(len(xy), self._level) + rest)
 
 
+def _spacing(places: Array) -> float:
+    """Return the usual distance of neighbouring places [m], shape (n, 2)."""
+    return float(np.median(np.asarray(cKDTree(places).query(places, 2)[0])[:, 1]))
+
+
 def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, float]:
     """Return the wall's stiffness without its level, the level k_w [N/m^3], and the onset of contact [m]."""
     curved = [press for press in presses if np.isfinite(press.force).sum() > 2]
@@ -148,7 +153,7 @@ def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, fl
         relaxing = tuple(float(form[3]) * g for g in usual.prony_g) if timed else ()
         made = usual.model_copy(
             update={
-                "length_m": radius * float(np.exp(form[0])),
+                "length_m": radius * float(form[0]),
                 "stiffening_per_m": float(form[1]) / depth,
                 "prony_g": relaxing,
                 "prony_tau_s": usual.prony_tau_s if timed else (),
@@ -165,11 +170,12 @@ def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, fl
         prior = 0.02 * (np.asarray(form) - start) / (1.0, 1.0, 0.1, 0.3)
         return np.concatenate((*rows, prior))
 
-    start = np.array((0.0, 0.8, 0.02, 1.0 if timed else 0.0))
-    form = np.array((np.log(usual.length_m / radius), usual.stiffening_per_m * depth, 0.0, 1.0))
+    start = np.array((1.0, 0.8, 0.02, 1.0 if timed else 0.0))
+    form = np.array((usual.length_m / radius, usual.stiffening_per_m * depth, 0.0, 1.0))
     if curved:  # else one depth only, which shows no form
-        bounds = (-2.0, 0.0, 0.0, 0.0), (1.0, 4.0, 0.3, 1.9)
-        form = least_squares(misfit, start, bounds=bounds, loss="soft_l1", f_scale=0.05, diff_step=0.02, max_nfev=12).x
+        bounds = (0.1, 0.0, 0.0, 0.0), (2.7, 4.0, 0.3, 1.9)
+        steps = (0.05, 0.05, 0.5, 0.05)  # relative; the simulation converges to some micrometres only
+        form = least_squares(misfit, start, bounds=bounds, loss="soft_l1", f_scale=0.05, diff_step=steps, max_nfev=12).x
     stiffness, forces = wall(form)
     level = np.median([amplitude(press.force, force) for press, force in zip(sample, forces, strict=True)])
     return stiffness, float(level) * usual.k_w_n_per_m3, float(form[2]) * depth
@@ -180,8 +186,8 @@ def _surface(recording: Recording, stiffness: Stiffness, edge: float, onset: flo
     radius = recording.indenter_radius_m
     p = recording.surface + onset * recording.normals
     low, high = p[:, :2].min(axis=0) - _ROUNDING_M, p[:, :2].max(axis=0) + _ROUNDING_M
-    spacing = float(np.median(cKDTree(p[:, :2]).query(p[:, :2], 2)[0][:, 1]))
-    height = fit_surface(p, np.full(len(p), TUNING.surface_sd_m), tuple(low), tuple(high), max(4 * spacing, 2 * radius))
+    cutoff = max(4 * _spacing(p[:, :2]), 2 * radius)
+    height = fit_surface(p, np.full(len(p), TUNING.surface_sd_m), tuple(low), tuple(high), cutoff)
     margin = TUNING.margin_radii * radius
     axes = [np.linspace(a, b, int(np.ceil((b - a) / edge)) + 1) for a, b in zip(low - margin, high + margin, strict=True)]
     x, y = (a.ravel() for a in np.meshgrid(*axes, indexing="ij"))

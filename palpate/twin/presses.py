@@ -85,7 +85,7 @@ def _pressed(touch: Contact) -> Press:
     chosen = np.unique(np.linspace(0, until - 1, LIMITS.readings).round().astype(int))
     chosen = chosen[touch.depth[chosen] > 0]
     if touch.time is None:
-        time = LIMITS.probe_step_s * np.arange(1, len(chosen) + 1)
+        time = np.asarray(LIMITS.probe_step_s * np.arange(1, len(chosen) + 1), dtype=np.float64)
     else:
         time = touch.time[chosen] - touch.time[0]
         chosen, time = chosen[time > 0], time[time > 0]

@@ -106,17 +106,16 @@ def _lumps(vertices: Array, finding: NDArray[np.int32], wall: Wall) -> list[Lesi
         inside = vertices[finding == index, :2]
         if not len(inside):
             continue
-        centre = inside.mean(axis=0)
-        radii = np.maximum(2 * inside.std(axis=0), LUMPS.least_radius_m)  # of a uniform ellipse
-        away = np.linalg.norm((nodes - centre) / radii, axis=1)
+        x, y = inside.mean(axis=0).tolist()
+        a, b = np.maximum(2 * inside.std(axis=0), LUMPS.least_radius_m).tolist()  # of a uniform ellipse
+        away = np.linalg.norm((nodes - (x, y)) / (a, b), axis=1)
         k_w = wall.grid.k_w_n_per_m3
         ring = (away > 1) & (away <= LUMPS.ring)
         if not ring.any():
             continue
         contrast = float(np.clip(np.median(k_w[away <= 1]) / np.median(k_w[ring]), 0.1, 20))
         if max(contrast, 1 / contrast) >= LUMPS.least:
-            shape = {"centre_m": tuple(centre.tolist()), "radii_m": tuple(radii.tolist()), "contrast": contrast}
-            lumps.append(Lesion(**shape, edge_m=min(0.008, float(radii.min()))))
+            lumps.append(Lesion(centre_m=(x, y), radii_m=(a, b), contrast=contrast, edge_m=min(0.008, a, b)))
     return lumps
 
 

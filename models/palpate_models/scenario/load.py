@@ -178,9 +178,9 @@ def load_scenario(source: str, settings: Sequence[str] = (), seed: int | None = 
     if not isinstance(raw, dict):
         raise ScenarioError(f"{name}: want a mapping of fields, not {type(raw).__name__}")
     raw.setdefault("name", Path(name).stem)
-    grid = phantom.get("grid") if isinstance(phantom := raw.get("phantom"), dict) else None
-    if isinstance(grid, str):
-        phantom["grid"] = str(Path(source).absolute().parent / grid)
+    phantom = raw.get("phantom")
+    if isinstance(phantom, dict) and isinstance(phantom.get("grid"), str):
+        phantom["grid"] = str(Path(source).absolute().parent / phantom["grid"])
     for setting in settings:
         if isinstance(raw.get("errors"), str):  # a level's name stands for a mapping with only the level
             raw["errors"] = {"level": raw["errors"]}
