@@ -74,6 +74,8 @@ GROUPS = {
 """Module and attribute of each command, by group: a function, or a Typer app of several commands."""
 EXTRAS = {
     "assess": "library",
+    "compare": "library",
+    "fit": "library",
     "dashboard": "dashboard",
     "fmu": "fmu",
     "study": "study",
