@@ -143,12 +143,12 @@ def _registration(a: Palpated, b: Palpated) -> Array:
     start = np.concatenate((a.map.vertices[a.map.scanned].mean(axis=0) - middle, np.zeros(3)))
 
     def placed(motion: Array) -> Array:
-        return Rotation.from_rotvec(motion[3:]).apply(points - middle) + middle + motion[:3]
+        return np.asarray(Rotation.from_rotvec(motion[3:]).apply(points - middle) + middle + motion[:3])
 
     def misfit(motion: Array) -> Array:
         p = placed(motion)
         rows = (height(p[:, :2]) - p[:, 2]) / TUNING.surface_m, (force(p[:, :2]) - felt) / TUNING.log_force
-        return np.nan_to_num(np.clip(np.concatenate(rows), -3, 3), nan=1.0)  # a place off the map costs one SD
+        return np.asarray(np.nan_to_num(np.clip(np.concatenate(rows), -3, 3), nan=1.0))  # a place off the map costs one SD
 
     motion = least_squares(misfit, start, x_scale=[0.002] * 3 + [0.05] * 3).x
     X = np.eye(4)
@@ -170,7 +170,7 @@ def _interval(inside: NDArray[np.bool_]) -> Interval:
 def _dice(a: Palpated, b: Palpated) -> float | None:
     """Return the overlap of the findings on the nodes of A that both have scanned."""
     apart, nearest = cKDTree(b.map.vertices[:, :2]).query(a.map.vertices[:, :2])
-    pitch = float(np.median(cKDTree(b.map.vertices[:, :2]).query(b.map.vertices[:, :2], 2)[0][:, 1]))
+    pitch = float(np.median(np.asarray(cKDTree(b.map.vertices[:, :2]).query(b.map.vertices[:, :2], 2)[0])[:, 1]))
     both = a.map.scanned & b.map.scanned[nearest] & (apart <= pitch)
     mine, other = (a.map.finding >= 0)[both], (b.map.finding[nearest] >= 0)[both]
     total = int(mine.sum() + other.sum())

