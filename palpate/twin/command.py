@@ -17,7 +17,7 @@ def fit(
     mapping: Annotated[Path | None, typer.Option("--mapping", "-m", help="Its mapping, as for `palpate assess`.")] = None,
     out: Annotated[Path, output_folder("Folder of twin.yaml, twin.csv, twin.png and twin.json.", "--out", "-o")] = Path("twin"),
     elastic: Annotated[bool, typer.Option("--elastic", help="Fit Young's modulus, for the elastic tier.")] = False,
-    thickness_m: Annotated[float, typer.Option(min=0.005, max=0.5, help="Of the body, for the elastic tier [m].")] = 0.05,
+    thickness_m: Annotated[float, typer.Option(min=0.005, max=0.5, help="Of the body in metres, for the elastic tier.")] = 0.05,
     as_json: Annotated[bool, typer.Option("--json", help="Print twin.json.")] = False,
 ) -> None:
     """Fit a twin to a recording: a simulated patient with its surface, stiffness and lumps.
