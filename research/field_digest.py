@@ -24,6 +24,7 @@ from palpate_bus.recordings import open_recording
 ADDED: Final = {
     "palpation_msgs/msg/PalpationTargets": re.compile("reason|[A-Z_]+"),
     "palpation_msgs/msg/ExamState": re.compile("reason|REASON_[A-Z_]+"),
+    "palpation_msgs/msg/SupervisorState": re.compile("CAUSE_SENSOR|joint_force"),
 }
 """Fields and constants by message type that did not exist when the digests were recorded (rosbags lists constants as fields)."""
 NOT_HASHED: Final = ("record_chunks", "diagnostics", "clock")

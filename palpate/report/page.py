@@ -122,17 +122,15 @@ def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
 
 def verdict(report: Report) -> str:
     """Return the result as a sentence."""
+    found, unknown = " ".join(map(_finding_text, report.findings)), unassessed(report)
     if report.failure:
-        return f"The examination did not complete: {report.failure}."
+        return f"The examination did not complete: {report.failure}. {unknown}{found}".strip()
     refused = [fault.text for fault in report.recorded.faults if fault.refused] if report.recorded else []
     if refused:
         return f"Not assessed: {'; '.join(refused)}."
     if not report.assessed:
-        return f"Not assessed: {report.samples} samples are too few for a map{_unreached(report)}."
-    muscles = rows.tensed(report.candidates)
-    if not report.findings:
-        return f"No lump was found{_unreached(report)}. {muscles} {unassessed(report)}".strip()
-    return f"{' '.join(map(_finding_text, report.findings))} {muscles} {unassessed(report)}".strip()
+        return f"Not assessed: {report.samples} samples are too few for a map. {unknown}".strip()
+    return f"{found or 'No lump was found.'} {rows.tensed(report.candidates)} {unknown}".strip()
 
 
 def _reached(report: Report, evidence: Evidence) -> int:
@@ -140,11 +138,6 @@ def _reached(report: Report, evidence: Evidence) -> int:
     if not report.failure:
         return evidence.target_count - report.skipped_targets
     return int(evidence.visited[-1]) if evidence.visited.size else 0
-
-
-def _unreached(report: Report) -> str:
-    n = report.skipped_targets
-    return f"; {n} target{'s were' if n > 1 else ' was'} skipped, and the tissue there was not examined" if n else ""
 
 
 def _finding_text(f: FindingRow) -> str:

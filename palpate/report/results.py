@@ -44,6 +44,7 @@ from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import quadrant
+from palpate_planning.reasons import Loss
 
 log = logging.getLogger(__name__)
 
@@ -127,13 +128,25 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
-        unassessed_m2={} if c.stiffness_map is None else unassessed_of(c.stiffness_map),
+        unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else unassessed_of(c.stiffness_map)),
         background_N=None if c.stiffness_map is None else float(c.stiffness_map.background),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
         blame=result.blame,
         services=result.counters,
     )
+
+
+def _unfelt(scenario: Scenario, result: RunResult) -> dict[str, float]:
+    """Return the part of the region whose targets were to be felt and were not, by reason [m^2]."""
+    exam, region = result.collected.exam, float(np.prod(scenario.exam.region_m))
+    if exam is None or not exam.target_count:
+        return {Loss.UNFINISHED: region} if result.failure else {}
+    lost = result.counters.get("planning", {}).get("facts", {}).get("unfelt_targets")
+    if lost is None and result.failure and not scenario.exam.searched:  # planning is lost, or the run was recovered
+        lost = {Loss.UNFINISHED: exam.target_count - exam.target_index}
+    lost = {Loss.NOT_REACHED: exam.targets_skipped} if lost is None else lost
+    return {str(reason): region * count / exam.target_count for reason, count in lost.items() if count}
 
 
 def _has_no_map(c: Collected) -> bool:
@@ -195,6 +208,14 @@ def write_samples(path: Path, samples: Samples, run: str = "") -> None:
 
 
 REASONS = {
+    Loss.NOT_REACHED: "out of the arm's reach, or hidden from the camera by the arm",
+    Loss.NO_CONTACT: "where no tissue was felt",
+    Loss.FORCE: "where the force limit ended the stroke",
+    Loss.NOT_TRACKED: "where the wall could not be tracked",
+    Loss.MOVED: "left because the patient moved",
+    Loss.OPERATOR: "left because the operator ended the examination",
+    Loss.FAULT: "left because of a fault",
+    Loss.UNFINISHED: "left when the run ended",
     "contradicted": "where the samples disagree by more than stiffness and the known errors explain",
     "yielded": "where the force limit was reached before the depth, as over bone",
 }

@@ -143,8 +143,9 @@ class Report(_Row):
     candidates: list[FindingRow] = []
     """Areas that were considered and not reported, the most probable first."""
     unassessed_m2: dict[str, float] = {}
-    """Scanned area without an assessment, by reason: `contradicted`, the samples disagree by more than stiffness and the known
-    errors explain; `yielded`, the force limit was reached before the depth."""
+    """Area without an assessment, by reason. Scanned: `contradicted`, the samples disagree by more than stiffness and the known
+    errors explain; `yielded`, the force limit was reached before the depth. With targets that were not felt: `not_reached` (by
+    plan), `no_contact`, `force`, `not_tracked`, `moved` (the patient), `operator` (ended it), `fault`, `unfinished` (the run)."""
     background_N: float | None = None
     """Apparent stiffness of the region outside of findings."""
     truth: TruthRow | None

@@ -110,7 +110,8 @@ def whole() -> Report:
     ("changes", "said"),
     [
         ({}, "No lump was found."),
-        ({"skipped_targets": 3}, "; 3 targets were skipped"),
+        ({"unassessed_m2": {"no_contact": 0.0067}}, "Not assessed: 67 cm², where no tissue was felt"),
+        ({"unassessed_m2": {"fault": 0.0067}, "failure": "aborted"}, "did not complete: aborted. Not assessed: 67 cm²"),
         ({"unassessed_m2": {"contradicted": 0.0012}, "background_N": 2.4}, "Not assessed: 12 cm², where the samples disagree"),
         ({"background_N": 7.0}, "The whole region is unusually firm: 7.0 N"),
     ],

@@ -455,6 +455,7 @@ class SupervisorState:
     CAUSE_OPERATOR: ClassVar[int]
     CAUSE_DRIVER: ClassVar[int]
     CAUSE_UNHEEDED: ClassVar[int]
+    CAUSE_SENSOR: ClassVar[int]
     header: Header
     level: int
     cause: int

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -19,15 +20,15 @@ from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND, Periods
-from palpate_planning.reasons import MOVED, NO_CAUSE, Cause, Reason
+from palpate_planning.presses import RequestedPresses
+from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, counted
 from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
 from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
-from palpate_planning.strokes.requests import PLANNING_TIME, PressPlanner, PressRequest
-from palpate_planning.strokes.segments import Segment
+from palpate_planning.views import Rest, Views
 from palpate_planning.waits import FOR_FINDINGS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT
 from palpate_planning.wall.wall import Wall, plane
 
@@ -36,9 +37,8 @@ from palpate_planning.wall.wall import Wall, plane
 class ExamTuning:
     """Limits of repetition and time of the phases."""
 
-    looks_max: int = 3
-    moves_max: int = 2
-    """A patient who moves more often is not viewed again."""
+    rescans_max: int = 2
+    """The surface is not scanned more often again because the patient moved or no tissue was felt."""
     replans_max: int = 3
     """The rest is not planned again more often because the arm would stretch or hides the wall."""
     resume_distance_m: float = 0.015
@@ -50,91 +50,11 @@ class ExamTuning:
     planning_ns: int = 2 * SECOND
     """Simulated time that planning the examination takes."""
     findings_timeout_ns: int = 120 * SECOND
+    lost_fraction_max: float = 0.1
+    """With more of the targets lost to faults the examination counts as failed."""
 
 
 EXAM = ExamTuning()
-
-
-class Views:
-    """The views of the abdomen: postures, tried in turn, and the bursts of the camera."""
-
-    def __init__(self, postures: list[Array]) -> None:
-        """`postures` [rad], shape (7,) each."""
-        self.postures = postures
-        self.failed = 0
-        """Number of views that failed."""
-        self.asked: int | None = None
-        """When the camera was asked for the burst that perception is to answer [ns]."""
-
-    @property
-    def posture(self) -> Array:
-        """The posture to look from [rad], shape (7,)."""
-        return self.postures[self.failed]
-
-    def fail(self) -> bool:
-        """Turn to the next posture; return True if none is left."""
-        self.asked = None
-        self.failed += 1
-        return self.failed >= min(EXAM.looks_max, len(self.postures))
-
-    def restart(self) -> None:
-        """Begin with the first posture again."""
-        self.asked, self.failed = None, 0
-
-
-@dataclass
-class Rest:
-    """The part of the examination that is planned, and planned again after an interruption."""
-
-    wanted: frozenset[int] | None = None
-    """Targets to examine; None: all."""
-    bend: float | None = None
-    """Least bend of the elbow [rad] in a plan that replaces one in which it became too straight."""
-    moves: int = 0
-    """Number of new views after a motion of the patient."""
-    replans: int = 0
-    unplanned: str = ""
-    """Text of the failure to plan the rest; empty if there was none."""
-
-    @property
-    def begun(self) -> bool:
-        """True if strokes were carried out before."""
-        return self.moves + self.replans > 0
-
-
-class RequestedPresses:
-    """The presses that a search requests, planned one at a time on the worker thread."""
-
-    def __init__(self, *, lockstep: bool) -> None:
-        self._lockstep = lockstep
-        self._request: PressRequest | None = None
-        self._planning: BackgroundTask[tuple[Segment, ...]] | None = None
-        self._number = 0
-        self.done = 0
-        """Number of the latest request that was carried out."""
-
-    def receive(self, request: PressRequest | None) -> None:
-        """Keep a request until the arm can carry it out: the search asks once."""
-        self._request = request or self._request
-
-    def drop_plan(self) -> None:
-        """Drop a press that is being planned on an outdated surface."""
-        self._planning = None
-
-    def step(self, t: int, presses: PressPlanner, palpation: Palpation, shift_A: Array) -> None:
-        """Plan the next press at `t` [ns], or append it to the strokes."""
-        if self._request is not None:
-            request, self._request = self._request.moved(shift_A), None
-            if request.xy is None:
-                palpation.close()
-            else:
-                self._planning = BackgroundTask(t, PLANNING_TIME, lambda: presses.press(request), lockstep=self._lockstep)
-                self._number = request.number
-        elif self._planning is not None and self._planning.due(t):
-            palpation.extend(self._planning.result())
-            self._planning = None
-        elif self._planning is None and palpation.waiting:
-            self.done = self._number
 
 
 class ExaminationSequence:
@@ -192,6 +112,16 @@ class ExaminationSequence:
     def skipped(self) -> dict[int, Cause]:
         """Skipped targets with the cause."""
         return dict(self._skipped)
+
+    @property
+    def unfelt(self) -> dict[int, Cause]:
+        """Targets that were to be felt and were not, with the cause: skipped ones, and those that an early end left."""
+        course, wanted = self._course, self._rest.wanted
+        if course.phase is Phase.DONE or self._known.exam.searched:
+            return self.skipped
+        everything = frozenset(range(self.status.target_count)) if wanted is None else wanted
+        left = everything if course.palpation is None else course.palpation.remaining
+        return dict.fromkeys(left, self.status.cause) | self._skipped
 
     def step(self, now: Observation) -> ExamStep:
         """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
@@ -285,11 +215,11 @@ class ExaminationSequence:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
         course, rest, sense, before = self._course, self._rest, self._sense, self._before
         course.perceived, self._averaged = perceived, None
-        sense.wall = sense.wall.rescanned(perceived.surface) if rest.moves else Wall(perceived.surface, sense.wall.breath)
+        sense.wall = sense.wall.rescanned(perceived.surface) if rest.rescans else Wall(perceived.surface, sense.wall.breath)
         count = self.status.target_count = len(perceived.positions)
         self.status.view_blocked = False
         text = f"planning over {count} targets"
-        if before is not None and not rest.moves:
+        if before is not None and not rest.rescans:
             X_WA = np.array(self._known.X_WA)
             if (away := perceived.surface.away_from(apply(X_WA, before.surface))) > EXAM.resume_distance_m:
                 limit = f"limit {EXAM.resume_distance_m * 1e3:.0f} mm"
@@ -342,10 +272,10 @@ class ExaminationSequence:
             planned_again = rest.wanted or frozenset()
             self._skipped = {i: cause for i, cause in self._skipped.items() if i not in planned_again} | plan.skipped
             self._sense.wall.shift_A = self._sense.wall.breath.shift_A
-            out.path = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m)
+            out.path, course.palpation = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m), None
             course.arm.start(plan.approach)
             self.status.targets_skipped = len(self._skipped)
-            course.enter(Phase.APPROACH, now.t, plan.skipped_text() or "approaching the first target")
+            course.enter(Phase.APPROACH, now.t, counted(plan.skipped.values()) or "approaching the first target")
         elif self._planning.late(now.t):
             self._planning = None
             self._give_up(now, out, FOR_PLAN.end)
@@ -366,6 +296,7 @@ class ExaminationSequence:
                 strokes=self.status.stroke,
                 more=course.plan.presses is not None,
             )
+            course.palpation.looked_again = self._rest.looked_again
             return self._palpate(now, out)
         return None
 
@@ -406,17 +337,20 @@ class ExaminationSequence:
         course, rest, cause = self._course, self._rest, palpation.left
         course.arm.hold(now.reading.q)
         self._requested.drop_plan()
-        more = palpation.open_ended or bool(palpation.ahead)
+        more = not palpation.failed and (palpation.open_ended or bool(palpation.ahead))
         wanted = None if palpation.open_ended else palpation.ahead
-        if more and palpation.moved and rest.moves < EXAM.moves_max:
-            rest.moves, rest.wanted, rest.bend = rest.moves + 1, wanted, None
+        if more and (palpation.moved or cause.reason is Reason.NO_TISSUE) and rest.rescans < EXAM.rescans_max:
+            rest.rescans, rest.wanted, rest.bend = rest.rescans + 1, wanted, None
+            rest.looked_again = rest.looked_again or not palpation.moved
+            why = MOVED if palpation.moved else cause
             self._views.restart()
-            course.enter(Phase.LOOK, now.t, "the patient has moved: looking again", MOVED)
+            course.enter(Phase.LOOK, now.t, f"{why.text}: looking again", why)
         elif more and cause.reason in REPLANNED and rest.replans < EXAM.replans_max:
             rest.replans, rest.wanted = rest.replans + 1, wanted
             rest.bend = max(rest.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
             course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause)
         else:
+            rest.unplanned = cause.text if palpation.open_ended else rest.unplanned  # a search that did not end by itself
             self._correct(out)
             course.go_home(now, palpation.failed)
             if cause and not palpation.failed:
@@ -425,7 +359,7 @@ class ExaminationSequence:
     def _correct(self, out: ExamStep) -> None:
         """Publish the final surface correction, unless the patient moved."""
         perceived, wall = self._course.perceived, self._sense.wall
-        if perceived is not None and not self._rest.moves and not wall.breath.moved:
+        if perceived is not None and not self._rest.rescans and not wall.breath.moved:
             out.correction = wall.corrected(perceived.vertices, self._averaged)
 
     def _held(self, now: Observation, out: ExamStep) -> Setpoint | None:
@@ -450,12 +384,22 @@ class ExaminationSequence:
 
     def _assess(self, now: Observation, out: ExamStep) -> None:
         if now.findings_final:
-            skipped = f", {len(self._skipped)} of {self.status.target_count} targets skipped" if self._skipped else ""
-            unplanned = f"; the rest was left: {self._rest.unplanned}" if self._rest.unplanned else ""
-            self._course.enter(Phase.DONE, now.t, f"examination complete{skipped}{unplanned}")
+            self._conclude(now.t)
         elif now.t - self._course.since > EXAM.findings_timeout_ns:
             text = f"no final findings after {EXAM.findings_timeout_ns / SECOND:.0f} s"
             self._course.abort(now, Cause(Reason.NO_FINDINGS, text, "assessment"))
+
+    def _conclude(self, t: int) -> None:
+        """End the examination at `t` [ns]: complete, incomplete, or failed because faults have cost too many targets."""
+        count, skipped, unplanned = self.status.target_count, self._skipped, self._rest.unplanned
+        lost = Counter(cause for cause in skipped.values() if cause.loss in FAULTS)
+        missing = [f"{len(skipped)} of {count} targets not felt: {counted(skipped.values())}"] if skipped else []
+        missing += [f"the rest was left: {unplanned}"] if unplanned else []
+        text = "; ".join(("examination incomplete", *missing)) if missing else "examination complete"
+        if lost.total() > EXAM.lost_fraction_max * count:
+            self._course.enter(Phase.ABORTED, t, text, lost.most_common(1)[0][0])
+        else:
+            self._course.enter(Phase.DONE, t, text)
 
 
 def _stay(now: Observation, out: ExamStep) -> None:

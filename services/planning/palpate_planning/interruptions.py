@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -45,6 +46,8 @@ class RecoveryTuning:
     soft_stops_max: int = 3
     repeats_max: int = 3
     """A stroke that is interrupted at one place more often is skipped from there on."""
+    blind_places_max: int = 2
+    """After no tissue was felt at this many places in a row, the surface or the force sensor is wrong."""
     one_place_m: float = 0.010
     """Two interruptions of a stroke that are closer than this are at one place."""
     displaced_max_m: float = 0.02
@@ -181,22 +184,22 @@ class Recovery:
         self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
         self.resume_at = max(s - back, 0.0)
         if self._repeats > RECOVERY.repeats_max:
-            self._skip(segment, segment.path.visits > s - 1e-6, cause)
-            self.resume_at, self._repeats = None, 0
+            self.give_up_place(segment, s, cause)
+
+    def give_up_place(self, segment: Segment, s: float, cause: Cause) -> None:
+        """Skip a stroke from path length s on."""
+        self._skip(segment, segment.path.visits > s - 1e-6, cause)
+        self.resume_at, self._repeats = None, 0
 
     def _skip(self, segment: Segment, visits: Bools, cause: Cause) -> None:
         """Skip targets, unless the skin is only touched there: they are pressed later."""
         if not segment.touch:
             self.skipped |= dict.fromkeys((int(i) for i in segment.path.targets[visits]), cause)
 
-    def leave(self, cause: Cause, segment: Segment, unfelt_from: float, later: list[int]) -> frozenset[int]:
-        """End the strokes early; skip and return the targets of the segment beyond a path length [m], and the `later` ones."""
-        ahead = list(later)
-        if segment.contact and not segment.touch:
-            ahead += [int(i) for i in segment.path.targets[segment.path.visits > unfelt_from]]
+    def leave(self, cause: Cause, targets: Iterable[int]) -> None:
+        """End the strokes early and skip the targets that are left."""
         self.left = cause
-        self.skipped |= dict.fromkeys(ahead, cause)
-        return frozenset(ahead)
+        self.skipped |= dict.fromkeys(targets, cause)
 
     def reached(self, position: float, *, slid: bool) -> float:
         """Return the path length up to which the present stroke has been measured [m]; before its first target if it has not."""

@@ -108,6 +108,9 @@ class Palpation:
         self.stage = StrokeStage.WAIT
         self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
         self._descent = Descent(self._motion, exam.depth_m, strokes)
+        self.looked_again = False
+        """True if the surface was scanned again because no tissue was felt."""
+        self._blind_places = 0
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
         self._recovery = Recovery(exam, limits, period_s)
         self._waits, self._strokes_before = StrokeWaits(period_s), strokes
@@ -159,6 +162,22 @@ class Palpation:
     def waiting(self) -> bool:
         """True if it waits for further segments."""
         return self.stage is StrokeStage.WAIT and len(self._segments) == self._number + 1
+
+    @property
+    def remaining(self) -> frozenset[int]:
+        """Targets of the present stroke that were not measured, and those of the later ones."""
+        segment, later = self._motion.segment, self._later
+        if not presses(segment):
+            return later
+        slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
+        reached = self._recovery.reached(self._motion.along.position, slid=slid)
+        behind = TUNING.unnoticed_m if self._watch.moved else 0.0
+        return later.union(segment.path.targets[segment.path.visits > reached - behind].tolist())
+
+    @property
+    def _later(self) -> frozenset[int]:
+        strokes = [segment for segment in self._segments[self._number + 1 :] if presses(segment)]
+        return frozenset(int(i) for stroke in strokes for i in stroke.path.targets)
 
     @property
     def open_ended(self) -> bool:
@@ -284,12 +303,21 @@ class Palpation:
     def _press(self) -> Stages[None]:
         """Press along the present segment, from where the arm is."""
         cause = yield from press(self._motion, self._descent)
-        if cause.reason is Reason.NO_TISSUE and self.stroke == 1:
-            self._recovery.give_up(cause)
-        elif cause.reason is Reason.NO_TISSUE:
-            self._skip_rest(cause)
+        self._blind_places = self._blind_places + 1 if cause.reason is Reason.NO_TISSUE else 0
+        if cause.reason is Reason.NO_TISSUE:
+            self._miss(cause)
         elif cause:
             self._recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, cause)
+
+    def _miss(self, cause: Cause) -> None:
+        """Scan the surface again where no tissue was felt; then give up the place; after several in a row, all of them."""
+        if not self.looked_again:
+            self._skip_rest(cause)
+        elif self._blind_places < RECOVERY.blind_places_max:
+            self._recovery.give_up_place(self._motion.segment, self._motion.along.position, cause)
+        else:
+            text = f"{cause.text}, at {self._blind_places} places: the surface or the force sensor is wrong"
+            self._recovery.give_up(cause._replace(text=text))
 
     def _lift(self) -> Stages[None]:
         """Lift off; take the stroke up again where it was interrupted, else move above the skin to the end of its path."""
@@ -407,13 +435,14 @@ class Palpation:
 
         A stroke in which the arm hides the wall is not `ahead`: the wall would be hidden there again.
         """
-        strokes = [s.path for s in self._segments[self._number + 1 :] if s.contact and not s.touch]
-        later = [int(i) for path in strokes for i in path.targets]
-        slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
-        reached = self._recovery.reached(self._motion.along.position, slid=slid)
-        behind = TUNING.unnoticed_m if self._watch.moved else 0.0
-        ahead = self._recovery.leave(cause, self._motion.segment, reached - behind, later)
-        self.ahead = frozenset(later) if cause.reason is Reason.WALL_HIDDEN else ahead
+        left = self.remaining
+        self._recovery.leave(cause, left)
+        self.ahead = self._later if cause.reason is Reason.WALL_HIDDEN else left
+
+
+def presses(segment: Segment) -> bool:
+    """Return True for a stroke that measures its targets."""
+    return segment.contact and not segment.touch
 
 
 def _done() -> Stages[None]:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import logging
-from collections.abc import Iterator, Mapping
+from collections import Counter
+from collections.abc import Mapping
 from functools import cache
 from typing import Any, ClassVar
 
@@ -44,8 +44,6 @@ NEEDED = ("robot", "assessment", "supervisor", "conductor")
 """Roles whose loss ends the examination in any phase. Without the conductor no operator could stop it."""
 NEEDED_BEFORE_TARGETS = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the examination before there are targets."""
-PERCEPTION_TOPICS = ("perception/surface", "perception/targets", "perception/motion", "perception/correction")
-"""Topics of perception that move the arm: messages that violate the contract are dropped."""
 CULPRITS = {
     PalpationTargets.NONE: "perception",
     PalpationTargets.NO_DEPTH: "camera/depth/image_raw",
@@ -55,6 +53,8 @@ CULPRITS = {
     PalpationTargets.BAD_FRAMES: "camera/depth/image_raw",
 }
 """Role or topic at fault, by the reason why perception has no targets."""
+FINAL = frozenset({SupervisorState.CAUSE_SENSOR})
+"""Causes of a stop that no release ends."""
 BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
 
@@ -78,15 +78,18 @@ class PlanningService(Service):
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
         self._peak_force = 0.0
-        self._refused = 0
+        self._commanded = False
+        """True once the driver has accepted a command."""
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Advance one planning period: read the measurements, step the examination, write set-point and state."""
         status = inbox.latest("robot/status")
         if status is not None:
-            self._read(status)
+            self._reading = SensorReading(status.position.copy(), wrench(status.wrench), status.velocity.copy())
+            self._commanded = self._commanded or status.mode == RobotStatus.MODE_ACTIVE
         requests = tuple(inbox.new("operator/request"))
-        stop, soft = _stop(status, inbox.latest("supervisor/state"), requests)
+        state = inbox.latest("supervisor/state")
+        stop, soft = _stop(status, state, requests, self._commanded)
         step = self._exam.step(
             Observation(
                 t=t,
@@ -97,6 +100,7 @@ class PlanningService(Service):
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
                 stop=stop,
                 soft=soft,
+                final=state is not None and state.level != SupervisorState.LEVEL_OK and state.cause in FINAL,
                 end=_end(requests),
                 lost=self._lost(t, inbox),
                 request=self._request(inbox),
@@ -119,42 +123,27 @@ class PlanningService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Return the phase reached, targets, skipped targets with causes, highest measured force [N]."""
+        """Return phase, targets, skipped ones with causes, those not felt by `Loss`, and the highest measured force [N]."""
         status = self._exam.status
         return {
             "phase": status.phase.name,
             "message": status.message,
             "targets": status.target_count,
             "skipped_targets": {str(i): cause.text for i, cause in sorted(self._exam.skipped.items())},
+            "unfelt_targets": Counter(cause.loss.value for cause in self._exam.unfelt.values()),
             "peak_force_N": self._peak_force,
-            "refused_messages": self._refused,
         }
-
-    def _valid(self, inbox: Inbox, topic: str) -> Iterator[Message | None]:
-        """Yield the new messages of a topic; None for one whose arrays are too short, which is counted and logged."""
-        for message in inbox.new(topic):
-            wrong = _too_short(message)
-            if wrong:
-                self._refused += 1
-                logging.getLogger(self.role).warning("%s of %s refused: %s", topic, contract().topics[topic].producer, wrong[0])
-            yield None if wrong else message
-
-    def _read(self, status: Message) -> None:
-        """Read joint positions and wrench, averaged by the robot over one period: force and depth of the same moment."""
-        self._reading = SensorReading(status.position.copy(), wrench(status.wrench), status.velocity.copy())
 
     def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | PerceptionFailure | None:
         """Return perception's newest answer, if one arrived."""
-        for mesh in self._valid(inbox, "perception/surface"):
+        for mesh in inbox.new("perception/surface"):
             self._mesh = mesh
         answer: PerceivedAbdomen | PerceptionFailure | None = None
-        for targets in self._valid(inbox, "perception/targets"):
+        for targets in inbox.new("perception/targets"):
             answer = self._answer(targets)
         return answer
 
-    def _answer(self, targets: Message | None) -> PerceivedAbdomen | PerceptionFailure:
-        if targets is None:
-            return PerceptionFailure(Cause(Reason.VIEW_FAILED, "perception/targets: refused", "perception/targets"))
+    def _answer(self, targets: Message) -> PerceivedAbdomen | PerceptionFailure:
         if not len(targets.positions) or self._mesh is None:
             text = targets.message or "perception found no targets, or no usable surface"
             blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
@@ -167,13 +156,14 @@ class PlanningService(Service):
 
     def _motion(self, inbox: Inbox) -> BreathObservation | None:
         """Return the newest motion of the wall, if one arrived and the scenario follows it."""
-        received = [motion_of(message) for message in self._valid(inbox, "perception/motion") if message is not None]
+        whole = (message for message in inbox.new("perception/motion") if len(message.forecast) >= SurfaceMotion.FORECASTS)
+        received = [motion_of(message) for message in whole]  # the contract has no lengths
         return received[-1] if received and self._known.exam.breathing is not Following.IGNORE else None
 
     def _averaged(self, inbox: Inbox) -> Array | None:
         """Return the height of the wall averaged over all images, if it arrived and belongs to the present surface."""
-        for message in self._valid(inbox, "perception/correction"):
-            if message is not None and self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
+        for message in inbox.new("perception/correction"):
+            if self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
                 return np.asarray(message.outward, dtype=float)
         return None
 
@@ -200,25 +190,19 @@ class PlanningService(Service):
         return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 
 
-def _too_short(message: Message) -> list[str]:
-    """Return an error if an array of a perception message is too short: the contract has no lengths."""
-    if isinstance(message, SurfaceMotion) and len(message.forecast) < SurfaceMotion.FORECASTS:
-        return [f"forecast has {len(message.forecast)} values, want {SurfaceMotion.FORECASTS}"]
-    return []
-
-
-def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...]) -> tuple[Cause, bool]:
+def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...], commanded: bool) -> tuple[Cause, bool]:
     """Return the cause of a stop, if any, and True for a soft stop, after which planning retreats (else the driver holds).
 
-    `status` is the latest `robot/status`, `state` the latest `supervisor/state`.
+    `status` is the latest `robot/status`, `state` the latest `supervisor/state`. `commanded`: the driver has accepted a command;
+    one that is idle again, after a release, awaits the next.
     """
     for request in requests:
         if request.request == OperatorRequest.STOP:
             return Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), False
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {status.reason}", status.culprit), False
-    if status is not None and status.mode == RobotStatus.MODE_IDLE and status.cause != RobotStatus.CAUSE_NONE:
-        return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason}", "robot"), False
+    if status is not None and status.mode == RobotStatus.MODE_IDLE and (commanded or status.cause != RobotStatus.CAUSE_NONE):
+        return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason or 'no command yet'}", "robot"), False
     if state is None or state.level == SupervisorState.LEVEL_OK:
         return NO_CAUSE, False
     if state.level == SupervisorState.LEVEL_SOFT_STOP:

@@ -76,6 +76,8 @@ class Observation(NamedTuple):
     """Cause for which the arm must rest, if any."""
     soft: bool = False
     """True if the stop leaves the arm to planning, which retreats along the normal; else the driver holds."""
+    final: bool = False
+    """True if no release can end the cause of the stop."""
     end: Cause = NO_CAUSE
     """Cause for which the examination is to go home and end, if that was just requested."""
     lost: Cause = NO_CAUSE

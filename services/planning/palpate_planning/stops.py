@@ -86,15 +86,15 @@ class Stops:
         """True if the stop was released and the arm returns to where it was."""
 
     def watch(self, now: Observation) -> None:
-        """Hold the examination when it is stopped; end it when a needed service is lost or an operator ends it."""
+        """Hold the examination when it is stopped; end it when a needed service or sensor is lost or an operator ends it."""
         course = self._course
         if course.phase in OVER:
             return
         if now.stop and course.phase is not Phase.HELD:
             course.interrupted = course.phase
             self._hold(now)
-        if now.lost:
-            self._end_after_loss(now, now.lost)
+        if now.lost or (now.stop and now.final):
+            self._end_after_loss(now, now.lost or now.stop)
         elif now.end:
             self._end_at_home(now, now.end)
 

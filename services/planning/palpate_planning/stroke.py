@@ -45,6 +45,9 @@ class TouchTuning:
     """Speed at which the skin is sought: force rises by about 3 N/s."""
     sigmas: float = 3.0
     """The skin is sought within this many standard deviations of its estimate."""
+    blind_m: float = 0.020
+    """The skin is sought no deeper than this below where it is believed: three SD of camera and arm together (6.5 mm with typical
+    errors, 1,000 tuning seeds)."""
     margin_m: float = 0.003
     """The search begins at this height above that range: the fit of the onset needs samples in air."""
     rest_s: float = 0.15
@@ -269,12 +272,15 @@ class Descent:
         return over
 
     def probe(self, now: StrokeInput) -> bool:
-        """Descend fast to the uncertainty of the wall, from there at probe speed; return True once the skin is touched."""
+        """Descend fast to the uncertainty of the wall, from there at probe speed; return True once the skin is touched.
+
+        What is known of the wall bounds the descent, whatever the force is.
+        """
         contact, depth = now.contact, self._motion.depth
         unsure = TOUCH.sigmas * contact.wall.sigma
         braking = depth.velocity**2 / MOTION.depth_acceleration_mps2
         near = depth.position > -unsure - TOUCH.margin_m - braking
-        self._deepest = max(self._deepest, unsure + self._depth)  # monotonic, as the height of a rest
+        self._deepest = max(self._deepest, min(unsure + self._depth, TOUCH.blind_m))  # monotonic, as the height of a rest
         there = depth.step(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps)
         if near:
             self._onset.add(contact.depth, contact.force, now.t, contact.wall.displacement)

@@ -109,6 +109,7 @@ class World:
         self.depth = self.pressed = 0.0
         self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
         self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, NO_CAUSE
+        self.final = False
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
         self.setpoints: list[Setpoint] = []
         self._answer_at: int | None = None
@@ -156,7 +157,9 @@ class World:
         final = self.exam.status.phase is Phase.ASSESS
         reading = SensorReading(self.q.copy(), wrench, qd)
         motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
-        outcome = self.exam.step(Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.end, self.lost))
+        outcome = self.exam.step(
+            Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.final, self.end, self.lost)
+        )
         self.end = NO_CAUSE
         if outcome.trigger:
             self._answer_at, self.moved = self.t + 300 * MS, False

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import PERIOD_S, World, hertz, known
+from planning_fakes import PERIOD_S, PERIODS, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
+from palpate_planning.contact import ContactMeasurement, SensorReading
+from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
-from palpate_planning.reasons import Cause, Reason
+from palpate_planning.reasons import NO_CAUSE, Cause, Loss, Reason
 from palpate_planning.status import Observation, PerceptionFailure, Phase
 from palpate_planning.strokes.segments import STRETCHED
 
@@ -118,11 +121,34 @@ def test_touch_corrects_a_camera_that_is_off(offset: float) -> None:
     assert np.sqrt(np.mean((steady - 0.010) ** 2)) < 6e-4
 
 
-def test_no_tissue_where_it_should_be_gives_up() -> None:
-    world = World(known(region_m=(0.025, 0.0125)), offset=-0.05)
-    world.run()
+def test_no_tissue_where_it_should_be_looks_again_then_gives_up() -> None:
+    world = World(known(region_m=(0.025, 0.025)), offset=-0.05)
+    looks = depth = 0.0
+    while world.exam.status.end_tick < 0:
+        step = world.step()
+        looks += step.trigger
+        depth = max(depth, -0.05 if step.contact is None else step.contact.depth - step.contact.wall.correction)
+    status = world.exam.status
+    assert (status.phase, status.cause.reason, looks) == (Phase.ABORTED, Reason.NO_TISSUE, 2)
+    assert 0.018 < depth < 0.0205, "it ends about 20 mm below where the skin is believed"
+    assert sum(cause.loss is Loss.NO_CONTACT for cause in world.exam.unfelt.values()) == status.target_count
+
+
+def test_a_force_sensor_that_freezes_is_neither_pressed_deep_nor_called_complete() -> None:
+    """It freezes in the first scan. Next to a touched place the next descent ends 3 SD below the depth of the examination."""
+    world, frozen = World(known(pattern="raster", region_m=(0.025, 0.025))), []
+    world.run(lambda: world.exam.status.phase is Phase.SCAN)
+    sense = world.exam._sense.sense
+
+    def freeze(reading: SensorReading, t: int) -> ContactMeasurement:
+        frozen.append(reading.wrench_S)
+        return sense(reading._replace(wrench_S=frozen[0]), t)
+
+    world.exam._sense.sense = freeze  # type: ignore[method-assign]
+    world.run(seconds=200.0)
     assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.cause.reason is Reason.NO_TISSUE
+    assert max(row[4] for row in world.rows) < 0.0135
+    assert Counter(cause.loss for cause in world.exam.unfelt.values())[Loss.NO_CONTACT] >= 6
 
 
 def test_a_touch_ends_on_very_soft_skin_with_wrong_forecasts() -> None:
@@ -160,6 +186,29 @@ def test_soft_stop_skips_targets_then_gives_up() -> None:
     assert world.exam.status.phase is Phase.ABORTED
     assert world.exam.status.cause.reason is Reason.FORCE
     assert world.exam.status.targets_skipped >= 3
+
+
+@pytest.mark.parametrize(
+    ("cause", "count", "phase", "text"),
+    [
+        (STRETCHED, 20, Phase.DONE, "incomplete"),
+        (Cause(Reason.OPERATOR_END, "enough"), 20, Phase.DONE, "incomplete"),
+        (Cause(Reason.CONTACT_LOST, "contact was lost"), 2, Phase.DONE, "incomplete"),
+        (
+            Cause(Reason.CONTACT_LOST, "contact was lost"),
+            3,
+            Phase.ABORTED,
+            "3 of 20 targets not felt: 3 targets skipped: contact",
+        ),
+        (NO_CAUSE, 0, Phase.DONE, "examination complete"),
+    ],
+)
+def test_only_what_is_complete_is_called_so(cause: Cause, count: int, phase: Phase, text: str) -> None:
+    exam = ExaminationSequence(known(), PERIODS)
+    exam.status.target_count, exam._skipped = 20, dict.fromkeys(range(count), cause)
+    exam._conclude(0)
+    assert exam.status.phase is phase
+    assert text in exam.status.message
 
 
 def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:

@@ -108,6 +108,17 @@ def test_without_a_release_it_ends() -> None:
     assert world.t == pytest.approx(status.end_tick - 1_000_000_000 + 10_000_000)
 
 
+@pytest.mark.parametrize("soft", [False, True])
+def test_a_stop_that_no_release_can_end_ends_it_at_once(soft: bool) -> None:
+    world = stopped_in(Phase.SCAN, soft=soft, seconds=0.02)
+    world.final = True
+    world.run(seconds=world.t / 1e9 + 3.0)
+    assert world.exam.status.phase is Phase.ABORTED
+    assert world.exam.status.cause.reason is Reason.EMERGENCY_STOP
+    assert len(world.exam.unfelt) >= 3
+    assert (world.pressed > 0.0) is not soft, "if planning moves the arm it is lifted"
+
+
 def drawn_sideways(world: World) -> float:
     """Run to the end; return the largest lateral distance [m] between set-point and an arm in the tissue."""
     begun, worst = len(world.rows), 0.0

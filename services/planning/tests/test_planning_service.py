@@ -155,7 +155,7 @@ def test_the_arm_is_held_where_it_was_found() -> None:
     assert np.all(out["planning/setpoint"].joint_stiffness > 0)
 
 
-@pytest.mark.parametrize("cause", ["hold", "unready", "operator", "soft", "robot"])
+@pytest.mark.parametrize("cause", ["hold", "unready", "idle", "operator", "soft", "robot"])
 def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     service = create(Scenario(robot=BASE))
     inbox = HandInbox()
@@ -168,6 +168,9 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
         inbox.put("robot/status", hold)
     elif cause == "unready":
         inbox.put("robot/status", status(10_000_000, q, np.zeros(6), RobotStatus.MODE_IDLE, "MONITORING_READY"))
+    elif cause == "idle":
+        service.step(10_000_000, inbox)
+        inbox.put("robot/status", status(20_000_000, q, np.zeros(6), RobotStatus.MODE_IDLE, ""))
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
@@ -181,6 +184,7 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
         == {
             "hold": Reason.ROBOT_HOLD,
             "unready": Reason.ROBOT_NOT_READY,
+            "idle": Reason.ROBOT_NOT_READY,
             "operator": Reason.OPERATOR_STOP,
             "soft": Reason.SOFT_STOP,
             "robot": Reason.SERVICE_LOST,

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
+from palpate_bus.messages import RobotStatus
 from palpate_supervisor.watch import Breach, Level, StopCause
 
 
@@ -16,11 +17,25 @@ class LatchTuning:
     """Driver hold is ignored for this long after a release (message latency)."""
     further_m: float = 0.010
     """After a release, a tool that goes this much further beyond its limit is stopped again."""
+    over_ns: int = 1_000_000_000
+    """The supervisor releases a harmless stop by itself after its cause has been over for this long."""
+    own_releases_max: int = 3
+    """Number of such releases in a run."""
 
 
 TUNING = LatchTuning()
 RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
 """Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
+HARMLESS = frozenset(
+    {
+        (StopCause.FORCE, RobotStatus.CAUSE_NONE),
+        (StopCause.SILENT, RobotStatus.CAUSE_NONE),
+        (StopCause.DRIVER, RobotStatus.CAUSE_COMMAND_EXPIRED),
+        (StopCause.DRIVER, RobotStatus.CAUSE_FORCE_LIMIT),
+        (StopCause.DRIVER, RobotStatus.CAUSE_STOP_REQUESTED),
+    }
+)
+"""Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,6 +56,8 @@ class Latch:
         self.cause = StopCause.NONE
         self.reason = self.culprit = ""
         self.releases = 0
+        self.own_releases = 0
+        """Releases without an operator; they count as releases, too."""
         self.refusals = 0
         self.stops: list[Stop] = []
         """All stops; an escalation counts again."""
@@ -48,9 +65,13 @@ class Latch:
         self._released = -TUNING.driver_grace_ns
         self._recovering: dict[StopCause, Breach] = {}  # ignored breaches, as they were at the release
         self._begun: dict[StopCause, int] = {}  # start of each uninterrupted present cause [ns]
+        self._causes: set[tuple[StopCause, int]] = set()  # all causes since the stop began
+        self._present = 0  # time of the latest cause other than the driver's hold [ns]
 
     def update(self, t: int, breaches: Sequence[Breach], release: bool) -> None:
         """Update the latch at `t` [ns] with the present breaches and an operator's request for release."""
+        if not release and self._is_over(t, breaches):
+            release, self.own_releases = True, self.own_releases + 1
         if not (breaches or release):
             self._recovering.clear()
             self._begun.clear()
@@ -70,6 +91,14 @@ class Latch:
             if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
                 reason = f"soft stop did not help within {breach.timeout_ns / 1e6:.0f} ms: {breach.reason}"
                 self._latch(t, Breach(Level.EMERGENCY, StopCause.UNHEEDED, reason, culprit=breach.culprit))
+        self._causes = self._causes | {(breach.cause, breach.hold) for breach in standing} if self.level else set()
+
+    def _is_over(self, t: int, breaches: Sequence[Breach]) -> bool:
+        """Return True if a stop has only had causes that do no harm and that have been over for long enough."""
+        if any(breach.cause is not StopCause.DRIVER for breach in breaches) or not self.level:
+            self._present = t
+        harmless = self._causes <= HARMLESS and self.own_releases < TUNING.own_releases_max
+        return harmless and t - max(self._since, self._present) > TUNING.over_ns
 
     def _recovers(self, breach: Breach) -> bool:
         """Return True if `breach` was released and has not grown since."""

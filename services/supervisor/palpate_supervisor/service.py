@@ -94,7 +94,7 @@ class SupervisorService(Service):
         return {"supervisor/state": state}
 
     def finish(self) -> Mapping[str, Any]:
-        """Return all stops with their cause, granted releases, and the largest force [N] and speed [m/s]."""
+        """Return all stops with their cause, all and own releases, and the largest force [N] and speed [m/s]."""
         stops = [
             {"t_s": stop.t / NS, "level": stop.level.name, "cause": stop.cause.name, "reason": stop.reason}
             for stop in self._latch.stops
@@ -102,6 +102,7 @@ class SupervisorService(Service):
         return {
             "stops": stops,
             "releases": self._latch.releases,
+            "own_releases": self._latch.own_releases,
             "peak_external_force_N": self._peak_force,
             "peak_tool_speed_mps": self._peak_speed,
         }
@@ -143,19 +144,19 @@ class SupervisorService(Service):
         self._tool = tool = self._sense.sense(*values.values())
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
-        depth = None if self._surface is None else self._surface.depth(tool.p_W)
-        self._depth = TUNING.no_depth_m if depth is None else min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
+        depth, above = (TUNING.no_depth_m, False) if self._surface is None else self._surface.depth(tool.p_W)
+        self._depth = min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
         stamp = nanoseconds(status.header.stamp)
         if stamp != self._stamp:
             self._stamp, self._stamped = stamp, t
-        found = self._watch.judge(tool, depth, stamp, t)
+        found = self._watch.judge(tool, depth if above else None, stamp, t)
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
             reason = f"robot/status repeats a measurement of age {age}"
             found.append(Breach(Level.EMERGENCY, StopCause.SILENT, reason, culprit="robot/status"))
         if status.mode == RobotStatus.MODE_SAFE_HOLD:
             reason = f"safe hold of the driver: {status.reason}"
-            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit))
+            found.append(Breach(Level.EMERGENCY, StopCause.DRIVER, reason, culprit=status.culprit, hold=status.cause))
         return found
 
 

@@ -27,6 +27,8 @@ class BiasTuning:
 
 
 TUNING = BiasTuning()
+OVER_M = 0.015
+"""A tool is over the perceived surface up to this distance along it from the nearest vertex; the mesh has 5 mm."""
 
 
 class Tool(NamedTuple):
@@ -88,7 +90,9 @@ class RestSurface:
             raise ValueError("perceived surface: vertices and normals must be finite")
         self._vertices, self._normals, self._radius = np.ascontiguousarray(vertices_W, float), normals_W, radius
 
-    def depth(self, p_W: Array) -> float:
-        """Return the depth of the sphere's deepest point [m]; negative above the surface."""
+    def depth(self, p_W: Array) -> tuple[float, bool]:
+        """Return the depth of the sphere's deepest point [m], negative above the surface, and True if it is over the surface."""
         _, i = nearest_vertex(p_W, self._vertices)
-        return self._radius - float(self._normals[i] @ (p_W - self._vertices[i]))
+        gap = p_W - self._vertices[i]
+        distance = float(self._normals[i] @ gap)
+        return self._radius - distance, float(gap @ gap) - distance**2 < OVER_M**2

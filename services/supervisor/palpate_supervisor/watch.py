@@ -8,6 +8,7 @@ from enum import IntEnum
 
 import numpy as np
 
+from palpate_bus.messages import RobotStatus
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import Tool
@@ -80,6 +81,8 @@ class Breach:
     """Distance beyond the limit of depth or workspace."""
     culprit: str = ""
     """Role or topic that is missing or invalid."""
+    hold: int = RobotStatus.CAUSE_NONE
+    """Cause of the driver's hold."""
 
 
 class LimitWatch:
@@ -95,11 +98,12 @@ class LimitWatch:
     def judge(self, tool: Tool, depth: float | None, stamp: int, t: int) -> list[Breach]:
         """Return the breaches at `t` [ns] of a measurement stamped `stamp` [ns].
 
-        `depth` [m] is below the perceived surface, None while there is no surface.
+        `depth` [m] is below the perceived surface. It is None without a surface and where the tool is not over it: there,
+        workspace and force are the limits.
         """
         p_W, speed, force = tool
         found = self._force(force, stamp, t) + self._speed(speed, force) + self._workspace(p_W)
-        return found if depth is None else found + self._depth(depth, force)
+        return found if depth is None else found + self._depth(depth)
 
     def _force(self, force: float, stamp: int, t: int) -> list[Breach]:
         limits, forces = self._limits, self._forces
@@ -123,10 +127,10 @@ class LimitWatch:
         timeout = TUNING.rising_timeout_ns if rising else TUNING.soft_stop_timeout_ns
         return [Breach(Level.SOFT_STOP, StopCause.FORCE, f"{found}, soft-stop limit {limits.force_soft_stop_n:g} N", timeout)]
 
-    def _depth(self, depth: float, force: float) -> list[Breach]:
+    def _depth(self, depth: float) -> list[Breach]:
         limit = self._limits.depth_m + TUNING.depth_margin_m
-        if depth <= limit or force <= TUNING.contact_n:
-            return []  # without force there is no tissue: the arm is next to the abdomen, which the workspace check covers
+        if depth <= limit:
+            return []
         level = Level.EMERGENCY if depth > limit + TUNING.depth_margin_m else Level.SOFT_STOP
         reason = f"depth {depth * 1e3:.1f} mm below the perceived surface, limit {limit * 1e3:.1f} mm"
         return [Breach(level, StopCause.DEPTH, reason, beyond_m=depth - limit)]

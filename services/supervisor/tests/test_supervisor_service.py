@@ -43,6 +43,7 @@ def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth
         ({"speed": 0.7}, Level.EMERGENCY, StopCause.SPEED),
         ({"speed": 0.3, "force": 6.0}, Level.EMERGENCY, StopCause.SPEED),
         ({"depth": 0.047, "force": 9.0}, Level.SOFT_STOP, StopCause.DEPTH),
+        ({"depth": 0.047}, Level.SOFT_STOP, StopCause.DEPTH),
         ({"depth": 0.071, "force": 9.0}, Level.EMERGENCY, StopCause.DEPTH),
         ({"p_W": np.array([0.56, 0.0, 0.80])}, Level.EMERGENCY, StopCause.WORKSPACE),
         ({"p_W": np.array([0.56, 0.7, 1.2])}, Level.EMERGENCY, StopCause.WORKSPACE),
@@ -59,7 +60,7 @@ def test_a_broken_limit_is_named_with_value_and_limit(values: dict[str, object],
     [
         {"force": 15.0, "depth": 0.02, "speed": 0.1},
         {"speed": 0.55, "force": 3.2},
-        {"depth": 0.1},
+        {"depth": None},
         {"p_W": np.array([0.2548758, 0.02, 1.68598239])},
     ],
 )
@@ -149,7 +150,11 @@ def test_depth_over_a_dome_is_that_of_geometry() -> None:
     surface = RestSurface(p, p / R, r)
     for direction in ((0.0, 0.0, 1.0), (0.08, -0.05, 1.0), (-0.11, 0.02, 1.0)):
         n = np.array(direction) / np.linalg.norm(direction)
-        assert surface.depth(n * (R - 0.010 + r)) == pytest.approx(0.010, abs=1e-4)
+        for depth in (0.010, 0.05):
+            found, above = surface.depth(n * (R - depth + r))
+            assert found == pytest.approx(depth, abs=1e-3 * depth + 1e-4)
+            assert above
+    assert not surface.depth(np.array((0.08, 0.0, 0.2)))[1], "it is not over the surface"
 
 
 def test_depth_is_that_at_the_nearest_vertex() -> None:
@@ -158,7 +163,7 @@ def test_depth_is_that_at_the_nearest_vertex() -> None:
     surface = RestSurface(vertices, normals, 0.015)
     for p in rng.normal(size=(100, 3)):
         i = int(np.argmin(np.linalg.norm(vertices - p, axis=1)))
-        assert surface.depth(p) == pytest.approx(0.015 - normals[i] @ (p - vertices[i]))
+        assert surface.depth(p)[0] == pytest.approx(0.015 - normals[i] @ (p - vertices[i]))
 
 
 @pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
@@ -218,6 +223,33 @@ def test_a_soft_stop_that_helps_stays_one() -> None:
     for t in range(10 * MS, 2 * TUNING.soft_stop_timeout_ns, 10 * MS):
         latch.update(t, [], False)
     assert latch.level is Level.SOFT_STOP
+
+
+@pytest.mark.parametrize(
+    ("breach", "alone"),
+    [
+        (SOFT, True),
+        (EMERGENCY, True),
+        (replace(DRIVER, hold=RobotStatus.CAUSE_COMMAND_EXPIRED), True),
+        (replace(DRIVER, hold=RobotStatus.CAUSE_VELOCITY_LIMIT), False),
+        (DEPTH, False),
+        (Breach(Level.SOFT_STOP, StopCause.OPERATOR, "soft stop by the operator"), False),
+    ],
+)
+def test_only_a_harmless_cause_that_is_over_is_released_alone_and_not_often(breach: Breach, alone: bool) -> None:
+    latch, over, held = Latch(), latch_module.TUNING.over_ns, replace(DRIVER, hold=RobotStatus.CAUSE_STOP_REQUESTED)
+    later = [] if breach.level is Level.SOFT_STOP else [breach if breach.cause is StopCause.DRIVER else held]
+    t = 0
+    for _ in range(latch_module.TUNING.own_releases_max if alone else 1):
+        latch.update(t, [breach], False)
+        latch.update(t + over, later, False)
+        assert latch.level is breach.level, "not over for long enough"
+        latch.update(t + over + 10 * MS, later, False)
+        assert (latch.level is Level.OK) is alone
+        t += 2 * over
+    latch.update(t, [breach], False)
+    latch.update(t + 2 * over, later, False)
+    assert latch.level is not Level.OK
 
 
 def test_a_release_is_refused_while_the_cause_stands() -> None:

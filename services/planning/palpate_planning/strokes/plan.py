@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections import Counter
 from dataclasses import dataclass
 
 import numpy as np
@@ -77,11 +76,6 @@ class ExamPlan:
                 centres = centre(segment.path.p, segment.path.n, radius, depth)
                 out += [pose(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
         return np.array(out)
-
-    def skipped_text(self) -> str:
-        """Return how many targets are skipped and why; empty if none are."""
-        counts = Counter(cause.text for cause in self.skipped.values())
-        return "; ".join(f"{count} targets skipped: {reason}" for reason, count in sorted(counts.items()))
 
 
 class ExamPlanner:

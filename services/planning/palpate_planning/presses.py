@@ -1,0 +1,44 @@
+"""Presses that a search requests, appended to the strokes one at a time."""
+
+from __future__ import annotations
+
+from palpate_models.numerics.frames import Array
+from palpate_planning.free_motion import BackgroundTask
+from palpate_planning.palpation import Palpation
+from palpate_planning.strokes.requests import PLANNING_TIME, PressPlanner, PressRequest
+from palpate_planning.strokes.segments import Segment
+
+
+class RequestedPresses:
+    """The presses that a search requests, planned one at a time on the worker thread."""
+
+    def __init__(self, *, lockstep: bool) -> None:
+        self._lockstep = lockstep
+        self._request: PressRequest | None = None
+        self._planning: BackgroundTask[tuple[Segment, ...]] | None = None
+        self._number = 0
+        self.done = 0
+        """Number of the latest request that was carried out."""
+
+    def receive(self, request: PressRequest | None) -> None:
+        """Keep a request until the arm can carry it out: the search asks once."""
+        self._request = request or self._request
+
+    def drop_plan(self) -> None:
+        """Drop a press that is being planned on an outdated surface."""
+        self._planning = None
+
+    def step(self, t: int, presses: PressPlanner, palpation: Palpation, shift_A: Array) -> None:
+        """Plan the next press at `t` [ns], or append it to the strokes."""
+        if self._request is not None:
+            request, self._request = self._request.moved(shift_A), None
+            if request.xy is None:
+                palpation.close()
+            else:
+                self._planning = BackgroundTask(t, PLANNING_TIME, lambda: presses.press(request), lockstep=self._lockstep)
+                self._number = request.number
+        elif self._planning is not None and self._planning.due(t):
+            palpation.extend(self._planning.result())
+            self._planning = None
+        elif self._planning is None and palpation.waiting:
+            self.done = self._number
