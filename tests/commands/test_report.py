@@ -214,6 +214,23 @@ def test_a_held_arm_is_reported_once_with_the_failure(
         assert "findings.confidence" not in said
 
 
+@pytest.mark.parametrize(
+    ("facts", "failure", "share"),
+    [
+        ({"planning": {"facts": {"unfelt_targets": {"no_contact": 24}}}}, None, {"no_contact": 0.24}),
+        ({}, None, {"not_reached": 0.02}),
+        ({}, "planning lost", {"unfinished": 0.01}),
+    ],
+)
+def test_targets_that_were_not_felt_are_unassessed(
+    scenario: Scenario, facts: dict[str, object], failure: str | None, share: dict[str, float]
+) -> None:
+    ran = replace(result(collected(map_too=False), failure), counters=facts)
+    region = float(np.prod(scenario.exam.region_m))
+    found = assemble(scenario, ran, Known(None, None, None)).unassessed_m2
+    assert found == pytest.approx({reason: part * region for reason, part in share.items()})
+
+
 def test_a_map_that_cannot_be_drawn_leaves_all_other_results(
     scenario: Scenario, folder: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
