@@ -105,7 +105,7 @@ def lattice(half_s: float, half_y: float, edge: float) -> Array:
     return np.asarray(points[np.abs(points[:, 0]) <= half_s])
 
 
-def _rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float) -> Array:
+def rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float) -> Array:
     """Points on offset curves of the inner rectangle, ever coarser, kept inside the outer one; shape (n, 2)."""
     rings: list[Array] = []
     offset = 0.9 * edge
@@ -151,7 +151,7 @@ def _plan(body: _Body, edge: float) -> tuple[Array, int]:
         min(EXAMINED_HALF_M, 0.8 * body.half_length),
     )
     outer = (body.half_arc, body.half_length)
-    inside = np.concatenate((lattice(half_s, half_y, edge), _rings(half_s, half_y, outer, edge)))
+    inside = np.concatenate((lattice(half_s, half_y, edge), rings(half_s, half_y, outer, edge)))
     end = _graded(outer[0], outer[1] - half_y, half_s, edge)
     side = _graded(outer[1], outer[0] - half_s, half_y, edge)[:-1]
     s_end = np.concatenate((-end[:0:-1], end))

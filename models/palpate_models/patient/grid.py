@@ -13,10 +13,12 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial import Delaunay
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.abdomen import Shape, lattice
+from palpate_models.patient.abdomen import Shape, lattice, rings
 from palpate_models.patient.mesh import boundary_vertices, orient, vertex_normals
 from palpate_models.patient.mesh_file import MeshError
 
+APRON_M = 0.12
+"""Continuation of a body around its grid: the camera follows the wall next to the arm."""
 LEAST_NODES = 4
 """Least number of nodes along an axis."""
 _PITCH_TOLERANCE = 0.01
@@ -49,10 +51,12 @@ class BodyGrid:
         return np.asarray(RegularGridInterpolator(axes, values)(inside))
 
     def surface(self, edge_m: float) -> Shape:
-        """Return the surface with edges of about `edge_m` [m]; its border is fixed."""
+        """Return the surface with edges of about `edge_m` [m]; it continues by `APRON_M` to a fixed border."""
         low, high = (np.array((f(self.x_m), f(self.y_m))) for f in (np.min, np.max))
-        middle, half = (low + high) / 2, (high - low) / 2
-        xy = middle + lattice(half[0], half[1], edge_m)
+        half = (high - low) / 2
+        inner = lattice(half[0], half[1], edge_m)
+        apron = rings(half[0], half[1], (half[0] + APRON_M, half[1] + APRON_M), edge_m)
+        xy = (low + high) / 2 + np.concatenate((inner, apron))
         vertices = np.column_stack((xy, self.at("z_m", xy)))
         triangles = Delaunay(np.round(xy, 7)).simplices.astype(np.int32)
         corners = xy[triangles]
