@@ -34,6 +34,7 @@ from palpate_bus.settings import RECORDING
 from palpate_bus.wire.zenoh_config import session
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
+from palpate_inputs import InputFile
 from palpate_models.scenario.load import load_scenario
 
 DISORDER = 2_000_000_000
@@ -83,7 +84,7 @@ def recording_of(folder: Path) -> tuple[Path, ...]:
 
 def end_of(files: Sequence[Path]) -> int | None:
     """Return the time of the last message [ns]; None if the last file is incomplete. Raises OSError."""
-    with files[-1].open("rb") as stream:
+    with InputFile(files[-1], RecordingError) as stream:
         try:
             summary = make_reader(stream).get_summary()
         except BROKEN:

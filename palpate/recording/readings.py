@@ -20,7 +20,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
 from palpate_errors import UserError
-from palpate_inputs import KB, InputFile, bounds, checked_xml, read_text
+from palpate_inputs import KB, MB, InputFile, bounds, checked_xml, over, read_bytes, read_text
 from palpate_models.numerics.frames import Array
 from palpate_plugins import needs
 
@@ -71,16 +71,28 @@ class Readings:
 def read_table(path: Path) -> pd.DataFrame:
     """Return a table. Raises ReadingError."""
     try:
-        with InputFile(path, ReadingError) as file:
-            if path.suffix == ".parquet":
-                return pd.read_parquet(io.BytesIO(file.read()))
-            return pd.read_csv(file, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
+        file = io.BytesIO(read_bytes(path, ReadingError))
+        if path.suffix == ".parquet":
+            _check_parquet(file, path)
+            return pd.read_parquet(file)
+        return pd.read_csv(file, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
     except UserError:
         raise
     except (OSError, ValueError, pd.errors.ParserError) as error:
         raise ReadingError(f"{path}: is not a table: {str(error).partition(chr(10))[0]}") from None
+
+
+def _check_parquet(file: io.BytesIO, path: Path) -> None:
+    """Raise ReadingError if a table is large unpacked: equal values take no room in the file."""
+    from pyarrow.parquet import ParquetFile  # noqa: PLC0415 - only for Parquet
+
+    facts = ParquetFile(file).metadata
+    if facts.num_rows > bounds().elements:
+        raise over(path, f"{facts.num_rows} rows", "elements", ReadingError)
+    if (size := facts.num_rows * facts.num_columns * 8) > bounds().unpacked_mb * MB:
+        raise over(path, f"{size / MB:.0f} MB unpacked", "unpacked_mb", ReadingError)
 
 
 def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:

@@ -30,6 +30,7 @@ from palpate_bus.messages.stamps import nanoseconds, time_message
 from palpate_bus.recordings import SCENARIO, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
+from palpate_inputs import read_text
 from palpate_models.scenario.load import load_scenario, view_of
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
@@ -155,7 +156,7 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     if name:
         implementations.check(role, name)
     recording = open_recording(path)
-    text = scenario.read_text(encoding="utf-8") if scenario else recording.scenario or _scenario_near(path, role)
+    text = read_text(scenario) if scenario else recording.scenario or _scenario_near(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
     recording.check(rules, topics)
     if recording.origin([name for name in topics if recording.counts.get(name)]):
@@ -182,7 +183,7 @@ def _scenario_near(path: Path, role: str) -> str:
     name = f"{view_of(role)}.yaml"
     for folder in (path, *path.resolve().parents[:2]):
         if (folder / name).is_file():
-            return (folder / name).read_text(encoding="utf-8")
+            return read_text(folder / name)
     raise RecordingError(f"{path}: no {name} in it or next to it; {role} needs the scenario of the run: --scenario FILE")
 
 
