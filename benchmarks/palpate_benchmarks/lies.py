@@ -162,26 +162,30 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
 
 
 def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those in wall-clock mode."""
+    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those in wall-clock mode.
+
+    `only` restricts them to topics, roles, kinds and moments.
+    """
     turn = cycle(MOMENTS)
-    chosen = [
-        (topic.name, kind, f"{topic.name} {path} {kind} {amount:g}", topic.producer) for topic, path, kind, amount in cells()
-    ]
-    chosen = [cell for cell in chosen if not only or {cell[0], cell[1], cell[3]} & set(only)]
-    ranked: list[tuple[int, str]] = []
+    ranked: list[tuple[int, Topic, str, str]] = []
     seen: set[tuple[str, str]] = set()
-    for topic, kind, where, _ in chosen:
-        moments = ["rest"] if topic in BEFORE_STROKES else [next(turn)]
-        ranked.append(((topic, kind) in seen, f"{where} {moments[0]}"))
-        seen.add((topic, kind))
-        if topic in SENSED:
-            ranked += [(2, f"{where} {moment}") for moment in MOMENTS if moment not in moments]
-    if "lockstep" in modes:
-        yield from (FaultCase(LIE, where, wallclock=False) for _, where in sorted(ranked, key=lambda case: case[0]))
-    if "wallclock" in modes:
-        for topic, kind, where, _ in chosen:
-            if topic not in BEFORE_STROKES and (kind in ("frozen", "repeated") or (topic in SENSED and kind in LIVE_KINDS)):
-                yield FaultCase(LIE, f"{where} depth", wallclock=True)
+    for topic, path, kind, amount in cells():
+        moments = ["rest"] if topic.name in BEFORE_STROKES else [next(turn)]
+        if topic.name in SENSED:
+            moments += [moment for moment in MOMENTS if moment not in moments]
+        for k, moment in enumerate(moments):
+            rank = 2 if k else int((topic.name, kind) in seen)
+            ranked.append((rank, topic, kind, f"{topic.name} {path} {kind} {amount:g} {moment}"))
+        seen.add((topic.name, kind))
+    for _, topic, kind, where in sorted(ranked, key=lambda case: case[0]):
+        moment = where.split()[-1]
+        if only and not {topic.name, topic.producer, kind, moment} & set(only):
+            continue
+        if "lockstep" in modes:
+            yield FaultCase(LIE, where, wallclock=False)
+        live = kind in ("frozen", "repeated") or (topic.name in SENSED and kind in LIVE_KINDS)
+        if "wallclock" in modes and live and moment == "depth":
+            yield FaultCase(LIE, where, wallclock=True)
 
 
 def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
