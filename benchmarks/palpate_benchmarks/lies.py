@@ -74,7 +74,7 @@ CASE_S: Final = 300.0
 """Wall time of a case at most."""
 HANGS: Final = "the examination did not end"
 BEFORE_S: Final = 0.25
-"""A case is forked this long before its lie, so that the liar has earlier messages to repeat."""
+"""A case of old messages is forked this long before its lie, so that the liar has some."""
 SIGNS_EVERY: Final = 10 * MS
 NEVER_NS: Final = 10**18
 LEFT_OUT: Final = {
@@ -206,6 +206,11 @@ def lie_of(where: str, healthy: Healthy) -> Lie:
     return Lie(topic, path, kind, float(amount), float(moment) * healthy.length_s if at_s is None else at_s)
 
 
+def start_s(lie: Lie) -> float:
+    """Return the simulated time at which a case is forked."""
+    return max(lie.at_s - (BEFORE_S if lie.kind in (*liar.ORDER_KINDS, "delayed") else 0.0), 0.0)
+
+
 def undetectable(lie: Lie) -> str:
     """Return why no other input contradicts the lie; empty if one does."""
     return next(
@@ -241,7 +246,7 @@ class Lockstep:
 
     def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
         """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
-        start = round(max(lie.at_s - BEFORE_S, 0.0) * 1e3) * MS
+        start = round(start_s(lie) * 1e3) * MS
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
         return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
@@ -325,7 +330,7 @@ def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
     """Yield the findings of the cases, those in lockstep in the order of their times."""
     lockstep = Lockstep()
     twin = lockstep.twin
-    for case in sorted(todo, key=lambda case: (case.wallclock, lie_of(case.where, twin).at_s)):
+    for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.where, twin)))):
         begin, lie = monotonic(), lie_of(case.where, twin)
         finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
         if case.wallclock:

@@ -171,8 +171,8 @@ def test_a_frozen_value_is_refused_until_it_changes() -> None:
 def test_a_refused_spike_leaves_the_messages_after_it_alone() -> None:
     check = PortCheck(RULES.topics["robot/status"])
     check(status(0, 5.0), 0)
-    with pytest.raises(RefusedMessage, match=r"wrench\.force = 20 after 5, 10 ms apart"):
-        check(status(10 * MS, 20.0), 10 * MS)
+    with pytest.raises(RefusedMessage, match=r"wrench\.force = 40 after 5, 10 ms apart"):
+        check(status(10 * MS, 40.0), 10 * MS)
     check(status(20 * MS, 5.1), 20 * MS)
 
 
