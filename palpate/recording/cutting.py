@@ -17,6 +17,9 @@ from palpate_models.numerics.frames import Array
 
 POWERS: Final = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 """Powers of depth that the force of loading is compared with."""
+HERTZ: Final = 1.5
+_FEW: Final = 10
+"""Number of loadings from which on they tell the power."""
 _SHORTEST_S: Final = 0.05
 _LOADED: Final = 0.95
 """Share of the greatest depth up to which a press loads."""
@@ -60,7 +63,12 @@ def onset(inward: Array, force: Array, power: float, sigma: float) -> Onset | No
 
 
 def power_of(loadings: Sequence[tuple[Array, Array]], sigma: float) -> float:
-    """Return the power of depth that fits most loadings best; each is inward coordinate [m] and force [N]."""
+    """Return the power of depth that fits most loadings best; each is inward coordinate [m] and force [N].
+
+    Of few it is that of a sphere on an elastic half-space (Hertz).
+    """
+    if len(loadings) < _FEW:
+        return HERTZ
     chosen = loadings[:: max(1, len(loadings) // 100)]
     misfits = [np.median([o.misfit if (o := onset(s, F, p, sigma)) else 1.0 for s, F in chosen] or [1.0]) for p in POWERS]
     return POWERS[int(np.argmin(misfits))]
@@ -112,6 +120,12 @@ def before_lift(inward: Array) -> slice:
     """Return the part of a press before it lifts."""
     deep = inward >= inward[0] + _LOADED * (inward.max() - inward[0])
     return slice(0, len(deep) - int(np.argmax(deep[::-1])))
+
+
+def modulated(force: Array) -> bool:
+    """Return True if the force rises and falls by more than its least value: then it tells where the skin is; shape (k,)."""
+    across = np.count_nonzero(np.diff(force > 0.5 * (force.max() + force.min())))
+    return bool(across >= 2 and force.max() > 2 * force.min() > 0)
 
 
 def windows(lateral: Array, travel: float) -> list[NDArray[np.intp]]:

@@ -140,7 +140,7 @@ def _of_bag(path: Path, lines: list[str]) -> Mapping:
 def _frames(bag: Any) -> tuple[list[str], list[str]]:
     """Return the roots of the tf tree, and the leaves of its longest way."""
     parents: dict[str, str] = {}
-    chosen = [c for c in bag.connections if c.msgtype == KINDS["tf"]]
+    chosen = [c for c in bag.connections if c.msgtype == KINDS["tf"] and c.topic.strip("/") in ("tf", "tf_static")]
     for count, (connection, _, data) in enumerate(bag.messages(chosen)):
         for one in bag.deserialize(data, connection.msgtype).transforms:
             parents[one.child_frame_id.strip("/")] = one.header.frame_id.strip("/")

@@ -29,7 +29,7 @@ class MotionTuning:
     """Duration over which force and motion are compared."""
     fewest: int = 4
     """Readings of a block."""
-    free_share: float = 0.05
+    free_share: float = 0.2
     """Slope of force against motion in free air, as a share of that in contact."""
     free_around: int = 31
     """Blocks of free air whose level is compared."""
@@ -89,10 +89,13 @@ def pressing_axis(position: Array, force: Array, parts: Sequence[slice], outward
     if that is known; else where motion changes no force; without such motion, where the force is small.
     """
     covariance, motion = np.zeros((force.shape[1], 3)), np.zeros((3, 3))
-    for one in parts:
+    variance = np.array([position[one].var(axis=0).sum() for one in parts])
+    usual = float(np.median(variance[variance > 0])) if (variance > 0).any() else 0.0
+    for one, size in zip(parts, variance, strict=True):
         p, F = position[one] - position[one].mean(axis=0), force[one] - force[one].mean(axis=0)
-        covariance += F.T @ p
-        motion += p.T @ p
+        weight = 1 / (size + usual) if usual else 0.0  # a fast motion in free air tells no more than another
+        covariance += weight * F.T @ p
+        motion += weight * p.T @ p
     if not np.trace(motion) > 0 or not np.abs(covariance).max() > 0:
         return None
     u, _, v = np.linalg.svd(covariance @ np.linalg.inv(motion + 0.02 * np.trace(motion) * np.eye(3)))
@@ -152,15 +155,15 @@ def free_air(time: Array, height: Array, force: Array, stiffness: float) -> Mask
     sigma = noise(force)
     for one in blocks(time):
         z, f = height[one] - height[one].mean(), force[one] - force[one].mean()
-        if np.ptp(z) * TUNING.free_share * stiffness > 2 * sigma:
-            slope = abs(float(z @ f / (z @ z)))
-            if slope < TUNING.free_share * stiffness and f.std() < max(3 * sigma, TUNING.free_share * stiffness * np.ptp(z)):
-                level.append(float(np.median(force[one])))
-                moves.append(one)
+        size = float(np.linalg.norm(z))
+        flat = TUNING.free_share * stiffness
+        if size > 0 and abs(float(z @ f)) / size**2 + 2 * sigma / size < flat and f.std() < max(3 * sigma, flat * z.std()):
+            level.append(float(np.median(force[one])))
+            moves.append(one)
     if not level:
         return free
     levels = np.array(level)
-    width = max(4 * sigma, 0.03 * float(np.quantile(force, 0.98) - levels.min()))
+    width = max(4 * sigma, 0.05 * float(np.quantile(force, 0.98) - levels.min()))
     around = min(TUNING.free_around, len(levels))
     lowest = percentile_filter(levels, 10, around, mode="nearest")  # it may drift
     lowest = median_filter(np.where(levels <= lowest + width, levels, lowest), around, mode="nearest")

@@ -31,7 +31,8 @@ KINDS: Final = {
     "tf": "tf2_msgs/msg/TFMessage",
     "joints": "sensor_msgs/msg/JointState",
 }
-_AXIS: Final = np.array((0.0, 0.0, 1.0))
+_SHORTEST_S: Final = 0.005
+"""Forces of a bag are averaged over this time."""
 
 
 class ReadingError(UserError):
@@ -131,9 +132,8 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     topics = mapping.topics
     assert isinstance(topics, Topics)
     with opened(path) as bag:
-        wrenches = list(_messages(bag, path, topics.wrench, "wrench"))
-        times = np.array([t for t, _ in wrenches])
-        force = np.array([(w.wrench.force.x, w.wrench.force.y, w.wrench.force.z) for _, w in wrenches])
+        forces = ((t, w.wrench.force) for t, w in _messages(bag, path, topics.wrench, "wrench"))
+        times, force = _averaged(np.fromiter(((t, f.x, f.y, f.z) for t, f in forces), np.dtype((float, 4))))
         stamps, position, rotation = _poses(bag, path, topics.pose)
     stamps, first = np.unique(stamps, return_index=True)
     if len(stamps) < 2:
@@ -147,6 +147,14 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     times, force = times[inside], force[inside]
     between = np.column_stack([np.interp(times, stamps, position[first, k]) for k in range(3)])
     return Readings(between, force, times - times[0], rotation=Slerp(stamps, rotation[first])(times))
+
+
+def _averaged(rows: Array) -> tuple[Array, Array]:
+    """Return stamps [s] and forces [N], averaged over _SHORTEST_S where they are more frequent; rows of both, shape (n, 4)."""
+    rows = rows[np.argsort(rows[:, 0], kind="stable")]
+    together = max(1, round(_SHORTEST_S / max(float(np.median(np.diff(rows[:, 0]))), 1e-6))) if len(rows) > 1 else 1
+    rows = rows[: len(rows) // together * together].reshape(-1, together, 4).mean(axis=1)
+    return rows[:, 0], rows[:, 1:]
 
 
 @contextmanager
@@ -181,9 +189,9 @@ def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tupl
         return _transforms(bag, path, source)
     if isinstance(source, Joints):
         return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
-    poses = [(t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose")]
-    quaternions = np.array([(q.x, q.y, q.z, q.w) for _, _, q in poses])
-    return np.array([t for t, _, _ in poses]), np.array([(p.x, p.y, p.z) for _, p, _ in poses]), Rotation.from_quat(quaternions)
+    poses = ((t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
+    rows = np.fromiter(((t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for t, p, q in poses), np.dtype((float, 8)))
+    return rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:])
 
 
 def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, Array, Rotation]:

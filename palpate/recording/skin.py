@@ -9,6 +9,7 @@ from typing import Final
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
+from scipy.linalg import cho_solve
 from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
@@ -23,6 +24,9 @@ _MOST: Final = 300
 """Points that the process is fitted to."""
 _NODES: Final = 40
 """Nodes of its grid along the longer side."""
+_OUTLIERS: Final = 3
+"""Times that points are given less weight, which are this many SD off the skin through the others:"""
+_STRANGE: Final = 4.0
 _PLANE: Final = 4
 """Least number of points that a plane is fitted to."""
 
@@ -102,6 +106,16 @@ def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float
     with warnings.catch_warnings(), threadpool_limits(1):
         warnings.simplefilter("ignore", ConvergenceWarning)
         process.fit(points[:, :2], rest / size)
+        for _ in range(_OUTLIERS):
+            precision = cho_solve((process.L_, True), np.eye(len(points)))
+            off = (precision @ (rest / size)) / np.diag(precision)  # of each point from the skin through the others
+            strange = np.abs(off) * np.sqrt(np.diag(precision)) > _STRANGE
+            if not strange.any():
+                break
+            process.set_params(
+                alpha=np.where(strange, np.maximum(process.alpha, off**2), process.alpha), kernel=process.kernel_, optimizer=None
+            )
+            process.fit(points[:, :2], rest / size)
     x, y = stations
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
     process.kernel_ = process.kernel_.k1  # the noise of the points is not the skin's

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final
 
@@ -24,8 +25,8 @@ _DELAY_S: Final = 0.04
 """Delay that is reported and corrected."""
 _DRIFT: Final = 0.05
 """Drift that is reported, as a share of the usual force."""
-_HOMOGENEOUS: Final = 0.2
-"""SD of the depth over itself, where it is known only from the force and the stiffness elsewhere."""
+_FOLLOWS: Final = 0.1
+"""SD of the depth over itself, of a slide that keeps it."""
 
 
 def normal_force(force: Array, normal: Array) -> Array:
@@ -87,16 +88,16 @@ def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fau
 
 @dataclass(frozen=True)
 class _Loading:
-    """The first part of a contact, along one normal."""
+    """The first part of a contact, or a stretch of a slide, along one normal."""
 
     normal: Array
     inward: Array
     """[m], shape (k,)."""
     force: Array
     """[N]"""
-    deepest: Array
-    """Position at its end [m], shape (3,)."""
-    end: float
+    at: Array
+    """A position in it [m], shape (3,): its end, or its mean."""
+    at_inward: float
     """Inward coordinate there [m]."""
 
 
@@ -153,34 +154,40 @@ class _Measured:
     def _skin_points(self, loads: list[_Loading], onsets: list[Onset | None]) -> tuple[Array, Array]:
         """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
 
-        They are of onsets; of stretches of slides in which the depth changes; and, with little weight, of stretches where it
-        does not, by their force and the usual stiffness.
+        They are of onsets; of stretches of slides in which the depth changes; and, with less weight, of the other stretches, in
+        which the tool is taken to keep the depth that it had when it began to slide.
         """
         points, sd = [], []
         for load, begin in zip(loads, onsets, strict=True):
             if begin is not None:
-                points.append(load.deepest + (load.end - begin.at) * load.normal)
+                points.append(load.at + (load.at_inward - begin.at) * load.normal)
                 sd.append(begin.sd)
-        usual = float(np.median([begin.stiffness for begin in onsets if begin is not None] or [np.nan]))
-        for one, slide in zip(self.touching, self.slides, strict=True):
-            if not slide:
-                continue
-            whole = self.readings.whole[one]
-            p, F = self.readings.position[one][whole], self.readings.force[one][whole]
-            normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
-            for part in cutting.windows(p - np.outer(p @ self.outward, self.outward), self.reach):
-                normal = normals[part].mean(axis=0)
-                force, inward = normal_force(F[part], normals[part]), -(p[part] @ normal)
-                begin = cutting.onset(inward, force, self.power, self.sigma)
-                middle, mean = p[part].mean(axis=0), float(force.mean())
-                if begin is not None and begin.sd <= self.reach:
-                    points.append(middle + (inward.mean() - begin.at) * normal)
-                    sd.append(begin.sd)
-                if (begin is None or begin.sd > self.reach) and np.isfinite(usual) and mean > 0:
-                    depth = (mean / usual) ** (1 / self.power)
-                    points.append(middle + depth * normal)
-                    sd.append(_HOMOGENEOUS * depth)
+        begun = [load.at_inward - begin.at if begin else np.nan for load, begin in zip(loads, onsets, strict=True)]
+        sliding = [depth for depth, slide in zip(begun, self.slides, strict=True) if slide and depth > 0]
+        usual = float(np.median(sliding)) if sliding else np.nan
+        for one, depth in zip(self.touching, begun, strict=True):
+            for stretch in self._stretches(one):
+                if cutting.modulated(stretch.force):
+                    begin = cutting.onset(stretch.inward, stretch.force, self.power, self.sigma)
+                    if begin is not None:
+                        points.append(stretch.at + (stretch.at_inward - begin.at) * stretch.normal)
+                        sd.append(begin.sd)
+                elif np.isfinite(usual):
+                    kept = depth if 0.5 * usual < depth < 2 * usual else usual
+                    points.append(stretch.at + kept * stretch.normal)
+                    sd.append(_FOLLOWS * kept)
         return np.array(points).reshape(-1, 3), np.array(sd)
+
+    def _stretches(self, one: slice) -> Iterator[_Loading]:
+        """Yield each stretch of a footprint of a slide, with its mean position; none of a press."""
+        if not self.slides[self.touching.index(one)]:
+            return
+        whole = self.readings.whole[one]
+        p, F = self.readings.position[one][whole], self.readings.force[one][whole]
+        normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
+        for part in cutting.windows(p - np.outer(p @ self.outward, self.outward), self.reach)[1:-1] or []:
+            normal, middle = normals[part].mean(axis=0), p[part].mean(axis=0)
+            yield _Loading(normal, -(p[part] @ normal), normal_force(F[part], normals[part]), middle, -float(middle @ normal))
 
     def _pressed(self, one: slice, load: _Loading, begin: Onset) -> Contact:
         p = self.readings.position[one]
