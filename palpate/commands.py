@@ -51,6 +51,7 @@ GROUPS = {
         "node": "palpate.live.graph:app",
     },
     "Replace a part, or run in several places": {
+        "arm": "palpate.arm.command:app",
         "check": "palpate.check.command:check_command",
         "join": "palpate.run.places:join",
         "takeover": "palpate.run.places:takeover",

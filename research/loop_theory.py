@@ -29,7 +29,7 @@ from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import build_phantom
-from palpate_models.robot.lbr import urdf
+from palpate_models.robot.arm import urdf
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.contact import shear_stiffness
@@ -108,7 +108,7 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> LinearL
     asked[2] = stiffness
     setpoint = Setpoint(
         mode=ControlMode.CARTESIAN, stamp=0, R_WD=model.R_WI.copy(), p_WD=model.p_WI.copy(), V_WD=np.zeros(6), F_W=np.zeros(6),
-        stiffness=asked, damping_ratio=DAMPING_RATIO, q=q, qd=np.zeros(7), joint_stiffness=POSTURE_STIFFNESS,
+        stiffness=asked, damping_ratio=DAMPING_RATIO, q=q, qd=np.zeros(7), joint_stiffness=np.full(7, POSTURE_STIFFNESS),
     )  # fmt: skip
     extrapolator = Extrapolator(contract().topics["planning/setpoint"].period)
     extrapolator.accept(setpoint, 0)

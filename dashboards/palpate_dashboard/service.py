@@ -33,7 +33,8 @@ from palpate_dashboard.scene import SceneView, Shaded
 from palpate_dashboard.sinks import Live, open_recording
 from palpate_models.numerics.frames import apply
 from palpate_models.numerics.maps import half_width, level_lines
-from palpate_models.robot import lbr, table
+from palpate_models.robot import table
+from palpate_models.robot.arm import arm_of
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Robot, Scenario
@@ -96,6 +97,7 @@ class DashboardService(Service):
         Raises OSError if `path` is not writable.
         """
         given = exam_input(scenario)
+        self._torque_nm = arm_of(given.robot).torque_nm
         self._name = scenario.name
         self._path = path
         self._X_WA = np.array(given.X_WA)
@@ -207,7 +209,7 @@ class DashboardService(Service):
         for link in poses.keys() & self._shapes.keys():
             self._scene.link_shape(link, self._shapes.pop(link))
         self._scene.link_poses(t, poses)
-        tool = transforms.get(lbr.LINK_NAMES[-1])
+        tool = transforms.get("indenter")
         if tool is not None:
             X_WI = transform_matrix(tool)
             self._scene.tool(t, X_WI[:3, 3], self._in_contact)
@@ -293,7 +295,7 @@ class DashboardService(Service):
         self._plots.true_contact(t, message.depth, message.normal_force)
 
     def _robot_status(self, t: int, message: Message) -> None:
-        self._plots.torques(t, np.asarray(message.applied_torque) / lbr.TORQUE_LIMIT)
+        self._plots.torques(t, np.asarray(message.applied_torque) / self._torque_nm)
         mode = plots.MODES[message.mode][0]
         self._robot = f"{mode}: {message.reason}" if message.reason else mode
         level = "ERROR" if message.mode == RobotStatus.MODE_SAFE_HOLD else "INFO"

@@ -44,6 +44,7 @@ from palpate_bus.messages import (
 from palpate_bus.messages.stamps import header, time_message
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M
 from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000
@@ -89,8 +90,8 @@ def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
         poses[f"lbr_link_{i + 1}"] = (position, rotation)
     for link, step in (
         ("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M),
-        ("ft_sensor", lbr.FLANGE_TO_FT_M),
-        ("indenter", lbr.FT_TO_INDENTER_M),
+        ("ft_sensor", FLANGE_TO_FT_M),
+        ("indenter", FT_TO_INDENTER_M),
     ):
         position = position + rotation.apply((0.0, 0.0, step))
         poses[link] = (position, rotation)

@@ -23,9 +23,11 @@ from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import AWAITED
 from palpate_dashboard.service import FILE, DashboardService, create
 from palpate_dashboard.sinks import Live
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import link_names
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
+
+LINKS = link_names(Scenario().robot)
 
 SECONDS = 12.0
 
@@ -114,7 +116,7 @@ def test_the_only_timeline_is_simulated_time(recording: Recording) -> None:
 
 
 def test_every_link_has_a_shape_and_moves(recording: Recording) -> None:
-    for link in lbr.LINK_NAMES[1:]:
+    for link in LINKS[1:]:
         assert f"/world/robot/{link}/shape_0" in recording.static, link
         assert recording.temporal[f"/world/robot/{link}"] > 0.9 * SECONDS * 20, link
     assert recording.temporal["/world/robot/lbr_link_0"] == 1  # the base stands still: written once

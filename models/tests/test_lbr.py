@@ -10,31 +10,36 @@ import pinocchio as pin
 import pytest
 import trimesh
 
+from palpate_models.robot import arm as robot_arm
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_MASS_KG, FT_TO_INDENTER_M, link_names, urdf
+from palpate_models.robot.chain import Capsule
 from palpate_models.robot.kinematics import link_transforms, tool_jacobian, tool_pose
 from palpate_models.robot.solids import Z, blend, box, cone, cut, cylinder, half_space, mesh, revolve
 from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot
 
+LINKS = link_names(Robot())
+
 
 @pytest.fixture(scope="module")
 def model() -> pin.Model:
-    return pin.buildModelFromXML(lbr.urdf(Robot()))
+    return pin.buildModelFromXML(urdf(Robot()))
 
 
 def test_masses_are_the_published_ones() -> None:
     robot = Robot(tool_mass_kg=0.5)
-    inertias = lbr.inertias(robot)
+    inertias = robot_arm.inertias(robot)
     assert sum(inertias[f"lbr_link_{i}"].mass for i in range(8)) == pytest.approx(23.9, abs=1e-5)
     below_sensor = inertias["ft_sensor"].mass + inertias["indenter"].mass
     assert below_sensor == pytest.approx(robot.tool_mass_kg)
     total = sum(float(link.find("inertial/mass").get("value")) for link in _links(robot) if link.find("inertial"))
-    assert total == pytest.approx(23.9 + lbr.FT_SENSOR_MASS_KG + robot.tool_mass_kg, abs=1e-5)
+    assert total == pytest.approx(23.9 + FT_SENSOR_MASS_KG + robot.tool_mass_kg, abs=1e-5)
 
 
 def _links(robot: Robot) -> list[ElementTree.Element]:
-    return list(ElementTree.fromstring(lbr.urdf(robot)).iter("link"))
+    return list(ElementTree.fromstring(urdf(robot)).iter("link"))
 
 
 def test_limits_reach_the_reader_of_the_urdf(model: pin.Model) -> None:
@@ -47,7 +52,7 @@ def test_limits_reach_the_reader_of_the_urdf(model: pin.Model) -> None:
 
 def test_joints_and_links_have_the_names_of_the_ros2_stack(model: pin.Model) -> None:
     assert tuple(model.names)[1:] == lbr.JOINT_NAMES
-    assert all(model.existFrame(link) for link in lbr.LINK_NAMES)
+    assert all(model.existFrame(link) for link in LINKS)
 
 
 def test_upright_arm_has_the_published_height(model: pin.Model) -> None:
@@ -57,14 +62,14 @@ def test_upright_arm_has_the_published_height(model: pin.Model) -> None:
     # 1.266 m from the base to the flange of an iiwa 7 R800 (340 + 400 + 400 + 126 mm)
     np.testing.assert_allclose(flange.translation, [*Robot().base_xy_m, Robot().base_height_m + 1.266], atol=1e-12)
     indenter = data.oMf[model.getFrameId("indenter")]
-    tool = lbr.FLANGE_TO_FT_M + lbr.FT_TO_INDENTER_M
+    tool = FLANGE_TO_FT_M + FT_TO_INDENTER_M
     np.testing.assert_allclose(flange.actInv(indenter).translation, [0.0, 0.0, tool], atol=1e-12)
     np.testing.assert_allclose(flange.rotation, indenter.rotation, atol=1e-12)
 
 
 def test_base_stands_where_the_scenario_says() -> None:
     robot = Robot(base_xy_m=(0.1, -0.2), base_height_m=0.5, base_yaw_rad=0.7)
-    model = pin.buildModelFromXML(lbr.urdf(robot))
+    model = pin.buildModelFromXML(urdf(robot))
     data = model.createData()
     pin.framesForwardKinematics(model, data, np.zeros(7))
     X_WB = data.oMf[model.getFrameId("lbr_link_0")]
@@ -82,7 +87,7 @@ def test_home_is_inside_the_limits_and_points_the_tool_down(model: pin.Model) ->
 
 
 def test_inertias_are_physical() -> None:
-    for link, inertia in lbr.inertias(Robot()).items():
+    for link, inertia in robot_arm.inertias(Robot()).items():
         (ixx, iyy, izz), (ixy, ixz, iyz) = inertia.diagonal, inertia.products
         principal = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
         assert principal[0] > 0, link
@@ -90,19 +95,19 @@ def test_inertias_are_physical() -> None:
 
 
 def test_urdf_refers_to_no_file_and_shapes_can_be_left_out() -> None:
-    text = lbr.urdf(Robot())
+    text = urdf(Robot())
     assert "mesh" not in text and "filename" not in text
-    bare = lbr.urdf(Robot(), geometry=False)
+    bare = urdf(Robot(), geometry=False)
     assert "geometry" not in bare
-    assert bare.count("<inertial>") == text.count("<inertial>") == len(lbr.LINK_NAMES)
+    assert bare.count("<inertial>") == text.count("<inertial>") == len(LINKS)
 
 
 def test_collision_primitives_are_the_capsules(model: pin.Model) -> None:
     """Every capsule's cylinder runs from its start to its end."""
     robot = Robot(indenter_radius_m=0.02)
-    geometry = pin.buildGeomFromUrdfString(model, lbr.urdf(robot), pin.COLLISION)
+    geometry = pin.buildGeomFromUrdfString(model, urdf(robot), pin.COLLISION)
     cylinders = [o for o in geometry.geometryObjects if type(o.geometry).__name__ == "Cylinder"]
-    capsules = [(link, c) for link, cs in lbr.capsules(robot).items() for c in cs if c.start != c.end]
+    capsules = [(link, c) for link, cs in robot_arm.capsules(robot).items() for c in cs if c.start != c.end]
     assert len(cylinders) == len(capsules)
     for shape, (link, capsule) in zip(cylinders, capsules, strict=True):
         assert shape.name.startswith(link)
@@ -112,8 +117,8 @@ def test_collision_primitives_are_the_capsules(model: pin.Model) -> None:
         np.testing.assert_allclose(X_LC.act(-half), capsule.start, atol=1e-9)
         np.testing.assert_allclose(X_LC.act(half), capsule.end, atol=1e-9)
         assert shape.geometry.radius == capsule.radius
-    tip = lbr.capsules(robot)["indenter"]
-    assert tip == (lbr.Capsule((0, 0, 0), (0, 0, 0), 0.02),)
+    tip = robot_arm.capsules(robot)["indenter"]
+    assert tip == (Capsule((0, 0, 0), (0, 0, 0), 0.02),)
 
 
 def test_shared_tables_cannot_be_changed() -> None:
@@ -127,7 +132,7 @@ POSES = [lbr.HOME, np.linspace(-1, 1, 7), np.full(7, 0.4)]
 
 @pytest.mark.parametrize("q", POSES)
 def test_every_link_is_where_the_urdf_has_it(q: np.ndarray) -> None:
-    model = pinocchio.buildModelFromXML(lbr.urdf(ROBOT))
+    model = pinocchio.buildModelFromXML(urdf(ROBOT))
     data = model.createData()
     pinocchio.framesForwardKinematics(model, data, q)
     X = np.eye(4)
@@ -184,7 +189,7 @@ def meshes() -> dict[str, list[VisualMesh]]:
 
 
 def test_every_link_has_a_look(meshes: dict[str, list[VisualMesh]]) -> None:
-    assert tuple(meshes) == lbr.LINK_NAMES
+    assert tuple(meshes) == LINKS
     assert sum(len(m.triangles) for parts in meshes.values() for m in parts) < 60_000
 
 
@@ -202,16 +207,16 @@ def test_arm_has_the_volume_of_a_slender_robot(meshes: dict[str, list[VisualMesh
     assert 0.012 < sum(body.volume for body in housings) < 0.025  # 24 kg at about the density of water
 
 
-def _outside(points: np.ndarray, capsules: tuple[lbr.Capsule, ...]) -> float:
+def _outside(points: np.ndarray, capsules: tuple[Capsule, ...]) -> float:
     """Distance of the farthest point outside all capsules [m]."""
     depth = [cone(c.start, np.add(c.end, (0, 0, 1e-9)), c.radius, c.radius)(points) for c in capsules]
     return float(np.min(depth, axis=0).max())
 
 
-@pytest.mark.parametrize("link", lbr.LINK_NAMES[1:8])
+@pytest.mark.parametrize("link", LINKS[1:8])
 def test_collision_capsules_enclose_the_housing(link: str, meshes: dict[str, list[VisualMesh]]) -> None:
     points = np.concatenate([part.vertices for part in meshes[link]])
-    assert _outside(points, lbr.capsules(Robot())[link]) < 0.005
+    assert _outside(points, robot_arm.capsules(Robot())[link]) < 0.005
 
 
 def test_indenter_has_the_radius_of_the_scenario() -> None:
@@ -222,7 +227,7 @@ def test_indenter_has_the_radius_of_the_scenario() -> None:
 
 def test_standoff_reaches_the_sphere(meshes: dict[str, list[VisualMesh]]) -> None:
     top = max(part.vertices[:, 2].max() for part in meshes["ft_sensor"])
-    assert top == pytest.approx(lbr.FT_TO_INDENTER_M)
+    assert top == pytest.approx(FT_TO_INDENTER_M)
 
 
 def test_surface_net_lies_on_the_field() -> None:

@@ -16,7 +16,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.patient.phantom import PhantomModel
-from palpate_models.robot.lbr import HOME
+from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import Scan
 from palpate_models.scenario.schema import Exam, Mode, Scenario
@@ -67,7 +67,7 @@ def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
     surface = PerceivedSurface.from_mesh(p_W, n_W, X_WA)
     positions, _ = surface.at(scan.targets)
     seen_abdomen = PerceivedAbdomen(positions, scan.line_of_target, p_W, triangles, surface)
-    plan = ExamPlanner(known, PERIOD_S).examination(seen_abdomen, np.asarray(HOME))
+    plan = ExamPlanner(known, PERIOD_S).examination(seen_abdomen, arm_of(known.robot).home_rad)
     contacts = [segment for segment in plan.segments if segment.contact]
     ways = [apply(inverse(X_WA), segment.path.p)[:, :2] for segment in contacts if not segment.touch]
     touches = [apply(inverse(X_WA), segment.path.p)[0, :2] for segment in contacts if segment.touch]

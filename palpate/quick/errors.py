@@ -30,7 +30,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import FT_TO_INDENTER_M
 from palpate_models.scenario.errors import Level, draw_errors, levels
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
@@ -271,7 +271,7 @@ class _TaredSensor:
         self._normal: list[float] = []
         self._tare = 0.0
         self.tare(0)
-        reads, lever = drawn.sensitivity[2], lbr.FT_TO_INDENTER_M
+        reads, lever = drawn.sensitivity[2], FT_TO_INDENTER_M
         self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
         """Reading of z for a unit force at the sphere's centre along each of the sensor's axes, shape (3,)."""
 

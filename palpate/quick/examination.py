@@ -147,7 +147,7 @@ class QuickExamination:
         self._mean_excursion = self.patient.tissue.breathing.mean_m
         self._believed = PerceivedSurface.from_mesh(*self.perceived, self._X_WA)
         wall = Wall(self._believed, Breath())
-        self._motion = StrokeMotion(self._exam, scenario.limits, self.patient.radius, PERIOD_S, wall)
+        self._motion = StrokeMotion(self._exam, scenario.limits, scenario.robot, PERIOD_S, wall)
         self._descent = _Descent(self._motion, self._exam.depth_m, self._tare)
         self._gated = self._exam.breathing is Following.GATE
         self._open = True

@@ -36,7 +36,6 @@ class ViolationKind(StrEnum):
     RANGE = "range"
     UNIT = "unit"
     GARBAGE = "garbage"
-    NAMES = "names"
     NORM = "norm of a quaternion"
     CHANGE = "rate of change"
     FROZEN = "frozen"
@@ -124,7 +123,6 @@ class Checker:
             self._headers = _own_header
         elif any(name == "transforms" for name, _ in names):
             self._headers = _headers_of_transforms
-        self._names = topic.names
         self._quaternions = [
             leaf.path[:-2] for leaf in leaves(topic.type) if leaf.message == QUATERNION and leaf.path.endswith(".w")
         ]
@@ -166,10 +164,7 @@ class Checker:
         return found + list(self._forms(message))
 
     def _forms(self, message: Message) -> Iterator[MessageViolation]:
-        """Yield what is wrong with names and quaternions."""
-        for path, names in self._names.items():
-            if getattr(message, path) != list(names):
-                yield MessageViolation(ViolationKind.NAMES, path, str(list(names)), str(getattr(message, path)))
+        """Yield what is wrong with quaternions."""
         for path in self._quaternions:
             values = numbers(message, path).reshape(-1, 4)
             norm = [hypot(*one) for one in values.tolist()]

@@ -1,6 +1,6 @@
 """The check of every message at a port, generated from the topic's row of the contract.
 
-A message is checked by itself (type, frame, names, ranges, finite numbers, unit quaternions) and against those before it at the
+A message is checked by itself (type, frame, ranges, finite numbers, unit quaternions) and against those before it at the
 same port (order and age of stamps, rates of change, values that repeat). The runtimes hold one `PortCheck` per port, where a
 service sends and where messages of other processes are received. In lockstep a refused message ends the run. In wall-clock mode
 it is dropped and reported, so its readers act as on silence. No service needs a check of its own.
@@ -87,7 +87,6 @@ def conforms(row: str, sends: bool) -> Callable[[Message, PastMessages, int], bo
         "array": np.asarray,
         "frame": topic.frame,
         "repeats": repeats,
-        "names": {path: list(values) for path, values in topic.names.items()},
     }
     exec(compile(text, f"<check of {topic.name}>", "exec"), names)
     check: Callable[[Message, PastMessages, int], bool] = names["conforms"]
@@ -110,7 +109,6 @@ class _Source:
         elif self._topic.frame is not None and "transforms" in names:
             yield "for one in m.transforms:"
             yield " if one.header.frame_id != frame: return False"
-        yield from (f"if m.{path} != names[{path!r}]: return False" for path in self._topic.names)
         yield from self._message(self._topic.type, "m", "")
         if self._topic.periodic and "header" in names:
             yield from self._past()

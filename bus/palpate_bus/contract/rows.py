@@ -97,8 +97,6 @@ class Topic(_Row):
     """Greatest change per second of each number."""
     varies: dict[str, int] = {}
     """Number of messages in a row whose field may repeat exactly."""
-    names: dict[str, tuple[str, ...]] = {}
-    """Fixed values of lists of texts."""
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0

@@ -104,8 +104,19 @@ _FLOAT64 = np.dtype(np.float64)
 
 _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
-_COMMAND = Struct("<56siI")  # torques, seconds and nanoseconds of valid_for
-_JOINTS = {gap: Struct(f"<I{gap}x56sI4x56sI4x56s") for gap in (0, 4)}  # position, velocity, effort of seven joints
+
+
+@lru_cache(maxsize=64)
+def _command(count: int, start: int) -> Struct:
+    """Return the layout of `count` torques from `start` on, and of seconds and nanoseconds of valid_for."""
+    gap = padding(start + LENGTH.size, 8) if count else 0
+    return Struct(f"<I{gap}x{8 * count}siI")
+
+
+@lru_cache(maxsize=64)
+def _joints(count: int, gap: int) -> Struct:
+    """Return the layout of position, velocity and effort of `count` joints, the first of which follow a gap of `gap` bytes."""
+    return Struct(f"<I{gap}x{8 * count}sI4x{8 * count}sI4x{8 * count}s")
 
 
 def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDArray[Any]:
@@ -159,10 +170,11 @@ def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
 
 def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
     """Convert `palpation_msgs/JointTorqueCommand`."""
-    torque = fitted(message.torque, _FLOAT64, 7, "torque").tobytes()
-    valid_for = message.valid_for
-    command = _COMMAND.pack(torque, valid_for.sec, valid_for.nanosec)
-    return pack_header(message.header, 8) + command + _pack_texts((message.problem, message.culprit))
+    torque = fitted(message.torque, _FLOAT64, None, "torque")
+    valid_for, count = message.valid_for, torque.size
+    head = pack_header(message.header, 4)
+    command = _command(count, len(head)).pack(count, torque.tobytes(), valid_for.sec, valid_for.nanosec)
+    return head + command + _pack_texts((message.problem, message.culprit))
 
 
 @lru_cache(maxsize=64)
@@ -176,9 +188,11 @@ def _pack_texts(texts: tuple[str, ...]) -> bytes:
 
 def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
     """Convert `palpation_msgs/JointTorqueCommand`."""
-    header, start = read_header(data, 8)
-    torque, sec, nanosec = _COMMAND.unpack_from(data, start)
-    problem, end = read_text(data, start + _COMMAND.size)
+    header, start = read_header(data, 4)
+    (count,) = LENGTH.unpack_from(data, start)
+    layout = _command(min(count, len(data)), start)
+    _, torque, sec, nanosec = layout.unpack_from(data, start)
+    problem, end = read_text(data, start + layout.size)
     culprit, end = read_text(data, end)
     return JointTorqueCommand(header, np.frombuffer(torque), Duration(sec, nanosec), problem, culprit), end
 
@@ -189,9 +203,10 @@ def encode_joint_state(message: JointState) -> bytes:
     position = fitted(message.position, _FLOAT64, None, "position")
     velocity = fitted(message.velocity, _FLOAT64, None, "velocity")
     effort = fitted(message.effort, _FLOAT64, None, "effort")
-    if position.size == velocity.size == effort.size == 7:
-        joints = _JOINTS[padding(len(data) + LENGTH.size, 8)]
-        return data + joints.pack(7, position.tobytes(), 7, velocity.tobytes(), 7, effort.tobytes())
+    n = position.size
+    if n == velocity.size == effort.size > 0:
+        joints = _joints(n, padding(len(data) + LENGTH.size, 8))
+        return data + joints.pack(n, position.tobytes(), n, velocity.tobytes(), n, effort.tobytes())
     for values in (position, velocity, effort):
         count = len(values)
         length = LENGTH.pack(count)
@@ -205,10 +220,10 @@ def decode_joint_state(data: bytes) -> tuple[JointState, int]:
     """Convert `sensor_msgs/JointState`."""
     header, start = read_header(data, 4)
     names, start = _read_names(data, start)
-    joints = _JOINTS[padding(start + LENGTH.size, 8)]
-    if len(data) - start == joints.size:
+    joints = _joints(len(names), padding(start + LENGTH.size, 8))
+    if names and len(data) - start == joints.size:
         n, q, n_qd, qd, n_effort, effort = joints.unpack_from(data, start)
-        if n == n_qd == n_effort == 7:
+        if n == n_qd == n_effort == len(names):
             state = JointState(header, names, np.frombuffer(q), np.frombuffer(qd), np.frombuffer(effort))
             return state, len(data)
     position, start = _read_array(data, start)

@@ -1,27 +1,20 @@
-"""The KUKA LBR iiwa 7 R800 with F/T sensor, stand-off and spherical indenter, as tables and as a URDF.
+"""The KUKA LBR iiwa 7 R800 as tables, the default arm.
 
-Kinematics, limits, masses and inertias: lbr_fri_ros2_stack, `iiwa7_description` and its joint limits. Capsules and tool
-are ours. Links: lbr_link_0..lbr_link_7, lbr_link_ee (flange), ft_sensor (origin at the measuring face, z along the
-flange's z), indenter (origin at the sphere's centre, z along the flange's z, out of the flange). Joint origins have no
-rotation.
+Kinematics, limits, masses and inertias: lbr_fri_ros2_stack, `iiwa7_description` and its joint limits. The capsules are ours.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
 
-from palpate_models.scenario.schema import Robot
-
-Array = NDArray[np.float64]
-Point = tuple[float, float, float]
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
 
 JOINT_NAMES: Final[tuple[str, ...]] = tuple(f"lbr_A{i}" for i in range(1, 8))
-LINK_NAMES: Final[tuple[str, ...]] = (*(f"lbr_link_{i}" for i in range(8)), "lbr_link_ee", "ft_sensor", "indenter")
-"""Every link, from the base to the tool; each is the child of the one before it."""
+LINK_NAMES: Final[tuple[str, ...]] = (*(f"lbr_link_{i}" for i in range(8)), "lbr_link_ee")
+"""The base, the link behind each joint, the flange."""
 
 
 def _fixed(values: Array) -> Array:
@@ -58,39 +51,6 @@ JOINT_AXIS: Final[tuple[Point, ...]] = (
     (0.0, 0.0, 1.0),
 )
 LINK_7_TO_FLANGE_M: Final = 0.035
-FLANGE_TO_FT_M: Final = 0.030
-"""Thickness of the F/T sensor: flange to measuring face [A: like an ATI Gamma, 75 mm x 33 mm, 0.255 kg]."""
-FT_TO_INDENTER_M: Final = 0.100
-"""Measuring face to the sphere's centre: the stand-off [A]."""
-FT_SENSOR_MASS_KG: Final = 0.25
-"""The sensor's own mass, on the flange's side of its measuring face [A]."""
-FT_SENSOR_RADIUS_M: Final = 0.0375
-STANDOFF_RADIUS_M: Final = 0.0125
-STANDOFF_MASS_FRACTION: Final = 0.6
-"""Part of the tool's mass that is in the stand-off; the rest is in the sphere [A]."""
-
-
-@dataclass(frozen=True, slots=True)
-class Inertia:
-    """Mass [kg], centre of mass [m] in the link frame, inertia about it [kg m^2], axes of the link frame."""
-
-    mass: float
-    com: Point
-    diagonal: Point
-    """ixx, iyy, izz."""
-    products: Point = (0.0, 0.0, 0.0)
-    """ixy, ixz, iyz."""
-
-
-@dataclass(frozen=True, slots=True)
-class Capsule:
-    """A cylinder from `start` to `end` [m, link frame] with round ends of its radius [m]; a sphere if they coincide."""
-
-    start: Point
-    end: Point
-    radius: float
-
-
 ARM_INERTIA: Final[tuple[Inertia, ...]] = (
     Inertia(4.855658, (-0.012857, 0.0, 0.069964), (0.017839, 0.022294, 0.021334), (0.0, 0.000781, 0.0)),
     Inertia(3.394011, (0.0, -0.034819, 0.123299), (0.021383, 0.020403, 0.007563), (0.0, 0.0, 0.003797)),
@@ -117,105 +77,25 @@ _ARM_CAPSULES: Final[tuple[tuple[Capsule, ...], ...]] = (
     (Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.005), 0.045),),
 )
 
+_SEEDS: Final = tuple((0.0, tilt, 0.0, -bend, 0.0, 1.2, 0.0) for tilt in (0.3, 0.8) for bend in (1.6, 1.0))
+"""Elbow up, the tool in front of the base."""
 
-def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
-    """Return a solid cylinder along z with its centre at height z of the link frame."""
-    across = mass * (3 * radius**2 + length**2) / 12
-    return Inertia(mass, (0.0, 0.0, z), (across, across, mass * radius**2 / 2))
-
-
-def _sphere(mass: float, radius: float) -> Inertia:
-    """Return a solid sphere about the link frame's origin."""
-    inertia = 0.4 * mass * radius**2
-    return Inertia(mass, (0.0, 0.0, 0.0), (inertia, inertia, inertia))
-
-
-def inertias(robot: Robot) -> dict[str, Inertia]:
-    """Inertia by link: the stand-off is in `ft_sensor`, the sphere in `indenter`, the sensor in `lbr_link_ee`."""
-    standoff = STANDOFF_MASS_FRACTION * robot.tool_mass_kg
-    tool = (
-        _cylinder(FT_SENSOR_MASS_KG, FT_SENSOR_RADIUS_M, FLANGE_TO_FT_M, FLANGE_TO_FT_M / 2),
-        _cylinder(standoff, STANDOFF_RADIUS_M, FT_TO_INDENTER_M, FT_TO_INDENTER_M / 2),
-        _sphere(robot.tool_mass_kg - standoff, robot.indenter_radius_m),
-    )
-    return dict(zip(LINK_NAMES, (*ARM_INERTIA, *tool), strict=True))
-
-
-def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
-    """Collision geometry by link, in link frames. It encloses the visual meshes to within a few millimetres."""
-    tip = (0.0, 0.0, 0.0)
-    tool = (
-        (Capsule(tip, (0.0, 0.0, FLANGE_TO_FT_M / 2), FT_SENSOR_RADIUS_M),),
-        (Capsule((0.0, 0.0, 0.01), (0.0, 0.0, FT_TO_INDENTER_M), STANDOFF_RADIUS_M),),
-        (Capsule(tip, tip, robot.indenter_radius_m),),
-    )
-    return dict(zip(LINK_NAMES, (*_ARM_CAPSULES, *tool), strict=True))
-
-
-def _text(values: Point) -> str:
-    return " ".join(repr(float(value)) for value in values)
-
-
-def _inertial(inertia: Inertia) -> str:
-    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    entries = " ".join(f'{n}="{v!r}"' for n, v in zip(names, (*inertia.diagonal, *inertia.products), strict=True))
-    com = f'<origin xyz="{_text(inertia.com)}"/>'
-    return f'<inertial>{com}<mass value="{inertia.mass!r}"/><inertia {entries}/></inertial>'
-
-
-def _geometry(tag: str, capsule: Capsule) -> str:
-    """Return a capsule as URDF primitives: a cylinder and a sphere at each end."""
-    start, end = np.array(capsule.start), np.array(capsule.end)
-    axis = end - start
-    length = float(np.linalg.norm(axis))
-    ends = (start,) if length == 0 else (start, end)
-    parts = [
-        f'<{tag}><origin xyz="{_text(tuple(point))}"/><geometry><sphere radius="{capsule.radius}"/></geometry></{tag}>'
-        for point in ends
-    ]
-    if length > 0:
-        x, y, z = axis / length
-        rpy = (0.0, float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x)))  # turns z onto the axis
-        parts.append(
-            f'<{tag}><origin xyz="{_text(tuple((start + end) / 2))}" rpy="{_text(rpy)}"/>'
-            f'<geometry><cylinder radius="{capsule.radius}" length="{length!r}"/></geometry></{tag}>'
-        )
-    return "".join(parts)
-
-
-def _joint(name: str, kind: str, parent: str, child: str, xyz: Point, rpy: Point = (0, 0, 0), extra: str = "") -> str:
-    return (
-        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
-        f'<origin xyz="{_text(xyz)}" rpy="{_text(rpy)}"/>{extra}</joint>'
-    )
-
-
-def _arm_joint(i: int, robot: Robot) -> str:
-    limit, velocity, torque = (float(x[i]) for x in (POSITION_LIMIT, VELOCITY_LIMIT, TORQUE_LIMIT))
-    extra = (
-        f'<axis xyz="{_text(JOINT_AXIS[i])}"/>'
-        f'<limit lower="{-limit!r}" upper="{limit!r}" velocity="{velocity!r}" effort="{torque!r}"/>'
-        f'<dynamics damping="{robot.joint_damping_nms!r}" friction="{robot.joint_friction_nm!r}"/>'
-    )
-    return _joint(JOINT_NAMES[i], "revolute", LINK_NAMES[i], LINK_NAMES[i + 1], JOINT_ORIGIN[i], extra=extra)
-
-
-def urdf(robot: Robot, *, geometry: bool = True) -> str:
-    """Return the robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file.
-
-    `geometry=False` leaves out visual and collision shapes.
-    """
-    inertia, shapes = inertias(robot), capsules(robot)
-    parts = ['<robot name="lbr">', '<link name="world"/>']
-    for link in LINK_NAMES:
-        seen = shapes[link] if geometry else ()
-        primitives = "".join(_geometry(tag, capsule) for tag in ("visual", "collision") for capsule in seen)
-        parts.append(f'<link name="{link}">{_inertial(inertia[link])}{primitives}</link>')
-    base = (*robot.base_xy_m, robot.base_height_m)
-    parts.append(_joint("lbr_base", "fixed", "world", LINK_NAMES[0], base, (0.0, 0.0, robot.base_yaw_rad)))
-    parts += [_arm_joint(i, robot) for i in range(7)]
-    parts.append(_joint("lbr_flange", "fixed", "lbr_link_7", "lbr_link_ee", (0.0, 0.0, LINK_7_TO_FLANGE_M)))
-    parts.append(_joint("ft_sensor_mount", "fixed", "lbr_link_ee", "ft_sensor", (0.0, 0.0, FLANGE_TO_FT_M)))
-    parts.append(_joint("standoff", "fixed", "ft_sensor", "indenter", (0.0, 0.0, FT_TO_INDENTER_M)))
-    parts.append("</robot>\n")
-    return "\n".join(parts)
+ARM: Final = Arm(
+    name="lbr",
+    joint_names=JOINT_NAMES,
+    link_names=LINK_NAMES,
+    origin_m=_fixed(np.array(JOINT_ORIGIN)),
+    axis=_fixed(np.array(JOINT_AXIS)),
+    flange_m=_fixed(np.array((0.0, 0.0, LINK_7_TO_FLANGE_M))),
+    lower_rad=_fixed(-POSITION_LIMIT),
+    upper_rad=POSITION_LIMIT,
+    velocity_radps=VELOCITY_LIMIT,
+    torque_nm=TORQUE_LIMIT,
+    acceleration_radps2=_fixed(np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])),
+    stiffness_nmprad=_fixed(np.array([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])),
+    hold_damping_nms=_fixed(np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])),
+    home_rad=HOME,
+    inertias=ARM_INERTIA,
+    capsules=_ARM_CAPSULES,
+    seeds_rad=_SEEDS,
+)

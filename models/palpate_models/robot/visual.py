@@ -1,4 +1,4 @@
-"""Visual meshes of the robot by link, with the proportions of an LBR iiwa 7 R800."""
+"""Visual meshes of the robot by link: drawn for the LBR iiwa 7 R800, the collision capsules for other arms."""
 
 from __future__ import annotations
 
@@ -9,6 +9,14 @@ import numpy as np
 
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import (
+    FLANGE_TO_FT_M,
+    FT_SENSOR_RADIUS_M,
+    FT_TO_INDENTER_M,
+    STANDOFF_RADIUS_M,
+    arm_of,
+)
+from palpate_models.robot.chain import Arm, Capsule
 from palpate_models.robot.solids import (
     Field,
     Triangles,
@@ -216,13 +224,13 @@ def _arm() -> dict[str, list[VisualMesh]]:
 
 
 def _tool(robot: Robot) -> dict[str, list[VisualMesh]]:
-    sensor, length = lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M
-    r, rod = lbr.FT_SENSOR_RADIUS_M, lbr.STANDOFF_RADIUS_M
+    sensor, length = FLANGE_TO_FT_M, FT_TO_INDENTER_M
+    r, rod = FT_SENSOR_RADIUS_M, STANDOFF_RADIUS_M
     angle = np.linspace(0.0, np.pi, 25)
     sphere = robot.indenter_radius_m * np.stack((np.sin(angle), -np.cos(angle)), axis=1)
     sphere[[0, -1], 0] = 0.0
     return {
-        "lbr_link_ee": [
+        arm_of(robot).link_names[-1]: [
             _turned([(r - 0.002, 0.0), (r, 0.002), (r, sensor - 0.004), (r - 0.002, sensor - 0.002)], DARK),
             _turned([(r - 0.001, sensor - 0.002), (r - 0.001, sensor)], STEEL),
         ],
@@ -236,5 +244,23 @@ def _tool(robot: Robot) -> dict[str, list[VisualMesh]]:
 
 @cache
 def visual_meshes(robot: Robot | None = None) -> dict[str, list[VisualMesh]]:
-    """Meshes by link of `lbr.LINK_NAMES`, each in its link's frame; the tool is the scenario's. Do not change the arrays."""
-    return _arm() | _tool(robot or Robot())
+    """Return meshes by link, each in its link's frame; the tool is the scenario's. Do not change the arrays."""
+    robot = robot or Robot()
+    arm = arm_of(robot)
+    return (_arm() if arm is lbr.ARM else _capsules(arm)) | _tool(robot)
+
+
+def _capsules(arm: Arm) -> dict[str, list[VisualMesh]]:
+    shapes = zip(arm.link_names, arm.capsules, strict=False)  # the flange has none
+    return {link: [VisualMesh(*_capsule(capsule), WHITE) for capsule in capsules] for link, capsules in shapes}
+
+
+def _capsule(capsule: Capsule) -> tuple[Array, Triangles]:
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    length = float(np.linalg.norm(end - start))
+    x, y, z = (end - start) / length if length else (0.0, 0.0, 1.0)
+    angle = np.linspace(0.0, np.pi / 2, 9)
+    low = capsule.radius * np.stack((np.sin(angle), -np.cos(angle)), axis=1)
+    profile = np.concatenate((low, low[::-1] * (1, -1) + (0, length)))
+    profile[[0, -1], 0] = 0.0
+    return revolve(profile, (float(x), float(y), float(z)), capsule.start)

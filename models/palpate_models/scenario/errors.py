@@ -216,7 +216,7 @@ class DrawnArm:
 
     given: ArmErrors
     origin_m: Array
-    """True less nominal origin of each joint in the link before it, shape (7, 3)."""
+    """True less nominal origin of each joint in the link before it, shape (n, 3)."""
     zero_rad: Array
     """Zero error of each position sensor."""
     ripple_phase_rad: Array
@@ -241,8 +241,8 @@ class DrawnErrors:
     arm: DrawnArm
 
 
-def draw_errors(errors: Errors, seed: int) -> DrawnErrors:
-    """Draw the equipment of the patient with this seed. Fields are drawn independently of each other's values."""
+def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
+    """Draw the equipment of the patient with this seed and an arm of `joints`. Fields are drawn independently."""
     streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(5)
     force, camera, hand_eye, registration, arm = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     return DrawnErrors(
@@ -250,7 +250,7 @@ def draw_errors(errors: Errors, seed: int) -> DrawnErrors:
         _camera(errors.camera, camera),
         _pose(errors.hand_eye, hand_eye),
         _pose(errors.registration, registration),
-        draw_arm(errors.arm, arm),
+        draw_arm(errors.arm, arm, joints),
     )
 
 
@@ -279,14 +279,14 @@ def _pose(given: PoseErrors, rng: np.random.Generator) -> Array:
     return np.asarray(matrix(Pose(xyz_m=(x, y, z), rpy_rad=(roll, pitch, yaw))) @ matrix(given.offset))
 
 
-def draw_arm(given: ArmErrors, rng: np.random.Generator) -> DrawnArm:
-    """Draw an arm."""
+def draw_arm(given: ArmErrors, rng: np.random.Generator, joints: int) -> DrawnArm:
+    """Draw an arm of so many `joints`."""
     return DrawnArm(
         given,
-        given.length_m * rng.standard_normal((7, 3)),
-        given.zero_rad * rng.standard_normal(7),
-        rng.uniform(0.0, 2 * np.pi, 7),
-        np.exp(given.friction * rng.standard_normal(7)),
-        np.exp(given.damping * rng.standard_normal(7)),
+        given.length_m * rng.standard_normal((joints, 3)),
+        given.zero_rad * rng.standard_normal(joints),
+        rng.uniform(0.0, 2 * np.pi, joints),
+        np.exp(given.friction * rng.standard_normal(joints)),
+        np.exp(given.damping * rng.standard_normal(joints)),
         float(np.exp(given.tool_mass * rng.standard_normal())),
     )

@@ -8,14 +8,16 @@ x to the patient's left, y to the head, z outward.
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from enum import StrEnum
 from math import dist
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom
+from palpate_models.robot.urdf_arm import placement_of
 from palpate_models.scenario.errors import Errors
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 from palpate_plugins import PluginKind, is_file
@@ -150,13 +152,16 @@ class RosCamera(Section):
 class Robot(Section):
     """Robot, tool and its sensor."""
 
+    arm: str = "lbr"
+    """`lbr`, `panda`, `ur5`, `ur10`, `xarm7`, or the path of a YAML file beside a URDF. Other defaults of this section are the
+    arm's."""
     lbr: LbrConnection = LbrConnection()
     indenter_radius_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.015
     """Radius of the spherical indenter."""
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Nominal mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
-    """Height of the base. The three defaults of its placement are the optimum of `python -m research.base_placement`."""
+    """Height of the base. The three defaults of its placement are the optimum of `palpate arm place lbr`."""
     base_xy_m: Vec2 = (0.03, 0.02)
     """Position of the base in world."""
     base_yaw_rad: float = 0.0
@@ -165,6 +170,14 @@ class Robot(Section):
     """Nominal Coulomb friction (lbr_fri_ros2_stack's URDF)."""
     joint_damping_nms: NonNegative = 10.0
     """Nominal viscous friction (same source)."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _of_arm(cls, given: Any) -> Any:
+        arm = given.get("arm") if isinstance(given, Mapping) else None
+        if not isinstance(arm, str) or arm == cls.model_fields["arm"].default:
+            return given
+        return {**placement_of(arm), **given}
 
 
 class Camera(Section):

@@ -13,27 +13,27 @@ from palpate_bus.messages import Clock, DiagnosticArray, Quaternion, TFMessage, 
 from palpate_bus.messages.geometry import transform_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of
 from palpate_models.robot.kinematics import link_transforms
 from palpate_models.scenario.schema import ExamInput
 
-_AXES = np.array(lbr.JOINT_AXIS)
 _FIRST_JOINT = 1
 """Index of the first joint's frame, after the base. All other frames are constant."""
 
 
 class FrameTree:
-    """Makes `tf` messages from measured joints: world, lbr_link_0 to 7, lbr_link_ee, ft_sensor, indenter; and world, abdomen."""
+    """Makes `tf` messages from measured joints: world, the arm's links, ft_sensor, indenter; and world, abdomen."""
 
     def __init__(self, exam: ExamInput) -> None:
-        frames = [*link_transforms(np.zeros(7), exam.robot), ("world", "abdomen", np.array(exam.X_WA))]
+        self._axes = arm_of(exam.robot).axis
+        frames = [*link_transforms(np.zeros(len(self._axes)), exam.robot), ("world", "abdomen", np.array(exam.X_WA))]
         self._names = [(parent, child) for parent, child, _ in frames]
         self._transforms = [transform_message(X) for _, _, X in frames]
 
     def message(self, t: int, q: Iterable[float]) -> TFMessage:
-        """Return the tree at joint positions `q` [rad], shape (7,), stamped `t` [ns]."""
+        """Return the tree at joint positions `q` [rad], shape (n,), stamped `t` [ns]."""
         half = 0.5 * np.array(q, np.float64)[:, None]
-        rotations = np.hstack((np.sin(half) * _AXES, np.cos(half)))  # unit quaternions (x, y, z, w), shape (7, 4)
+        rotations = np.hstack((np.sin(half) * self._axes, np.cos(half)))  # unit quaternions (x, y, z, w), shape (n, 4)
         transforms = self._transforms.copy()
         for i, rotation in enumerate(rotations.tolist(), _FIRST_JOINT):
             transforms[i] = Transform(transforms[i].translation, Quaternion(*rotation))

@@ -29,8 +29,8 @@ import numpy as np
 import pinocchio as pin
 
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_control.model import DOF, ArmModel
-from palpate_control.reference import QD, F, P, Q, Reference, V
+from palpate_control.model import ArmModel
+from palpate_control.reference import JOINTS, F, P, Reference, V
 from palpate_control.safety import SafetyNet
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
@@ -74,18 +74,18 @@ TUNING = ControllerTuning()
 
 
 class CartesianGains(NamedTuple):
-    """Gains of mode CARTESIAN: K and B for the six axes of D, shape (6,); K_0 and B_0 for the null-space posture, shape (7,)."""
+    """Gains of mode CARTESIAN: K and B for the six axes of D, shape (6,); K_0 and B_0 for the null-space posture, shape (n,)."""
 
     K: Array
     B: Array
     K_0: Array
     B_0: Array
     J_bar: Array
-    """Inverse of the Jacobian (world axes) consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (7, 6)."""
+    """Inverse of the Jacobian (world axes) consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (n, 6)."""
 
 
 class JointGains(NamedTuple):
-    """Gains of mode JOINT, shape (7, 7) each."""
+    """Gains of mode JOINT, shape (n, n) each."""
 
     K: Array
     B: Array
@@ -103,7 +103,7 @@ class ImpedanceController:
         self._designed_for: Setpoint | None = None
         self._design_age = 0
         self._cartesian_gains: Arrays = ()  # the fields of `CartesianGains`
-        self._joint_gains = JointGains(np.zeros((DOF, DOF)), np.zeros((DOF, DOF)))
+        self._joint_gains = JointGains(np.zeros(0), np.zeros(0))
 
     def reset(self) -> None:
         """Restart the rate limit from zero torque, after a pause without commands."""
@@ -111,13 +111,13 @@ class ImpedanceController:
         self._designed_for = None
 
     def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Return the torque command without gravity [N m], shape (7,), at positions `q` [rad] and velocities `qd` [rad/s]."""
+        """Return the torque command without gravity [N m], shape (n,), at positions `q` [rad] and velocities `qd` [rad/s]."""
         q, qd = np.array(q, dtype=float), np.array(qd, dtype=float)
         law = self._cartesian if reference.setpoint.mode is ControlMode.CARTESIAN else self._joint
         return self._net.torque(law(q, qd, reference), q, self.model.gravity)
 
     def _cartesian(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Return the unlimited torque of mode CARTESIAN [N m], shape (7,)."""
+        """Return the unlimited torque of mode CARTESIAN [N m], shape (n,)."""
         model, (R_WD, x) = self.model, reference.motion
         model.update(q, qd)
         if self._design_due(reference.setpoint):
@@ -127,12 +127,12 @@ class ImpedanceController:
             self._cartesian_gains = tuple(cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time))
         arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
         R_DI = R_WD.T.dot(model.R_WI)
-        gains, torque = self._cartesian_gains, np.empty(DOF)
+        gains, torque = self._cartesian_gains, np.empty_like(q)
         cartesian_torque(arm, R_WD, x, pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction, torque)
         return torque
 
     def _joint(self, q: Array, qd: Array, reference: Reference) -> Array:
-        """Return the unlimited torque of mode JOINT [N m], shape (7,)."""
+        """Return the unlimited torque of mode JOINT [N m], shape (n,)."""
         model, motion = self.model, reference.motion
         model.update_gravity(q)
         if self._design_due(reference.setpoint):
@@ -167,15 +167,15 @@ def cartesian_torque(
     Args:
         arm: q, qd, p_WI, J_W, C(q, qd) qd + gravity, and gravity, as `ArmModel` evaluates them.
         R_WD: desired rotation of the indenter, shape (3, 3).
-        x: coordinates of the desired `ReferenceMotion`, shape (39,).
+        x: coordinates of the desired `ReferenceMotion`, shape (18 + 3 n,).
         phi: rotation vector of R_DI [rad], shape (3,).
         Jlog: derivative of `phi` with respect to a rotation in axes of I, shape (3, 3).
         gains: the fields of `CartesianGains`.
-        friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, 7).
-        torque: output [N m], shape (7,).
+        friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, n).
+        torque: output [N m], shape (n,).
     """
     q, qd, p_WI, J, bias, gravity = arm
-    p_WD, V_WD, F_W, q_0, qd_0 = x[P], x[V], x[F], x[Q], x[QD]
+    p_WD, V_WD, F_W, q_0, qd_0 = x[P], x[V], x[F], x[JOINTS : JOINTS + len(q)], x[JOINTS + len(q) : JOINTS + 2 * len(q)]
     K, B, K_0, B_0, J_bar = gains
     viscous, coulomb, velocity_limit = friction[0], friction[1], friction[2]
 
@@ -201,7 +201,7 @@ def clip(x: Array, bound: Array | float) -> Array:
 
 @compiled
 def friction_torque(qd: Array, viscous: Array, coulomb: Array) -> Array:
-    """Return the torque that compensates joint friction at desired velocities `qd` [rad/s], [N m], shape (7,)."""
+    """Return the torque that compensates joint friction at desired velocities `qd` [rad/s], [N m], shape (n,)."""
     return (viscous + coulomb / (np.abs(qd) + STICTION_SPEED_RADPS)) * qd
 
 
@@ -218,9 +218,9 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     Args:
         requested: stiffness, damping ratio and joint stiffness of a `Setpoint`.
         R_WD: desired rotation of the indenter, shape (3, 3).
-        J_W: Jacobian in world axes, shape (6, 7).
-        M: joint-space inertia [kg m^2], shape (7, 7).
-        D: viscous joint friction [N m s/rad], shape (7,).
+        J_W: Jacobian in world axes, shape (6, n).
+        M: joint-space inertia [kg m^2], shape (n, n).
+        D: viscous joint friction [N m s/rad], shape (n,).
         dead_time: delay from measurement to torque [s].
     """
     stiffness, damping_ratio, K_0 = requested
@@ -241,7 +241,7 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
-    """Return the gains of mode JOINT at inertia `M`, shape (7, 7), bounded mode by mode as in `cartesian_gains`."""
+    """Return the gains of mode JOINT at inertia `M`, shape (n, n), bounded mode by mode as in `cartesian_gains`."""
     L = np.linalg.cholesky(M)
     L_inverse = np.linalg.inv(L)
     squared, V = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)

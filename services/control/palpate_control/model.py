@@ -6,7 +6,6 @@ import pinocchio as pin
 
 from palpate_models.numerics.frames import Array
 
-DOF = 7
 _AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
@@ -16,18 +15,19 @@ class ArmModel:
     Attributes after `update` (most are views of pinocchio's memory, valid until the next evaluation):
         R_WI: rotation of the indenter frame I in world, shape (3, 3), in Fortran order.
         p_WI: origin of I in world [m], shape (3,).
-        J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, 7).
-        gravity: torques that hold the arm against gravity [N m], shape (7,).
-        bias: Coriolis, centrifugal and gravity torques C(q, qd) qd + gravity [N m], shape (7,).
+        J_W: Jacobian of V_WI_W (linear first, then angular, world axes, at I's origin), shape (6, n).
+        gravity: torques that hold the arm against gravity [N m], shape (n,).
+        bias: Coriolis, centrifugal and gravity torques C(q, qd) qd + gravity [N m], shape (n,).
     """
 
     J_W: Array
 
     def __init__(self, urdf: str, frame: str = "indenter") -> None:
-        """Build the model from URDF text. Raises ValueError unless it is a seven-joint arm with a link `frame`."""
+        """Build the model from URDF text. Raises ValueError unless it is an arm of revolute joints with a link `frame`."""
         self._model = pin.buildModelFromXML(urdf)
-        if self._model.nq != DOF or self._model.nv != DOF:
-            raise ValueError(f"robot description has {self._model.nv} joints, want {DOF}")
+        self.joints: int = self._model.nv
+        if self._model.nq != self.joints:
+            raise ValueError(f"robot description has {self._model.nq} positions of {self.joints} joints, want one a joint")
         if not self._model.existFrame(frame):
             raise ValueError(f"robot description has no link {frame!r}")
         self._data = self._model.createData()
@@ -45,7 +45,7 @@ class ArmModel:
         self.coulomb_friction: Array = self._model.upperDryFrictionLimit.copy()
 
     def update(self, q: Array, qd: Array) -> None:
-        """Evaluate the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (7,)."""
+        """Evaluate the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (n,)."""
         model, data, frame = self._model, self._data, self._frame
         self.J_W = pin.computeFrameJacobian(model, data, q, frame, _AXES)  # also places the frame
         pin.nonLinearEffects(model, data, q, qd)
@@ -57,15 +57,15 @@ class ArmModel:
 
     @property
     def coriolis(self) -> Array:
-        """Return Coriolis and centrifugal torques C(q, qd) qd [N m], shape (7,)."""
+        """Return Coriolis and centrifugal torques C(q, qd) qd [N m], shape (n,)."""
         return self.bias - self.gravity
 
     def inverse_dynamics(self, q: Array, qd: Array, qdd: Array) -> Array:
-        """Return the torques for accelerations `qdd` [rad/s^2], with gravity and without friction [N m], shape (7,)."""
+        """Return the torques for accelerations `qdd` [rad/s^2], with gravity and without friction [N m], shape (n,)."""
         torque: Array = pin.rnea(self._model, self._data, q, qd, qdd)
         return torque
 
     def inertia(self, q: Array) -> Array:
-        """Return the joint-space inertia matrix [kg m^2], shape (7, 7)."""
+        """Return the joint-space inertia matrix [kg m^2], shape (n, n)."""
         M: Array = pin.crba(self._model, self._data, q)
         return M

@@ -28,13 +28,13 @@ class ReferenceTuning:
 TUNING = ReferenceTuning()
 
 
-# The coordinates of a motion are one vector, shape (39,), so that extrapolation and blending are one expression: position,
-# rotation vector relative to the set-point's R_WD in world axes, joint positions; their velocities; wrench; joint acceleration,
-# which is the only part that is not blended.
-P, PHI, Q, V, QD, F, QDD = (
-    slice(0, 3), slice(3, 6), slice(6, 13), slice(13, 19), slice(19, 26), slice(26, 32), slice(32, 39)
-)  # fmt: skip
-_POSITIONS, _VELOCITIES, _JOINED = slice(0, 13), slice(13, 26), slice(0, 32)
+# The coordinates of a motion are one vector, shape (18 + 3 n,) for n joints, so that extrapolation and blending are one
+# expression: position, rotation vector relative to the set-point's R_WD in world axes, their velocity, wrench; then joint
+# positions, velocities and accelerations. Only the accelerations are not blended.
+P, PHI, V, F = slice(0, 3), slice(3, 6), slice(6, 12), slice(12, 18)
+JOINTS = 18
+"""Index of the first joint position."""
+_POSE = slice(0, 6)
 
 
 class ReferenceMotion(NamedTuple):
@@ -42,7 +42,7 @@ class ReferenceMotion(NamedTuple):
 
     R_WD: Array
     x: Array
-    """Coordinates, shape (39,)."""
+    """Coordinates, shape (18 + 3 n,)."""
 
     @property
     def p_WD(self) -> Array:
@@ -61,18 +61,23 @@ class ReferenceMotion(NamedTuple):
 
     @property
     def q(self) -> Array:
-        """[rad], shape (7,)."""
-        return self.x[Q]
+        """[rad], shape (n,)."""
+        return np.asarray(self._joints[0])
 
     @property
     def qd(self) -> Array:
-        """[rad/s], shape (7,)."""
-        return self.x[QD]
+        """[rad/s], shape (n,)."""
+        return np.asarray(self._joints[1])
 
     @property
     def qdd(self) -> Array:
-        """Acceleration of `q` [rad/s^2], shape (7,); zero in mode CARTESIAN."""
-        return self.x[QDD]
+        """Acceleration of `q` [rad/s^2], shape (n,); zero in mode CARTESIAN."""
+        return np.asarray(self._joints[2])
+
+    @property
+    def _joints(self) -> Array:
+        joints: Array = self.x[JOINTS:].reshape(3, -1)
+        return joints
 
 
 class Reference(NamedTuple):
@@ -92,7 +97,7 @@ class Extrapolator:
     def __init__(self, period: int) -> None:
         """Create an extrapolator for set-points that arrive every `period` [ns]."""
         self._max_age = TUNING.bridged_periods * period
-        self._terms = np.zeros((4, 39))
+        self._terms = np.zeros((4, JOINTS))
         """Rows: coordinates at the set-point's stamp, coefficients of its age [s] and of the age squared, and the gap."""
         self._since = 0  # last tick of the previous set-point [ns]: the gap decays from then on
         self._tick = 0
@@ -106,16 +111,17 @@ class Extrapolator:
         """Accept a new set-point at time `t` [ns]."""
         before = self.current
         if before is None or before.mode is not setpoint.mode:
-            self.current, self._tick, self._terms = setpoint, t, _terms(setpoint, np.zeros(7))
+            self.current, self._tick, self._terms = setpoint, t, _terms(setpoint, np.zeros_like(setpoint.q))
             return
-        now, acceleration = self._coordinates(before, t, self._tick), np.zeros(7)
+        now, acceleration = self._coordinates(before, t, self._tick), np.zeros_like(setpoint.q)
         now[PHI] = pin.log3(pin.exp3(now[PHI]).dot(before.R_WD).dot(setpoint.R_WD.T))  # relative to the new R_WD
         spacing = setpoint.stamp - before.stamp
         if setpoint.mode is ControlMode.JOINT and 0 < spacing <= self._max_age:
             limit = TUNING.max_acceleration_radps2
             acceleration = np.clip((setpoint.qd - before.qd) / (spacing * 1e-9), -limit, limit)
         self.current, self._since, self._terms = setpoint, self._tick, _terms(setpoint, acceleration)
-        self._terms[3, _JOINED] = (now - self._coordinates(setpoint, t, t))[_JOINED]
+        blended = slice(0, len(now) - len(acceleration))
+        self._terms[3, blended] = (now - self._coordinates(setpoint, t, t))[blended]
 
     def at(self, t: int) -> Reference:
         """Return the reference at time `t` [ns]. Raises ValueError before the first set-point."""
@@ -127,26 +133,30 @@ class Extrapolator:
         return Reference(setpoint, ReferenceMotion(pin.exp3(x[PHI]).dot(setpoint.R_WD), x))
 
     def _coordinates(self, setpoint: Setpoint, t: int, faded: int) -> Array:
-        """Return the coordinates at `t`, shape (39,), with the gap decayed until `faded` [ns]."""
+        """Return the coordinates at `t`, shape (18 + 3 n,), with the gap decayed until `faded` [ns]."""
         since, longest = t - setpoint.stamp, self._max_age
         age = min(max(since, -longest), longest) * 1e-9
         fading = min(self._since - faded, 0) * 1e-9  # a clock that is set back does not widen the gap
         x: Array = np.array((1.0, age, age * age, exp(fading / TUNING.smoothing_s))).dot(self._terms)
         if since > longest:  # set-points stopped: brake smoothly
-            x[_VELOCITIES] *= exp((longest - since) * 1e-9 / TUNING.smoothing_s)
-            x[QDD] = 0.0
+            braking, n = exp((longest - since) * 1e-9 / TUNING.smoothing_s), len(setpoint.q)
+            x[V] *= braking
+            x[JOINTS + n : JOINTS + 2 * n] *= braking
+            x[JOINTS + 2 * n :] = 0.0
         return x
 
 
 def coordinates(setpoint: Setpoint, acceleration: Array) -> Array:
-    """Return the coordinates of a set-point at its stamp, shape (39,); `acceleration` of the joints [rad/s^2]."""
-    return np.concatenate((setpoint.p_WD, np.zeros(3), setpoint.q, setpoint.V_WD, setpoint.qd, setpoint.F_W, acceleration))
+    """Return the coordinates of a set-point at its stamp, shape (18 + 3 n,); `acceleration` of the n joints [rad/s^2]."""
+    return np.concatenate((setpoint.p_WD, np.zeros(3), setpoint.V_WD, setpoint.F_W, setpoint.q, setpoint.qd, acceleration))
 
 
 def _terms(setpoint: Setpoint, acceleration: Array) -> Array:
-    """Return the terms of a set-point's coordinates without a gap, shape (4, 39); `acceleration` of the joints [rad/s^2]."""
-    terms = np.zeros((4, 39))
-    terms[0] = coordinates(setpoint, acceleration)
-    terms[1, _POSITIONS], terms[1, QD] = terms[0, _VELOCITIES], acceleration
-    terms[2, Q] = acceleration / 2
+    """Return the terms of a set-point's coordinates without a gap, shape (4, 18 + 3 n); `acceleration` [rad/s^2]."""
+    x, n = coordinates(setpoint, acceleration), len(acceleration)
+    terms = np.zeros((4, len(x)))
+    terms[0] = x
+    terms[1, _POSE] = x[V]
+    terms[1, JOINTS : JOINTS + 2 * n] = x[JOINTS + n :]
+    terms[2, JOINTS : JOINTS + n] = acceleration / 2
     return terms

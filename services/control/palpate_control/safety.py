@@ -21,7 +21,7 @@ class SafetyNet:
     """
 
     def __init__(self, lower: Array, upper: Array, torque_limit: Array, zone: float, period_s: float) -> None:
-        """Take joint limits [rad] and torque limits [N m], shapes (7,); `zone` [rad] (0: no repulsion); one torque per
+        """Take joint limits [rad] and torque limits [N m], shapes (n,); `zone` [rad] (0: no repulsion); one torque per
         `period_s`.
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
@@ -34,7 +34,7 @@ class SafetyNet:
         self._last = np.zeros_like(self._last)
 
     def torque(self, wanted: Array, q: Array, gravity: Array) -> Array:
-        """Return the torque to command instead of `wanted` [N m], shape (7,), at joint positions `q` [rad].
+        """Return the torque to command instead of `wanted` [N m], shape (n,), at joint positions `q` [rad].
 
         The torque, and the torque plus `gravity`, are within limits.
         """
@@ -46,7 +46,7 @@ class SafetyNet:
 
 @compiled
 def safe_torque(wanted: Array, q: Array, gravity: Array, last: Array, rate: float, joints: Array, safe: Array) -> None:
-    """Set `safe` [N m], shape (7,), to `wanted` plus repulsion from joint limits, within all limits.
+    """Set `safe` [N m], shape (n,), to `wanted` plus repulsion from joint limits, within all limits.
 
     It is within the torque limits, also with `gravity` added, and within `rate` of `last` [N m]. Rows of `joints`: middle of each
     joint range [rad], angle from it at which the repulsion begins [rad], its gain [N m/rad^2], torque limit [N m].

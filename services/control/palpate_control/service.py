@@ -15,10 +15,10 @@ from palpate_bus.messages.stamps import NS, duration_message, header, nanosecond
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
 from palpate_control.impedance import ImpedanceController
-from palpate_control.model import DOF, ArmModel
+from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.lbr import HOME, urdf
+from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
 
@@ -47,6 +47,8 @@ class ControlService(Service):
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
         self.model = ArmModel(urdf(robot))
+        arm = arm_of(robot)
+        self._names, self._home, self._still = list(arm.joint_names), arm.home_rad, np.zeros(self.model.joints)
         topics = contract().topics
         self._controller = ImpedanceController(self.model, limits.joint_margin_rad, contract().roles[self.role].period / NS)
         self._reference = Extrapolator(topics[TOPIC].period)
@@ -58,8 +60,7 @@ class ControlService(Service):
         self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
         self._facts = dict.fromkeys(("setpoints", "setpoints_rejected", "ticks_without_joint_states", "ticks_without_command"), 0)
-        self._peak = np.zeros(DOF)
-        self._torque = np.zeros(DOF)
+        self._peak, self._torque = self._still.copy(), self._still
         self._torque_expires = -1
         """Expiry of the last torque [ns]."""
         self._problem = ""
@@ -69,7 +70,7 @@ class ControlService(Service):
 
     def _warm_up(self) -> None:
         """Compile the law in both modes on decoded set-points, which would take too long at 1 kHz."""
-        kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", np.zeros(DOF), Vector3(0.0, 0.0, 0.0)
+        kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", self._still, Vector3(0.0, 0.0, 0.0)
         pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
         for mode in ControlMode:
             guide = Extrapolator(contract().topics[TOPIC].period)
@@ -84,11 +85,11 @@ class ControlService(Service):
                     np.ones(6),
                     rest,
                     rest,
-                    np.ones(DOF),
+                    np.ones_like(rest),
                     self._full_validity,
                 )
                 guide.accept(Setpoint.from_message(codec.decode(codec.encode(message, kind), kind)), stamp)
-                self._controller.torque(np.array(HOME), rest, guide.at(stamp))
+                self._controller.torque(self._home, rest, guide.at(stamp))
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -106,7 +107,7 @@ class ControlService(Service):
         while self._pending and self._pending[0].stamp <= followed:
             self._reference.accept(self._pending.popleft(), followed)
         if self._setpoint_expires is None or joints is None:
-            return self._command(t, np.zeros(DOF), self._full_validity)
+            return self._command(t, self._still, self._full_validity)
         frozen = t - measured > self._setpoint_expiry  # repeated, or stamped by a wrong clock
         if self._stop_reason or frozen or t > self._setpoint_expires:
             age, limit = (t - measured) / MS, self._setpoint_expiry / MS
@@ -116,6 +117,9 @@ class ControlService(Service):
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
+        if not (joints.name == self._names and len(joints.position) == len(joints.velocity) == len(self._names)):
+            wrong = f"joint_states: name = {joints.name}, {len(joints.position)} positions: must be {self._names}"
+            return self._stop_commands(t, Problem("joint_states", wrong))
         torque = self._controller.torque(joints.position, joints.velocity, self._reference.at(followed))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
         self._torque, self._torque_expires = torque, t + self._torque_expiry
@@ -128,6 +132,11 @@ class ControlService(Service):
     def _accept(self, message: Message, t: int) -> None:
         """Check a set-point and queue it until joint states as late as its stamp arrive; the first one is applied at once."""
         setpoint = Setpoint.from_message(message)
+        counts = {len(values) for values in (setpoint.q, setpoint.qd, setpoint.joint_stiffness)}
+        if counts != {self.model.joints}:
+            names = "joint_position, joint_velocity, joint_stiffness"
+            self._refuse(t, f"{names}: {sorted(counts)} values, want {self.model.joints} each")
+            return
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS
             self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {limit:.0f} ms")
@@ -164,7 +173,7 @@ class ControlService(Service):
         self._controller.reset()
         self._reference.clear()
         self._pending.clear()
-        return self._command(t, np.zeros(DOF), self._no_validity, problem)
+        return self._command(t, self._still, self._no_validity, problem)
 
     @staticmethod
     def _command(t: int, torque: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:

@@ -10,7 +10,7 @@ import pinocchio as pin
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control.model import ArmModel
 from palpate_control.reference import Reference, ReferenceMotion, coordinates
-from palpate_models.robot.lbr import urdf
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.schema import Robot
 
 DT = 1e-3

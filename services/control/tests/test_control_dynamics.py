@@ -14,7 +14,8 @@ from palpate_bus.setpoint import ControlMode
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
-from palpate_models.robot.lbr import HOME, urdf
+from palpate_models.robot.arm import urdf
+from palpate_models.robot.lbr import HOME
 from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000

@@ -14,7 +14,8 @@ from palpate_control import impedance, safety
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import TUNING, Extrapolator, Reference
-from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
+from palpate_models.robot.arm import urdf
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT
 
 REST = np.zeros(7)
 

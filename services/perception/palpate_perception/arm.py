@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, apply
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import capsules
 from palpate_models.robot.kinematics import link_transforms
 from palpate_models.scenario.schema import Robot
 
@@ -33,7 +33,7 @@ class ArmMask:
 
     def __init__(self, robot: Robot) -> None:
         self._robot = robot
-        self._capsules = lbr.capsules(robot)
+        self._capsules = capsules(robot)
 
     def hides(self, q: Array, p_WC: Array, r_W: Array, z: Array) -> NDArray[np.bool_]:
         """Return the mask of wall points p_WC + z r_W that may be hidden or dented at joint positions `q` [rad], shape (n,).

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import inertias
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.wall.surface import Foot
@@ -37,7 +37,7 @@ class ToolWeight:
     @staticmethod
     def of(robot: Robot) -> ToolWeight:
         """Return the tool of a robot: stand-off and sphere."""
-        inertia = lbr.inertias(robot)
+        inertia = inertias(robot)
         return ToolWeight(inertia["ft_sensor"].mass + inertia["indenter"].mass)
 
     def force(self, R_WS: Array) -> Array:
@@ -80,18 +80,18 @@ class SensorReading(NamedTuple):
     """Sensor values averaged over one planning period, so that force and depth belong together."""
 
     q: Array
-    """Joint positions [rad], shape (7,)."""
+    """Joint positions [rad], shape (n,)."""
     wrench_S: Array
     """Raw reading of the force/torque sensor, in its axes, force [N] then torque [N m], shape (6,)."""
     qd: Array
-    """Joint velocities [rad/s], shape (7,)."""
+    """Joint velocities [rad/s], shape (n,)."""
 
 
 class ContactMeasurement(NamedTuple):
     """Measured contact."""
 
     q: Array
-    """Joint positions [rad], shape (7,)."""
+    """Joint positions [rad], shape (n,)."""
     X_WI: Array
     """Pose of the indenter, shape (4, 4)."""
     R_WS: Array

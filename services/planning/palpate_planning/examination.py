@@ -10,7 +10,6 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.robot import lbr
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactSensing, ToolWeight
@@ -22,7 +21,7 @@ from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.presses import RequestedPresses
 from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, counted
-from palpate_planning.setpoints import NO_STIFFNESS, joint_setpoint
+from palpate_planning.setpoints import joint_setpoint
 from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
@@ -77,7 +76,7 @@ class ExaminationSequence:
         self._sense = ContactSensing(self._kinematics, ToolWeight.of(known.robot), wall, radius, periods.step_s)
         self._planner = ExamPlanner(known, periods.step_s)
         WORKER.submit(self._planner.prepare)
-        follower = TrajectoryFollower(self._kinematics, np.array(lbr.HOME))
+        follower = TrajectoryFollower(self._kinematics, self._kinematics.arm.home_rad)
         arm = FreeMotion(follower, self._planner, lockstep=lockstep)
         self._course = ExamCourse(arm, 0 if before is None else before.strokes)
         self._stops = Stops(self._course, known.limits.release_patience_s)
@@ -129,9 +128,9 @@ class ExaminationSequence:
         course.rate = self._restart.step(now.t)
         self._began = now.t if self._began is None else self._began
         if now.reading is None:
-            q = np.array(lbr.HOME)
+            q = self._kinematics.arm.home_rad
             self._await_robot(now.t, self._began)
-            return ExamStep(None, setpoint=joint_setpoint(now.t, self._kinematics.pose(q), q, stiffness=NO_STIFFNESS))
+            return ExamStep(None, setpoint=joint_setpoint(now.t, self._kinematics.pose(q), q, np.zeros_like(q), np.zeros_like(q)))
         if not self._started:
             self._started = True
             course.arm.hold(now.reading.q)
@@ -179,7 +178,7 @@ class ExaminationSequence:
     def _home(self, now: Observation, out: ExamStep) -> None:
         course = self._course
         try:
-            at_home = course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived)
+            at_home = course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived)
         except NoPathError as error:
             course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))
             return
@@ -290,7 +289,7 @@ class ExaminationSequence:
                 course.plan.segments,
                 known.exam,
                 known.limits,
-                known.robot.indenter_radius_m,
+                known.robot,
                 self._periods.step_s,
                 self._sense.wall,
                 strokes=self.status.stroke,
@@ -372,7 +371,7 @@ class ExaminationSequence:
     def _return(self, now: Observation, out: ExamStep) -> None:
         course = self._course
         try:
-            if not course.arm.move_to(now.t, np.array(lbr.HOME), course.perceived):
+            if not course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived):
                 return
         except NoPathError as error:
             course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))

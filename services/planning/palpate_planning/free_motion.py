@@ -76,13 +76,13 @@ class TrajectoryFollower:
     """Holds a posture, or follows a trajectory to its end and holds there."""
 
     def __init__(self, kinematics: ArmKinematics, q: Array) -> None:
-        """Start at rest at q [rad], shape (7,)."""
+        """Start at rest at q [rad], shape (n,)."""
         self._kinematics = kinematics
         self.hold(q)
 
     def hold(self, q: Array) -> None:
-        """Stay at q [rad], shape (7,)."""
-        self._trajectory = JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, 7)))
+        """Stay at q [rad], shape (n,)."""
+        self._trajectory = JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, len(q))))
         self._sample = 0.0
 
     def start(self, trajectory: JointTrajectory) -> None:
@@ -96,14 +96,14 @@ class TrajectoryFollower:
 
     @property
     def q(self) -> Array:
-        """Posture of the last set-point [rad], shape (7,)."""
+        """Posture of the last set-point [rad], shape (n,)."""
         return self._trajectory.at(self._sample)[0]
 
     def step(self, t: int, rate: float = 1.0) -> Setpoint:
         """Return the set-point at `t` [ns], `rate` samples further; see `RestartRamp`."""
         self._sample = min(self._sample + rate, len(self._trajectory) - 1.0)
         q, qd = self._trajectory.at(self._sample)
-        return joint_setpoint(t, self._kinematics.pose(q), q, rate * qd)
+        return joint_setpoint(t, self._kinematics.pose(q), q, rate * qd, self._kinematics.arm.stiffness_nmprad)
 
 
 class FreeMotion:
@@ -121,11 +121,11 @@ class FreeMotion:
 
     @property
     def q(self) -> Array:
-        """Posture of the last set-point [rad], shape (7,)."""
+        """Posture of the last set-point [rad], shape (n,)."""
         return self._follower.q
 
     def hold(self, q: Array) -> None:
-        """Stay at q [rad], shape (7,); drop a motion that is being planned."""
+        """Stay at q [rad], shape (n,); drop a motion that is being planned."""
         self._task = None
         self._follower.hold(q)
 
@@ -134,7 +134,7 @@ class FreeMotion:
         self._follower.start(trajectory)
 
     def move_to(self, t: int, goal: Array, perceived: PerceivedAbdomen | None) -> bool:
-        """Plan a motion to a posture [rad], shape (7,), then follow it; return True once there. Raises NoPathError."""
+        """Plan a motion to a posture [rad], shape (n,), then follow it; return True once there. Raises NoPathError."""
         if not self._follower.arrived:
             return False
         if self._task is None:

@@ -9,7 +9,7 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import Exam, Limits
+from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, Recovery, WallWatch
 from palpate_planning.reasons import Cause, Reason
@@ -83,7 +83,7 @@ class Palpation:
         segments: tuple[Segment, ...],
         exam: Exam,
         limits: Limits,
-        radius: float,
+        robot: Robot,
         period_s: float,
         wall: Wall,
         *,
@@ -96,7 +96,7 @@ class Palpation:
             segments: strokes and the paths between them.
             exam: what is examined, and how.
             limits: of force and speed.
-            radius: of the sphere [m].
+            robot: arm and tool.
             period_s: planning period [s].
             wall: what is pressed; every touch corrects it.
             strokes: descents made before.
@@ -106,7 +106,7 @@ class Palpation:
         self._more = more
         self._number = -1
         self.stage = StrokeStage.WAIT
-        self._motion = StrokeMotion(exam, limits, radius, period_s, wall)
+        self._motion = StrokeMotion(exam, limits, robot, period_s, wall)
         self._descent = Descent(self._motion, exam.depth_m, strokes)
         self.looked_again = False
         """True if the surface was scanned again because no tissue was felt."""

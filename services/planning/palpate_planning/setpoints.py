@@ -22,15 +22,11 @@ NORMAL_STIFFNESS: Final = 5000.0
 CARTESIAN_STIFFNESS: Final = _fixed([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
 """[N/m, N m/rad] in axes of the indenter: stiff along the tool, softer across it, softest in spin."""
 DAMPING_RATIO: Final = _fixed([0.8] * 6)
-JOINT_STIFFNESS: Final = _fixed([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
-"""Free motion [N m/rad]."""
-POSTURE_STIFFNESS: Final = _fixed([20.0] * 7)
+POSTURE_STIFFNESS: Final = 20.0
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
-NO_STIFFNESS: Final = _fixed([0.0] * 7)
-"""No torque [N m/rad]; the set-point only keeps the chain of commands alive."""
 _NO_TWIST: Final = _fixed([0.0] * 6)
 _NO_WRENCH: Final = _fixed([0.0] * 6)
-_JOINTS_AT_REST: Final = _fixed([0.0] * 7)
+_NO_JOINTS: Final = _fixed([])
 AT_REST: Final = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,
@@ -40,15 +36,15 @@ AT_REST: Final = Setpoint(
     F_W=_NO_WRENCH,
     stiffness=CARTESIAN_STIFFNESS,
     damping_ratio=DAMPING_RATIO,
-    q=_JOINTS_AT_REST,
-    qd=_JOINTS_AT_REST,
-    joint_stiffness=JOINT_STIFFNESS,
+    q=_NO_JOINTS,
+    qd=_NO_JOINTS,
+    joint_stiffness=_NO_JOINTS,
 )
 """Common fields of both kinds."""
 
 
-def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array = _JOINTS_AT_REST, stiffness: Array = JOINT_STIFFNESS) -> Setpoint:
-    """Return the set-point of free motion at `t` [ns]: joint positions q [rad] and velocities qd [rad/s], shape (7,).
+def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array, stiffness: Array) -> Setpoint:
+    """Return the set-point of free motion at `t` [ns]: positions [rad], velocities [rad/s], stiffness [N m/rad], shapes (n,).
 
     X_WI, shape (4, 4): pose of the indenter, for other readers of the message; the controller does not use it.
     """
@@ -62,11 +58,11 @@ def cartesian_setpoint(
     q: Array,
     V_WD: Array = _NO_TWIST,
     F_W: Array = _NO_WRENCH,
-    qd: Array = _JOINTS_AT_REST,
+    qd: Array | None = None,
 ) -> Setpoint:
     """Return the set-point of contact at `t` [ns]: pose, twist, feed-forward wrench, posture q [rad] in the null space.
 
     Shapes and units as in `Setpoint`.
     """
-    motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": qd}
-    return replace(AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=POSTURE_STIFFNESS, **motion)
+    motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": np.zeros_like(q) if qd is None else qd}
+    return replace(AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=np.full_like(q, POSTURE_STIFFNESS), **motion)

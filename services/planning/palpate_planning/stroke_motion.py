@@ -9,10 +9,11 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import Exam, Limits
+from palpate_models.robot.arm import arm_of
+from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
-from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
 from palpate_planning.motion.timing import JerkLimitedAxis
 from palpate_planning.periods import SECOND
 from palpate_planning.setpoints import NORMAL_STIFFNESS, cartesian_setpoint, joint_setpoint
@@ -65,9 +66,9 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
 class StrokeMotion:
     """Moves the commanded indenter along segments and up and down, within limits of speed and acceleration."""
 
-    def __init__(self, exam: Exam, limits: Limits, radius: float, period_s: float, wall: Wall) -> None:
-        """`radius` of the sphere [m]; depth is measured from the present `wall`."""
-        self._exam, self._limits, self._radius = exam, limits, radius
+    def __init__(self, exam: Exam, limits: Limits, robot: Robot, period_s: float, wall: Wall) -> None:
+        """Depth is measured from the present `wall`."""
+        self._exam, self._limits, self._radius, self._arm = exam, limits, robot.indenter_radius_m, arm_of(robot)
         self.period_s, self.speed_mps, self.wall = period_s, exam.speed_mps, wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
@@ -90,7 +91,7 @@ class StrokeMotion:
         self.segment = segment
         self.joined = self.joined and segment.free is None
         speed = self.speed_mps if segment.contact else MOTION.transfer_mps
-        self._speed_limit = segment.path.speed_limit(speed, self._limits)
+        self._speed_limit = segment.path.speed_limit(speed, self._limits.joint_velocity_scale * self._arm.velocity_radps)
         self._acceleration = LIMITS.acceleration_mps2 if segment.contact else MOTION.transfer_acceleration_mps2
         self.along = self._path_axis(0.0)
         """Path length travelled [m]."""
@@ -98,7 +99,7 @@ class StrokeMotion:
         self._following = True
         """False while a free motion pauses."""
         self._q_offset: Array | None = None
-        """Measured less planned joint positions at the start of a free motion [rad], shape (7,); None until then."""
+        """Measured less planned joint positions at the start of a free motion [rad], shape (n,); None until then."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
 
     def join(self, contact: ContactMeasurement) -> None:
@@ -151,13 +152,13 @@ class StrokeMotion:
         The square of the bend falls in proportion to the arm's reach. Where the skin is deeper or more lateral than perceived,
         the elbow bends less than planned, and will do so by as much on the rest of the plan.
         """
-        lost = self.point.q[ELBOW] ** 2 - q[ELBOW] ** 2
+        lost = self._arm.bend(self.point.q) ** 2 - self._arm.bend(q) ** 2
         return float(np.sqrt(max(KINEMATIC_LIMITS.too_straight_rad**2 + lost, 0.0)))
 
     @property
     def bend_ahead(self) -> float:
         """Planned bend of the elbow where the motion along the path can come to rest [rad]."""
-        return float(abs(self.segment.path.at(self.along.position + self.stopping_distance).q[ELBOW]))
+        return abs(self._arm.bend(self.segment.path.at(self.along.position + self.stopping_distance).q))
 
     # --- one period of motion -----------------------------------------------------------------------------------------
 
@@ -239,4 +240,5 @@ class StrokeMotion:
             self._q_offset = contact.q - free.q[0]
         x = self._sample / last if last else 1.0
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
-        return joint_setpoint(t, contact.X_WI, q + share * self._q_offset, rate * (qd + fading * self._q_offset))
+        q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
+        return joint_setpoint(t, contact.X_WI, q_now, qd_now, self._arm.stiffness_nmprad)

@@ -6,7 +6,8 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
-from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT, urdf
+from palpate_models.robot.arm import urdf
+from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
 from palpate_planning.placement.redundancy import RESOLUTION, PostureSequence, plan_redundancy, prepare
@@ -183,7 +184,7 @@ def test_bad_arguments_are_named(changes: dict[str, np.ndarray], named: str) -> 
 
 
 def test_default_base_serves_the_default_scan() -> None:
-    from research.base_placement import RAISED_M, scan_targets
+    from palpate.arm.placement import RAISED_M, scan_targets
 
     scenario = Scenario()
     for raised in (0.0, RAISED_M):
@@ -197,7 +198,7 @@ def test_default_base_serves_the_default_scan() -> None:
 
 @pytest.mark.slow
 def test_default_base_is_what_the_optimisation_finds() -> None:
-    from research.base_placement import best_placement
+    from palpate.arm.placement import best_placement
 
     best = best_placement(Scenario())
     np.testing.assert_allclose(base_of(best.robot), base_of(ROBOT), atol=0.011)

@@ -10,12 +10,13 @@ import pytest
 from planning_fakes import BASE, PERIOD_S, World, known
 
 from palpate_bus.setpoint import Setpoint
+from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.timing import JOINT_ACCELERATION, TIMING, JointTrajectory, RestartRamp, joint_trajectory
+from palpate_planning.motion.timing import TIMING, JointTrajectory, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.status import Phase
@@ -89,7 +90,7 @@ def free_palpation() -> Palpation:
     """Return a palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
     wall = plane(np.eye(4))
-    return Palpation((segment, segment), ExamSettings(), Limits(), BASE.indenter_radius_m, PERIOD_S, wall)
+    return Palpation((segment, segment), ExamSettings(), Limits(), BASE, PERIOD_S, wall)
 
 
 def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:
@@ -138,7 +139,7 @@ def test_after_a_gap_a_motion_resumes_from_rest(mover: str, late: int) -> None:
     for a, b in pairwise(setpoints[middle:]):
         step = 0.5 * PERIOD_S * (a.qd + b.qd)
         assert b.q - a.q == pytest.approx(step, abs=4e-4), "position and velocity belong together"
-        assert (np.abs(b.qd - a.qd) / PERIOD_S <= 1.5 * JOINT_ACCELERATION).all()
+        assert (np.abs(b.qd - a.qd) / PERIOD_S <= 1.5 * ARM.acceleration_radps2).all()
     along = np.array([s.q[0] for s in setpoints])
     assert (np.diff(along) >= 0.0).all()
 

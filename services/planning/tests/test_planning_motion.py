@@ -10,10 +10,10 @@ from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
-from palpate_planning.motion.kinematics import ELBOW, KINEMATIC_LIMITS, ArmKinematics
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene, with_skirt
-from palpate_planning.motion.timing import JOINT_ACCELERATION, JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 from palpate_planning.strokes.path import centre, least_twist, pose
 from palpate_planning.strokes.plan import ExamPlanner, look_postures
 from palpate_planning.strokes.segments import REACH, STRETCHED
@@ -140,7 +140,7 @@ def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
     assert trajectory.q[-1] == pytest.approx(points[1], abs=1e-9)
     speed = np.abs(np.diff(trajectory.q, axis=0)) / PERIOD_S
     assert (speed <= LIMITS.joint_velocity_scale * lbr.VELOCITY_LIMIT * 1.02).all()
-    assert (np.abs(np.diff(trajectory.qd, axis=0)) / PERIOD_S <= JOINT_ACCELERATION * 1.1).all()
+    assert (np.abs(np.diff(trajectory.qd, axis=0)) / PERIOD_S <= lbr.ARM.acceleration_radps2 * 1.1).all()
     tool = np.array([KINEMATICS.pose(q)[:3, 3] for q in trajectory.q])
     assert np.linalg.norm(np.diff(tool, axis=0), axis=1).max() / PERIOD_S <= LIMITS.speed_mps * 1.02
     assert trajectory.qd[-1] == pytest.approx(np.zeros(7), abs=1e-9)
@@ -158,16 +158,16 @@ def test_targets_that_need_a_stretched_arm_are_skipped() -> None:
     far = known(Robot(base_xy_m=(-0.22, 0.0)), region_m=(0.15, 0.0125), centre_m=(0.0, 0.0))
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME))
     assert {REACH, STRETCHED} == set(examination.skipped.values())
-    assert min(np.abs(segment.path.q[:, ELBOW]).min() for segment in examination.segments) > KINEMATIC_LIMITS.straight_rad
+    assert min(np.abs(segment.path.q[:, 3]).min() for segment in examination.segments) > KINEMATIC_LIMITS.straight_rad
 
 
 def test_paths_keep_the_elbow_bent(monkeypatch: pytest.MonkeyPatch) -> None:
     """Also between targets: the filter of targets is switched off here."""
-    monkeypatch.setattr("palpate_planning.strokes.plan.stretched", lambda q, bend: False)
+    monkeypatch.setattr("palpate_planning.motion.kinematics.ArmKinematics.stretched", lambda self, q, bend: False)
     far, bend = known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), 0.5
     examination = ExamPlanner(far, PERIOD_S).examination(seen_dome(far), np.array(lbr.HOME), bend=bend)
     assert STRETCHED in examination.skipped.values()
-    assert min(np.abs(segment.path.q[:, ELBOW]).min() for segment in examination.segments if segment.free is None) > 0.98 * bend
+    assert min(np.abs(segment.path.q[:, 3]).min() for segment in examination.segments if segment.free is None) > 0.98 * bend
 
 
 def test_speed_limit_brakes_ahead_of_a_slow_place() -> None:

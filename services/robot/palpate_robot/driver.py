@@ -16,10 +16,7 @@ import numpy as np
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
-
-HOLD_DAMPING: Final = np.array([100.0, 100.0, 80.0, 80.0, 40.0, 40.0, 20.0])
-"""Joint damping in a hold [N m s/rad] [A]: about 300 N s/m at the tool. Breathing at 8 mm/s against it adds less than 3 N."""
+from palpate_models.robot.chain import Arm
 
 
 @dataclass(frozen=True)
@@ -45,18 +42,7 @@ class DriverTuning:
 
 
 TUNING: Final = DriverTuning()
-_LIMITS: Final = tuple(
-    zip(
-        lbr.JOINT_NAMES,
-        lbr.POSITION_LIMIT.tolist(),
-        lbr.VELOCITY_LIMIT.tolist(),
-        lbr.TORQUE_LIMIT.tolist(),
-        strict=True,
-    )
-)
 _COMMAND: Final = "control/joint_torque"
-_ZERO: Final = np.zeros(7)
-_ZERO.setflags(write=False)
 
 
 class DriverMode(IntEnum):
@@ -98,10 +84,13 @@ class Command:
 
 
 class Driver:
-    """Chooses joint torques and damping. All arrays have shape (7,), order lbr_A1..lbr_A7."""
+    """Chooses joint torques and damping. All arrays have shape (n,), from the base to the flange."""
 
-    def __init__(self, force_emergency_n: float) -> None:
+    def __init__(self, arm: Arm, force_emergency_n: float) -> None:
         """`force_emergency_n`: external force at the tool [N] above which the driver holds."""
+        self._arm = arm
+        self._still = np.zeros(arm.joints)
+        self._still.setflags(write=False)
         self._force_emergency = force_emergency_n
         self.mode = DriverMode.IDLE
         self.cause = HoldCause.NONE
@@ -114,9 +103,9 @@ class Driver:
         self._checked: Command | None = None
         self._before: Array | None = None
         """Torques of the last checked command; None if no command was accepted since the driver was IDLE."""
-        still = np.zeros(7)  # compiles the functions of a tick
-        _within(still, still, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT)
-        _acceptable(still, still, still, lbr.TORQUE_LIMIT, TUNING.torque_rate_nm_per_ms)
+        still = np.zeros(arm.joints)  # compiles the functions of a tick
+        _within(still, still, arm.lower_rad, arm.upper_rad, arm.velocity_radps)
+        _acceptable(still, still, still, arm.torque_nm, TUNING.torque_rate_nm_per_ms)
 
     @property
     def held(self) -> bool:
@@ -150,7 +139,7 @@ class Driver:
             lost: True if the commander is lost.
         """
         if self.held:
-            return _ZERO
+            return self._still
         if lost:
             self.hold(t, HoldCause.COMMANDER_LOST, "the service of role control is lost", "control")
         elif not force <= self._force_emergency:  # also for NaN
@@ -164,25 +153,27 @@ class Driver:
             elif self.mode is DriverMode.ACTIVE:  # not checked, so it must not be applied
                 age = (t - command.stamp) / 1e6
                 self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is {age:.0f} ms old", _COMMAND)
-        return command.torque if command is not None and self.mode is DriverMode.ACTIVE else _ZERO
+        return command.torque if command is not None and self.mode is DriverMode.ACTIVE else self._still
 
     def damping(self, v: Array, gravity: Array) -> Array:
         """Return the joint damping of this tick [N m s/rad]; in a hold it is limited by the torque limits."""
         if self.mode is DriverMode.ACTIVE:
-            return _ZERO
-        wanted = HOLD_DAMPING
+            return self._still
+        wanted = self._arm.hold_damping_nms
         if self._brake:
             self._brake -= 1
-            wanted = TUNING.brake_factor * HOLD_DAMPING
-        room = lbr.TORQUE_LIMIT - np.abs(gravity)
+            wanted = TUNING.brake_factor * wanted
+        room = self._arm.torque_nm - np.abs(gravity)
         return np.asarray(np.minimum(wanted, np.maximum(room, 0.0) / np.maximum(np.abs(v), 1e-9)))
 
     def _check_joints(self, t: int, q: Array, v: Array) -> None:
-        if _within(q, v, lbr.POSITION_LIMIT, lbr.VELOCITY_LIMIT):
+        arm = self._arm
+        if _within(q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps):
             return
-        for (joint, q_max, v_max, _), q_i, v_i in zip(_LIMITS, q.tolist(), v.tolist(), strict=True):
-            if not -q_max <= q_i <= q_max:
-                self.hold(t, HoldCause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limit +-{q_max:.4f} rad")
+        limits = zip(arm.joint_names, arm.lower_rad.tolist(), arm.upper_rad.tolist(), arm.velocity_radps.tolist(), strict=True)
+        for (joint, q_min, q_max, v_max), q_i, v_i in zip(limits, q.tolist(), v.tolist(), strict=True):
+            if not q_min <= q_i <= q_max:
+                self.hold(t, HoldCause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limits {q_min:.4f} and {q_max:.4f} rad")
             elif not -v_max <= v_i <= v_max:
                 self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
 
@@ -204,9 +195,9 @@ class Driver:
             self.mode = DriverMode.ACTIVE
 
     def _check(self, t: int, command: Command, gravity: Array) -> None:
-        shape = np.shape(command.torque)
-        if shape != (7,):
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: torque of shape {shape}, want (7,)")
+        shape, want = np.shape(command.torque), (self._arm.joints,)
+        if shape != want:
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: torque of shape {shape}, want {want}")
             return
         if command.stamp > t + TUNING.ahead_ns:
             ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6
@@ -214,14 +205,15 @@ class Driver:
             self._reject(t, HoldCause.INVALID_COMMAND, reason)
             return
         first = self._before is None
-        before = _ZERO if self._before is None else self._before
+        before = self._still if self._before is None else self._before
         interval_ms = 1.0
         if self._checked is not None:
             interval_ms = min(max((command.stamp - self._checked.stamp) / 1e6, 1.0), TUNING.validity_ns / 1e6)
         change = TUNING.first_torque_nm if first else TUNING.torque_rate_nm_per_ms * interval_ms
-        if not _acceptable(command.torque, gravity, before, lbr.TORQUE_LIMIT, change):
+        if not _acceptable(command.torque, gravity, before, self._arm.torque_nm, change):
             numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
-            for (joint, _, _, limit), torque, last, weight in zip(_LIMITS, *numbers, strict=True):
+            joints = zip(self._arm.joint_names, self._arm.torque_nm.tolist(), *numbers, strict=True)
+            for joint, limit, torque, last, weight in joints:
                 if torque - torque != 0.0:  # NaN or infinite
                     self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {joint} = {torque} N m, must be finite")
                     return
@@ -246,12 +238,12 @@ class Driver:
 
 
 @compiled
-def _within(q: Array, v: Array, position_limit: Array, velocity_limit: Array) -> bool:
-    """Return True if positions and velocities, shapes (7,), are within plus or minus their limits and not NaN."""
-    return bool(np.all(np.abs(q) <= position_limit) and np.all(np.abs(v) <= velocity_limit))
+def _within(q: Array, v: Array, lower: Array, upper: Array, velocity_limit: Array) -> bool:
+    """Return True if positions and velocities, shapes (n,), are within their limits and not NaN."""
+    return bool(np.all(q >= lower) and np.all(q <= upper) and np.all(np.abs(v) <= velocity_limit))
 
 
 @compiled
 def _acceptable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
-    """Return True if a command (7,) plus gravity is within its limit and within `change` of the previous one [N m]."""
+    """Return True if a command (n,) plus gravity is within its limit and within `change` of the previous one [N m]."""
     return bool(np.all(np.abs(torque + gravity) <= limit) and np.all(np.abs(torque - before) <= change))

@@ -8,6 +8,7 @@ from typing import Final, Protocol
 import numpy as np
 
 from palpate_models.numerics.frames import Array
+from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.errors import ArmErrors, DrawnArm, draw_arm
 from palpate_models.scenario.schema import Robot
 
@@ -17,17 +18,20 @@ END_STOP_MARGIN_RAD: Final = 0.03
 """Distance of the mechanical end stop behind the position limit [A]; the driver acts at the limit."""
 STICK_RADPS: Final = 1e-3
 """Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this [A]."""
-FIXED_LINKS: Final = ("lbr_link_0", "lbr_link_1")
-"""Links at the base, which have no collision shapes."""
+FIXED_LINKS: Final = 2
+"""Number of links at the base, which have no collision shapes."""
 
-NOMINAL_ARM: Final = draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)))
-"""An arm without errors."""
+
+def nominal(robot: Robot) -> DrawnArm:
+    """Return an arm without errors."""
+    return draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)), arm_of(robot).joints)
+
 
 Wrench = tuple[float, float, float, float, float, float]
 
 
 class Plant(Protocol):
-    """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
+    """The arm with its tool. Arrays of joints have shape (n,), from the base to the flange; units N, N m, m, rad, s."""
 
     q: Array
     """Joint positions [rad], a fresh array at every step."""
@@ -41,13 +45,13 @@ class Plant(Protocol):
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
-        `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
+        `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
         ...
 
     def gravity_torque(self) -> Array:
-        """Return the joint torques that compensate gravity [N m], shape (7,), with the nominal tool mass."""
+        """Return the joint torques that compensate gravity [N m], shape (n,), with the nominal tool mass."""
         ...
 
     def sensor_wrench(self) -> Wrench:
@@ -62,7 +66,7 @@ class Plant(Protocol):
         ...
 
     def link_poses(self) -> Array:
-        """Return the poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
         ...
 
     def contacts(self) -> int:
@@ -74,5 +78,5 @@ class PlantFactory(Protocol):
     """Creates the plant of a scenario's robot."""
 
     def __call__(self, robot: Robot, *, drawn: DrawnArm) -> Plant:
-        """Return a plant at rest at `lbr.HOME`: the nominal robot with the arm errors `drawn`."""
+        """Return a plant at rest at home: the nominal robot with the arm errors `drawn`."""
         ...

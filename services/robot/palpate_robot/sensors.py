@@ -37,12 +37,12 @@ _NOISE_BLOCK: Final = 1024
 
 @compiled
 def _read(table: Array, q: Array, v: Array, torque: Array, dt: float) -> Array:
-    """Return readings of position and velocity, shape (2, 7), after a step of `dt` [s].
+    """Return readings of position and velocity, shape (2, n), after a step of `dt` [s].
 
-    Rows of `table`, shape (5, 7): zero, compliance, amplitude, phase, and d, which is updated.
+    Rows of `table`, shape (5, n): zero, compliance, amplitude, phase, and d, which is updated.
     """
-    out = np.empty((2, 7))
-    for i in range(7):
+    out = np.empty((2, len(q)))
+    for i in range(len(q)):
         rate = (table[1, i] * torque[i] - table[4, i]) / SETTLING_S
         table[4, i] += dt * rate
         angle = RIPPLES * q[i] + table[3, i]
@@ -52,20 +52,20 @@ def _read(table: Array, q: Array, v: Array, torque: Array, dt: float) -> Array:
 
 
 class JointSensor:
-    """Measured positions [rad] and velocities [rad/s], shapes (7,). Without white noise they are `q` and `v`."""
+    """Measured positions [rad] and velocities [rad/s], shapes (n,). Without white noise they are `q` and `v`."""
 
     def __init__(self, drawn: DrawnArm, rng: np.random.Generator, q: Array, torque: Array) -> None:
-        """Start with an arm at rest at positions `q` [rad] under joint torques including gravity [N m], shapes (7,)."""
+        """Start with an arm at rest at positions `q` [rad] under joint torques including gravity [N m], shapes (n,)."""
         given = drawn.given
-        ripple, compliance = np.full(7, given.ripple_rad), np.full(7, given.compliance_radpnm)
+        ripple, compliance = np.full(len(q), given.ripple_rad), np.full(len(q), given.compliance_radpnm)
         self._table = np.array((drawn.zero_rad, compliance, ripple, drawn.ripple_phase_rad, compliance * torque))
-        self._deviation = np.repeat((given.position_noise_rad, given.velocity_noise_radps), 7)
+        self._deviation = np.repeat((given.position_noise_rad, given.velocity_noise_radps), len(q))
         self._rng = rng
         self._noise: list[Array] = []
         """Noise of later measurements in reverse order; per tick positions, then velocities."""
         self.q: Array
         self.v: Array
-        self.q, self.v = _read(self._table, q, np.zeros(7), torque, 0.0)
+        self.q, self.v = _read(self._table, q, np.zeros_like(q), torque, 0.0)
 
     def update(self, q: Array, v: Array, torque: Array) -> None:
         """Advance by a step of the plant: true positions and velocities after it, and the torque during it."""
@@ -74,8 +74,8 @@ class JointSensor:
     def read(self) -> tuple[Array, Array]:
         """Return positions and velocities with white noise."""
         if not self._noise:
-            noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, 14))
-            self._noise = list(noise.reshape(-1, 7)[::-1])
+            noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, len(self._deviation)))
+            self._noise = list(noise.reshape(-1, len(self.q))[::-1])
         return self.q + self._noise.pop(), self.v + self._noise.pop()
 
 

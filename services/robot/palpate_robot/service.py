@@ -31,7 +31,7 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of, link_names, urdf
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
@@ -45,24 +45,24 @@ _LINKS_PERIOD = contract().topics["sim/link_poses"].period
 _CONTACT_AGE = contract().topics["sim/contact_wrench"].max_age
 _MOST_STEPS = 50
 """Largest number of plant steps in one tick, after an overrun in wall-clock mode."""
-_NAMES = list(lbr.JOINT_NAMES)
 
 
 class RobotService(Service):
-    """LBR iiwa 7 R800 with F/T sensor and spherical indenter, simulated."""
+    """The arm with F/T sensor and spherical indenter, simulated."""
 
     role: ClassVar[str] = "robot"
 
     def __init__(self, known: PlantInput, plant: PlantFactory) -> None:
-        """Start at rest at `lbr.HOME`. `plant` creates the physics."""
-        robot, drawn = known.robot, draw_errors(known.errors, known.seed)
+        """Start at rest at home. `plant` creates the physics."""
+        robot, arm = known.robot, arm_of(known.robot)
+        drawn = draw_errors(known.errors, known.seed, arm.joints)
         streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(2)
         joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
-        self._robot = robot
+        self._robot, self._names, self._links = robot, list(arm.joint_names), link_names(robot)
         self._plant = plant(robot, drawn=drawn.arm)
         self._sensor = FtSensor(drawn.force, ft_rng, DT)
         self._joints = JointSensor(drawn.arm, joint_rng, self._plant.q, self._plant.gravity_torque())
-        self._driver = Driver(known.limits.force_emergency_n)
+        self._driver = Driver(arm, known.limits.force_emergency_n)
         self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
@@ -71,7 +71,7 @@ class RobotService(Service):
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._pressed = False
-        self._applied: Array = np.zeros(7)  # never written to: messages keep it
+        self._applied: Array = np.zeros(arm.joints)  # never written to: messages keep it
         self._recent: list[Array] = []
         self._readings: list[list[float]] = []
         """Positions and velocities, and F/T readings, since the last status."""
@@ -80,7 +80,7 @@ class RobotService(Service):
 
     def start(self) -> Outbox:
         """Publish the robot description."""
-        return {"robot_description": String(lbr.urdf(self._robot))}
+        return {"robot_description": String(urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Advance the plant to `t` under the messages of the previous tick, and measure."""
@@ -162,7 +162,7 @@ class RobotService(Service):
     def _joint_state(self, stamp: Message) -> Message:
         q, v = self._joints.read()
         self._recent += (q, v)
-        return JointState(Header(stamp, ""), _NAMES, q, v, self._applied)
+        return JointState(Header(stamp, ""), self._names, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """Return the sensor reading. `up_S`: world z axis in sensor axes, for subtracting the tool weight."""
@@ -187,8 +187,8 @@ class RobotService(Service):
             int(driver.mode),
             int(driver.cause),
             driver.reason,
-            mean[:7],
-            mean[7:],
+            mean[: len(self._names)],
+            mean[len(self._names) :],
             Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)),
             self._applied,
             driver.rejected,
@@ -197,7 +197,7 @@ class RobotService(Service):
 
     def _link_poses(self, stamp: Message) -> Message:
         transforms, stamped = [], Header(stamp, "world")
-        for link, (px, py, pz, x, y, z, w) in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
+        for link, (px, py, pz, x, y, z, w) in zip(self._links, self._plant.link_poses().tolist(), strict=True):
             pose = Transform(Vector3(px, py, pz), Quaternion(x, y, z, w))
             transforms.append(TransformStamped(stamped, link, pose))
         return TFMessage(transforms)

@@ -6,8 +6,8 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import message_type
 from palpate_models.robot import lbr
+from palpate_models.robot.lbr import ARM
 from palpate_robot.driver import (
-    HOLD_DAMPING,
     TUNING,
     Command,
     Driver,
@@ -32,7 +32,7 @@ def _update(driver: Driver, t: int, command: Command | None, **changes: object) 
 
 @pytest.fixture
 def active() -> Driver:
-    driver = Driver(EMERGENCY)
+    driver = Driver(ARM, EMERGENCY)
     _update(driver, MS, _command(0))
     assert driver.mode is DriverMode.ACTIVE
     return driver
@@ -51,7 +51,7 @@ def test_validity_is_that_of_the_contract() -> None:
 
 
 def test_idle_until_the_first_valid_command() -> None:
-    driver = Driver(EMERGENCY)
+    driver = Driver(ARM, EMERGENCY)
     assert not _update(driver, 0, None).any()
     assert not _update(driver, 5 * MS, _command(MS, valid_ms=0)).any()
     assert driver.mode is DriverMode.IDLE, "a command that is already expired is ignored"
@@ -97,7 +97,7 @@ def test_broken_limits_hold(active: Driver, changes: dict, cause: HoldCause, wor
 )
 @pytest.mark.parametrize("first", [True, False])
 def test_bad_commands_hold_and_are_counted(torque: np.ndarray, cause: HoldCause, words: str, first: bool) -> None:
-    driver = Driver(EMERGENCY)
+    driver = Driver(ARM, EMERGENCY)
     if not first:
         _update(driver, MS, _command(0))
     assert not _update(driver, 2 * MS, _command(MS, torque)).any()
@@ -199,8 +199,8 @@ def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
     active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")
     for _ in range(TUNING.brake_ticks):
-        np.testing.assert_array_equal(active.damping(STILL, GRAVITY), TUNING.brake_factor * HOLD_DAMPING)
-    np.testing.assert_array_equal(active.damping(STILL, GRAVITY), HOLD_DAMPING)
+        np.testing.assert_array_equal(active.damping(STILL, GRAVITY), TUNING.brake_factor * ARM.hold_damping_nms)
+    np.testing.assert_array_equal(active.damping(STILL, GRAVITY), ARM.hold_damping_nms)
     fast = np.array([1.7, -1.7, 1.7, 2.2, -2.4, 3.1, 3.1])
     total = np.abs(active.damping(fast, GRAVITY) * fast) + np.abs(GRAVITY)
     assert np.all(total <= lbr.TORQUE_LIMIT + 1e-9)

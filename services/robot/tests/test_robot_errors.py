@@ -11,6 +11,7 @@ from lbr_bench import Rig
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, ArmErrors, DrawnArm, DrawnForce, Errors, ForceErrors, draw_errors
 from palpate_models.scenario.load import load_scenario, plant_input
@@ -217,7 +218,7 @@ def test_the_service_measures_another_tool_pose_than_the_true_one_and_reports_th
     for errors in ("none", "poor"):
         scenario = Scenario(seed=5, errors=Errors(level=errors))  # type: ignore[arg-type]
         service = create(scenario)
-        assert service.start()["robot_description"].data == lbr.urdf(scenario.robot)
+        assert service.start()["robot_description"].data == urdf(scenario.robot)
         sent = service.step(0, HandInbox())
         p = sent["sim/tool_state"].pose.position
         reported = tool_pose(sent["joint_states"].position, scenario.robot)[:3, 3]
@@ -244,4 +245,4 @@ def test_the_emulated_arm_has_the_errors_and_the_driver_does_not_know_them() -> 
     f = emulator.wrench(0).wrench.force
     expected = drawn.force.bias[2] + drawn.arm.tool_mass * scenario.robot.tool_mass_kg * GRAVITY
     assert f.z == pytest.approx(expected, abs=1.5)
-    assert Rig().driver.start()["robot_description"].data == lbr.urdf(scenario.robot)
+    assert Rig().driver.start()["robot_description"].data == urdf(scenario.robot)

@@ -10,13 +10,16 @@ from palpate.check.suites import check
 from palpate_bus.contract import MS
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import link_names, urdf
+from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart import plant as in_dart
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.backends.mujoco.service import create
-from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import END_STOP_MARGIN_RAD
+
+LINKS = link_names(Robot())
 
 NOTHING = np.zeros(3)
 
@@ -111,7 +114,7 @@ def test_sensor_at_rest_reads_weight_and_push() -> None:
     np.testing.assert_allclose(plant.sensor_wrench(), [0, 0, weight, 0, 0, 0], atol=1e-9)
     up = np.array([0.0, 0.0, 10.0])
     for _ in range(50):  # held by gravity torque and the driver's damping: it creeps, as a hold does
-        plant.step(plant.gravity_torque(), up, NOTHING, 50 * HOLD_DAMPING)
+        plant.step(plant.gravity_torque(), up, NOTHING, 50 * ARM.hold_damping_nms)
     np.testing.assert_allclose(plant.sensor_wrench()[:3], [0, 0, weight - 10.0], atol=0.2)
 
 
@@ -146,7 +149,7 @@ def test_limp_arm_comes_to_rest_on_the_table_not_in_it() -> None:
         plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)
         touched = max(touched, plant.contacts())
     assert touched > 0
-    assert plant.link_poses()[lbr.LINK_NAMES.index("lbr_link_7"), 2] > 0.73
+    assert plant.link_poses()[LINKS.index("lbr_link_7"), 2] > 0.73
 
 
 @pytest.mark.slow
@@ -158,7 +161,7 @@ def test_it_conforms_to_the_role_robot() -> None:
 
 def test_it_starts_at_home_and_says_what_it_is() -> None:
     service = create(load_scenario("clean"))
-    assert service.start()["robot_description"].data == lbr.urdf(load_scenario("clean").robot)
+    assert service.start()["robot_description"].data == urdf(load_scenario("clean").robot)
     rig = ServiceRig(service, RigSettings(load_scenario("clean"), 0.0, True))
     rig.run(0.01, {})
     assert rig.t > 5 * MS

@@ -8,11 +8,15 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import GRAVITY
+from palpate_models.robot import arm as robot_arm
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import FT_TO_INDENTER_M, link_names, urdf
+from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant
-from palpate_robot.driver import HOLD_DAMPING
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS
+
+LINKS = link_names(Robot())
 
 NOTHING = np.zeros(3)
 
@@ -28,7 +32,7 @@ def _postures(count: int, seed: int = 1) -> np.ndarray:
 
 
 def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
-    model = pin.buildModelFromXML(lbr.urdf(robot))
+    model = pin.buildModelFromXML(urdf(robot))
     model.gravity.linear = np.array([0.0, 0.0, -GRAVITY])
     return model, model.createData()
 
@@ -40,7 +44,7 @@ def test_forward_kinematics_agrees_with_pinocchio() -> None:
     for q in _postures(20):
         plant.reset(q)
         pin.framesForwardKinematics(model, data, q)
-        for link in lbr.LINK_NAMES:
+        for link in LINKS:
             p_WL, rotation = plant.link_pose(link)
             X_WL = data.oMf[model.getFrameId(link)]
             np.testing.assert_allclose(p_WL, X_WL.translation, atol=1e-9, err_msg=link)
@@ -72,7 +76,7 @@ def test_poses_and_weight_are_the_engines() -> None:
     rng = np.random.default_rng(5)
     for q in rng.uniform(-2, 2, (50, 7)):
         plant.reset(q)
-        engine = [plant.link_pose(link) for link in lbr.LINK_NAMES]
+        engine = [plant.link_pose(link) for link in LINKS]
         poses = plant.link_poses()
         np.testing.assert_allclose(poses[:, :3], [p for p, _ in engine], atol=1e-12)
         np.testing.assert_allclose(poses[:, 3:], [(r.x(), r.y(), r.z(), r.w()) for _, r in engine], atol=1e-12)
@@ -209,7 +213,7 @@ def test_hold_stops_a_moving_tool_within_a_millimetre() -> None:
     plant.reset(q, np.linalg.pinv(J) @ [0.0, 0.0, -0.03, 0.0, 0.0, 0.0])
     start = plant.tool_motion()
     for _ in range(300):
-        plant.step(plant.gravity_torque(), NOTHING, NOTHING, HOLD_DAMPING)
+        plant.step(plant.gravity_torque(), NOTHING, NOTHING, ARM.hold_damping_nms)
     end = plant.tool_motion()
     assert 0 < start[2] - end[2] < 1e-3
     assert np.abs(plant.v).max() < 1e-3
@@ -227,9 +231,9 @@ def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = 
 
 def _centre_of_mass(robot: Robot) -> np.ndarray:
     """Centre of mass of what is below the sensor, in its frame [m]."""
-    inertias = lbr.inertias(robot)
+    inertias = robot_arm.inertias(robot)
     standoff, sphere = inertias["ft_sensor"], inertias["indenter"]
-    at = np.array([0.0, 0.0, lbr.FT_TO_INDENTER_M])
+    at = np.array([0.0, 0.0, FT_TO_INDENTER_M])
     moment = standoff.mass * np.array(standoff.com) + sphere.mass * (np.array(sphere.com) + at)
     return np.asarray(moment / (standoff.mass + sphere.mass))
 
@@ -264,17 +268,17 @@ def test_sideways_force_has_the_lever_of_the_standoff() -> None:
     force_W = np.array([0.0, 3.0, 0.0])  # HOME turns the tool by pi about y, so y of the sensor is y of world
     pushed = _settle(plant, force=force_W, moment=np.array([0.0, 0.02, 0.0])) - free
     np.testing.assert_allclose(pushed[:3], [0.0, 3.0, 0.0], atol=0.01)
-    np.testing.assert_allclose(pushed[3:], [-3.0 * lbr.FT_TO_INDENTER_M, 0.02, 0.0], atol=1e-3)
+    np.testing.assert_allclose(pushed[3:], [-3.0 * FT_TO_INDENTER_M, 0.02, 0.0], atol=1e-3)
 
 
 def test_moving_tool_reads_weight_contact_and_inertia() -> None:
     """Newton and Euler for the body below the sensor, from pinocchio, along a motion of the plant."""
     plant = DartPlant(ROBOT, lbr.HOME)
-    model = pin.buildModelFromXML(lbr.urdf(ROBOT, geometry=False))
+    model = pin.buildModelFromXML(urdf(ROBOT, geometry=False))
     data = model.createData()
     frame = model.getFrameId("ft_sensor")
-    inertias = lbr.inertias(ROBOT)
-    X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, lbr.FT_TO_INDENTER_M]))
+    inertias = robot_arm.inertias(ROBOT)
+    X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, FT_TO_INDENTER_M]))
     spatial = {
         link: pin.Inertia(i.mass, np.array(i.com), np.diag(i.diagonal))
         for link, i in inertias.items()

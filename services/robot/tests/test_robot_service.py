@@ -12,10 +12,13 @@ from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import link_names, urdf
 from palpate_models.scenario.errors import Errors, ForceErrors
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_robot.backends.dart.service import create
 from palpate_robot.service import RobotService
+
+LINKS = link_names(Robot())
 
 MS = 1_000_000
 STATUS = message_type("palpation_msgs/msg/RobotStatus")
@@ -94,13 +97,13 @@ def test_every_topic_comes_at_its_tick_and_keeps_its_ranges(rig: Rig) -> None:
 
 
 def test_description_is_the_urdf(rig: Rig) -> None:
-    assert rig.robot.start()["robot_description"].data == lbr.urdf(Robot())
+    assert rig.robot.start()["robot_description"].data == urdf(Robot())
 
 
 def test_link_poses_name_every_link_once(rig: Rig) -> None:
     rig.tick()
     children = [transform.child_frame_id for transform in rig.outbox["sim/link_poses"].transforms]
-    assert children == list(lbr.LINK_NAMES)
+    assert children == list(LINKS)
 
 
 def test_first_tick_is_the_state_at_the_start(rig: Rig) -> None:

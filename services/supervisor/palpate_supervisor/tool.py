@@ -10,7 +10,7 @@ import pinocchio as pin
 
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import nearest_vertex
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.schema import Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -46,7 +46,7 @@ class ToolSense:
     """Evaluates tool state from joint state and F/T reading. The sensor bias is the mean reading before the arm first moves."""
 
     def __init__(self, robot: Robot) -> None:
-        self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
+        self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
         self._data = self._model.createData()
         self._indenter = self._model.getFrameId("indenter")
         self._sensor = self._model.getFrameId("ft_sensor")
@@ -57,7 +57,7 @@ class ToolSense:
         self._bias_S, self._rested, self._moved = np.zeros(3), 0, False
 
     def sense(self, q: Array, qd: Array, wrench_S: Array) -> Tool:
-        """Return the tool state at joint positions [rad] and velocities [rad/s], shapes (7,), and the F/T reading, shape (6,)."""
+        """Return the tool state at joint positions [rad] and velocities [rad/s], shapes (n,), and the F/T reading, shape (6,)."""
         model, data = self._model, self._data
         pin.forwardKinematics(model, data, q, qd)
         pin.updateFramePlacement(model, data, self._indenter)

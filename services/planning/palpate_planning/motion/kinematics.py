@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.scenario.schema import Limits, Robot
 
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
@@ -32,16 +32,13 @@ class KinematicLimits:
 
 KINEMATIC_LIMITS = KinematicLimits()
 
-ELBOW = 3
-"""Index of the joint that determines the distance from shoulder to wrist."""
-
 
 @dataclass(frozen=True, slots=True)
 class IkSolution:
     """Result of inverse kinematics."""
 
     q: Array
-    """Joint positions [rad], shape (7,)."""
+    """Joint positions [rad], shape (n,)."""
     ok: bool
     """True if the pose is met to `KINEMATIC_LIMITS.tolerance_m` and `KINEMATIC_LIMITS.tolerance_rad` within the limits."""
     error_m: float
@@ -50,23 +47,24 @@ class IkSolution:
     """Orientation error, or error of the tool axis if spin is free [rad]."""
 
 
-def stretched(q: Array, bend: float) -> bool:
-    """Return True if the elbow is bent by less than `bend` [rad] at joint positions q [rad]."""
-    return bool(abs(q[ELBOW]) < bend)
-
-
 class ArmKinematics:
     """Kinematics of the arm on pinocchio. W: world, I: indenter (origin at the sphere's centre), S: F/T sensor."""
 
     def __init__(self, robot: Robot, limits: Limits) -> None:
-        self.model = pin.buildModelFromXML(lbr.urdf(robot))
+        self.arm = arm_of(robot)
+        self.model = pin.buildModelFromXML(urdf(robot))
         self.data = self.model.createData()
         self._indenter = self.model.getFrameId("indenter")
         self._sensor = self.model.getFrameId("ft_sensor")
         self._R_WS: Array = self.data.oMf[self._sensor].rotation
         """View of pinocchio's latest result."""
-        self.upper: Array = lbr.POSITION_LIMIT - limits.joint_margin_rad
-        """Upper joint limits used by planning [rad], shape (7,); the lower limits are their negatives."""
+        self.lower: Array = self.arm.lower_rad + limits.joint_margin_rad
+        """Joint limits used by planning [rad], shape (n,)."""
+        self.upper: Array = self.arm.upper_rad - limits.joint_margin_rad
+
+    def stretched(self, q: Array, bend: float) -> bool:
+        """Return True if the elbow is bent by less than `bend` [rad] at joint positions q [rad]."""
+        return abs(self.arm.bend(q)) < bend
 
     def pose(self, q: Array) -> Array:
         """Return X_WI, shape (4, 4), at joint positions q [rad]."""
@@ -83,7 +81,7 @@ class ArmKinematics:
         return X_WI, self._R_WS.copy()
 
     def jacobian(self, q: Array) -> Array:
-        """Return J with V_WI_W = J qd of the sphere's centre, linear rows first, world axes, shape (6, 7)."""
+        """Return J with V_WI_W = J qd of the sphere's centre, linear rows first, world axes, shape (6, n)."""
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
@@ -101,8 +99,8 @@ class ArmKinematics:
         Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates; the null space tends to `q_rest`
         (mid-range if None), and joints are clipped to the limits with margin. Deterministic; at most `iterations` steps.
         """
-        rest = np.zeros(7) if q_rest is None else q_rest
-        q = np.clip(np.asarray(q_seed, dtype=float), -self.upper, self.upper)
+        rest = self.arm.middle_rad if q_rest is None else q_rest
+        q = np.clip(np.asarray(q_seed, dtype=float), self.lower, self.upper)
         best = (np.inf, q, np.inf, np.inf)
         rows = 5 if spin_free else 6
         damping = 1e-6 * np.eye(rows)
@@ -123,7 +121,7 @@ class ArmKinematics:
             scale = min(1.0, 0.3 / max(float(np.linalg.norm(b)), 1e-9))
             pull = 0.1 * (rest - q)
             q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
-            q = np.clip(q, -self.upper, self.upper)
+            q = np.clip(q, self.lower, self.upper)
         _, q, error_m, error_rad = best
         return IkSolution(
             q, error_m < KINEMATIC_LIMITS.tolerance_m and error_rad < KINEMATIC_LIMITS.tolerance_rad, error_m, error_rad

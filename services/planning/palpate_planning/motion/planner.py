@@ -39,8 +39,8 @@ class NoPathError(RunError):
     """No collision-free motion was found between two postures."""
 
 
-def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
-    """Return way points, shape (n, 7), of a collision-free path from q0 to q1 within +-bound [rad], ends included.
+def plan(scene: CollisionScene, q0: Array, q1: Array, bounds: tuple[Array, Array], seed: int) -> Array:
+    """Return way points, shape (k, n), of a collision-free path from q0 to q1 within `bounds` [rad], ends included.
 
     Raises NoPathError if an end collides or after `TUNING.iterations`.
     """
@@ -49,14 +49,14 @@ def plan(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -
             raise NoPathError(f"{name} posture {np.round(q, 3).tolist()} collides: {', '.join(scene.collisions(q))}")
     if scene.motion_free(q0, q1):
         return np.array([q0, q1])
-    return _shortcut(scene, _rrt_connect(scene, q0, q1, bound, seed))
+    return _shortcut(scene, _rrt_connect(scene, q0, q1, bounds, seed))
 
 
 def timed_motion(
     scene: CollisionScene, kinematics: ArmKinematics, limits: Limits, q0: Array, q1: Array, seed: int, period_s: float
 ) -> JointTrajectory:
     """Return a collision-free motion from q0 to q1 within all limits, sampled every `period_s`. Raises NoPathError."""
-    points = plan(scene, q0, q1, kinematics.upper, seed)
+    points = plan(scene, q0, q1, (kinematics.lower, kinematics.upper), seed)
     for blend in TUNING.blends_rad:
         smooth = rounded(points, blend)
         if len(points) == 2 or scene.path_free(smooth):
@@ -64,21 +64,22 @@ def timed_motion(
     raise NoPathError(f"corners of the motion to {np.round(q1, 3).tolist()} cannot be rounded without collision")
 
 
-def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed: int) -> Array:
+def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, within: tuple[Array, Array], seed: int) -> Array:
     util.noOutputHandler()  # suppresses a warning about the late seed; every sampler is created below
     util.RNG.setSeed(seed + 1)  # OMPL rejects seed 0
-    space = base.RealVectorStateSpace(7)
-    bounds = base.RealVectorBounds(7)
-    for i in range(7):
-        bounds.setLow(i, float(min(-bound[i], q0[i], q1[i])))
-        bounds.setHigh(i, float(max(bound[i], q0[i], q1[i])))
+    n, (lower, upper) = len(q0), within
+    space = base.RealVectorStateSpace(n)
+    bounds = base.RealVectorBounds(n)
+    for i in range(n):
+        bounds.setLow(i, float(min(lower[i], q0[i], q1[i])))
+        bounds.setHigh(i, float(max(upper[i], q0[i], q1[i])))
     space.setBounds(bounds)
     information = base.SpaceInformation(space)
-    information.setStateValidityChecker(lambda state: scene.free(np.array([state[i] for i in range(7)])))
+    information.setStateValidityChecker(lambda state: scene.free(np.array([state[i] for i in range(n)])))
     information.setStateValidityCheckingResolution(COLLISION.step_rad / space.getMaximumExtent())
     information.setup()
     start, goal = space.allocState(), space.allocState()
-    for i in range(7):
+    for i in range(n):
         start[i], goal[i] = float(q0[i]), float(q1[i])
     problem = base.ProblemDefinition(information)
     problem.setStartAndGoalStates(start, goal)
@@ -91,7 +92,7 @@ def _rrt_connect(scene: CollisionScene, q0: Array, q1: Array, bound: Array, seed
     if not problem.hasExactSolution():
         ends = f"from {np.round(q0, 3).tolist()} to {np.round(q1, 3).tolist()}"
         raise NoPathError(f"no collision-free motion {ends} in {TUNING.iterations} iterations")
-    return np.array([[state[i] for i in range(7)] for state in problem.getSolutionPath().getStates()])
+    return np.array([[state[i] for i in range(n)] for state in problem.getSolutionPath().getStates()])
 
 
 def _shortcut(scene: CollisionScene, path: Array) -> Array:

@@ -12,7 +12,8 @@ import pinocchio as pin
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply
-from palpate_models.robot import lbr, table
+from palpate_models.robot import table
+from palpate_models.robot.arm import capsules, link_names
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
@@ -45,9 +46,9 @@ def _alignment(start: Array, end: Array) -> pin.SE3:
 
 def _arm_shapes(model: pin.Model, robot: Robot) -> Iterator[tuple[str, int, pin.SE3, coal.CollisionGeometry]]:
     """Yield link, parent joint, pose in the joint and shape of each capsule of the arm, base first."""
-    for link, capsules in lbr.capsules(robot).items():
+    for link, parts in capsules(robot).items():
         frame = model.frames[model.getFrameId(link)]
-        for capsule in capsules:
+        for capsule in parts:
             start, end = np.array(capsule.start), np.array(capsule.end)
             length = float(np.linalg.norm(end - start))
             shape = coal.Capsule(capsule.radius, length) if length > 0 else coal.Sphere(capsule.radius)
@@ -96,17 +97,17 @@ class CollisionScene:
         self._model = kinematics.model
         self._data = self._model.createData()
         self._geometry = pin.GeometryModel()
-        arm = self._add_arm(robot)
+        arm, links = self._add_arm(robot), link_names(robot)
         obstacles = [(box.name, self._add(box.name, 0, pin.SE3(box.X_WB), coal.Box(*box.size))) for box in table.boxes(robot)]
         if abdomen is not None:
             vertices, triangles = with_skirt(*abdomen, table.TABLE_TOP_M)
             obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
         for k, (link, shape) in enumerate(arm):
             for other, other_shape in arm[:k]:
-                if lbr.LINK_NAMES.index(link) - lbr.LINK_NAMES.index(other) >= COLLISION.links_apart:
+                if links.index(link) - links.index(other) >= COLLISION.links_apart:
                     self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
             for name, obstacle in obstacles:
-                mounted = link == "lbr_link_0" or (link == "lbr_link_1" and name == "robot_base")
+                mounted = link == links[0] or (link == links[1] and name == "robot_base")
                 if not mounted and not (name == "abdomen" and tool_may_touch and link in TOOL_LINKS):
                     self._geometry.addCollisionPair(pin.CollisionPair(shape, obstacle))
         self._results = self._geometry.createData()

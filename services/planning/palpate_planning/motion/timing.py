@@ -13,13 +13,9 @@ import ruckig
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS
-
-JOINT_ACCELERATION: Final = np.array([4.0, 4.0, 5.0, 5.0, 7.0, 7.0, 8.0])
-"""Joint acceleration of free motion [rad/s^2] [A]: about a third of what the arm's torques allow."""
 
 
 @dataclass(frozen=True)
@@ -148,7 +144,7 @@ class JointTrajectory:
 
 
 def rounded(points: Array, blend: float) -> Array:
-    """Return a joint-space polyline, shape (n, 7), with corners replaced by sampled parabolas, shape (m, 7).
+    """Return a joint-space polyline, shape (k, n), with corners replaced by sampled parabolas, shape (m, 7).
 
     At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola is in the triangle of
     the corner and its two ends, at most blend / 4 from the corner.
@@ -168,7 +164,7 @@ def rounded(points: Array, blend: float) -> Array:
 
 
 def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, period_s: float) -> JointTrajectory:
-    """Time a joint-space polyline, shape (n, 7), within joint speed, joint acceleration and tool speed limits.
+    """Time a joint-space polyline, shape (k, n), within joint speed, joint acceleration and tool speed limits.
 
     The path is q(s) with s its length; s(t) comes from ruckig with a speed limit per position:
     |q'| v <= joint_velocity_scale * limit, |J q'| v <= speed_mps, |q''| v^2 <= half of the acceleration limit; the other
@@ -177,21 +173,21 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     lengths = np.linalg.norm(np.diff(points, axis=0), axis=1)
     points = points[np.concatenate(([True], lengths > 1e-9))]
     if len(points) < 2:
-        return JointTrajectory(points[:1].copy(), np.zeros((1, 7)))
+        return JointTrajectory(points[:1].copy(), np.zeros_like(points[:1]))
     knots = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(points, axis=0), axis=1))))
     s = np.unique(np.concatenate([np.linspace(a, b, max(2, round((b - a) / 0.02) + 1)) for a, b in pairwise(knots)]))
-    q = np.column_stack([np.interp(s, knots, points[:, i]) for i in range(7)])
+    q = np.column_stack([np.interp(s, knots, points[:, i]) for i in range(points.shape[1])])
     tangent = np.gradient(q, s, axis=0)
     bend = np.abs(np.gradient(tangent, s, axis=0)) if len(s) > 2 else np.zeros_like(q)
     tool = np.array([np.linalg.norm((kinematics.jacobian(a) @ b)[:3]) for a, b in zip(q, tangent, strict=True)])
     speeds = np.column_stack(
         [
-            limits.joint_velocity_scale * lbr.VELOCITY_LIMIT / np.maximum(np.abs(tangent), 1e-9),
-            np.sqrt(0.5 * JOINT_ACCELERATION / np.maximum(bend, 1e-9)),
+            limits.joint_velocity_scale * kinematics.arm.velocity_radps / np.maximum(np.abs(tangent), 1e-9),
+            np.sqrt(0.5 * kinematics.arm.acceleration_radps2 / np.maximum(bend, 1e-9)),
         ]
     )
     speed = np.minimum(speeds.min(axis=1), limits.speed_mps / np.maximum(tool, 1e-9))
-    acceleration = float((0.5 * JOINT_ACCELERATION / np.maximum(np.abs(tangent), 1e-9)).min())
+    acceleration = float((0.5 * kinematics.arm.acceleration_radps2 / np.maximum(np.abs(tangent), 1e-9)).min())
     limit = SpeedLimit(s, speed, 0.7 * acceleration)
     axis = JerkLimitedAxis(0.0, acceleration, acceleration / TIMING.rise_s, period_s)
     positions, rates = [0.0], [0.0]
@@ -201,6 +197,6 @@ def joint_trajectory(kinematics: ArmKinematics, points: Array, limits: Limits, p
     positions.append(float(s[-1]))
     rates.append(0.0)
     along, rate = np.array(positions), np.array(rates)
-    Q = np.column_stack([np.interp(along, s, q[:, i]) for i in range(7)])
-    T = np.column_stack([np.interp(along, s, tangent[:, i]) for i in range(7)])
+    Q = np.column_stack([np.interp(along, s, q[:, i]) for i in range(points.shape[1])])
+    T = np.column_stack([np.interp(along, s, tangent[:, i]) for i in range(points.shape[1])])
     return JointTrajectory(Q, T * rate[:, None])

@@ -2,9 +2,9 @@
 
     postures = plan_redundancy(robot, positions_W, normals_W, q_seed)
 
-Position and tool axis take five of seven joints. The rest (elbow swivel and spin about the tool) is chosen by optimisation: far
-from joint limits and singularities, little torque at the pressing force, elbow high, smooth along the path.
-`python -m research.base_placement` optimises the base placement with the same costs.
+Position and tool axis take five of six or seven joints. The rest (elbow swivel, spin about the tool) is chosen by optimisation:
+far from joint limits and singularities, little torque at the pressing force, elbow high, smooth along the path.
+`palpate arm place` optimises the base placement with the same costs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ from scipy.interpolate import PchipInterpolator
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.lbr import POSITION_LIMIT, TORQUE_LIMIT
+from palpate_models.robot.arm import arm_of
+from palpate_models.robot.chain import Arm
 from palpate_models.scenario.schema import Robot
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
@@ -45,9 +46,9 @@ RESOLUTION = ResolutionTuning()
 class Batch:
     """Targets with their CasADi maps, evaluated for all postures at once. Postures are rows."""
 
-    def __init__(self, robot: Robot, positions: Array, normals: Array, limit: Array, force: float) -> None:
-        n = len(positions)
-        self.robot, self.count, self.limit, self.force = robot, n, limit, force
+    def __init__(self, robot: Robot, positions: Array, normals: Array, limits: tuple[Array, Array], force: float) -> None:
+        n, self.arm = len(positions), arm_of(robot)
+        self.robot, self.count, self.limits, self.force = robot, n, limits, force
         self.base = base_of(robot)
         self.positions = positions
         self.frames = surface_frames(normals)
@@ -57,9 +58,9 @@ class Batch:
         self._frames = np.hstack(list(self.frames))
 
     def task(self, q: Array) -> tuple[Array, Array]:
-        """Return residuals (n, 5) and their Jacobians (n, 5, 7)."""
+        """Return residuals (n, 5) and their Jacobians (n, 5, joints)."""
         residual, jacobian = self._task(q.T, self._base, self.positions.T, self._frames)
-        return np.array(residual).T, np.array(jacobian).reshape(5, self.count, 7).transpose(1, 0, 2)
+        return np.array(residual).T, np.array(jacobian).reshape(5, self.count, self.arm.joints).transpose(1, 0, 2)
 
     def cost(self, q: Array) -> Array:
         """Return the costs of the postures, shape (n,)."""
@@ -67,7 +68,7 @@ class Batch:
         return cost
 
     def gradient(self, q: Array) -> Array:
-        """Return the gradients of the costs, shape (n, 7)."""
+        """Return the gradients of the costs, shape (n, joints)."""
         return np.array(self._cost(q.T, self._base, self.force)[1]).T
 
     def facing(self, q: Array) -> Array:
@@ -76,7 +77,7 @@ class Batch:
         return cosine
 
     def solve(self, q: Array, steps: int, descent: float) -> Array:
-        """Return postures after damped Gauss-Newton steps, shape (n, 7); `descent` scales the cost gradient in the null space."""
+        """Return postures after damped Gauss-Newton steps, shape (n, joints); `descent` scales the gradient in the null space."""
         damping = 1e-6 * np.eye(5)
         for step in range(steps):
             residual, J = self.task(q)
@@ -90,20 +91,20 @@ class Batch:
                 move += push
             largest = np.abs(move).max(axis=1, keepdims=True)
             q = q + move * np.minimum(1.0, RESOLUTION.largest_step_rad / np.maximum(largest, 1e-12))
-            q = np.clip(q, -self.limit, self.limit)
+            q = np.clip(q, *self.limits)
         return q
 
     def part(self, indices: NDArray[np.intp]) -> Batch:
         """Return a batch with some of the targets."""
-        return Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limit, self.force)
+        return Batch(self.robot, self.positions[indices], self.frames[indices, :, 2], self.limits, self.force)
 
     def search(self, q: Array) -> Array:
-        """Return inverse kinematics from postures `q` with low cost, shape (n, 7)."""
+        """Return inverse kinematics from postures `q` with low cost, shape (n, joints)."""
         return self.solve(self.solve(q, RESOLUTION.ik_steps, RESOLUTION.descent), RESOLUTION.projection_steps, 0.0)
 
     def from_one(self, start: Array) -> Array:
-        """Return inverse kinematics of all targets from one posture, shape (n, 7)."""
-        return self.search(np.tile(np.clip(start, -self.limit, self.limit), (self.count, 1)))
+        """Return inverse kinematics of all targets from one posture, shape (n, joints)."""
+        return self.search(np.tile(np.clip(start, *self.limits), (self.count, 1)))
 
     def verdict(self, q: Array) -> tuple[int, float]:
         """Return a score, lower is better: number of missed targets, then mean cost of the others, rounded for repeatability."""
@@ -141,7 +142,7 @@ class PostureSequence:
     """A posture for each target, in the order of the targets."""
 
     q: Array
-    """Joint positions [rad], shape (n, 7); the closest posture where the target is not reachable."""
+    """Joint positions [rad], shape (n, joints); the closest posture where the target is not reachable."""
     reachable: Mask
     """True where the target is reached within the joint limits minus the margin, shape (n,)."""
     margin: Array
@@ -171,7 +172,7 @@ def plan_redundancy(
         robot: the robot with its base placement and tool.
         positions_W: origins of the indenter frame (the sphere's centre) in world, in path order [m], shape (n, 3).
         normals_W: outward unit surface normals in world, shape (n, 3).
-        q_seed: initial posture, e.g. the present one [rad], shape (7,); it selects among equally good branches.
+        q_seed: initial posture, e.g. the present one [rad], shape (joints,); it selects among equally good branches.
         joint_margin_rad: distance kept from each joint limit.
         force_n: normal force of the postures.
 
@@ -180,19 +181,21 @@ def plan_redundancy(
     """
     positions, normals = np.asarray(positions_W, dtype=float), np.asarray(normals_W, dtype=float)
     seed = np.asarray(q_seed, dtype=float)
-    if positions.ndim != 2 or positions.shape[1] != 3 or normals.shape != positions.shape or seed.shape != (7,):
+    model = arm_of(robot)
+    if positions.ndim != 2 or positions.shape[1] != 3 or normals.shape != positions.shape or seed.shape != (model.joints,):
         raise ValueError(
-            f"want positions_W (n, 3), normals_W (n, 3), q_seed (7,), not {positions.shape}, {normals.shape}, {seed.shape}"
+            f"want positions_W (n, 3), normals_W (n, 3), q_seed ({model.joints},), "
+            f"not {positions.shape}, {normals.shape}, {seed.shape}"
         )
     for name, value in (("positions_W", positions), ("normals_W", normals), ("q_seed", seed)):
         if not np.isfinite(value).all():
             raise ValueError(f"{name}: must be finite")
     if len(positions) == 0:
         empty = np.zeros(0)
-        return PostureSequence(np.zeros((0, 7)), np.zeros(0, dtype=bool), empty, empty, empty, empty, True)
+        return PostureSequence(np.zeros((0, model.joints)), np.zeros(0, dtype=bool), empty, empty, empty, empty, True)
 
-    limit = np.asarray(POSITION_LIMIT) - joint_margin_rad
-    batch = Batch(robot, positions, normals, limit, force_n)
+    limits = (model.lower_rad + joint_margin_rad, model.upper_rad - joint_margin_rad)
+    batch = Batch(robot, positions, normals, limits, force_n)
     q = _inverse_kinematics(batch, seed)
     refined = False
     reachable = batch.reached(q)[1]
@@ -215,16 +218,26 @@ def _at_origin(robot: Robot) -> Robot:
 
 
 def _seeds(batch: Batch, seed: Array) -> list[Array]:
-    """Return initial postures: the caller's, and elbow-up ones facing the centre of the targets."""
+    """Return initial postures: the caller's, and those of the arm, facing the centre of the targets."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
-    fan = [np.array([azimuth, tilt, 0.0, -bend, 0.0, 1.2, 0.0]) for tilt in (0.3, 0.8) for bend in (1.6, 1.0)]
-    return [seed, *fan]
+    return [seed, *_turned(batch.arm, azimuth)]
+
+
+def _turned(model: Arm, azimuth: float) -> list[Array]:
+    """Return the arm's seeds, home if it has none, turned about its first joint so that the tool is at `azimuth` [rad]."""
+    seeds = []
+    for q in np.array(model.seeds_rad or (model.home_rad,)):
+        q[0] = 0.0
+        x, y, _ = model.placed(q)[-1] if model.R_BL is None else model.R_BL @ model.placed(q)[-1]
+        q[0] = azimuth - np.arctan2(y, x)
+        seeds.append(q)
+    return seeds
 
 
 def _inverse_kinematics(batch: Batch, seed: Array) -> Array:
-    """Return a posture for each target, shape (n, 7), from the best seed, then from the nearest reached neighbour."""
+    """Return a posture for each target, shape (n, joints), from the best seed, then from the nearest reached neighbour."""
     sample = batch.part(np.unique(np.linspace(0, batch.count - 1, min(_SAMPLES, batch.count)).round().astype(int)))
     best = min(_seeds(batch, seed), key=lambda start: sample.verdict(sample.from_one(start)))
     q = batch.from_one(best)
@@ -258,7 +271,7 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     """Return an Ipopt solver for `count` knots. Parameters: base, positions, frames, weight of each step between knots."""
     ca = casadi()
     functions = arm(robot)
-    Q = ca.MX.sym("q", 7, count)
+    Q = ca.MX.sym("q", arm_of(robot).joints, count)
     base, P = ca.MX.sym("base", 4), ca.MX.sym("P", 3, count)
     frames, weights = ca.MX.sym("frames", 3, 3 * count), ca.MX.sym("weights", count - 1)
     bases = ca.repmat(base, 1, count)
@@ -296,11 +309,11 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
             weights,
         )
     )
-    bound = np.tile(batch.limit, len(knots))
-    result = solver(x0=q[knots].ravel(), p=parameters, lbx=-bound, ubx=bound, lbg=0, ubg=0)
+    lower, upper = (np.tile(limit, len(knots)) for limit in batch.limits)
+    result = solver(x0=q[knots].ravel(), p=parameters, lbx=lower, ubx=upper, lbg=0, ubg=0)
     if not solver.stats()["success"]:
         return q, False
-    optimal = np.array(result["x"]).reshape(len(knots), 7)
+    optimal = np.array(result["x"]).reshape(len(knots), -1)
     within = np.clip(s, s[knots[0]], s[knots[-1]])
     between = PchipInterpolator(s[knots], optimal)(within)
     return batch.solve(between, RESOLUTION.projection_steps, 0.0), True
@@ -319,8 +332,8 @@ def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
     return PostureSequence(
         q=q,
         reachable=reachable,
-        margin=(np.asarray(POSITION_LIMIT) - np.abs(q)).min(axis=1),
-        torque_fraction=(np.abs(torque) / TORQUE_LIMIT).max(axis=1),
+        margin=np.minimum(batch.arm.upper_rad - q, q - batch.arm.lower_rad).min(axis=1),
+        torque_fraction=(np.abs(torque) / batch.arm.torque_nm).max(axis=1),
         dexterity=np.array(batch.functions.dexterity.map(batch.count)(q.T, bases))[0],
         residual=residual,
         refined=refined,

@@ -14,23 +14,13 @@ import numpy as np
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.lbr import (
-    FLANGE_TO_FT_M,
-    FT_TO_INDENTER_M,
-    JOINT_AXIS,
-    JOINT_ORIGIN,
-    LINK_7_TO_FLANGE_M,
-    LINK_NAMES,
-    POSITION_LIMIT,
-    TORQUE_LIMIT,
-    inertias,
-)
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, inertias
 from palpate_models.scenario.schema import Robot
 
 ELBOW_CLEARANCE_M = 0.15
 """Least height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
 REACH_LENGTH_M = 0.4
-"""Length scale of linear against angular rows of the Jacobian: upper arm and forearm of the LBR iiwa 7."""
+"""Length scale of linear against angular rows of the Jacobian: upper arm and forearm."""
 _RIDGE = 1e-12
 """Added to the Gram matrix of the Jacobian [1], so that no pivot is zero at a singularity."""
 WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
@@ -48,18 +38,18 @@ def casadi() -> Any:
 class ArmFunctions(NamedTuple):
     """CasADi functions of the arm.
 
-    `q` (7,) [rad], `base` (4,), `p` (3,) [m], `frame` (3, 3): columns t1, t2 (tangents), n (outward surface normal).
+    `q` (n,) [rad], `base` (4,), `p` (3,) [m], `frame` (3, 3): columns t1, t2 (tangents), n (outward surface normal).
     `force` [N] is pressed along the tool's z axis.
     """
 
     task: Any
-    """(q, base, p, frame) -> residual (5,) [m, 1], its Jacobian by q (5, 7): zero residual at the task's solutions."""
+    """(q, base, p, frame) -> residual (5,) [m, 1], its Jacobian by q (5, n): zero residual at the task's solutions."""
     facing: Any
     """(q, base, frame) -> cosine between the tool's z axis and -n [1]."""
     cost: Any
-    """(q, base, force) -> cost of a posture [1], its gradient by q (7,)."""
+    """(q, base, force) -> cost of a posture [1], its gradient by q (n,)."""
     torque: Any
-    """(q, base, force) -> joint torques that hold gravity and press with `force` [N m], shape (7,)."""
+    """(q, base, force) -> joint torques that hold gravity and press with `force` [N m], shape (n,)."""
     dexterity: Any
     """(q, base) -> sqrt(det(J J^T)) of the length-scaled Jacobian [1]: zero where singular."""
     pose: Any
@@ -68,9 +58,9 @@ class ArmFunctions(NamedTuple):
     """(q, base) -> position of the elbow in world [m], shape (3,)."""
 
 
-def _axis_rotation(ca: Any, axis: tuple[float, float, float], angle: Any) -> Any:
+def _axis_rotation(ca: Any, axis: Array | tuple[float, float, float], angle: Any) -> Any:
     """Return the rotation matrix about a unit vector (Rodrigues)."""
-    K = ca.skew(ca.DM(axis))
+    K = ca.skew(ca.DM(np.asarray(axis)))
     return ca.DM.eye(3) + ca.sin(angle) * K + (1 - ca.cos(angle)) * ca.mtimes(K, K)
 
 
@@ -86,29 +76,28 @@ def _determinant(ca: Any, A: Any) -> Any:
 @lru_cache(maxsize=8)
 def arm(robot: Robot) -> ArmFunctions:
     """Return the functions of an arm with this robot's tool. The robot's base fields are not used: base is an argument."""
-    ca = casadi()
-    q, base = ca.SX.sym("q", 7), ca.SX.sym("base", 4)
+    ca, model = casadi(), arm_of(robot)
+    n = model.joints
+    q, base = ca.SX.sym("q", n), ca.SX.sym("base", 4)
     target, frame, force = ca.SX.sym("p", 3), ca.SX.sym("frame", 3, 3), ca.SX.sym("force")
-    loads = inertias(robot)
+    loads = list(inertias(robot).values())
 
     R = _axis_rotation(ca, (0.0, 0.0, 1.0), base[3])
+    if model.R_BL is not None:
+        R = ca.mtimes(R, ca.DM(model.R_BL))
     p = base[:3]
     origins, axes = [], []
     energy = ca.SX(0)
-    for i in range(7):
-        p = p + ca.mtimes(R, ca.DM(JOINT_ORIGIN[i]))
-        R = ca.mtimes(R, _axis_rotation(ca, JOINT_AXIS[i], q[i]))
+    for i in range(n):
+        p = p + ca.mtimes(R, ca.DM(model.origin_m[i]))
+        R = ca.mtimes(R, _axis_rotation(ca, model.axis[i], q[i]))
         origins.append(p)
-        axes.append(ca.mtimes(R, ca.DM(JOINT_AXIS[i])))
-        link = loads[LINK_NAMES[i + 1]]
+        axes.append(ca.mtimes(R, ca.DM(model.axis[i])))
+        link = loads[i + 1]
         energy += link.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(link.com)))[2]
-    for name, offset in (
-        ("lbr_link_ee", LINK_7_TO_FLANGE_M),
-        ("ft_sensor", FLANGE_TO_FT_M),
-        ("indenter", FT_TO_INDENTER_M),
-    ):
+    p = p + ca.mtimes(R[:, :2], ca.DM(model.flange_m[:2])) if model.flange_m[:2].any() else p
+    for load, offset in zip(loads[-3:], (model.flange_m[2], FLANGE_TO_FT_M, FT_TO_INDENTER_M), strict=True):
         p = p + R[:, 2] * offset
-        load = loads[name]
         energy += load.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(load.com)))[2]
 
     tool_axis = R[:, 2]
@@ -117,13 +106,13 @@ def arm(robot: Robot) -> ArmFunctions:
     gram = _determinant(ca, ca.mtimes(jacobian, jacobian.T))
     torque = ca.gradient(energy, q) + ca.mtimes(linear.T, tool_axis * force)
     residual = ca.vertcat(p - target, ca.mtimes(frame[:, :2].T, tool_axis))
-    elbow = origins[3]
+    elbow = origins[model.elbow[0]]
 
-    relative = q / ca.DM(np.array(POSITION_LIMIT))
+    relative = (q - ca.DM(model.middle_rad)) / ca.DM(model.half_range_rad)
     low = (p[2] + ELBOW_CLEARANCE_M - elbow[2]) / 0.03
     cost = (
         WEIGHT_LIMITS * ca.sum1(-ca.log(1 - relative**2))
-        + WEIGHT_TORQUE * ca.sumsqr(torque / ca.DM(np.array(TORQUE_LIMIT)))
+        + WEIGHT_TORQUE * ca.sumsqr(torque / ca.DM(model.torque_nm))
         - WEIGHT_DEXTERITY * ca.log(gram + 1e-9)
         + WEIGHT_ELBOW * ca.log1p(ca.exp(ca.fmin(low, 50)))
     )

@@ -16,8 +16,6 @@ from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
-from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.timing import SpeedLimit
 from palpate_planning.wall.surface import CubicPieces, PerceivedSurface, cubic_at
 
@@ -100,7 +98,7 @@ class PathPoint(NamedTuple):
     R: Array
     """Orientation of the indenter, z opposite to n, shape (3, 3)."""
     q: Array
-    """Posture [rad], shape (7,)."""
+    """Posture [rad], shape (n,)."""
     dp: Array
     """dp/ds, shape (3,)."""
     dn: Array
@@ -108,14 +106,14 @@ class PathPoint(NamedTuple):
     w: Array
     """Turn of R [rad/m], shape (3,)."""
     dq: Array
-    """dq/ds [rad/m], shape (7,)."""
+    """dq/ds [rad/m], shape (n,)."""
 
 
 class SurfacePath:
     """p(s), n(s), R(s), q(s) for s in 0..length: natural cubic splines through samples."""
 
     def __init__(self, s: Array, p: Array, n: Array, R: Array, q: Array, targets: Ints, visits: Ints) -> None:
-        """Samples at path lengths s: points and normals (k, 3), orientations (k, 3, 3), postures (k, 7).
+        """Samples at path lengths s: points and normals (k, 3), orientations (k, 3, 3), postures (k, n).
 
         `targets` are indices of targets, `visits` the samples at which they are reached, shape (m,).
         """
@@ -132,7 +130,7 @@ class SurfacePath:
         """Return the path at length s, clipped to its ends."""
         if self._curve is None:
             still = np.zeros(3)
-            return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], dp=still, dn=still, w=still, dq=np.zeros(7))
+            return PathPoint(self.p[0], self.n[0], self.R[0], self.q[0], dp=still, dn=still, w=still, dq=np.zeros_like(self.q[0]))
         y, dy, R, w = _along(self._curve, min(max(s, 0.0), self.length))
         return PathPoint(p=y[:3], n=-R[:, 2], R=R, q=y[9:], dp=dy[:3], dn=dy[3:6], w=w, dq=dy[9:])
 
@@ -141,14 +139,17 @@ class SurfacePath:
         visits, targets = self._order
         return targets[max(bisect_right(visits, s) - 1, 0)]
 
-    def speed_limit(self, speed: float, limits: Limits) -> SpeedLimit:
-        """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast."""
+    def speed_limit(self, speed: float, turning: Array) -> SpeedLimit:
+        """Return the speed limit along the path: `speed` [m/s], less in tight curves and where the tool or joints turn fast.
+
+        `turning`: greatest joint speeds [rad/s], shape (n,).
+        """
         if self.length == 0.0:
             return SpeedLimit(self.s, np.array([speed]), LIMITS.acceleration_mps2)
         dp = np.gradient(self.p, self.s, axis=0)
         curvature = np.linalg.norm(np.gradient(dp, self.s, axis=0), axis=1)
         turn = np.linalg.norm(np.gradient(self.n, self.s, axis=0), axis=1)
-        joints = np.abs(np.gradient(self.q, self.s, axis=0)) / (limits.joint_velocity_scale * lbr.VELOCITY_LIMIT)
+        joints = np.abs(np.gradient(self.q, self.s, axis=0)) / turning
         allowed = np.minimum.reduce(
             [
                 np.full(len(self.s), speed),
@@ -164,7 +165,7 @@ def compile_ahead() -> None:
     """Compile what `SurfacePath.at` calls before the first deadline."""
     R = np.stack((np.eye(3), np.eye(3)))
     first = np.zeros(1, np.int64)
-    SurfacePath(np.array((0.0, 1.0)), np.zeros((2, 3)), -R[:, :, 2], R, np.zeros((2, 7)), first, first).at(0.0)
+    SurfacePath(np.array((0.0, 1.0)), np.zeros((2, 3)), -R[:, :, 2], R, np.zeros((2, 1)), first, first).at(0.0)
 
 
 @compiled

@@ -8,10 +8,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.robot import lbr
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics, stretched
+from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, timed_motion
 from palpate_planning.motion.scene import CollisionScene, ViewPyramid, region_corners
 from palpate_planning.motion.timing import JointTrajectory
@@ -159,7 +158,7 @@ class ExamPlanner:
         for i, q in enumerate(chosen.q):
             if not chosen.reachable[i]:
                 skipped[i] = REACH
-            elif stretched(q, bend):
+            elif self._kinematics.stretched(q, bend):
                 skipped[i] = STRETCHED
             elif not scene.free(q):
                 skipped[i] = collision(scene, q)
@@ -178,7 +177,7 @@ def look_postures(known: ExamInput) -> list[Array]:
     scene = CollisionScene(kinematics, known.robot)
     postures = []
     for turn in SCAN.turns_rad:
-        q = np.array(lbr.HOME)
+        q = kinematics.arm.home_rad.copy()
         q[0] += turn
         if scene.free(q):
             postures.append(q)

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.frames import Array
-from palpate_planning.motion.kinematics import ArmKinematics, stretched
+from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JointTrajectory
@@ -180,16 +180,16 @@ class SegmentPlanner:
         s, p, n, R = frames_along(self._surface, stroke.xy, self._R_ref)
         centres = centre(p, n, self._radius, depth)
         known = self._postures[stroke.targets]
-        near = np.column_stack([np.interp(s, s[stroke.visits], known[:, j]) for j in range(7)])
+        near = np.column_stack([np.interp(s, s[stroke.visits], column) for column in known.T])
         solved = np.unique(np.concatenate((np.arange(0, len(s), SEGMENTS.posture_every), stroke.visits, [len(s) - 1])))
-        q = np.empty((len(solved), 7))
+        q = np.empty((len(solved), known.shape[1]))
         infeasible: Infeasible = []
         for row, i in enumerate(solved):
             solution = self._kinematics.solve(pose(R[i], centres[i]), near[i], near[i])
             q[row] = solution.q
             if not solution.ok:
                 infeasible.append((int(i), REACH))
-            elif stretched(solution.q, self._bend):
+            elif self._kinematics.stretched(solution.q, self._bend):
                 infeasible.append((int(i), STRETCHED))
             elif not self._scene.free(solution.q):
                 infeasible.append((int(i), collision(self._scene, solution.q)))

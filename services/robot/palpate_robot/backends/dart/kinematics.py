@@ -1,4 +1,4 @@
-"""Link poses, tool motion and gravity torques from the tables of `robot.lbr`, compiled.
+"""Link poses, tool motion and gravity torques from the tables of an arm, compiled.
 
 With X_WL the pose of link i behind joint i, a its axis, r the vector from the joint to the point or mass behind it:
 
@@ -20,18 +20,14 @@ import numpy as np
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import Vector, add, cross, dot, row, scale, subtract
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of, base_pose, inertias, mounts
 from palpate_models.scenario.schema import Robot
 
 _LIFT_W: Final = (0.0, 0.0, GRAVITY)
 """Minus the gravitational acceleration [m/s^2]."""
-_MOUNTS: Final[Array] = np.cumsum((lbr.LINK_7_TO_FLANGE_M, lbr.FLANGE_TO_FT_M, lbr.FT_TO_INDENTER_M))
-"""Flange, F/T sensor and indenter along the last link's z axis [m], shape (3,)."""
-_TOOL_M: Final = float(_MOUNTS[-1])
 _X, _Y, _Z, _ORIGIN, _AXIS, _CENTRE, _MASS = 0, 3, 6, 9, 12, 15, 18
 """Columns of a table of links: axes and origin of the link frame, unit axis of its joint, centre of mass, mass [kg]. A chain,
-shape
-(8, 19), holds the base in world and the seven links, each at q = 0 in the previous frame. One array, because each argument of a
+shape (n + 1, 19), holds the base in world and n links, each at q = 0 in the previous frame. One array, because each argument of a
 compiled function costs 0.1 us."""
 
 
@@ -51,7 +47,7 @@ def _in_world(links: Array, i: int, a: Vector) -> Vector:
 
 @compiled
 def _placed(chain: Array, q: Array) -> Array:
-    """Return the links of a chain in world at joint positions `q`, shape (8, 19)."""
+    """Return the links of a chain in world at joint positions `q`, shape (n + 1, 19)."""
     links = chain.copy()
     for i in range(1, len(links)):
         axis = _in_world(links, i - 1, row(chain, i, _AXIS))
@@ -81,79 +77,77 @@ def _quaternion(links: Array, i: int) -> tuple[float, float, float, float]:
 
 
 @compiled
-def _state(chain: Array, q: Array, v: Array) -> Array:
+def _state(chain: Array, mounts: Array, q: Array, v: Array) -> Array:
     """Return `Kinematics.state`. From the last joint to the first, the mass behind a joint grows by a link."""
-    links, torque = _placed(chain, q), np.empty(7)
-    p_WI = add(row(links, 7, _ORIGIN), scale(_TOOL_M, row(links, 7, _Z)))
+    links, n = _placed(chain, q), len(q)
+    p_WI = add(row(links, n, _ORIGIN), _in_world(links, n, row(mounts, 2, 0)))
+    state = np.empty(13 + n)
     velocity = angular_velocity = moment = (0.0, 0.0, 0.0)
     mass = 0.0
-    for i in range(7, 0, -1):
+    for i in range(n, 0, -1):
         axis, p_WL, qd = row(links, i, _AXIS), row(links, i, _ORIGIN), v[i - 1]
         velocity = add(velocity, scale(qd, cross(axis, subtract(p_WI, p_WL))))
         angular_velocity = add(angular_velocity, scale(qd, axis))
         mass += links[i, _MASS]
         moment = add(moment, scale(links[i, _MASS], row(links, i, _CENTRE)))
-        torque[i - 1] = dot(axis, cross(subtract(moment, scale(mass, p_WL)), _LIFT_W))
-    state = np.empty(20)
-    state[:13] = p_WI + _quaternion(links, 7) + velocity + angular_velocity
-    state[13:] = torque
+        state[12 + i] = dot(axis, cross(subtract(moment, scale(mass, p_WL)), _LIFT_W))
+    state[:13] = p_WI + _quaternion(links, n) + velocity + angular_velocity
     return state
 
 
 @compiled
 def _links(chain: Array, mounts: Array, q: Array) -> Array:
-    """Return `Kinematics.links`. Flange, sensor and indenter are at `mounts` (3,) along the last link's z axis [m]."""
-    links = _placed(chain, q)
-    poses = np.empty((11, 7))
-    for i in range(8):
+    """Return `Kinematics.links`. Flange, sensor and indenter are at `mounts` (3, 3) in the last link [m]."""
+    links, n = _placed(chain, q), len(q)
+    poses = np.empty((n + 4, 7))
+    for i in range(n + 1):
         poses[i] = row(links, i, _ORIGIN) + _quaternion(links, i)
     for i in range(3):
-        poses[8 + i] = add(row(links, 7, _ORIGIN), scale(mounts[i], row(links, 7, _Z))) + _quaternion(links, 7)
+        poses[n + 1 + i] = add(row(links, n, _ORIGIN), _in_world(links, n, row(mounts, i, 0))) + _quaternion(links, n)
     return poses
 
 
 class Kinematics:
-    """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (7,)."""
+    """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (n,)."""
 
     def __init__(self, robot: Robot, origin_m: Array | None = None) -> None:
         """Take the arm on its base with its tool. Compiles, which takes seconds the first time.
 
-        `origin_m`, shape (7, 3), is added to the nominal origin of each joint in the previous link.
+        `origin_m`, shape (n, 3), is added to the nominal origin of each joint in the previous link.
         """
-        mass, centre = _masses(robot)
-        yaw = robot.base_yaw_rad
-        base = np.concatenate(
-            ((cos(yaw), sin(yaw), 0.0), (-sin(yaw), cos(yaw), 0.0), (0.0, 0.0, 1.0), robot.base_xy_m, (robot.base_height_m,))
-        )
-        self._chain: Array = np.zeros((8, 19))
-        self._chain[0, :_AXIS] = base
+        arm, X_WB = arm_of(robot), base_pose(robot)
+        n, (mass, centre) = arm.joints, _masses(robot)
+        self._mounts = mounts(robot)
+        self._chain: Array = np.zeros((n + 1, 19))
+        self._chain[0, :_AXIS] = X_WB[:3].T.ravel()
         self._chain[1:, :_ORIGIN] = np.eye(3).ravel()
-        origin = np.array(lbr.JOINT_ORIGIN) + (0.0 if origin_m is None else origin_m)
-        self._chain[1:, _ORIGIN:_MASS] = np.hstack((origin, lbr.JOINT_AXIS, centre))
+        origin = arm.origin_m + (0.0 if origin_m is None else origin_m)
+        self._chain[1:, _ORIGIN:_MASS] = np.hstack((origin, arm.axis, centre))
         self._chain[1:, _MASS] = mass
-        self.state(np.zeros(7), np.zeros(7))
-        self.links(np.zeros(7))
+        self.state(np.zeros(n), np.zeros(n))
+        self.links(np.zeros(n))
 
     def state(self, q: Array, v: Array) -> Array:
-        """Return the indenter's motion in world and the gravity torques, shape (20,).
+        """Return the indenter's motion in world and the gravity torques, shape (13 + n,).
 
         Position p_WI [m], orientation x, y, z, w, velocity of the sphere's centre [m/s], angular velocity [rad/s]; then the joint
         torques that compensate gravity [N m].
         """
-        state: Array = _state(self._chain, q, v)
+        state: Array = _state(self._chain, self._mounts, q, v)
         return state
 
     def links(self, q: Array) -> Array:
-        """Return position [m] and orientation x, y, z, w in world of each link of `lbr.LINK_NAMES`, shape (11, 7)."""
-        poses: Array = _links(self._chain, _MOUNTS, q)
+        """Return position [m] and orientation x, y, z, w in world of each link, from the base to the tool, shape (n + 4, 7)."""
+        poses: Array = _links(self._chain, self._mounts, q)
         return poses
 
 
 def _masses(robot: Robot) -> tuple[Array, Array]:
-    """Return mass [kg], shape (7,), and centre in the link [m], shape (7, 3), of each moving link with its fixed parts."""
-    links = list(lbr.inertias(robot).values())[1:]  # without the base
+    """Return mass [kg], shape (n,), and centre in the link [m], shape (n, 3), of each moving link with its fixed parts."""
+    n = arm_of(robot).joints
+    links = list(inertias(robot).values())[1:]  # without the base
     mass, centre = np.array([link.mass for link in links]), np.array([link.com for link in links])
-    centre[7:, 2] += _MOUNTS
+    centre[n:] += mounts(robot)
     moment = mass[:, None] * centre
-    mass[6], moment[6] = mass[6:].sum(), moment[6:].sum(axis=0)
-    return mass[:7], moment[:7] / mass[:7, None]
+    mass[n - 1], moment[n - 1] = mass[n - 1 :].sum(), moment[n - 1 :].sum(axis=0)
+    return mass[:n], moment[:n] / mass[:n, None]

@@ -25,13 +25,13 @@ import numpy as np
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot import lbr
-from palpate_models.robot.lbr import Capsule
+from palpate_models.robot.arm import arm_of, capsules, link_names, urdf
+from palpate_models.robot.chain import Capsule
 from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.kinematics import Kinematics
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench, nominal
 
 REACH_M: Final = 1.5
 """Largest distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
@@ -41,17 +41,21 @@ class Clearance:
     """Lower bound on the joint travel before a capsule can reach a box or a joint its stop."""
 
     def __init__(
-        self, links: Mapping[str, Any], capsules: Mapping[str, tuple[Capsule, ...]], boxes: tuple[Box, ...], stop: Array
+        self,
+        links: Mapping[str, Any],
+        shapes: Mapping[str, tuple[Capsule, ...]],
+        boxes: tuple[Box, ...],
+        stops: tuple[Array, Array],
     ):
-        """Take DART bodies and capsules by link, the boxes, and the joint stops [rad], shape (7,)."""
-        pairs = [(links[name], capsule) for name, parts in capsules.items() for capsule in parts]
+        """Take DART bodies and capsules by link, the boxes, and lower and upper joint stops [rad], shapes (n,)."""
+        pairs = [(links[name], capsule) for name, parts in shapes.items() for capsule in parts]
         self._bodies = [body for body, _ in pairs]
         ends = np.array([(capsule.start, capsule.end) for _, capsule in pairs])
         self._ends: Array = np.concatenate((ends, np.ones((*ends.shape[:2], 1))), axis=2)  # (n, 2, 4)
         self._radii = np.array([capsule.radius for _, capsule in pairs])
         self._X_BW = np.array([np.linalg.inv(box.X_WB) for box in boxes])
         self._half = np.array([box.size for box in boxes]) / 2
-        self._stop = stop
+        self._lowest, self._highest = stops
 
     def angle(self, q: Array) -> float:
         """Return the sum of |angles| [rad] that joints may turn from `q` before one can reach a stop or box; may be negative."""
@@ -61,7 +65,7 @@ class Clearance:
         # bounding boxes of the capsules, axis by axis
         gap = np.maximum(ends_B.min(axis=2), -ends_B.max(axis=2)) - self._half[:, None, :]
         distance = np.linalg.norm(np.maximum(gap, 0.0), axis=2) - self._radii
-        return min(float(distance.min()) / REACH_M, float((self._stop - np.abs(q)).min()))
+        return min(float(distance.min()) / REACH_M, float(np.minimum(self._highest - q, q - self._lowest).min()))
 
 
 LEAST_CLEARANCE_RAD: Final = 0.01
@@ -95,12 +99,12 @@ def _add_shape(body: Any, shape: Any, X: Array) -> None:
 def _load_arm(robot: Robot) -> Any:
     """Return the arm as a DART skeleton without shapes. DART's loader needs an absolute file path."""
     with tempfile.TemporaryDirectory() as folder:
-        path = Path(folder).resolve() / "lbr.urdf"
-        path.write_text(lbr.urdf(robot, geometry=False), encoding="utf-8")
-        arm = dart.utils.DartLoader().parseSkeleton(str(path))
-    if arm is None or arm.getNumDofs() != len(lbr.JOINT_NAMES):
-        raise RunError("DART could not load the robot's URDF with seven joints")
-    return arm
+        path = Path(folder).resolve() / "robot.urdf"
+        path.write_text(urdf(robot, geometry=False), encoding="utf-8")
+        skeleton = dart.utils.DartLoader().parseSkeleton(str(path))
+    if skeleton is None or skeleton.getNumDofs() != arm_of(robot).joints:
+        raise RunError(f"DART could not load the robot's URDF with {arm_of(robot).joints} joints")
+    return skeleton
 
 
 def _environment(robot: Robot) -> Any:
@@ -114,26 +118,28 @@ def _environment(robot: Robot) -> Any:
 
 
 class DartPlant:
-    """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
+    """The arm with its tool. Arrays of joints have shape (n,), from the base to the flange; units N, N m, m, rad, s."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
-        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
+    def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
+        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
+        arm, drawn = arm_of(robot), drawn or nominal(robot)
+        joints = slice(1, 1 + arm.joints)
         self._arm = _load_arm(robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass}))
-        for joint, origin, error in zip(self._arm.getJoints()[1:8], lbr.JOINT_ORIGIN, drawn.origin_m, strict=True):
+        for joint, origin, error in zip(self._arm.getJoints()[joints], arm.origin_m, drawn.origin_m, strict=True):
             X_PL = np.eye(4)
             X_PL[:3, 3] = origin + error
             joint.setTransformFromParentBodyNode(_isometry(X_PL))
-        self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(7))
-        stops = lbr.POSITION_LIMIT + END_STOP_MARGIN_RAD
-        for joint, stop in zip(self._arm.getJoints()[1:8], stops, strict=True):
-            joint.setPositionLowerLimit(0, -stop)
-            joint.setPositionUpperLimit(0, stop)
+        self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(arm.joints))
+        stops = (arm.lower_rad - END_STOP_MARGIN_RAD, arm.upper_rad + END_STOP_MARGIN_RAD)
+        for joint, lowest, highest in zip(self._arm.getJoints()[joints], *stops, strict=True):
+            joint.setPositionLowerLimit(0, lowest)
+            joint.setPositionUpperLimit(0, highest)
             joint.setVelocityLowerLimit(0, -np.inf)  # no physical speed limit: the driver checks it
             joint.setVelocityUpperLimit(0, np.inf)
             joint.setLimitEnforcement(True)
             joint.setCoulombFriction(0, 0.0)
-        capsules = {link: parts for link, parts in lbr.capsules(robot).items() if link not in FIXED_LINKS}
-        for link, parts in capsules.items():
+        shapes = dict(list(capsules(robot).items())[FIXED_LINKS:])
+        for link, parts in shapes.items():
             for capsule in parts:
                 self._add_capsule(self._arm.getBodyNode(link), capsule)
         self._world = dart.simulation.World()
@@ -146,11 +152,11 @@ class DartPlant:
         self._world.getConstraintSolver().setCollisionDetector(dart.collision.DARTCollisionDetector())
         self._world.addSkeleton(self._arm)
         self._world.addSkeleton(_environment(robot))
-        self._links = {link: self._arm.getBodyNode(link) for link in lbr.LINK_NAMES}
+        self._links = {link: self._arm.getBodyNode(link) for link in link_names(robot)}
         self._sensor = self._links["ft_sensor"]
         self._indenter = self._links["indenter"]
         self._kinematics = Kinematics(robot, drawn.origin_m)
-        self._clearance = Clearance(self._links, capsules, boxes(robot), stops)
+        self._clearance = Clearance(self._links, shapes, boxes(robot), stops)
         self._free_travel = 0.0  # sum of angles [rad] that the joints may turn before a contact is possible
         self._check_in = 0  # steps until the next clearance check
         self._viscous = (robot.joint_damping_nms * drawn.damping).tolist()
@@ -160,10 +166,10 @@ class DartPlant:
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
         """Joint velocities [rad/s], a fresh array at every step."""
-        self.reset(q)
+        self.reset(arm.home_rad if q is None else q)
 
     @staticmethod
-    def _add_capsule(body: Any, capsule: lbr.Capsule) -> None:
+    def _add_capsule(body: Any, capsule: Capsule) -> None:
         start, end = np.array(capsule.start), np.array(capsule.end)
         length = float(np.linalg.norm(end - start))
         if length > 0:
@@ -176,7 +182,7 @@ class DartPlant:
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
         self._arm.setPositions(np.asarray(q, dtype=float))
-        self._arm.setVelocities(np.zeros(7) if v is None else np.asarray(v, dtype=float))
+        self._arm.setVelocities(np.zeros(self._arm.getNumDofs()) if v is None else np.asarray(v, dtype=float))
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
         self._cached_state = None
         self._arm.setForces(self.gravity_torque())
@@ -186,7 +192,7 @@ class DartPlant:
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
-        `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
+        `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
         joints = zip(self._set_damping, self.v.tolist(), damping.tolist(), self._viscous, self._coulomb, strict=True)
@@ -224,7 +230,7 @@ class DartPlant:
         return clear
 
     def gravity_torque(self) -> Array:
-        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (7,)."""
+        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (n,)."""
         return self._state()[13:]
 
     def _state(self) -> Array:
@@ -254,11 +260,11 @@ class DartPlant:
         return self._state()[:13]
 
     def link_poses(self) -> Array:
-        """Return the poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
         return self._kinematics.links(self.q)
 
     def link_pose(self, link: str) -> tuple[Array, Any]:
-        """Return DART's position [m], shape (3,), and quaternion of a link of `lbr.LINK_NAMES` in world."""
+        """Return DART's position [m], shape (3,), and quaternion of a link in world."""
         X_WL = self._links[link].getTransform()  # in world; dartpy takes longer over `getWorldTransform`
         return X_WL.translation(), X_WL.quaternion()
 

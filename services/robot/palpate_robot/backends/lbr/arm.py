@@ -11,6 +11,7 @@ import pinocchio as pin
 from palpate_bus.contract import contract
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.lbr.port import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
 
@@ -37,7 +38,7 @@ class GravityModel:
     """Evaluates gravity torques and the sensor's orientation."""
 
     def __init__(self, robot: Robot) -> None:
-        self._model = pin.buildModelFromXML(lbr.urdf(robot, geometry=False))
+        self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
         self._data = self._model.createData()
         self._sensor = self._model.getFrameId("ft_sensor")
 
@@ -49,7 +50,7 @@ class GravityModel:
         return CarriedLoad(np.array(gravity), rotation[2].copy())
 
 
-class Arm:
+class MeasuredArm:
     """Joint state from a stream of LBRState."""
 
     def __init__(self) -> None:

@@ -53,6 +53,7 @@ from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import link_names
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
@@ -220,7 +221,7 @@ class Emulator:
         self._ft = FtSensor(drawn.force, ft, options.period_ms * 1e-3)
         self._joints = JointSensor(drawn.arm, joints, self._plant.q, self._plant.gravity_torque())
         self.session = FriSession(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
-        self._radius = known.robot.indenter_radius_m
+        self._radius, self._links = known.robot.indenter_radius_m, link_names(known.robot)
         self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
         """Constant error of the arm's load data [N m]."""
         self._applied = Drive(self._joints.q.copy(), np.zeros(7))
@@ -281,7 +282,7 @@ class Emulator:
     def links(self, now: int) -> Any:
         """Return the exact tf2_msgs/TFMessage of all links in world."""
         found = []
-        for link, pose in zip(lbr.LINK_NAMES, self._plant.link_poses().tolist(), strict=True):
+        for link, pose in zip(self._links, self._plant.link_poses().tolist(), strict=True):
             transform = Transform(Vector3(*pose[:3]), Quaternion(*pose[3:]))
             found.append(TransformStamped(header(now, "world"), link, transform))
         return TFMessage(found)

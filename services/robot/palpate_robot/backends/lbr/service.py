@@ -28,9 +28,10 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm, GravityModel
+from palpate_robot.backends.lbr.arm import STATE_AGE_NS, GravityModel, MeasuredArm
 from palpate_robot.backends.lbr.port import LbrPort, ZenohPort
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.stop_requests import StopRequests
@@ -104,9 +105,9 @@ class LbrService(Service):
         self._robot = exam.robot
         self._port = port
         self._inner = inner
-        self._arm = Arm()
+        self._arm = MeasuredArm()
         self._model = GravityModel(exam.robot)
-        self._driver = Driver(exam.limits.force_emergency_n)
+        self._driver = Driver(lbr.ARM, exam.limits.force_emergency_n)
         self._stop_requests = StopRequests(self._driver)
         lbr_side = exam.robot.lbr
         self._emulated = lbr_side.emulated
@@ -130,7 +131,7 @@ class LbrService(Service):
 
     def start(self) -> Outbox:
         """Publish the robot description."""
-        return {"robot_description": String(lbr.urdf(self._robot))}
+        return {"robot_description": String(urdf(self._robot))}
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         """Run one tick: arm state, driver, command to the arm."""

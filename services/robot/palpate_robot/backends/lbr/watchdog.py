@@ -25,7 +25,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import LbrConnection
-from palpate_robot.backends.lbr.arm import STATE_AGE_NS, Arm
+from palpate_robot.backends.lbr.arm import STATE_AGE_NS, MeasuredArm
 from palpate_robot.backends.lbr.port import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 
 log = logging.getLogger("watchdog")
@@ -42,7 +42,7 @@ class Watchdog:
 
     def __init__(self, timeout: int = TIMEOUT_NS) -> None:
         self._timeout = timeout
-        self._arm = Arm()
+        self._arm = MeasuredArm()
         self._commander = b""
         self._commanded: int | None = None
         self.holding = False

@@ -9,8 +9,8 @@ MuJoCo's semi-implicit Euler method takes joint damping implicitly, (M + h D) a 
 `frictionloss` is not
 used: its solver weighs it with M instead of M + h D, as DART's does.
 
-The model is built from the tables in `palpate_models.robot.lbr`, as the URDF is. MuJoCo's URDF reader merges links that are fixed
-to one another, and with them the F/T sensor's measuring face into link 7.
+The model is built from the tables of the arm, as the URDF is. MuJoCo's URDF reader merges links that are fixed
+to one another, and with them the F/T sensor's measuring face into the last link.
 """
 
 from __future__ import annotations
@@ -22,11 +22,12 @@ import mujoco
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose, capsules, inertias, link_names
+from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, NOMINAL_ARM, STICK_RADPS, Wrench
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench, nominal
 
 SUBSTEPS: Final = 2
 """Integration steps per millisecond: different from the DART plant, so that effects of the step size show."""
@@ -37,11 +38,6 @@ _STOP: Final = (2 * DT / SUBSTEPS, 1.0)
 """Time constant [s] and damping ratio of end stops and contacts: the stiffest that MuJoCo allows at this step."""
 _IMPEDANCE: Final = (0.999, 0.999, 0.001, 0.5, 2.0)
 """Fraction of the acceleration they remove. With MuJoCo's default 0.95, 30 N m push A7 (5e-4 kg m^2) 50 mrad into its stop."""
-_FIXED: Final = {
-    "lbr_link_ee": (0.0, 0.0, lbr.LINK_7_TO_FLANGE_M),
-    "ft_sensor": (0.0, 0.0, lbr.FLANGE_TO_FT_M),
-    "indenter": (0.0, 0.0, lbr.FT_TO_INDENTER_M),
-}
 
 
 def _quaternion(rotation: Array) -> Array:
@@ -51,7 +47,7 @@ def _quaternion(rotation: Array) -> Array:
     return quaternion
 
 
-def _add_link(parent: Any, link: str, position: tuple[float, float, float] | Array, inertia: lbr.Inertia) -> Any:
+def _add_link(parent: Any, link: str, position: tuple[float, float, float] | Array, inertia: Inertia) -> Any:
     body = parent.add_body(name=link, pos=position)
     body.explicitinertial = True
     body.mass = inertia.mass
@@ -60,20 +56,19 @@ def _add_link(parent: Any, link: str, position: tuple[float, float, float] | Arr
     return body
 
 
-def _add_joint(body: Any, i: int) -> None:
-    stop = float(lbr.POSITION_LIMIT[i]) + END_STOP_MARGIN_RAD
+def _add_joint(body: Any, arm: Arm, i: int) -> None:
     body.add_joint(
-        name=lbr.JOINT_NAMES[i],
+        name=arm.joint_names[i],
         type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=lbr.JOINT_AXIS[i],
+        axis=arm.axis[i],
         limited=True,
-        range=(-stop, stop),
+        range=(float(arm.lower_rad[i]) - END_STOP_MARGIN_RAD, float(arm.upper_rad[i]) + END_STOP_MARGIN_RAD),
         solref_limit=_STOP,
         solimp_limit=_IMPEDANCE,
     )
 
 
-def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
+def _add_shape(body: Any, capsule: Capsule) -> None:
     shape: dict[str, Any] = {"contype": _ARM, "conaffinity": _ENVIRONMENT, "solref": _STOP, "solimp": _IMPEDANCE}
     if capsule.start == capsule.end:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, pos=capsule.start, size=[capsule.radius, 0, 0], **shape)
@@ -82,11 +77,17 @@ def _add_shape(body: Any, capsule: lbr.Capsule) -> None:
         body.add_geom(type=mujoco.mjtGeom.mjGEOM_CAPSULE, fromto=ends, size=[capsule.radius, 0, 0], **shape)
 
 
-def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
+def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
     """Return the compiled model of the nominal `robot` with the arm errors `drawn`.
 
-    Bodies are named as in `lbr.LINK_NAMES`; force and torque sensors are at the measuring face.
+    Bodies have the names of the links; force and torque sensors are at the measuring face.
     """
+    arm, drawn, X_WB = arm_of(robot), drawn or nominal(robot), base_pose(robot)
+    fixed: dict[str, Any] = {
+        arm.link_names[-1]: arm.flange_m,
+        "ft_sensor": (0.0, 0.0, FLANGE_TO_FT_M),
+        "indenter": (0.0, 0.0, FT_TO_INDENTER_M),
+    }
     spec = mujoco.MjSpec()
     spec.compiler.degree = False
     spec.compiler.balanceinertia = False
@@ -105,19 +106,18 @@ def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
             solimp=_IMPEDANCE,
         )
     true = robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass})
-    inertias, capsules = lbr.inertias(true), lbr.capsules(robot)
+    masses, shapes = inertias(true), capsules(robot)
     body = spec.worldbody
-    for i, link in enumerate(lbr.LINK_NAMES):
+    for i, link in enumerate(link_names(robot)):
         if i == 0:
-            body = _add_link(body, link, (*robot.base_xy_m, robot.base_height_m), inertias[link])
-            body.quat = (np.cos(robot.base_yaw_rad / 2), 0.0, 0.0, np.sin(robot.base_yaw_rad / 2))
-        elif link in _FIXED:
-            body = _add_link(body, link, _FIXED[link], inertias[link])
+            body = _add_link(body, link, X_WB[:3, 3], masses[link])
+            body.quat = _quaternion(X_WB[:3, :3])
+        elif link in fixed:
+            body = _add_link(body, link, fixed[link], masses[link])
         else:
-            origin = np.array(lbr.JOINT_ORIGIN[i - 1]) + drawn.origin_m[i - 1]
-            body = _add_link(body, link, origin, inertias[link])
-            _add_joint(body, i - 1)
-        for capsule in () if link in FIXED_LINKS else capsules[link]:
+            body = _add_link(body, link, arm.origin_m[i - 1] + drawn.origin_m[i - 1], masses[link])
+            _add_joint(body, arm, i - 1)
+        for capsule in () if i < FIXED_LINKS else shapes[link]:
             _add_shape(body, capsule)
         if link == "ft_sensor":
             body.add_site(name="measuring_face")
@@ -127,10 +127,11 @@ def build(robot: Robot, drawn: DrawnArm = NOMINAL_ARM) -> Any:
 
 
 class MujocoPlant:
-    """The arm with its tool. Arrays of joints have shape (7,), order lbr_A1..lbr_A7; units N, N m, m, rad, s."""
+    """The arm with its tool. Arrays of joints have shape (n,), from the base to the flange; units N, N m, m, rad, s."""
 
-    def __init__(self, robot: Robot, q: Sequence[float] | Array = lbr.HOME, drawn: DrawnArm = NOMINAL_ARM) -> None:
-        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad]."""
+    def __init__(self, robot: Robot, q: Sequence[float] | Array | None = None, drawn: DrawnArm | None = None) -> None:
+        """Create the nominal `robot` with the arm errors `drawn`, at rest at joint positions `q` [rad], by default at home."""
+        arm, drawn = arm_of(robot), drawn or nominal(robot)
         self._model = build(robot, drawn)
         self._data = mujoco.MjData(self._model)
         data = self._data
@@ -140,7 +141,7 @@ class MujocoPlant:
         self._force_W = data.xfrc_applied[self._model.body("indenter").id, :3]
         self._moment_W = data.xfrc_applied[self._model.body("indenter").id, 3:]
         self._sensed, self._xpos, self._xquat = data.sensordata, data.xpos, data.xquat
-        self._bodies = [self._model.body(link).id for link in lbr.LINK_NAMES]
+        self._bodies = [self._model.body(link).id for link in link_names(robot)]
         self._base, self._indenter = self._bodies[0], self._bodies[-1]
         self._weight = GRAVITY * float(self._model.body_subtreemass[self._base])
         self._tool = self._model.body("ft_sensor").id
@@ -148,14 +149,14 @@ class MujocoPlant:
         """Tool weight missing from the controller's load data [N]."""
         self._viscous = robot.joint_damping_nms * drawn.damping
         self._coulomb = robot.joint_friction_nm * drawn.friction
-        self._jacobian = np.zeros((3, 7))
+        self._jacobian = np.zeros((3, arm.joints))
         self._twist = np.zeros(6)
         self._contacts = 0
         self.q: Array
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
         """Joint velocities [rad/s], a fresh array at every step."""
-        self.reset(q)
+        self.reset(arm.home_rad if q is None else q)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
@@ -171,7 +172,7 @@ class MujocoPlant:
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
-        `damping` [N m s/rad], shape (7,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
+        `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre (its centre of mass), in world axes, and is held over the step.
         """
         model, data, v = self._model, self._data, self._qvel
@@ -194,7 +195,7 @@ class MujocoPlant:
         self.q, self.v = self._qpos.copy(), v.copy()
 
     def gravity_torque(self) -> Array:
-        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (7,).
+        """Return the joint torques that compensate gravity with the nominal tool [N m], shape (n,).
 
         The weight times the derivative of the centre of mass's height by each joint.
         """
@@ -207,7 +208,7 @@ class MujocoPlant:
 
     def kinetic_energy(self) -> float:
         """Return the kinetic energy [J]."""
-        product = np.zeros(7)
+        product = np.zeros_like(self.v)
         mujoco.mj_mulM(self._model, self._data, product, self.v)
         return float(self.v @ product / 2)
 
@@ -231,7 +232,7 @@ class MujocoPlant:
         return np.concatenate((self._xpos[body], quaternion[1:], quaternion[:1], twist[3:], twist[:3]))
 
     def link_poses(self) -> Array:
-        """Return the poses of the links `lbr.LINK_NAMES` in world: position [m], orientation x, y, z, w, shape (11, 7)."""
+        """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
         quaternions = self._xquat[self._bodies]  # w first
         return np.column_stack((self._xpos[self._bodies], quaternions[:, 1:], quaternions[:, :1]))
 

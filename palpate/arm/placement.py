@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.phantom import build_phantom
-from palpate_models.robot.lbr import HOME, POSITION_LIMIT
+from palpate_models.robot.arm import arm_of
 from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Exam, Robot, Scenario
@@ -52,7 +53,7 @@ class Placement:
 
 
 def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:
-    """Origins of the indenter [m] at `exam.depth_m` below the surface and outward normals, in world, shapes (n, 3).
+    """Return origins of the indenter [m] at `exam.depth_m` below the surface and outward normals, in world, shapes (n, 3).
 
     They lie in snake order on a grid of at most `spacing` over the examined region widened by `border`; `raised` lifts
     them along their normals. Normals are averaged over the indenter's footprint.
@@ -75,25 +76,25 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 
 
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
-    """Return the base placement with the least cost over the scenario's region. Raises RuntimeError if no start converges."""
+    """Return the base placement with the least cost over the scenario's region. Raises RunError if no start converges."""
     contact = scan_targets(scenario, spacing, BORDER_M)
     raised = scan_targets(scenario, spacing, BORDER_M, RAISED_M)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
     found = [_optimise(scenario.robot, positions, normals, np.array(start)) for start in STARTS]
     placements = [placement for placement in found if placement is not None]
     if not placements:
-        raise RuntimeError("no base placement found from any start")
+        raise RunError("no base placement found from any start")
     return min(placements, key=lambda placement: placement.cost)
 
 
 def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> Placement | None:
-    """Base placement and postures from one start by Ipopt; None if it does not converge."""
+    """Return base placement and postures from one start by Ipopt; None if it does not converge."""
     ca = casadi()
     count = len(positions)
-    functions = arm(robot)
-    guess = plan_redundancy(_standing(robot, start), positions, normals, HOME, joint_margin_rad=2 * _MARGIN_RAD).q
+    model, functions = arm_of(robot), arm(robot)
+    guess = plan_redundancy(_standing(robot, start), positions, normals, model.home_rad, joint_margin_rad=2 * _MARGIN_RAD).q
 
-    base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", 7, count), ca.MX.sym("worst")
+    base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", model.joints, count), ca.MX.sym("worst")
     bases = ca.repmat(base, 1, count)
     costs = functions.cost.map(count)(Q, bases, POSTURES.pressing_force_n)[0]
     objective = worst + MEAN_WEIGHT * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
@@ -110,12 +111,12 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
         "print_time": False,
     }
     solver = ca.nlpsol("placement", "ipopt", problem, options)
-    bound = np.tile(np.asarray(POSITION_LIMIT) - _MARGIN_RAD, count)
+    lower, upper = np.tile(model.lower_rad + _MARGIN_RAD, count), np.tile(model.upper_rad - _MARGIN_RAD, count)
     zeros = np.zeros(5 * count)
     result = solver(
         x0=np.concatenate((start, guess.ravel(), [float(np.array(first).max())])),
-        lbx=np.concatenate((BOUNDS[0], -bound, [-np.inf])),
-        ubx=np.concatenate((BOUNDS[1], bound, [np.inf])),
+        lbx=np.concatenate((BOUNDS[0], lower, [-np.inf])),
+        ubx=np.concatenate((BOUNDS[1], upper, [np.inf])),
         lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
         ubg=np.concatenate((zeros, [TABLE_X_M[0] - CLEARANCE_M], np.zeros(count))),
     )
@@ -123,17 +124,17 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
         return None
     solution = np.array(result["x"])[:, 0]
     placed = _standing(robot, np.round(solution[:4], 2))
-    return Placement(placed, float(result["f"]), plan_redundancy(placed, positions, normals, HOME))
+    return Placement(placed, float(result["f"]), plan_redundancy(placed, positions, normals, model.home_rad))
 
 
 def _standing(robot: Robot, base: Array) -> Robot:
-    """`robot` on the base placement `base`, shape (4,)."""
+    """Return `robot` on the base placement `base`, shape (4,)."""
     x, y, height, yaw = (float(value) + 0.0 for value in base)  # + 0.0 makes no -0.0 of a zero
     return robot.model_copy(update={"base_xy_m": (x, y), "base_height_m": height, "base_yaw_rad": yaw})
 
 
 def describe(robot: Robot, postures: PostureSequence) -> str:
-    """One line on a placement: how much of the targets it reaches, and the worst margins."""
+    """Return a line on a placement: how much of the targets it reaches, and the worst margins."""
     reached: Mask = postures.reachable
     x, y, height, yaw = base_of(robot)
     head = f"x {x:6.2f} m  y {y:5.2f} m  height {height:4.2f} m  yaw {yaw:5.2f} rad"
@@ -145,20 +146,3 @@ def describe(robot: Robot, postures: PostureSequence) -> str:
         f"largest torque {100 * postures.torque_fraction[reached].max():.0f} % of its limit, "
         f"least dexterity {postures.dexterity[reached].min():.2f}"
     )
-
-
-def report() -> str:
-    """The best placement for the default scenario next to the present one, judged on the whole scan and on its approach."""
-    scenario = Scenario()
-    best = best_placement(scenario)
-    lines = []
-    for label, robot in (("best", best.robot), ("scenario", scenario.robot)):
-        for height, raised in (("at depth", 0.0), ("raised", RAISED_M)):
-            targets = scan_targets(scenario, scenario.exam.spacing_m, raised=raised)
-            postures = plan_redundancy(robot, *targets, np.asarray(HOME))
-            lines.append(f"{label:8} {height:8}  {describe(robot, postures)}")
-    return "\n".join(lines)
-
-
-if __name__ == "__main__":
-    print(report())

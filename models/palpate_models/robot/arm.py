@@ -1,0 +1,162 @@
+"""The arm of a scenario on its base with its tool, as tables and as a URDF.
+
+Behind the arm's flange follow `ft_sensor` (origin at the measuring face) and `indenter` (origin at the sphere's centre), z out of
+the flange.
+"""
+
+from __future__ import annotations
+
+from typing import Final
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
+from palpate_models.robot.lbr import ARM
+from palpate_models.robot.urdf_arm import load_arm
+from palpate_models.scenario.schema import Robot
+
+FLANGE_TO_FT_M: Final = 0.030
+"""Thickness of the F/T sensor: flange to measuring face [A: like an ATI Gamma, 75 mm x 33 mm, 0.255 kg]."""
+FT_TO_INDENTER_M: Final = 0.100
+"""Measuring face to the sphere's centre: the stand-off [A]."""
+FT_SENSOR_MASS_KG: Final = 0.25
+"""The sensor's own mass, on the flange's side of its measuring face [A]."""
+FT_SENSOR_RADIUS_M: Final = 0.0375
+STANDOFF_RADIUS_M: Final = 0.0125
+STANDOFF_MASS_FRACTION: Final = 0.6
+"""Part of the tool's mass that is in the stand-off; the rest is in the sphere [A]."""
+
+
+def arm_of(robot: Robot) -> Arm:
+    """Return the arm of a robot. Raises UserError that names file, link or joint, and what is wrong."""
+    return ARM if robot.arm == ARM.name else load_arm(robot.arm)
+
+
+def base_pose(robot: Robot) -> Array:
+    """Return X_WL0 of the base link in world, shape (4, 4)."""
+    X = np.eye(4)
+    turn = Rotation.from_euler("z", robot.base_yaw_rad).as_matrix()
+    R_BL = arm_of(robot).R_BL
+    X[:3, :3] = turn if R_BL is None else turn @ R_BL
+    X[:3, 3] = (*robot.base_xy_m, robot.base_height_m)
+    return X
+
+
+def link_names(robot: Robot) -> tuple[str, ...]:
+    """Return every link, from the base to the tool; each is the child of the one before it."""
+    return (*arm_of(robot).link_names, "ft_sensor", "indenter")
+
+
+def mounts(robot: Robot) -> Array:
+    """Return the origins of flange, F/T sensor and indenter in the arm's last link [m], shape (3, 3)."""
+    x, y, z = arm_of(robot).flange_m
+    return np.column_stack((np.full(3, x), np.full(3, y), np.cumsum((z, FLANGE_TO_FT_M, FT_TO_INDENTER_M))))
+
+
+def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
+    """Return a solid cylinder along z with its centre at height z of the link frame."""
+    across = mass * (3 * radius**2 + length**2) / 12
+    return Inertia(mass, (0.0, 0.0, z), (across, across, mass * radius**2 / 2))
+
+
+def _sphere(mass: float, radius: float) -> Inertia:
+    """Return a solid sphere about the link frame's origin."""
+    inertia = 0.4 * mass * radius**2
+    return Inertia(mass, (0.0, 0.0, 0.0), (inertia, inertia, inertia))
+
+
+def inertias(robot: Robot) -> dict[str, Inertia]:
+    """Return the inertia by link: the stand-off is in `ft_sensor`, the sphere in `indenter`, the sensor in the flange."""
+    standoff = STANDOFF_MASS_FRACTION * robot.tool_mass_kg
+    tool = (
+        _cylinder(FT_SENSOR_MASS_KG, FT_SENSOR_RADIUS_M, FLANGE_TO_FT_M, FLANGE_TO_FT_M / 2),
+        _cylinder(standoff, STANDOFF_RADIUS_M, FT_TO_INDENTER_M, FT_TO_INDENTER_M / 2),
+        _sphere(robot.tool_mass_kg - standoff, robot.indenter_radius_m),
+    )
+    return dict(zip(link_names(robot), (*arm_of(robot).inertias, *tool), strict=True))
+
+
+def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
+    """Return the collision geometry by link, in link frames. It encloses the visual meshes to within a few millimetres."""
+    tip = (0.0, 0.0, 0.0)
+    tool = (
+        (Capsule(tip, (0.0, 0.0, FLANGE_TO_FT_M / 2), FT_SENSOR_RADIUS_M),),
+        (Capsule((0.0, 0.0, 0.01), (0.0, 0.0, FT_TO_INDENTER_M), STANDOFF_RADIUS_M),),
+        (Capsule(tip, tip, robot.indenter_radius_m),),
+    )
+    return dict(zip(link_names(robot), (*arm_of(robot).capsules, *tool), strict=True))
+
+
+def _text(values: Point | Array) -> str:
+    return " ".join(repr(float(value)) for value in values)
+
+
+def _inertial(inertia: Inertia) -> str:
+    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+    entries = " ".join(f'{n}="{v!r}"' for n, v in zip(names, (*inertia.diagonal, *inertia.products), strict=True))
+    com = f'<origin xyz="{_text(inertia.com)}"/>'
+    return f'<inertial>{com}<mass value="{inertia.mass!r}"/><inertia {entries}/></inertial>'
+
+
+def _geometry(tag: str, capsule: Capsule) -> str:
+    """Return a capsule as URDF primitives: a cylinder and a sphere at each end."""
+    start, end = np.array(capsule.start), np.array(capsule.end)
+    axis = end - start
+    length = float(np.linalg.norm(axis))
+    ends = (start,) if length == 0 else (start, end)
+    parts = [
+        f'<{tag}><origin xyz="{_text(tuple(point))}"/><geometry><sphere radius="{capsule.radius}"/></geometry></{tag}>'
+        for point in ends
+    ]
+    if length > 0:
+        x, y, z = axis / length
+        rpy = (0.0, float(np.arctan2(np.hypot(x, y), z)), float(np.arctan2(y, x)))  # turns z onto the axis
+        parts.append(
+            f'<{tag}><origin xyz="{_text(tuple((start + end) / 2))}" rpy="{_text(rpy)}"/>'
+            f'<geometry><cylinder radius="{capsule.radius}" length="{length!r}"/></geometry></{tag}>'
+        )
+    return "".join(parts)
+
+
+def _joint(
+    name: str, kind: str, parent: str, child: str, xyz: Point | Array, rpy: Point | Array = (0, 0, 0), extra: str = ""
+) -> str:
+    return (
+        f'<joint name="{name}" type="{kind}"><parent link="{parent}"/><child link="{child}"/>'
+        f'<origin xyz="{_text(xyz)}" rpy="{_text(rpy)}"/>{extra}</joint>'
+    )
+
+
+def _revolute(arm: Arm, i: int, robot: Robot) -> str:
+    lower, upper, velocity, torque = (float(x[i]) for x in (arm.lower_rad, arm.upper_rad, arm.velocity_radps, arm.torque_nm))
+    extra = (
+        f'<axis xyz="{_text(arm.axis[i])}"/>'
+        f'<limit lower="{lower!r}" upper="{upper!r}" velocity="{velocity!r}" effort="{torque!r}"/>'
+        f'<dynamics damping="{robot.joint_damping_nms!r}" friction="{robot.joint_friction_nm!r}"/>'
+    )
+    return _joint(arm.joint_names[i], "revolute", arm.link_names[i], arm.link_names[i + 1], arm.origin_m[i], extra=extra)
+
+
+def urdf(robot: Robot, *, geometry: bool = True) -> str:
+    """Return the robot as URDF text: link `world` (W), the base fixed to it, the arm, the tool. It refers to no file.
+
+    `geometry=False` leaves out visual and collision shapes.
+    """
+    arm, links, X_WB = arm_of(robot), link_names(robot), base_pose(robot)
+    inertia, shapes = inertias(robot), capsules(robot)
+    parts = [f'<robot name="{arm.name}">', '<link name="world"/>']
+    for link in links:
+        seen = shapes[link] if geometry else ()
+        primitives = "".join(_geometry(tag, capsule) for tag in ("visual", "collision") for capsule in seen)
+        parts.append(f'<link name="{link}">{_inertial(inertia[link])}{primitives}</link>')
+    rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
+    parts.append(_joint(f"{arm.name}_base", "fixed", "world", links[0], X_WB[:3, 3], rpy))
+    parts += [_revolute(arm, i, robot) for i in range(arm.joints)]
+    flange = arm.link_names[-1]
+    parts.append(_joint(f"{arm.name}_flange", "fixed", arm.link_names[-2], flange, arm.flange_m))
+    parts.append(_joint("ft_sensor_mount", "fixed", flange, "ft_sensor", (0.0, 0.0, FLANGE_TO_FT_M)))
+    parts.append(_joint("standoff", "fixed", "ft_sensor", "indenter", (0.0, 0.0, FT_TO_INDENTER_M)))
+    parts.append("</robot>\n")
+    return "\n".join(parts)

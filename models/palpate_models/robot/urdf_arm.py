@@ -1,0 +1,463 @@
+"""Arms from a URDF and a YAML file beside it, which has what a URDF does not.
+
+`read_arm` collects everything that is missing or impossible, each with its link or joint; `palpate arm check` prints it.
+"""
+
+from __future__ import annotations
+
+import sys
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Final, Literal
+from xml.etree import ElementTree
+
+import numpy as np
+import yaml
+from pydantic import Field, ValidationError
+from scipy.spatial import ConvexHull, QhullError
+from scipy.spatial.transform import Rotation
+
+from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
+from palpate_models.section import NonNegative, Section, Vec2
+
+FOLDER: Final = Path(__file__).parent / "arms"
+"""YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
+
+Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
+"""One value a joint, from the base to the flange."""
+
+
+@dataclass(frozen=True)
+class ArmTuning:
+    """Values of an arm that says nothing of them, and bounds of plausible ones."""
+
+    stiffness_per_torque: float = 5.0
+    """Joint stiffness over torque limit [1/rad], as that of the LBR."""
+    damping_per_torque: float = 0.6
+    """Joint damping of a hold over torque limit [s/rad], as that of the LBR."""
+    acceleration_per_speed: float = 2.4
+    """Limit of acceleration over limit of speed [1/s], as that of the LBR."""
+    continuous_rad: float = 2 * np.pi
+    """Range of a joint without end stops, either way."""
+    largest_link_m: float = 2.0
+    """A larger mesh is in other units."""
+    smallest_link_m: float = 0.005
+    inertia_tolerance: float = 1e-3
+    """Relative excess of a principal moment over the sum of the others that counts as rounding."""
+
+
+TUNING: Final = ArmTuning()
+
+
+class ArmFile(Section):
+    """What a URDF lacks. Values a joint are in the order of the chain, from the base to the flange."""
+
+    urdf: str
+    """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
+    flange: str
+    """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
+    home_rad: Joints
+    """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view."""
+    level: Literal["torque", "position"] = "torque"
+    """What the arm's controller takes."""
+    base_xy_m: Vec2 = (0.0, 0.0)
+    """Position of the base in world; `palpate arm place` finds it."""
+    base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
+    base_yaw_rad: float = 0.0
+    joint_friction_nm: NonNegative = 0.1
+    """Coulomb friction."""
+    joint_damping_nms: NonNegative = 1.0
+    """Viscous friction."""
+    lower_rad: Joints | None = None
+    """Replaces the URDF's limit, and so do the next three."""
+    upper_rad: Joints | None = None
+    velocity_radps: Joints | None = None
+    torque_nm: Joints | None = None
+    acceleration_radps2: Joints | None = None
+    stiffness_nmprad: Joints | None = None
+    """Joint stiffness in free motion."""
+    hold_damping_nms: Joints | None = None
+    """Joint damping in a hold."""
+    seeds_rad: tuple[Joints, ...] = ()
+    """Further postures from which inverse kinematics starts, with the first joint at zero."""
+
+
+PLACEMENT: Final = ("base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
+"""Fields that are defaults of the scenario's section `robot`."""
+
+
+def arm_path(name: str) -> Path:
+    """Return the YAML file of an arm: a path, or a name of `FOLDER`. Raises UserError."""
+    path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(("lbr", *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
+        raise UserError(f"robot.arm: {name}: no such file; want {known}, or the path of a YAML file")
+    return path
+
+
+@cache
+def arm_file(name: str) -> ArmFile:
+    """Return the YAML file of an arm. Raises UserError that names file, field and what is allowed."""
+    path = arm_path(name)
+    try:
+        return ArmFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
+    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
+        raise UserError(f"{path}: {error}") from error
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
+        raise UserError(f"{path}: {wrong}") from error
+
+
+def placement_of(name: str) -> dict[str, Any]:
+    """Return the defaults of section `robot` for an arm. Raises UserError."""
+    return arm_file(name).model_dump(include=set(PLACEMENT))
+
+
+@cache
+def load_arm(name: str) -> Arm:
+    """Return an arm by name or path. Raises UserError with the first fault."""
+    arm, faults = read_arm(name)
+    if arm is None:
+        more = f" (and {len(faults) - 1} more: palpate arm check {name})" if len(faults) > 1 else ""
+        raise UserError(f"robot.arm: {name}: {faults[0]}{more}")
+    return arm
+
+
+def read_arm(name: str) -> tuple[Arm | None, list[str]]:
+    """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
+    given, path = arm_file(name), arm_path(name)
+    return _Reader(given, _resolved(given.urdf, path.parent)).read(path.stem)
+
+
+def _resolved(name: str, folder: Path) -> Path:
+    """Return the path of a file of a URDF: relative to `folder`, or in a package in a folder above it or on Python's path."""
+    if not name.startswith("package://"):
+        return folder / name.removeprefix("file://")
+    package, _, rest = name.removeprefix("package://").partition("/")
+    roots = [*folder.resolve().parents, *(Path(entry) / "cmeel.prefix" / "share" for entry in sys.path)]
+    found = next((root / package / rest for root in (folder.resolve(), *roots) if (root / package / rest).is_file()), None)
+    if found is None and package == "example-robot-data":
+        raise UserError("this arm needs the package example-robot-data: pip install 'palpate[arms]'")
+    return found or folder / package / rest
+
+
+def _numbers(element: ElementTree.Element | None, attribute: str, default: str = "0 0 0") -> Array:
+    text = default if element is None else element.get(attribute, default)
+    return np.array([float(part) for part in text.split()])
+
+
+def _pose(element: ElementTree.Element | None) -> Array:
+    """Return the pose of an `origin`, shape (4, 4)."""
+    X = np.eye(4)
+    X[:3, :3] = Rotation.from_euler("xyz", _numbers(element, "rpy")).as_matrix()
+    X[:3, 3] = _numbers(element, "xyz")
+    return X
+
+
+class _Reader:
+    """Reads the chain from base to flange of one URDF and collects faults."""
+
+    def __init__(self, given: ArmFile, path: Path) -> None:
+        self._given, self._path = given, path
+        self.faults: list[str] = []
+        try:
+            root = ElementTree.parse(path).getroot()
+        except (OSError, ElementTree.ParseError) as error:
+            raise UserError(f"{path}: not a URDF: {error}") from error
+        self._links = {link.get("name", ""): link for link in root.findall("link")}
+        self._joint_of = {}
+        for joint in root.findall("joint"):
+            child = joint.find("child")
+            if child is not None and joint.find("parent") is not None:
+                self._joint_of[child.get("link", "")] = joint
+
+    def read(self, name: str) -> tuple[Arm | None, list[str]]:
+        """Return the arm, None if it is unusable, and the faults."""
+        if self._given.flange not in self._links:
+            near = ", ".join(list(self._links)[-6:])
+            return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; its last links are {near}"]
+        try:
+            chain = self._chain()
+            poses, moving = self._placed(chain)
+        except (ValueError, KeyError) as error:
+            return None, [f"{self._path.name}: {error}"]
+        n = len(moving)
+        if n not in (6, 7):
+            return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]
+        limits = self._limits(moving)
+        R_BF = poses[-1][:3, :3]
+        groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
+        frames = [np.eye(4), *(poses[chain.index(self._child(joint))] for joint in moving)]
+        origins = np.array([X[:3, 3] for X in frames])
+        inertias = tuple(
+            self._inertia(group, R_BF, origin, name=links[0], fixed=k == 0)
+            for k, (group, origin, links) in enumerate(zip(groups, origins, [[g[0][0]] for g in groups], strict=True))
+        )
+        capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
+        home = np.array(self._given.home_rad)
+        if len(home) != n:
+            self.faults.append(f"home_rad: {len(home)} values, want {n}")
+        if self.faults:
+            return None, self.faults
+        given_axes = [_unit(_numbers(joint.find("axis"), "xyz", "1 0 0")) for joint in moving]
+        axes = np.array([X[:3, :3] @ axis for X, axis in zip(frames[1:], given_axes, strict=True)])
+        lower, upper, velocity, torque = limits
+        given = self._given
+        outside = np.flatnonzero((home < lower) | (home > upper))
+        for k in outside:
+            joint = moving[k].get("name")
+            self.faults.append(f"home_rad: {home[k]:.3f} of {joint} is outside {lower[k]:.3f} to {upper[k]:.3f} rad")
+        arm = Arm(
+            name=name,
+            joint_names=tuple(joint.get("name", "") for joint in moving),
+            link_names=(chain[0], *(self._child(joint) for joint in moving), self._flange_name(moving)),
+            origin_m=np.diff(origins, axis=0) @ R_BF,
+            axis=axes @ R_BF,
+            flange_m=R_BF.T @ (poses[-1][:3, 3] - origins[-1]),
+            lower_rad=lower,
+            upper_rad=upper,
+            velocity_radps=velocity,
+            torque_nm=torque,
+            acceleration_radps2=_or(given.acceleration_radps2, TUNING.acceleration_per_speed * velocity),
+            stiffness_nmprad=_or(given.stiffness_nmprad, TUNING.stiffness_per_torque * torque),
+            hold_damping_nms=_or(given.hold_damping_nms, TUNING.damping_per_torque * torque),
+            home_rad=home,
+            inertias=inertias,
+            capsules=capsules,
+            seeds_rad=given.seeds_rad,
+            R_BL=R_BF,
+        )
+        return (None if self.faults else arm), self.faults
+
+    def _flange_name(self, moving: list[ElementTree.Element]) -> str:
+        last = self._child(moving[-1])
+        return self._given.flange if self._given.flange != last else f"{last}_flange"
+
+    def _chain(self) -> list[str]:
+        """Return the links from the root to the flange."""
+        chain = [self._given.flange]
+        while joint := self._joint_of.get(chain[-1]):
+            parent = _child_of(joint, "parent")
+            if parent in chain:
+                raise ValueError(f"link {parent}: its joints form a circle")
+            chain.append(parent)
+        chain = chain[::-1]
+        return chain[1:] if chain[0] == "world" and len(chain) > 2 else chain
+
+    def _child(self, joint: ElementTree.Element) -> str:
+        return _child_of(joint, "child")
+
+    def _placed(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
+        """Return the pose of each link in the root at zero, and the joints that turn."""
+        X, poses, moving = np.eye(4), [np.eye(4)], []
+        for link in chain[1:]:
+            joint = self._joint_of[link]
+            X = X @ _pose(joint.find("origin"))
+            poses.append(X)
+            kind = joint.get("type")
+            if kind in ("revolute", "continuous"):
+                moving.append(joint)
+            elif kind != "fixed":
+                raise ValueError(f"joint {joint.get('name')}: is {kind}; want joints that turn")
+        return poses, moving
+
+    def _limits(self, moving: list[ElementTree.Element]) -> tuple[Array, Array, Array, Array]:
+        """Return lower and upper position, speed and torque limits, shapes (n,)."""
+        table = np.zeros((4, len(moving)))
+        for k, joint in enumerate(moving):
+            limit, name = joint.find("limit"), joint.get("name")
+            endless = joint.get("type") == "continuous"
+            for row, (attribute, field, usual) in enumerate(
+                (("lower", "lower_rad", -TUNING.continuous_rad), ("upper", "upper_rad", TUNING.continuous_rad),
+                 ("velocity", "velocity_radps", None), ("effort", "torque_nm", None))
+            ):  # fmt: skip
+                given = getattr(self._given, field)
+                text = None if limit is None else limit.get(attribute)
+                if given is not None and k < len(given):
+                    table[row, k] = given[k]
+                elif endless and usual is not None:
+                    table[row, k] = usual
+                elif text is None:
+                    self.faults.append(f"joint {name}: no limit {attribute!r}; give {field} in the YAML file")
+                else:
+                    table[row, k] = float(text)
+            lower, upper, velocity, torque = table[:, k]
+            if not upper > lower:
+                self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad")
+            for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
+                if not value > 0:
+                    self.faults.append(f"joint {name}: {field} is {value:g}, want more than 0")
+        return table[0], table[1], table[2], table[3]
+
+    def _rigid(
+        self, chain: list[str], poses: dict[str, Array], moving: list[ElementTree.Element]
+    ) -> list[list[tuple[str, Array]]]:
+        """Return for the base and each moving link the links fixed to it, with their pose in the root at zero.
+
+        Links behind the flange are left out; other fixed branches belong to the arm.
+        """
+        carrier: dict[str, int] = {}
+        movers = {self._child(joint): k + 1 for k, joint in enumerate(moving)}
+        groups: list[list[tuple[str, Array]]] = [[] for _ in range(len(moving) + 1)]
+        current = 0
+        for link in chain:
+            current = movers.get(link, current)
+            carrier[link] = current
+            groups[current].append((link, poses[link]))
+        todo = list(chain[:-1])
+        while todo:
+            parent = todo.pop()
+            for child, joint in self._joint_of.items():
+                if child not in carrier and _child_of(joint, "parent") == parent and joint.get("type") == "fixed":
+                    poses[child] = poses[parent] @ _pose(joint.find("origin"))
+                    carrier[child] = carrier[parent]
+                    groups[carrier[parent]].append((child, poses[child]))
+                    todo.append(child)
+        return groups
+
+    def _inertia(self, group: list[tuple[str, Array]], R_BF: Array, origin: Array, *, name: str, fixed: bool) -> Inertia:
+        """Return the inertia of links fixed to each other, about their common centre, in the axes of the flange at zero."""
+        parts = []
+        for link, X in group:
+            inertial = self._links[link].find("inertial") if link in self._links else None
+            if inertial is None:
+                continue
+            mass = float(_numbers(inertial.find("mass"), "value", "0")[0])
+            entries = inertial.find("inertia")
+            xx, yy, zz, xy, xz, yz = (float(_numbers(entries, key, "0")[0]) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
+            if mass == 0 and not tensor.any():
+                continue
+            self._check_inertia(link, mass, tensor)
+            X_C = X @ _pose(inertial.find("origin"))
+            parts.append((mass, X_C[:3, 3], X_C[:3, :3] @ tensor @ X_C[:3, :3].T))
+        total = sum(mass for mass, _, _ in parts)
+        if total <= 0:
+            if not fixed:
+                self.faults.append(f"link {name}: no mass")
+            return Inertia(1.0, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))  # the base does not move
+        centre = sum(mass * p for mass, p, _ in parts) / total
+        about = sum(
+            tensor + mass * ((r := p - centre) @ r * np.eye(3) - np.outer(r, r))
+            for mass, p, tensor in parts  # Steiner
+        )
+        local = R_BF.T @ about @ R_BF
+        return Inertia(
+            float(total),
+            _point(R_BF.T @ (centre - origin)),
+            _point(np.diag(local)),
+            (float(local[0, 1]), float(local[0, 2]), float(local[1, 2])),
+        )
+
+    def _check_inertia(self, link: str, mass: float, tensor: Array) -> None:
+        if not (np.isfinite(mass) and np.isfinite(tensor).all()):
+            self.faults.append(f"link {link}: mass or inertia is not finite")
+            return
+        if mass <= 0:
+            self.faults.append(f"link {link}: mass is {mass:g} kg, want more than 0")
+        a, b, c = np.linalg.eigvalsh(tensor)
+        if a <= 0:
+            self.faults.append(f"link {link}: inertia is not positive: a principal moment is {a:.3g} kg m^2")
+        elif c > (a + b) * (1 + TUNING.inertia_tolerance):
+            self.faults.append(
+                f"link {link}: inertia against the triangle inequality: {c:.3g} kg m^2 is more than {a:.3g} and {b:.3g} together"
+            )
+
+    def _shape(self, group: list[tuple[str, Array]], R_BF: Array, origin: Array) -> tuple[Capsule, ...]:
+        """Return a capsule about the collision geometry of each link of a group (visual where there is none)."""
+        found = []
+        for link, X in group:
+            element = self._links.get(link)
+            if element is None:
+                continue
+            shapes = element.findall("collision") or element.findall("visual")
+            clouds = [points for shape in shapes if len(points := self._points(link, X, shape))]
+            if clouds:
+                found.append(enclosing_capsule((np.concatenate(clouds) - origin) @ R_BF))
+        return tuple(found)
+
+    def _points(self, link: str, X: Array, shape: ElementTree.Element) -> Array:
+        """Return points of a shape's surface in the axes of the root, shape (n, 3)."""
+        X = X @ _pose(shape.find("origin"))
+        geometry = shape.find("geometry")
+        kind = None if geometry is None or not len(geometry) else geometry[0]
+        if kind is None:
+            return np.zeros((0, 3))
+        if kind.tag == "mesh":
+            points = self._mesh(link, kind)
+        elif kind.tag == "box":
+            points = np.array(np.meshgrid(*((-s / 2, s / 2) for s in _numbers(kind, "size")))).reshape(3, -1).T
+        else:
+            radius = float(kind.get("radius", "0"))
+            half = float(kind.get("length", "0")) / 2
+            turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
+            ring = radius * np.column_stack((np.cos(turn), np.sin(turn), 0 * turn))
+            tips = np.array(((0, 0, radius), (0, 0, -radius))) if kind.tag == "sphere" else np.zeros((0, 3))
+            top = np.array((0.0, 0.0, half))
+            points = np.concatenate((ring + top, ring - top, tips))
+        return np.asarray(points @ X[:3, :3].T + X[:3, 3])
+
+    def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:
+        """Return the vertices of the convex hull of a mesh [m]."""
+        import coal  # noqa: PLC0415 - only arms from a URDF need it
+
+        name = mesh.get("filename", "")
+        path = _resolved(name, self._path.parent)
+        if not path.is_file():
+            self.faults.append(f"link {link}: mesh {name} is not there")
+            return np.zeros((0, 3))
+        try:
+            vertices = np.array(coal.MeshLoader().load(str(path), _numbers(mesh, "scale", "1 1 1")).vertices())
+            hull = vertices[ConvexHull(vertices).vertices]
+        except (RuntimeError, ValueError, QhullError) as error:
+            self.faults.append(f"link {link}: mesh {name} cannot be read: {error}")
+            return np.zeros((0, 3))
+        size = float(np.ptp(hull, axis=0).max())
+        if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
+            self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; give a scale in the URDF")
+        return np.asarray(hull)
+
+
+def enclosing_capsule(points: Array) -> Capsule:
+    """Return a small capsule that encloses points, shape (n, 3), along the principal axis of their spread."""
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    best: tuple[float, Capsule] | None = None
+    for axis in axes:
+        along = (points - middle) @ axis
+        across = points - middle - np.outer(along, axis)
+        centre = (across.max(axis=0) + across.min(axis=0)) / 2
+        off = np.linalg.norm(across - centre, axis=1)
+        radius = float(off.max()) * (1 + 1e-9)
+        cap = np.sqrt(radius**2 - off**2)
+        start, end = float((along + cap).min()), float((along - cap).max())
+        if start > end:
+            start = end = (start + end) / 2
+            radius = float(np.linalg.norm(points - middle - centre - start * axis, axis=1).max())
+        volume = np.pi * radius**2 * (end - start) + 4 / 3 * np.pi * radius**3
+        capsule = Capsule(_point(middle + centre + start * axis), _point(middle + centre + end * axis), radius)
+        if best is None or volume < best[0]:
+            best = (volume, capsule)
+    assert best is not None
+    return best[1]
+
+
+def _point(values: Array) -> Point:
+    x, y, z = (float(v) for v in values)
+    return x, y, z
+
+
+def _unit(axis: Array) -> Array:
+    return axis / np.linalg.norm(axis)
+
+
+def _or(given: tuple[float, ...] | None, usual: Array) -> Array:
+    return usual if given is None else np.array(given)
+
+
+def _child_of(joint: ElementTree.Element, tag: str) -> str:
+    element = joint.find(tag)
+    return "" if element is None else element.get("link", "")

@@ -1,0 +1,1 @@
+"""`palpate arm`: check an arm, place its base."""

@@ -1,0 +1,107 @@
+"""`palpate arm`."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from palpate.run.options import DEFAULT_SCENARIO, Settings
+
+if TYPE_CHECKING:
+    from palpate_models.numerics.frames import Array
+    from palpate_models.scenario.schema import Scenario
+
+app = typer.Typer(name="arm", help="Check an arm, and find a place for its base.", no_args_is_help=True)
+Name = Annotated[str, typer.Argument(help="lbr, panda, ur5, ur10, xarm7, or a YAML file beside a URDF.")]
+
+
+@app.command()
+def check(arm: Name) -> None:
+    """Say what an arm has, and what is missing or impossible, each with its link or joint. Starts nothing."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from palpate.console import EXIT_BAD_INPUT, say
+    from palpate_models.robot import lbr
+    from palpate_models.robot.urdf_arm import arm_file, read_arm
+
+    known = arm == lbr.ARM.name
+    found, faults = (lbr.ARM, []) if known else read_arm(arm)
+    for fault in faults:
+        say(f"{arm}: {fault}")
+    if found is None:
+        raise typer.Exit(EXIT_BAD_INPUT)
+    table = Table("joint", "range [rad]", "speed [rad/s]", "torque [N m]", "home [rad]", "link [kg]", box=None)
+    limits = (found.lower_rad, found.upper_rad, found.velocity_radps, found.torque_nm, found.home_rad)
+    for k, (name, low, high, speed, torque, home) in enumerate(zip(found.joint_names, *limits, strict=True)):
+        mass = found.inertias[k + 1].mass
+        table.add_row(name, f"{low:.2f} to {high:.2f}", f"{speed:.2f}", f"{torque:.0f}", f"{home:.2f}", f"{mass:.2f}")
+    console = Console()
+    console.print(table)
+    elbow, _ = found.elbow
+    shapes = sum(map(len, found.capsules))
+    level = "torque" if known else arm_file(arm).level
+    console.print(
+        f"{found.joints} joints, flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes, level {level}",
+        highlight=False,
+    )
+
+
+@app.command()
+def place(
+    arm: Name,
+    scenario: Annotated[str, typer.Argument(help="Scenario whose region is to be reached, by name or file.")] = DEFAULT_SCENARIO,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("place.png"),
+    settings: Settings = None,
+) -> None:
+    """Find where the base should stand to reach a scenario's region, and draw which targets it reaches."""
+    import numpy as np
+    from rich.console import Console
+
+    from palpate.arm.placement import RAISED_M, best_placement, describe, scan_targets
+    from palpate.run.inputs import usable
+    from palpate_models.robot.arm import arm_of
+    from palpate_planning.placement.redundancy import plan_redundancy
+
+    chosen = usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
+    console = Console()
+    with Console(stderr=True).status("optimising: about a minute"):
+        robot = best_placement(chosen).robot
+        targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, RAISED_M)]
+        home = arm_of(robot).home_rad
+        deep, raised = (plan_redundancy(robot, *pair, home) for pair in targets)
+    console.print(f"pressed: {describe(robot, deep)}", highlight=False, soft_wrap=True)
+    console.print(f"raised:  {describe(robot, raised)}", highlight=False, soft_wrap=True)
+    x, y = robot.base_xy_m
+    console.print(
+        f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}\nbase_yaw_rad: {robot.base_yaw_rad:g}",
+        highlight=False,
+    )
+    _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
+    console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
+
+
+def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:
+    """Draw the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Rectangle
+
+    from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M, TABLE_Y_M
+
+    figure = Figure(figsize=(6.5, 6.5), dpi=110, layout="constrained")
+    axes = figure.add_subplot()
+    width, length = TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0]
+    axes.add_patch(Rectangle((TABLE_X_M[0], TABLE_Y_M[0]), width, length, fill=False, color="#7a8c94", label="table"))
+    corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
+    axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
+    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (~reached, "#d07000", "out of reach")):
+        if chosen.any():
+            axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
+    axes.set(
+        xlabel="x [m]", ylabel="y [m]", title=f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets", aspect="equal"
+    )
+    axes.set_ylim(-0.6, 0.6)
+    axes.legend()
+    figure.savefig(path)
