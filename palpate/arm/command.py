@@ -25,10 +25,9 @@ def check(arm: Name) -> None:
 
     from palpate.console import EXIT_BAD_INPUT, say
     from palpate_models.robot import lbr
-    from palpate_models.robot.urdf_arm import arm_file, read_arm
+    from palpate_models.robot.urdf_arm import read_arm
 
-    known = arm == lbr.ARM.name
-    found, faults = (lbr.ARM, []) if known else read_arm(arm)
+    found, faults = (lbr.ARM, []) if arm == lbr.ARM.name else read_arm(arm)
     for fault in faults:
         say(f"{arm}: {fault}")
     if found is None:
@@ -42,9 +41,8 @@ def check(arm: Name) -> None:
     console.print(table)
     elbow, _ = found.elbow
     shapes = sum(map(len, found.capsules))
-    level = "torque" if known else arm_file(arm).level
     console.print(
-        f"{found.joints} joints, flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes, level {level}",
+        f"{found.joints} joints, flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes",
         highlight=False,
     )
 

@@ -9,7 +9,7 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -61,8 +61,6 @@ class ArmFile(Section):
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
     home_rad: Joints
     """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view."""
-    level: Literal["torque", "position"] = "torque"
-    """What the arm's controller takes."""
     base_xy_m: Vec2 = (0.0, 0.0)
     """Position of the base in world; `palpate arm place` finds it."""
     base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9

@@ -1,0 +1,132 @@
+"""Arms from a URDF: the tables agree with pinocchio, and what is broken is named with its link or joint."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pinocchio as pin
+import pytest
+import yaml
+
+from palpate_errors import UserError
+from palpate_models.robot.arm import arm_of, urdf
+from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.robot.urdf_arm import enclosing_capsule, read_arm
+from palpate_models.scenario.schema import Robot
+
+TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "0.2 0 0")
+INERTIAL = '<inertial><origin xyz="0 0 0.05"/><mass value="{m}"/><inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>'
+GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
+
+
+def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: str) -> str:
+    """Return the YAML file of an arm of six joints; `changes` replace parts of the URDF's third joint and link, or of the YAML file."""
+    given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
+        key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "wrong")
+    }
+    links = ['<link name="link_0"/>']
+    for k, rpy in enumerate(TWISTS, start=1):
+        odd = k == 3
+        mass = INERTIAL.format(**(GOOD | (inertia or {}) if odd else GOOD))
+        shape = '<geometry><cylinder radius="0.05" length="0.2"/></geometry>'
+        collision = changes.get("collision", shape) if odd else shape
+        links.append(
+            f'<link name="link_{k}">{changes.get("inertial", mass) if odd else mass}<collision>{collision}</collision></link>'
+        )
+        limit = changes.get("limit", "") if odd else ""
+        limit = limit or '<limit lower="-2.5" upper="2.5" velocity="2" effort="80"/>'
+        kind = changes.get("kind", "revolute") if odd else "revolute"
+        links.append(
+            f'<joint name="joint_{k}" type="{kind}"><parent link="link_{k - 1}"/><child link="link_{k}"/>'
+            f'<origin xyz="0.02 0 0.2" rpy="{rpy}"/><axis xyz="0 0 2"/>{limit}</joint>'
+        )
+    links.append(
+        '<link name="tip"/><joint name="mount" type="fixed"><parent link="link_6"/><child link="tip"/><origin xyz="0 0 0.1" rpy="0 0.4 0"/></joint>'
+    )
+    links.append('<link name="gripper"/><joint name="slide" type="prismatic"><parent link="tip"/><child link="gripper"/></joint>')
+    (folder / "arm.urdf").write_text(changes.get("text", f'<robot name="arm">{"".join(links)}</robot>'))
+    path = folder / "arm.yaml"
+    path.write_text(yaml.safe_dump(given))
+    return str(path)
+
+
+def test_the_tables_agree_with_pinocchio(tmp_path: Path) -> None:
+    name = write(tmp_path)
+    robot = Robot(arm=name, base_yaw_rad=0.4)
+    arm = arm_of(robot)
+    whole = pin.buildModelFromUrdf(str(tmp_path / "arm.urdf"))
+    theirs = pin.buildReducedModel(whole, [whole.getJointId("slide")], pin.neutral(whole))
+    ours = pin.buildModelFromXML(urdf(robot))
+    yaw = pin.SE3(pin.utils.rotate("z", 0.4), np.array((*robot.base_xy_m, robot.base_height_m)))
+    rng = np.random.default_rng(0)
+    for q in rng.uniform(arm.lower_rad, arm.upper_rad, (5, 6)):
+        data, other = ours.createData(), theirs.createData()
+        pin.framesForwardKinematics(ours, data, q)
+        pin.framesForwardKinematics(theirs, other, q)
+        tip = yaw * other.oMf[theirs.getFrameId("tip")]
+        np.testing.assert_allclose(data.oMf[ours.getFrameId("tip")].homogeneous, tip.homogeneous, atol=1e-9)
+        np.testing.assert_allclose(tool_pose(q, robot), data.oMf[ours.getFrameId("indenter")].homogeneous, atol=1e-9)
+        J = pin.computeFrameJacobian(ours, data, q, ours.getFrameId("indenter"), pin.LOCAL_WORLD_ALIGNED)
+        np.testing.assert_allclose(tool_jacobian(q, robot), J, atol=1e-9)
+        heavy = pin.crba(ours, data, q) - pin.crba(theirs, other, q)  # our tool
+        assert np.linalg.eigvalsh(heavy).min() > -1e-9
+    assert [inertia.mass for inertia in arm.inertias[1:]] == [2.0] * 6
+
+
+BROKEN = {
+    "mass of zero": ({"inertia": {"m": 0.0}}, "link link_3: mass is 0 kg"),
+    "no mass": ({"inertial": ""}, "link link_3: no mass"),
+    "negative inertia": ({"inertia": {"z": -0.01}}, "link link_3: inertia is not positive"),
+    "triangle": ({"inertia": {"x": 0.2}}, "link link_3: inertia against the triangle inequality"),
+    "not a number": ({"inertia": {"x": float("nan")}}, "link link_3: mass or inertia is not finite"),
+    "no mesh": ({"collision": '<geometry><mesh filename="no.stl"/></geometry>'}, "link link_3: mesh no.stl is not there"),
+    "no limits": ({"limit": "<unlimited/>"}, "joint joint_3: no limit"),
+    "empty range": ({"limit": '<limit lower="1" upper="1" velocity="2" effort="80"/>'}, "joint joint_3: its range"),
+    "no speed": ({"limit": '<limit lower="-1" upper="1" velocity="0" effort="80"/>'}, "joint joint_3: velocity_radps is 0"),
+    "no torque": ({"limit": '<limit lower="-1" upper="1" velocity="2" effort="0"/>'}, "joint joint_3: torque_nm is 0"),
+    "slides": ({"kind": "prismatic"}, "joint joint_3: is prismatic"),
+    "one joint less": ({"kind": "fixed"}, "5 joints"),
+    "no flange": ({"flange": "tool"}, "no link 'tool'"),
+    "home outside": ({"home_rad": [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]}, "home_rad: 3.000 of joint_3"),
+    "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, want 6"),
+}
+
+
+@pytest.mark.parametrize(("changes", "named"), BROKEN.values(), ids=BROKEN)
+def test_what_is_broken_is_named(tmp_path: Path, changes: dict[str, str], named: str) -> None:
+    arm, faults = read_arm(write(tmp_path, **changes))  # type: ignore[arg-type]
+    assert arm is None
+    assert any(named in fault for fault in faults), faults
+
+
+def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
+    import trimesh
+
+    trimesh.creation.box((80.0, 80.0, 200.0)).export(tmp_path / "link.stl")
+    mesh = '<geometry><mesh filename="link.stl"{}/></geometry>'
+    _, faults = read_arm(write(tmp_path, collision=mesh.format("")))
+    assert "its unit is not metres" in faults[0]
+    (tmp_path / "scaled").mkdir()
+    (tmp_path / "scaled" / "link.stl").write_bytes((tmp_path / "link.stl").read_bytes())
+    assert read_arm(write(tmp_path / "scaled", collision=mesh.format(' scale="0.001 0.001 0.001"')))[1] == []
+
+
+@pytest.mark.parametrize(
+    ("changes", "named"),
+    [({"text": "<robot"}, "not a URDF"), ({"urdf": "other.urdf"}, "other.urdf"), ({"wrong": "1"}, "wrong: Extra inputs")],
+)
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, str], named: str) -> None:
+    with pytest.raises(UserError, match=named):
+        read_arm(write(tmp_path, **changes))  # type: ignore[arg-type]
+
+
+def test_a_capsule_encloses_its_points() -> None:
+    rng = np.random.default_rng(1)
+    for scale in rng.uniform(0.02, 0.5, (20, 3)):
+        points = rng.standard_normal((200, 3)) * scale + rng.uniform(-1, 1, 3)
+        capsule = enclosing_capsule(points)
+        start, end = np.array(capsule.start), np.array(capsule.end)
+        axis = end - start
+        share = np.clip((points - start) @ axis / max(axis @ axis, 1e-12), 0, 1)
+        assert np.linalg.norm(points - start - share[:, None] * axis, axis=1).max() <= capsule.radius * (1 + 1e-9)
