@@ -16,12 +16,13 @@ from palpate_models.robot.urdf_arm import enclosing_capsule, read_arm
 from palpate_models.scenario.schema import Robot
 
 TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "0.2 0 0")
-INERTIAL = '<inertial><origin xyz="0 0 0.05"/><mass value="{m}"/><inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/></inertial>'
+TENSOR = '<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
+INERTIAL = f'<inertial><origin xyz="0 0 0.05"/><mass value="{{m}}"/>{TENSOR}</inertial>'
 GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 
 
 def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: str) -> str:
-    """Return the YAML file of an arm of six joints; `changes` replace parts of the URDF's third joint and link, or of the YAML file."""
+    """Return the YAML file of an arm of six joints; `changes` replace parts of its third joint and link, or of the YAML file."""
     given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
         key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "wrong")
     }
@@ -41,10 +42,10 @@ def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: s
             f'<joint name="joint_{k}" type="{kind}"><parent link="link_{k - 1}"/><child link="link_{k}"/>'
             f'<origin xyz="0.02 0 0.2" rpy="{rpy}"/><axis xyz="0 0 2"/>{limit}</joint>'
         )
-    links.append(
-        '<link name="tip"/><joint name="mount" type="fixed"><parent link="link_6"/><child link="tip"/><origin xyz="0 0 0.1" rpy="0 0.4 0"/></joint>'
-    )
-    links.append('<link name="gripper"/><joint name="slide" type="prismatic"><parent link="tip"/><child link="gripper"/></joint>')
+    mount = '<parent link="link_6"/><child link="tip"/><origin xyz="0 0 0.1" rpy="0 0.4 0"/>'
+    slide = '<parent link="tip"/><child link="gripper"/><limit lower="0" upper="0.1" velocity="1" effort="1"/>'
+    links.append(f'<link name="tip"/><joint name="mount" type="fixed">{mount}</joint>')
+    links.append(f'<link name="gripper"/><joint name="slide" type="prismatic">{slide}</joint>')
     (folder / "arm.urdf").write_text(changes.get("text", f'<robot name="arm">{"".join(links)}</robot>'))
     path = folder / "arm.yaml"
     path.write_text(yaml.safe_dump(given))

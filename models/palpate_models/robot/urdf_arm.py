@@ -428,6 +428,7 @@ def enclosing_capsule(points: Array) -> Capsule:
         along = (points - middle) @ axis
         across = points - middle - np.outer(along, axis)
         centre = (across.max(axis=0) + across.min(axis=0)) / 2
+        centre = centre - (centre @ axis) * axis
         off = np.linalg.norm(across - centre, axis=1)
         radius = float(off.max()) * (1 + 1e-9)
         cap = np.sqrt(radius**2 - off**2)
