@@ -9,25 +9,18 @@ import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Annotated, Any, Final
+from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
-import yaml
-from pydantic import Field, ValidationError
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError
+from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
-from palpate_models.section import NonNegative, Section, Vec2
-
-FOLDER: Final = Path(__file__).parent / "arms"
-"""YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
-
-Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
-"""One value a joint, from the base to the flange."""
+from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 
 
 @dataclass(frozen=True)
@@ -50,68 +43,6 @@ class ArmTuning:
 
 
 TUNING: Final = ArmTuning()
-
-
-class ArmFile(Section):
-    """What a URDF lacks. Values a joint are in the order of the chain, from the base to the flange."""
-
-    urdf: str
-    """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
-    flange: str
-    """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
-    home_rad: Joints
-    """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view."""
-    base_xy_m: Vec2 = (0.0, 0.0)
-    """Position of the base in world; `palpate arm place` finds it."""
-    base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
-    base_yaw_rad: float = 0.0
-    joint_friction_nm: NonNegative = 0.1
-    """Coulomb friction."""
-    joint_damping_nms: NonNegative = 1.0
-    """Viscous friction."""
-    lower_rad: Joints | None = None
-    """Replaces the URDF's limit, and so do the next three."""
-    upper_rad: Joints | None = None
-    velocity_radps: Joints | None = None
-    torque_nm: Joints | None = None
-    acceleration_radps2: Joints | None = None
-    stiffness_nmprad: Joints | None = None
-    """Joint stiffness in free motion."""
-    hold_damping_nms: Joints | None = None
-    """Joint damping in a hold."""
-    seeds_rad: tuple[Joints, ...] = ()
-    """Further postures from which inverse kinematics starts, with the first joint at zero."""
-
-
-PLACEMENT: Final = ("base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
-"""Fields that are defaults of the scenario's section `robot`."""
-
-
-def arm_path(name: str) -> Path:
-    """Return the YAML file of an arm: a path, or a name of `FOLDER`. Raises UserError."""
-    path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
-    if not path.is_file():
-        known = ", ".join(("lbr", *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
-        raise UserError(f"robot.arm: {name}: no such file; want {known}, or the path of a YAML file")
-    return path
-
-
-@cache
-def arm_file(name: str) -> ArmFile:
-    """Return the YAML file of an arm. Raises UserError that names file, field and what is allowed."""
-    path = arm_path(name)
-    try:
-        return ArmFile.model_validate(yaml.safe_load(path.read_text(encoding="utf-8")))
-    except (OSError, UnicodeDecodeError, yaml.YAMLError) as error:
-        raise UserError(f"{path}: {error}") from error
-    except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
-        raise UserError(f"{path}: {wrong}") from error
-
-
-def placement_of(name: str) -> dict[str, Any]:
-    """Return the defaults of section `robot` for an arm. Raises UserError."""
-    return arm_file(name).model_dump(include=set(PLACEMENT))
 
 
 @cache
@@ -162,7 +93,10 @@ class _Reader:
         self._given, self._path = given, path
         self.faults: list[str] = []
         try:
-            root = ElementTree.parse(path).getroot()
+            text = read_text(path)
+            if "<!ENTITY" in text:
+                raise UserError(f"{path}: has XML entities, which may name other files: write their text")
+            root = ElementTree.fromstring(text)
         except (OSError, ElementTree.ParseError) as error:
             raise UserError(f"{path}: not a URDF: {error}") from error
         self._links = {link.get("name", ""): link for link in root.findall("link")}
@@ -174,14 +108,17 @@ class _Reader:
 
     def read(self, name: str) -> tuple[Arm | None, list[str]]:
         """Return the arm, None if it is unusable, and the faults."""
+        try:
+            return self._arm(name)
+        except (ValueError, KeyError) as error:
+            return None, [*self.faults, f"{self._path.name}: {error}"]
+
+    def _arm(self, name: str) -> tuple[Arm | None, list[str]]:
         if self._given.flange not in self._links:
             near = ", ".join(list(self._links)[-6:])
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; its last links are {near}"]
-        try:
-            chain = self._chain()
-            poses, moving = self._placed(chain)
-        except (ValueError, KeyError) as error:
-            return None, [f"{self._path.name}: {error}"]
+        chain = self._chain()
+        poses, moving = self._placed(chain)
         n = len(moving)
         if n not in (6, 7):
             return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]

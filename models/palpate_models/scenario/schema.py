@@ -17,7 +17,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom
-from palpate_models.robot.urdf_arm import placement_of
+from palpate_models.scenario.arm_file import placement_of
 from palpate_models.scenario.errors import Errors
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 from palpate_plugins import PluginKind, is_file

@@ -1,0 +1,81 @@
+"""The YAML file of an arm: what its URDF lacks, and the defaults of section `robot`."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Annotated, Any, Final
+
+from pydantic import Field, ValidationError
+
+from palpate_errors import UserError
+from palpate_inputs import read_yaml
+from palpate_models.section import NonNegative, Section, Vec2
+
+FOLDER: Final = Path(__file__).parent / "arms"
+"""YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
+
+Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
+"""One value a joint, from the base to the flange."""
+
+
+class ArmFile(Section):
+    """What a URDF lacks. Values a joint are in the order of the chain, from the base to the flange."""
+
+    urdf: str
+    """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
+    flange: str
+    """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
+    home_rad: Joints
+    """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view."""
+    base_xy_m: Vec2 = (0.0, 0.0)
+    """Position of the base in world; `palpate arm place` finds it."""
+    base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
+    base_yaw_rad: float = 0.0
+    joint_friction_nm: NonNegative = 0.1
+    """Coulomb friction."""
+    joint_damping_nms: NonNegative = 1.0
+    """Viscous friction."""
+    lower_rad: Joints | None = None
+    """Replaces the URDF's limit, and so do the next three."""
+    upper_rad: Joints | None = None
+    velocity_radps: Joints | None = None
+    torque_nm: Joints | None = None
+    acceleration_radps2: Joints | None = None
+    stiffness_nmprad: Joints | None = None
+    """Joint stiffness in free motion."""
+    hold_damping_nms: Joints | None = None
+    """Joint damping in a hold."""
+    seeds_rad: tuple[Joints, ...] = ()
+    """Further postures from which inverse kinematics starts, with the first joint at zero."""
+
+
+PLACEMENT: Final = ("base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
+"""Fields that are defaults of the scenario's section `robot`."""
+
+
+def arm_path(name: str) -> Path:
+    """Return the YAML file of an arm: a path, or a name of `FOLDER`. Raises UserError."""
+    path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
+    if not path.is_file():
+        known = ", ".join(("lbr", *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
+        raise UserError(f"robot.arm: {name}: no such file; want {known}, or the path of a YAML file")
+    return path
+
+
+@cache
+def arm_file(name: str) -> ArmFile:
+    """Return the YAML file of an arm. Raises UserError that names file, field and what is allowed."""
+    path = arm_path(name)
+    try:
+        return ArmFile.model_validate(read_yaml(path))
+    except OSError as error:
+        raise UserError(f"{path}: {error}") from error
+    except ValidationError as error:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
+        raise UserError(f"{path}: {wrong}") from error
+
+
+def placement_of(name: str) -> dict[str, Any]:
+    """Return the defaults of section `robot` for an arm. Raises UserError."""
+    return arm_file(name).model_dump(include=set(PLACEMENT))
