@@ -101,6 +101,23 @@ def test_expired_setpoint_ends_commanding(rig: Rig) -> None:
     assert rig.service.finish()["ticks_without_command"] == 31
 
 
+@pytest.mark.parametrize("state", [{"names": JOINT_NAMES[::-1]}, {"q": HOME[:6]}], ids=["permuted", "one too few"])
+def test_joints_of_another_arm_end_commanding(rig: Rig, state: dict[str, Any]) -> None:
+    rig.tick()
+    rig.send(setpoint(rig.t))
+    assert valid_for(rig.tick(5)) > 0
+    command = rig.tick(**state)
+    assert valid_for(command) == 0
+    assert command.culprit == "joint_states"
+
+
+def test_a_setpoint_for_another_arm_is_refused(rig: Rig) -> None:
+    rig.tick()
+    rig.send(setpoint(rig.t, joint_position=HOME[:6]))
+    rig.tick(5)
+    assert rig.service.finish()["setpoints_rejected"] == 1
+
+
 def test_no_setpoint_outlives_the_contract(rig: Rig) -> None:
     rig.send(setpoint(0, valid=10_000 * MS))
     assert valid_for(rig.tick(251)) == EXPIRY
