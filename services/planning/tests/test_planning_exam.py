@@ -222,7 +222,7 @@ def test_targets_out_of_reach_are_skipped_counted_and_named() -> None:
 
 
 def test_the_arm_does_not_stretch_to_skin_deeper_than_perceived() -> None:
-    world = World(known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), offset=-0.02)
+    world = World(known(Robot(base_xy_m=(-0.165, 0.0)), region_m=(0.15, 0.025), centre_m=(0.0, 0.0)), offset=-0.015)
     bend = []
     while world.exam.status.end_tick < 0:
         world.step()
