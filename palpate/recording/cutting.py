@@ -19,7 +19,7 @@ POWERS: Final = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 """Powers of depth that the force of loading is compared with."""
 HERTZ: Final = 1.5
 _FEW: Final = 10
-"""Number of loadings from which on they tell the power."""
+"""Number of loadings from which on the power is fitted."""
 _SHORTEST_S: Final = 0.05
 _LOADED: Final = 0.95
 """Share of the greatest depth up to which a press loads."""
@@ -123,7 +123,7 @@ def before_lift(inward: Array) -> slice:
 
 
 def modulated(force: Array) -> bool:
-    """Return True if the force rises and falls by more than its least value: then it tells where the skin is; shape (k,)."""
+    """Return True if the force rises and falls by more than its least value, which shows where the skin is; shape (k,)."""
     across = np.count_nonzero(np.diff(force > 0.5 * (force.max() + force.min())))
     return bool(across >= 2 and force.max() > 2 * force.min() > 0)
 

@@ -40,13 +40,13 @@ _TEXTS = {
     FaultCode.NO_CONTACT: "{count} of {of} contacts never touch",
     FaultCode.JUMP: "{count} of {of} positions jump by up to {value:.3g} m",
     FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
-    FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to tell",
+    FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to be assessed",
     FaultCode.INVALID: "{count} of {of} rows have no number, or a normal of length 0",
 }
 
 
 class Remedy(StrEnum):
-    """What was done about a fault."""
+    """Actions on a fault."""
 
     LEFT_OUT = "left out"
     KEPT = "kept as they are"

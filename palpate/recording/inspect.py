@@ -197,7 +197,7 @@ def _with_mass(mapping: Mapping, raw: Readings, free: Any, lines: list[str]) -> 
         return mapping
     down = raw.rotation[np.flatnonzero(free)].inv().apply((0.0, 0.0, -GRAVITY))
     if np.linalg.norm(np.ptp(down, axis=0)) < 0.2 * GRAVITY:
-        lines.append("not sure: tool.mass_kg: the tool keeps its orientation, so that weight and zero cannot be told apart")
+        lines.append("not sure: tool.mass_kg: the tool keeps its orientation, so that weight and zero cannot be separated")
         return mapping
     centred = down - down.mean(axis=0)
     mass = float((centred * (raw.force[free] - raw.force[free].mean(axis=0))).sum() / (centred**2).sum())

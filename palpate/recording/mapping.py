@@ -126,7 +126,7 @@ class Body(Section):
 
 
 class Mapping(Section):
-    """How a recording is read."""
+    """Meaning of the columns or topics of a recording, and its tool."""
 
     table: Columns | None = None
     topics: Topics | None = None

@@ -1,4 +1,4 @@
-"""What force and motion together tell of a recording over time: pressing axis, sign, delay, free air, zero of the force.
+"""Pressing axis, sign, delay, free air and zero of the force of a recording over time, from force and motion together.
 
 In contact the force follows the motion along one axis, dF = -k n (n . dp); in free air it does not. Nothing here depends on
 the sensor's range or on the stiffness of the body.
@@ -93,7 +93,7 @@ def pressing_axis(position: Array, force: Array, parts: Sequence[slice], outward
     usual = float(np.median(variance[variance > 0])) if (variance > 0).any() else 0.0
     for one, size in zip(parts, variance, strict=True):
         p, F = position[one] - position[one].mean(axis=0), force[one] - force[one].mean(axis=0)
-        weight = 1 / (size + usual) if usual else 0.0  # a fast motion in free air tells no more than another
+        weight = 1 / (size + usual) if usual else 0.0  # a fast motion in free air counts no more than another
         covariance += weight * F.T @ p
         motion += weight * p.T @ p
     if not np.trace(motion) > 0 or not np.abs(covariance).max() > 0:

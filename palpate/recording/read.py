@@ -16,8 +16,8 @@ from palpate.recording.own import is_own, own_recording
 from palpate.recording.probes import contacts_of_probes, probes
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
 from palpate.recording.recording import Recording
-from palpate.recording.telling import telling
 from palpate.recording.timed import contacts_over_time
+from palpate.recording.usable import usable
 from palpate_models.numerics.frames import Array, inverse, matrix
 
 _UPRIGHT: Final = 0.7
@@ -89,7 +89,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
     touches = (
         []
         if any(fault.remedy is Remedy.REFUSED for fault in faults)
-        else telling(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
+        else usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
     )
     return Recording(
         name=name,

@@ -1,4 +1,4 @@
-"""A recording of palpation as contacts with a body, whoever made it."""
+"""A recording of palpation, by any robot, as contacts with a body."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ class Contact:
 
 @dataclass(frozen=True, eq=False)
 class Palpated:
-    """What was found in readings, in A."""
+    """Contacts and skin found in readings, in A."""
 
     contacts: list[Contact]
     surface: Array

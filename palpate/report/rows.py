@@ -82,7 +82,7 @@ class FaultRow(_Row):
     of: int
     """All of them."""
     text: str
-    """What was found, and what was done."""
+    """Description, and action."""
     refused: bool
     """True if nothing was assessed for it."""
 

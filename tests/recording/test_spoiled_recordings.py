@@ -11,7 +11,7 @@ import pytest
 
 from palpate.interface.assessment import assess
 from palpate.recording.faults import FaultCode
-from palpate.recording.mapping import Columns, Mapping, Tool, Units
+from palpate.recording.mapping import Columns, ForceSource, Mapping, Tool, Units
 from palpate.recording.read import recording_of
 from palpate.recording.readings import from_table
 from palpate.recording.recording import Recording
@@ -129,6 +129,37 @@ def shifted(t):
     return t.assign(x=t.x + 0.06 * (some(t) & (np.arange(len(t)) % 10 > 5)))
 
 
+def resampled(t, rate):
+    at = np.arange(t.t.min(), t.t.max(), 1 / rate)
+    return pd.DataFrame({name: np.interp(at, t.t, t[name]) for name in ("t", *P, *F)})
+
+
+def mapped(mapping, **changes):
+    return mapping.model_copy(update=changes)
+
+
+MAPPED = {
+    "20-hz": (lambda t: resampled(t, 20), OVER_TIME),
+    "500-hz": (lambda t: resampled(t, 500), OVER_TIME),
+    "millimetres": (in_mm, mapped(OVER_TIME, units=Units(length="mm"))),
+    "on-the-body": (flipped, mapped(OVER_TIME, force=ForceSource(on="body"))),
+    "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=Tool(radius_m=0.015, point="tip"))),
+    "late": (late, mapped(OVER_TIME, force=ForceSource(delay_s=0.2))),
+}
+
+
+@pytest.mark.parametrize(("change", "mapping"), MAPPED.values(), ids=MAPPED)
+def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, change, mapping: Mapping) -> None:
+    sound, recording = (read(*one) for one in ((pressed, OVER_TIME), (change(pressed), mapping)))
+    assert not {fault.code for fault in recording.faults} - {FaultCode.FROZEN}
+    found, same = assess(recording), assess(sound)
+    place, usual = found.findings.iloc[0], same.findings.iloc[0]
+    assert np.hypot(place.x_m - usual.x_m, place.y_m - usual.y_m) < 0.005
+    assert usual.ratio_lower < place.ratio < usual.ratio_upper
+    inside = (found.map.apparent > same.map.lower) & (found.map.apparent < same.map.upper)
+    assert inside[: len(same.map.apparent)].mean() > 0.9
+
+
 C = FaultCode
 SPOILED = {
     "flipped": (flipped, OVER_TIME, C.SIGN),
@@ -167,7 +198,7 @@ def test_a_sound_recording_has_no_fault_and_the_lump(pressed: pd.DataFrame, mapp
 
 
 @pytest.mark.parametrize(("spoil", "mapping", "code"), SPOILED.values(), ids=SPOILED)
-def test_a_fault_is_named_and_makes_no_finding(pressed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode) -> None:
+def test_a_fault_is_named_and_adds_no_finding(pressed: pd.DataFrame, spoil, mapping: Mapping, code: FaultCode) -> None:
     recording = read(spoil(probed(pressed) if mapping is PROBES else pressed), mapping)
     fault = next(one for one in recording.faults if one.code is code)
     assert fault.count > 0

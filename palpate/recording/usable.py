@@ -18,22 +18,22 @@ _SHARE: Final = 0.3
 """Least depth, as a share of the usual one."""
 
 
-def telling(contacts: list[Contact], radius: float, untold: int, faults: list[Fault]) -> list[Contact]:
-    """Return the contacts that tell of stiffness; adds faults. `untold`: contacts that are left out already."""
+def usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
+    """Return the contacts that can be assessed; adds faults. `undeep_ones`: contacts that are left out already."""
     depths = np.array([contact.depth.max() for contact in contacts])
     usual = float(np.median(depths)) if len(depths) else 0.0
     deep = [
         depth > max(_SURE * contact.depth_uncertainty, _SHARE * usual) and contact.force.max() > _SURE * contact.force_noise
         for contact, depth in zip(contacts, depths, strict=True)
     ]
-    shallow = untold + len(contacts) - sum(deep)
+    shallow = undeep_ones + len(contacts) - sum(deep)
     if shallow:
-        faults.append(Fault(FaultCode.SHALLOW, shallow, untold + len(contacts), Remedy.LEFT_OUT))
-    told = [contact for contact, enough in zip(contacts, deep, strict=True) if enough]
-    wrong = _disagreeing(told, usual, radius)
+        faults.append(Fault(FaultCode.SHALLOW, shallow, undeep_ones + len(contacts), Remedy.LEFT_OUT))
+    deep_ones = [contact for contact, enough in zip(contacts, deep, strict=True) if enough]
+    wrong = _disagreeing(deep_ones, usual, radius)
     if wrong:
-        faults.append(Fault(FaultCode.DISAGREE, len(wrong), len(told), Remedy.LEFT_OUT))
-    return [contact for k, contact in enumerate(told) if k not in wrong]
+        faults.append(Fault(FaultCode.DISAGREE, len(wrong), len(deep_ones), Remedy.LEFT_OUT))
+    return [contact for k, contact in enumerate(deep_ones) if k not in wrong]
 
 
 def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[int]:
