@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
 
 app = typer.Typer(name="arm", help="Check an arm, and find a place for its base.", no_args_is_help=True)
-Name = Annotated[str, typer.Argument(help="lbr, panda, ur5, ur10, xarm7, or a YAML file beside a URDF.")]
+Name = Annotated[str, typer.Argument(help="lbr, panda, ur5, ur10, xarm7, or a YAML file next to a URDF.")]
 
 
 @app.command()

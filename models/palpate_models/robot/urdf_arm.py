@@ -1,4 +1,4 @@
-"""Arms from a URDF and a YAML file beside it, which has what a URDF does not.
+"""Arms from a URDF and a YAML file next to it, which has what a URDF does not.
 
 `read_arm` collects everything that is missing or impossible, each with its link or joint; `palpate arm check` prints it.
 """

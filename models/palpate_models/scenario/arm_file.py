@@ -20,7 +20,7 @@ Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
 
 
 class ArmFile(Section):
-    """What a URDF lacks. Values a joint are in the order of the chain, from the base to the flange."""
+    """Values that a URDF lacks. Lists have one value a joint, from the base to the flange."""
 
     urdf: str
     """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""

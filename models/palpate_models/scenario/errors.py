@@ -242,7 +242,7 @@ class DrawnErrors:
 
 
 def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
-    """Draw the equipment of the patient with this seed and an arm of `joints`. Fields are drawn independently."""
+    """Draw the equipment of the patient with this seed; `joints`: number of the arm's. Fields are drawn independently."""
     streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(5)
     force, camera, hand_eye, registration, arm = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     return DrawnErrors(
@@ -280,7 +280,7 @@ def _pose(given: PoseErrors, rng: np.random.Generator) -> Array:
 
 
 def draw_arm(given: ArmErrors, rng: np.random.Generator, joints: int) -> DrawnArm:
-    """Draw an arm of so many `joints`."""
+    """Draw the errors of an arm; `joints`: their number."""
     return DrawnArm(
         given,
         given.length_m * rng.standard_normal((joints, 3)),

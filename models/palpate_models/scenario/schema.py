@@ -153,7 +153,7 @@ class Robot(Section):
     """Robot, tool and its sensor."""
 
     arm: str = "lbr"
-    """`lbr`, `panda`, `ur5`, `ur10`, `xarm7`, or the path of a YAML file beside a URDF. Other defaults of this section are the
+    """`lbr`, `panda`, `ur5`, `ur10`, `xarm7`, or the path of a YAML file next to a URDF. Other defaults of this section are the
     arm's."""
     lbr: LbrConnection = LbrConnection()
     indenter_radius_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.015
