@@ -41,6 +41,7 @@ NEEDS = {
     "research.search.whole": "study",
     "palpate.study": "study",
     "palpate_bus": BARE,
+    "palpate_bus.decompression": "recordings group",
     "palpate_bus.recordings": "recordings group",
     "palpate_bus.security.keys": "conductor group",
     "palpate_bus.testing.strategies": "bench",

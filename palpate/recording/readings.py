@@ -6,6 +6,7 @@ import io
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib import import_module
 from pathlib import Path
 from typing import Any, Final
 
@@ -87,9 +88,7 @@ def read_table(path: Path) -> pd.DataFrame:
 
 def _check_parquet(file: io.BytesIO, path: Path) -> None:
     """Raise ReadingError if a table is large unpacked: equal values take no room in the file."""
-    from pyarrow.parquet import ParquetFile  # noqa: PLC0415 - only for Parquet
-
-    facts = ParquetFile(file).metadata
+    facts = import_module("pyarrow.parquet").ParquetFile(file).metadata  # of another extra, as pandas imports it
     if facts.num_rows > bounds().elements:
         raise over(path, f"{facts.num_rows} rows", "elements", ReadingError)
     if (size := facts.num_rows * facts.num_columns * 8) > bounds().unpacked_mb * MB:
