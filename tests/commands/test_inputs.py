@@ -60,7 +60,7 @@ def refused(*words: str) -> str:
         ("--service robot=bullet --composed", ("services.robot = 'bullet'",)),
         ("--service assessment=mine.py --composed --record none", ("line 2: AttributeError",)),
         ("--service tissue=fmu --set tissue.fmu=nosuch.fmu --composed", ("there is no such file",)),
-        ("--service tissue=fmu --set tissue.fmu=mine.fmu --composed", ("this is not an FMU",)),
+        ("--service tissue=fmu --set tissue.fmu=mine.fmu --composed", ("not an FMU",)),
         ("--composed --realtime", ("--composed", "--realtime")),
         ("--composed --secure", ("--secure",)),
         ("--secure --keys none", ("ca.pem",)),
