@@ -83,8 +83,16 @@ LEFT_OUT: Final = {
     "assessment/findings": "planning reads only whether they are final",
 }
 """Topics without cases, or of which only the codes have some, and why."""
-UNDETECTABLE: Final[tuple[tuple[str, str, str], ...]] = ()
-"""Lies that no other input contradicts: topic, kinds (empty: all), and the reason."""
+_STATE = "the simulation's own state, which hardware does not send"
+UNDETECTABLE: Final = (
+    ("sim/tool_state", "", _STATE),
+    ("sim/link_poses", "", _STATE),
+    ("sim/surface", "", _STATE),
+    ("sim/contact_wrench", "", "the force on the arm in truth: sensor and joints feel it"),
+    ("robot/status position", "drift bias delayed", "contradicts only joint_states, which its readers do not have"),
+    ("robot/status velocity", "drift bias delayed gain", "contradicts only joint_states, which its readers do not have"),
+)
+"""Lies that no other input contradicts: topic or topic and field, kinds (empty: all), and the reason."""
 
 
 @dataclass(frozen=True)
@@ -213,9 +221,9 @@ def start_s(lie: Lie) -> float:
 
 def undetectable(lie: Lie) -> str:
     """Return why no other input contradicts the lie; empty if one does."""
-    return next(
-        (why for topic, kinds, why in UNDETECTABLE if lie.topic == topic and (not kinds or lie.kind in kinds.split())), ""
-    )
+    said = f"{lie.topic} {lie.field}"
+    found = (why for what, kinds, why in UNDETECTABLE if said.startswith(what) and (not kinds or lie.kind in kinds.split()))
+    return next(found, "")
 
 
 def _scenario() -> Scenario:
