@@ -90,7 +90,7 @@ class Lie:
         return (self.topic,) if twin is None else (self.topic, twin)
 
 
-class _LyingTopic:
+class LyingTopic:
     """The lie in one topic."""
 
     def __init__(self, lie: Lie) -> None:
@@ -173,7 +173,7 @@ class Liar(Service):
         self._service = service
         self.role = service.role  # type: ignore[misc]  # that of the wrapped service
         self.catches_up = service.catches_up  # type: ignore[misc]
-        self._lying = {topic: _LyingTopic(replace(lie, topic=topic)) for topic in lie.topics}
+        self._lying = {topic: LyingTopic(replace(lie, topic=topic)) for topic in lie.topics}
 
     def start(self) -> Outbox:
         """Return the latched messages; a lie in them begins at once."""

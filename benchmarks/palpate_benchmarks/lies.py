@@ -14,7 +14,7 @@ from itertools import cycle
 from pathlib import Path
 from random import Random
 from time import monotonic
-from typing import Final
+from typing import Any, Final
 
 from palpate.apart import guarded
 from palpate.environment import given
@@ -308,23 +308,28 @@ def by_wall_clock(lie: Lie | None, folder: Path) -> LieOutcome:
 
 
 def healthy(outcome: LieOutcome) -> Healthy:
-    """Return what is compared with. Raises RunError if the run failed."""
+    """Return the figures of the run without a lie. Raises RunError if the run failed."""
     if outcome.failure is not None:
         raise RunError(f"the examination without a lie failed: {outcome.failure}")
-    states = [(nanoseconds(s.header.stamp) / NS, s) for s in outcome.collected.exam_states]
+    states = outcome.collected.exam_states
+    felt, findings, background = _felt(outcome.collected)
+    return Healthy(moments_of(states), felt, findings, background, nanoseconds(states[-1].header.stamp) / NS)
+
+
+def moments_of(exam_states: Sequence[Any]) -> dict[str, float]:
+    """Return the simulated times of the moments [s]."""
+    states = [(nanoseconds(state.header.stamp) / NS, state) for state in exam_states]
 
     def begin(phase: int) -> float:
-        return next(t for t, s in states if s.phase == phase)
+        return next(t for t, state in states if state.phase == phase)
 
-    touched = next(t for t, s in states if s.in_contact)
-    moments = {
+    touched = next(t for t, state in states if state.in_contact)
+    return {
         "rest": REST_S,
         "descent": (begin(ExamState.PHASE_INDENT) + touched) / 2,
         "depth": begin(ExamState.PHASE_SCAN) + LIMITS.at_depth_s,
         "transfer": begin(ExamState.PHASE_RETRACT) + LIMITS.at_depth_s,
     }
-    felt, findings, background = _felt(outcome.collected)
-    return Healthy(moments, felt, findings, background, states[-1][0])
 
 
 def _felt(c: Collected) -> tuple[int, int, float]:

@@ -110,7 +110,7 @@ class _Source:
             yield "for one in m.transforms:"
             yield " if one.header.frame_id != frame: return False"
         yield from self._message(self._topic.type, "m", "")
-        if self._topic.periodic and "header" in names:
+        if "header" in names and (self._topic.periodic or self._topic.max_age_ms):
             yield from self._past()
 
     def _past(self) -> Iterator[str]:
