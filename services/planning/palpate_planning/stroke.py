@@ -280,8 +280,8 @@ class Descent:
         unsure = TOUCH.sigmas * contact.wall.sigma
         braking = depth.velocity**2 / MOTION.depth_acceleration_mps2
         near = depth.position > -unsure - TOUCH.margin_m - braking
-        self._deepest = max(self._deepest, min(unsure + self._depth, TOUCH.blind_m))  # monotonic, as the height of a rest
-        there = depth.step(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps)
+        self._deepest = max(self._deepest, unsure + self._depth)  # monotonic, as the height of a rest
+        there = depth.step(self._deepest, TOUCH.probe_mps if near else TOUCH.descend_mps) or depth.position >= TOUCH.blind_m
         if near:
             self._onset.add(contact.depth, contact.force, now.t, contact.wall.displacement)
         if contact.force >= FELT_N and not near:
@@ -290,7 +290,7 @@ class Descent:
             self._found = True
             self.learn(now)
         elif there:
-            text = f"no tissue felt down to {self._deepest * 1e3:.0f} mm below where it is believed to be"
+            text = f"no tissue felt down to {min(self._deepest, TOUCH.blind_m) * 1e3:.0f} mm below where it is believed to be"
             self.failed = Cause(Reason.NO_TISSUE, text)
         return self._found
 
