@@ -55,6 +55,21 @@ def mounts(robot: Robot) -> Array:
     return np.column_stack((np.full(3, x), np.full(3, y), np.cumsum((z, FLANGE_TO_FT_M, FT_TO_INDENTER_M))))
 
 
+MOUNT_CLEARANCE_M: Final = 0.02
+"""A link that comes nearer to the base in every posture is not checked against it."""
+
+
+def mounted(robot: Robot) -> int:
+    """Return how many links, counted from the base, are always at the base: two, and those thicker than their joint is high."""
+    arm, count = arm_of(robot), 2
+    height = (arm.placed(np.zeros(arm.joints)) @ (np.eye(3) if arm.R_BL is None else arm.R_BL).T)[:, 2]
+    while count <= arm.joints and arm.capsules[count]:
+        if height[count - 1] - max(capsule.radius for capsule in arm.capsules[count]) > MOUNT_CLEARANCE_M:
+            break
+        count += 1
+    return count
+
+
 def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
     """Return a solid cylinder along z with its centre at height z of the link frame."""
     across = mass * (3 * radius**2 + length**2) / 12

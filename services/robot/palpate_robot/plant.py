@@ -18,8 +18,6 @@ END_STOP_MARGIN_RAD: Final = 0.03
 """Distance of the mechanical end stop behind the position limit [A]; the driver acts at the limit."""
 STICK_RADPS: Final = 1e-3
 """Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this [A]."""
-FIXED_LINKS: Final = 2
-"""Number of links at the base, which have no collision shapes."""
 
 
 def nominal(robot: Robot) -> DrawnArm:

@@ -25,13 +25,13 @@ import numpy as np
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import arm_of, capsules, link_names, urdf
+from palpate_models.robot.arm import arm_of, capsules, link_names, mounted, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.kinematics import Kinematics
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench, nominal
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal
 
 REACH_M: Final = 1.5
 """Largest distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
@@ -138,7 +138,7 @@ class DartPlant:
             joint.setVelocityUpperLimit(0, np.inf)
             joint.setLimitEnforcement(True)
             joint.setCoulombFriction(0, 0.0)
-        shapes = dict(list(capsules(robot).items())[FIXED_LINKS:])
+        shapes = dict(list(capsules(robot).items())[mounted(robot) :])
         for link, parts in shapes.items():
             for capsule in parts:
                 self._add_capsule(self._arm.getBodyNode(link), capsule)

@@ -22,12 +22,12 @@ import mujoco
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose, capsules, inertias, link_names
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose, capsules, inertias, link_names, mounted
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, FIXED_LINKS, STICK_RADPS, Wrench, nominal
+from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal
 
 SUBSTEPS: Final = 2
 """Integration steps per millisecond: different from the DART plant, so that effects of the step size show."""
@@ -106,7 +106,7 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
             solimp=_IMPEDANCE,
         )
     true = robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass})
-    masses, shapes = inertias(true), capsules(robot)
+    masses, shapes, at_base = inertias(true), capsules(robot), mounted(robot)
     body = spec.worldbody
     for i, link in enumerate(link_names(robot)):
         if i == 0:
@@ -117,7 +117,7 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
         else:
             body = _add_link(body, link, arm.origin_m[i - 1] + drawn.origin_m[i - 1], masses[link])
             _add_joint(body, arm, i - 1)
-        for capsule in () if i < FIXED_LINKS else shapes[link]:
+        for capsule in () if i < at_base else shapes[link]:
             _add_shape(body, capsule)
         if link == "ft_sensor":
             body.add_site(name="measuring_face")
