@@ -60,14 +60,15 @@ MOUNT_CLEARANCE_M: Final = 0.02
 
 
 def mounted(robot: Robot) -> int:
-    """Return how many links, counted from the base, are always at the base: two, and those thicker than their joint is high."""
-    arm, count = arm_of(robot), 2
-    height = (arm.placed(np.zeros(arm.joints)) @ (np.eye(3) if arm.R_BL is None else arm.R_BL).T)[:, 2]
-    while count <= arm.joints and arm.capsules[count]:
-        if height[count - 1] - max(capsule.radius for capsule in arm.capsules[count]) > MOUNT_CLEARANCE_M:
-            break
-        count += 1
-    return count
+    """Return how many links, counted from the base, are always at it: two, and a third that is thicker than its joint is high.
+
+    The first joint turns about the vertical, so the second keeps its height.
+    """
+    arm = arm_of(robot)
+    p = arm.placed(np.zeros(arm.joints))[1]
+    height = float(p[2] if arm.R_BL is None else (arm.R_BL @ p)[2])
+    thickness = max((capsule.radius for capsule in arm.capsules[2]), default=0.0)
+    return 2 if height - thickness > MOUNT_CLEARANCE_M else 3
 
 
 def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
