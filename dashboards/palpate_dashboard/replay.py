@@ -77,9 +77,12 @@ class RecordedInbox:
 
 
 def recording_of(folder: Path) -> tuple[Path, ...]:
-    """Return the MCAP files of the run in `folder`, in order; a long recording has several."""
-    files = (folder / RECORDING).glob(f"{RECORDING}_*.mcap")
-    return tuple(sorted(files, key=lambda path: int(path.stem.rpartition("_")[2])))
+    """Return the MCAP files of the run in `folder`, in order; a long recording has several.
+
+    Without a recording, as of an assessed recording of another robot, it is the file of its results.
+    """
+    files = sorted((folder / RECORDING).glob(f"{RECORDING}_*.mcap"), key=lambda path: int(path.stem.rpartition("_")[2]))
+    return tuple(files) or tuple(folder.glob("evidence.mcap"))
 
 
 def end_of(files: Sequence[Path]) -> int | None:

@@ -27,6 +27,7 @@ from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
+from palpate_models.section import Pose
 
 RUNTIME: Final = "recording"
 _SHOWN: Final = 5000
@@ -104,6 +105,7 @@ def scenario_of(recording: Recording) -> Scenario:
     sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
     low, high = 1e-3, 1.0
     exam = Exam(
+        pose=Pose(),
         centre_m=centre,
         region_m=tuple(np.clip(size, low, high).tolist()),
         depth_m=recording.depth_m if samples else Exam().depth_m,
