@@ -66,7 +66,7 @@ def region(samples: list[ForceSample]) -> tuple[tuple[float, float], tuple[float
     """Return centre and size of the sampled region in A [m], and the usual distance of neighbouring samples [m]."""
     xy = np.array([sample.position[:2] for sample in samples])
     low, high = xy.min(axis=0), xy.max(axis=0)
-    spacing = float(np.median(cKDTree(xy).query(xy, 2)[0][:, 1])) if len(xy) > 1 else 0.0
+    spacing = float(np.median(np.asarray(cKDTree(xy).query(xy, 2)[0])[:, 1])) if len(xy) > 1 else 0.0
     (x, y), (width, height) = (0.5 * (low + high)).tolist(), (high - low).tolist()
     return (x, y), (width, height), spacing
 

@@ -89,7 +89,7 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
     few = max(3, round(_SHORTEST_S / step))
     limit = TUNING.sigmas * sigma
     smooth = median_filter(force, size=min(few, 9) | 1)
-    numbered, _ = label(binary_closing(np.pad(smooth > limit, few), np.ones(few))[few:-few])
+    numbered, _ = label(binary_closing(np.pad(smooth > limit, few), np.ones(few, bool))[few:-few])
     gaps = np.flatnonzero(np.diff(time) > max(TUNING.block_s, 5 * step)) + 1
     found = [part for one in find_objects(numbered) for part in _split(one[0], gaps)]
     touching = [one for one in found if one.stop - one.start >= few and smooth[one].max() > 2 * limit]

@@ -158,7 +158,7 @@ def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapp
     """Return the mapping with axes, sign, weight and delay of the force as the data say, and the pressing axis."""
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
-        candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})  # type: ignore[arg-type] # one of two
+        candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})
         readings = moved(raw, candidate)
         axis = pressing_axis(readings.position, readings.force, probes(readings) if raw.time is None else blocks(raw.time))
         if axis is not None:

@@ -67,7 +67,8 @@ class Readings:
 
     def part(self, chosen: NDArray[Any]) -> Readings:
         """Return some of the readings."""
-        return Readings(**{name: None if kept is None else kept[chosen] for name, kept in vars(self).items()})
+        columns: dict[str, Any] = {name: None if kept is None else kept[chosen] for name, kept in vars(self).items()}
+        return Readings(**columns)
 
 
 def read_table(path: Path) -> pd.DataFrame:
@@ -110,7 +111,7 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
             raise ReadingError(f"{name}: columns {', '.join(names)} have no numbers")
         return numbers * SCALES.get(unit, 1.0)
 
-    times = values(columns.time and (columns.time,), units.time)
+    times = values((columns.time,) if columns.time else None, units.time)
     quaternion = values(columns.orientation)
     if quaternion is not None:
         quaternion = np.roll(quaternion, -1, axis=1) if columns.quaternion == "wxyz" else quaternion
@@ -189,7 +190,7 @@ def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tupl
     if isinstance(source, Joints):
         return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
     poses = ((t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
-    rows = np.fromiter(((t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for t, p, q in poses), np.dtype((float, 8)))
+    rows: Array = np.fromiter(((t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for t, p, q in poses), np.dtype((float, 8))).view(float)
     return rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:])
 
 
@@ -205,12 +206,13 @@ def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, A
                 links.setdefault(name, (one.header.frame_id.strip("/"), []))[1].append(
                     (nanoseconds(one.header.stamp) / NS, p.x, p.y, p.z, q.x, q.y, q.z, q.w)
                 )
-    chain, frame = [], source.child.strip("/")
+    chain: list[Array] = []
+    frame = source.child.strip("/")
     while frame != source.parent.strip("/"):
         if frame not in links or len(chain) > len(links):
             raise ReadingError(f"{path}: tf has no way from {source.child} to {source.parent}; it has {', '.join(sorted(links))}")
-        frame, rows = links[frame]
-        chain.append(np.array(sorted(rows)))
+        frame, poses = links[frame]
+        chain.append(np.array(sorted(poses)))
     stamps = np.unique(max(chain, key=len)[:, 0])
     position, rotation = np.zeros((len(stamps), 3)), Rotation.identity(len(stamps))
     for rows in chain:

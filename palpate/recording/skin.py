@@ -46,7 +46,7 @@ class Skin:
     def at(self, xy: Array) -> tuple[Array, Array, Array]:
         """Return height [m] (k,), outward unit normal (k, 3) and SD of the height [m] (k,) at places [m], shape (k, 2)."""
         surface = RectBivariateSpline(self.x, self.y, self.z, kx=3, ky=3)
-        slope = np.column_stack((surface.ev(*xy.T, dx=1), surface.ev(*xy.T, dy=1)))
+        slope = np.column_stack((surface.ev(xy[:, 0], xy[:, 1], dx=1), surface.ev(xy[:, 0], xy[:, 1], dy=1)))
         normal = np.column_stack((-slope, np.ones(len(xy))))
         spread = RectBivariateSpline(self.x, self.y, self.sd, kx=1, ky=1).ev(*xy.T)
         return surface.ev(*xy.T), normal / np.linalg.norm(normal, axis=1)[:, None], spread
