@@ -21,7 +21,7 @@ def draw(path: Path, compared: Compared) -> None:
         _map(axes, side)
     mean = np.sqrt(compared.of_a * compared.of_b)
     ratio = np.log(compared.of_b / compared.of_a)
-    maps[2].semilogx(mean, 100 * ratio, ".", ms=3)
+    maps[2].plot(mean, 100 * ratio, ".", ms=3)
     middle, half = 100 * float(ratio.mean()), 196 * float(ratio.std())
     for at, style in ((middle, "-"), (middle - half, "--"), (middle + half, "--")):
         maps[2].axhline(at, ls=style, color="tab:red", lw=1)
@@ -50,8 +50,6 @@ def _map(axes: Axes, side: Palpated) -> None:
     low, high = np.quantile(ratio, (0.01, 0.99))
     shown = axes.scatter(x[scanned], y[scanned], c=ratio, s=14, marker="s", vmin=low, vmax=high)
     inside = scanned & (side.map.finding >= 0)
-    axes.plot(x[inside], y[inside], "x", ms=3, color="tab:red", label="finding")
-    axes.set(title=f"{side.name}: apparent stiffness over {level:.3g} N", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
-    if inside.any():
-        axes.legend()
+    axes.plot(x[inside], y[inside], "x", ms=3, color="tab:red")
+    axes.set(title=f"{side.name}, over {level:.3g} N; x: finding", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
     axes.figure.colorbar(shown, ax=axes, shrink=0.8)
