@@ -374,8 +374,8 @@ def _judged(finding: FaultFinding, lie: Lie, outcome: LieOutcome, twin: Healthy)
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
         finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
-    if reason := undetectable(lie):
-        finding.sign = finding.sign or f"not detectable: {reason}"
-    finding.named = bool(reason) or not with_producers(blamed).isdisjoint(with_producers(lie.topics))
+    finding.named = not with_producers(blamed).isdisjoint(with_producers(lie.topics))
+    if not finding.named and (reason := undetectable(lie)):
+        finding.named, finding.sign = True, f"not detectable: {reason}"
     finding.reaction = _reaction(c, finding.outcome)
     return finding

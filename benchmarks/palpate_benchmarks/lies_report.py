@@ -41,11 +41,11 @@ def verdict(finding: FaultFinding) -> LieVerdict:
     """Return the verdict on a case."""
     if not finding.good:
         return LieVerdict.BAD
-    if " refused: " in finding.ended:
-        return LieVerdict.REFUSED
     if finding.outcome.unharmed:
         return LieVerdict.HARMLESS
-    return LieVerdict.UNDETECTABLE if finding.sign.startswith("not detectable") else LieVerdict.NAMED
+    if finding.sign.startswith("not detectable"):
+        return LieVerdict.UNDETECTABLE
+    return LieVerdict.REFUSED if " refused: " in finding.ended else LieVerdict.NAMED
 
 
 def figure(findings: Sequence[FaultFinding], path: Path) -> None:
