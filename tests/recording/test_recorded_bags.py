@@ -1,0 +1,89 @@
+"""Bags of other writers: MCAP and SQLite, poses as topic, tf or joints; the same as a table."""
+
+from __future__ import annotations
+
+import runpy
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from rosbags.rosbag2 import StoragePlugin, Writer
+from scipy.spatial.transform import Rotation
+
+from palpate.recording.mapping import Joints, Mapping, Tool, Topics, Transform
+from palpate.recording.read import read_recording
+from palpate_bus.messages import (
+    JointState,
+    Point,
+    Pose,
+    PoseStamped,
+    Quaternion,
+    TFMessage,
+    TransformStamped,
+    Vector3,
+    Wrench,
+    WrenchStamped,
+)
+from palpate_bus.messages import Transform as TransformMessage
+from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.typestore import store
+
+EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
+TOOL = Tool(radius_m=0.015, mass_kg=0.5)
+SLIDERS = """<robot name="gantry"><link name="world"/><link name="a"/><link name="b"/><link name="tool"/>
+<joint name="x" type="prismatic"><parent link="world"/><child link="a"/><axis xyz="1 0 0"/>{0}</joint>
+<joint name="y" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>{0}</joint>
+<joint name="z" type="prismatic"><parent link="b"/><child link="tool"/><axis xyz="0 0 1"/>{0}</joint></robot>
+""".format('<limit lower="-1" upper="1" effort="1" velocity="1"/>')
+POSES = {
+    "topic": "/tool_pose",
+    "tf": Transform(parent="world", child="tool"),
+    "joints": Joints(topic="/joints", urdf=Path("gantry.urdf"), frame="tool"),
+}
+
+
+@pytest.fixture(scope="module")
+def few() -> pd.DataFrame:
+    return runpy.run_path(str(EXAMPLE))["recording"](spacing=0.05)
+
+
+def write(folder: Path, table: pd.DataFrame, plugin: StoragePlugin) -> None:
+    """Poses at 50 Hz, wrenches at 100 Hz in the axes of a tool that is turned about z, with its weight."""
+    turn = Rotation.from_euler("z", 0.7)
+    q = Quaternion(*turn.as_quat())
+    weighed = turn.inv().apply((*table[["fx", "fy", "fz"]].to_numpy(), 0, 0, -9.81 * TOOL.mass_kg))
+    with Writer(folder, version=9, storage_plugin=plugin) as bag:
+        types = {"/wrench": WrenchStamped, "/tool_pose": PoseStamped, "/tf": TFMessage, "/joints": JointState}
+        topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}
+
+        def send(name: str, message: object, t: int) -> None:
+            bag.write(topics[name], t, store.serialize_cdr(message, types[name].__msgtype__))
+
+        for k, (row, force) in enumerate(zip(table.itertuples(), weighed, strict=True)):
+            t = round((row.t + 1000) * NS)
+            send("/wrench", WrenchStamped(header(t, "tool"), Wrench(Vector3(*force), Vector3(0.0, 0.0, 0.0))), t)
+            if k % 2 == 0:
+                p = (row.x, row.y, row.z)
+                send("/tool_pose", PoseStamped(header(t, "world"), Pose(Point(*p), q)), t)
+                send("/tf", TFMessage([TransformStamped(header(t, "world"), "tool", TransformMessage(Vector3(*p), q))]), t)
+                send("/joints", JointState(header(t), list("xyz"), np.array(p), np.empty(0), np.empty(0)), t)
+
+
+@pytest.mark.parametrize("plugin", list(StoragePlugin))
+@pytest.mark.parametrize("pose", POSES)
+def test_a_bag_gives_the_contacts_of_its_table(few: pd.DataFrame, tmp_path: Path, pose: str, plugin: StoragePlugin) -> None:
+    folder = tmp_path / "bag"
+    write(folder, few, plugin)
+    (tmp_path / "gantry.urdf").write_text(SLIDERS)
+    yaw = 0.7 if pose == "joints" else 0.0
+    source = POSES[pose]
+    if isinstance(source, Joints):
+        source = source.model_copy(update={"urdf": tmp_path / "gantry.urdf"})
+    mapping = Mapping.model_validate(
+        {"topics": Topics(wrench="/wrench", pose=source), "tool": TOOL, "force": {"axes": "tool", "rpy_rad": (0, 0, yaw)}}
+    )
+    recording = read_recording(folder, mapping)
+    assert not recording.faults
+    assert len(recording.touches) == 9
+    assert abs(recording.depth_m - 0.010) < 0.0008
