@@ -24,7 +24,8 @@ from palpate_bus.recordings import open_recording
 ADDED: Final = {
     "palpation_msgs/msg/PalpationTargets": re.compile("reason|[A-Z_]+"),
     "palpation_msgs/msg/ExamState": re.compile("reason|REASON_[A-Z_]+"),
-    "palpation_msgs/msg/SupervisorState": re.compile("CAUSE_SENSOR|joint_force"),
+    "palpation_msgs/msg/RobotStatus": re.compile("measured_torque"),
+    "palpation_msgs/msg/SupervisorState": re.compile("joint_force|CAUSE_SENSOR"),
 }
 """Fields and constants by message type that did not exist when the digests were recorded (rosbags lists constants as fields)."""
 NOT_HASHED: Final = ("record_chunks", "diagnostics", "clock")

@@ -90,7 +90,17 @@ def arm(case: Scenario, t: int, q: Array, q_true: Array) -> tuple[Any, Any]:
     """Return robot/status with the measured joints, and sim/link_poses with the true ones."""
     zero = np.zeros(7)
     status = RobotStatus(
-        header(t), RobotStatus.MODE_ACTIVE, 0, "", q, zero, Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)), zero, 0, ""
+        header(t),
+        RobotStatus.MODE_ACTIVE,
+        0,
+        "",
+        q,
+        zero,
+        Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)),
+        zero,
+        0,
+        "",
+        zero,
     )
     X, links = np.eye(4), []
     for _, child, X_PC in link_transforms(q_true, case.robot):

@@ -106,7 +106,11 @@ class Robot(Service):
 
 
 def _status(h: Any, x: Any, t: int, lost: bool) -> Any:
-    fields = {name: x for name in ("applied_torque", "position", "velocity") if name in RobotStatus.__dataclass_fields__}
+    fields = {
+        name: x
+        for name in ("applied_torque", "measured_torque", "position", "velocity")
+        if name in RobotStatus.__dataclass_fields__
+    }
     if "wrench" in RobotStatus.__dataclass_fields__:
         fields["wrench"] = wrench(1e-9 * t)
     return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", culprit="", commands_rejected=0, **fields)
@@ -250,7 +254,7 @@ class Supervisor(Service):
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
         depth = min(0.1, abs(float(inbox.latest("robot/status").position[0])))
-        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0, "")}
+        return {"supervisor/state": SupervisorState(header(t), 0, 0, "", 0, 0.0, depth, 0.0, 0, "", 0.0)}
 
 
 EVERY = (Robot, Control, Tissue, Planning, Assessment, Camera, Perception, Supervisor)

@@ -223,6 +223,7 @@ def robot_status(t: int, torque: Array) -> Any:
         "velocity": zero,
         "wrench": Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)),
         "applied_torque": torque,
+        "measured_torque": torque,
         "commands_rejected": 0,
     }
     return RobotStatus(header=header(t), mode=1, cause=0, reason="", culprit="", **rest)

@@ -201,7 +201,7 @@ def test_a_held_arm_is_reported_once_with_the_failure(
     messages = collected()
     why = "emergency stop of the supervisor: planning is silent"
     zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
-    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0, "")
+    held = RobotStatus(header(17_830_000_000), RobotStatus.MODE_SAFE_HOLD, 0, why, zero, zero, wrench, zero, 0, "", zero)
     messages.status_changes.append(held)
     lost, gave_up = Failure(FailureCode.ROLE_LOST, "planning lost"), Failure(FailureCode.GAVE_UP, f"aborted: {why}")
     aborted = {"phase": ExamState.PHASE_ABORTED, "reason": ExamState.REASON_EMERGENCY_STOP}

@@ -362,6 +362,7 @@ class RobotStatus:
     applied_torque: NDArray[np.float64]
     commands_rejected: int
     culprit: str
+    measured_torque: NDArray[np.float64]
 
 @dataclass
 class RunControl:
@@ -466,6 +467,7 @@ class SupervisorState:
     speed: float
     refusals: int
     culprit: str
+    joint_force: float
 
 @dataclass
 class SurfaceCorrection:

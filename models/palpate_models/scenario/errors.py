@@ -130,6 +130,31 @@ class ArmErrors(Section):
     """Relative error of the mass below the F/T sensor, likewise."""
 
 
+class TorqueErrors(Section):
+    """Joint torque sensors, and the nominal masses of the links.
+
+    Each joint's sensor reads
+
+        (1 + gain) (tau + tau_mass) + zero + (friction + load_friction |tau|) sign(speed) + white noise
+
+    with the torque tau on the link and the difference tau_mass between true and nominal weight of the links, which the arm's own
+    controller compensates and the nominal model does not know.
+    """
+
+    noise_nm: NonNegative = 0.05
+    """White noise of each reading, standard deviation."""
+    zero_nm: NonNegative = 0.0
+    """Constant offset, standard deviation."""
+    gain: Fraction = 0.0
+    """Relative error of the sensitivity, standard deviation."""
+    friction_nm: NonNegative = 0.0
+    """Friction between sensor and link (bearings, seals): it opposes the motion."""
+    load_friction: Fraction = 0.0
+    """The same per torque: friction that grows with the load, and hysteresis."""
+    link_mass: Fraction = 0.0
+    """Relative error of each link's mass: standard deviation of its logarithm."""
+
+
 class Errors(Section):
     """Errors of sensors, calibrations and arm."""
 
@@ -142,6 +167,7 @@ class Errors(Section):
     registration: PoseErrors = PoseErrors()
     """Registered pose of the patient (`exam.pose`); the error is in the abdomen frame."""
     arm: ArmErrors = ArmErrors()
+    torque: TorqueErrors = TorqueErrors()
 
     @model_validator(mode="before")
     @classmethod
@@ -229,6 +255,18 @@ class DrawnArm:
 
 
 @dataclass(frozen=True, eq=False)
+class DrawnTorque:
+    """Drawn errors of the joint torque sensors. Joints in order, shapes (7,)."""
+
+    given: TorqueErrors
+    zero_nm: Array
+    gain: Array
+    """Reading over true torque."""
+    link_mass: Array
+    """True over nominal mass of each link from the first moving one."""
+
+
+@dataclass(frozen=True, eq=False)
 class DrawnErrors:
     """Drawn errors of one patient's equipment."""
 
@@ -239,18 +277,20 @@ class DrawnErrors:
     X_AAt: Array
     """True abdomen frame in the registered one, shape (4, 4)."""
     arm: DrawnArm
+    torque: DrawnTorque
 
 
 def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
     """Draw the equipment of the patient with this seed; `joints`: number of the arm's. Fields are drawn independently."""
-    streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(5)
-    force, camera, hand_eye, registration, arm = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+    streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(6)
+    force, camera, hand_eye, registration, arm, torque = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
     return DrawnErrors(
         _force(errors.force, force),
         _camera(errors.camera, camera),
         _pose(errors.hand_eye, hand_eye),
         _pose(errors.registration, registration),
         draw_arm(errors.arm, arm, joints),
+        _torque(errors.torque, torque, joints),
     )
 
 
@@ -277,6 +317,11 @@ def _camera(given: CameraErrors, rng: np.random.Generator) -> DrawnCamera:
 def _pose(given: PoseErrors, rng: np.random.Generator) -> Array:
     x, y, z, roll, pitch, yaw = (np.repeat((given.translation_m, given.rotation_rad), 3) * rng.standard_normal(6)).tolist()
     return np.asarray(matrix(Pose(xyz_m=(x, y, z), rpy_rad=(roll, pitch, yaw))) @ matrix(given.offset))
+
+
+def _torque(given: TorqueErrors, rng: np.random.Generator, joints: int) -> DrawnTorque:
+    zero, gain, mass = rng.standard_normal((3, joints))
+    return DrawnTorque(given, given.zero_nm * zero, 1 + given.gain * gain, np.exp(given.link_mass * mass))
 
 
 def draw_arm(given: ArmErrors, rng: np.random.Generator, joints: int) -> DrawnArm:

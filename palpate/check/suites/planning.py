@@ -40,7 +40,17 @@ class PerfectFollower:
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
         return RobotStatus(
-            header(t), self.mode, cause, reason, sensed(self.q, t), sensed(velocity, t), weight, np.zeros(7), 0, ""
+            header(t),
+            self.mode,
+            cause,
+            reason,
+            sensed(self.q, t),
+            sensed(velocity, t),
+            weight,
+            np.zeros(7),
+            0,
+            "",
+            sensed(np.zeros(7), t),
         )
 
 

@@ -38,7 +38,7 @@ def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
 
     def supervisor(t: int) -> Any:
         reason = "conformance check" if cause else ""
-        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0, 0, "")
+        return SupervisorState(header(t), level, cause, reason, rig.memory.get("releases", 0), 0.0, -1.0, 0.0, 0, "", 0.0)
 
     return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero), "supervisor/state": supervisor}
 

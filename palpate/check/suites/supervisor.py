@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, ReceivedMessage, Rig, sensed
@@ -16,6 +17,7 @@ from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, Superv
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.load import exam_input
 
@@ -35,6 +37,9 @@ class Expected:
     silent_s: float = 0.6
     rise_nps: float = 10.0
     step_s: float = 0.02
+    swing_rad: float = 0.3
+    """Amplitude and angular frequency of the motion in which the tool is weighed."""
+    swing_radps: float = 1.0
 
 
 EXPECTED = Expected()
@@ -50,6 +55,8 @@ class PlayedArm:
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
         self.robot = exam_input(rig.settings.scenario).robot
+        self._model = pin.buildModelFromXML(urdf(self.robot, geometry=False))
+        self._data = self._model.createData()
         self.calm()
 
     def calm(self) -> None:
@@ -64,13 +71,13 @@ class PlayedArm:
         return {name: source for name, source in ((STATUS, self._status), (EXAM, self._exam)) if name not in without}
 
     def _status(self, t: int) -> Any:
-        R_WS = tool_pose(np.nan_to_num(self.q), self.robot)[:3, :3]
-        force = R_WS.T @ np.array((0.0, 0.0, self.push_N - self.robot.tool_mass_kg * GRAVITY))
+        q, push_W = np.nan_to_num(self.q), np.array((0.0, 0.0, self.push_N))
+        force = tool_pose(q, self.robot)[:3, :3].T @ (push_W - np.array((0.0, 0.0, self.robot.tool_mass_kg * GRAVITY)))
+        torque = pin.rnea(self._model, self._data, q, self.qd, np.zeros(7)) - tool_jacobian(q, self.robot)[:3].T @ push_W
         wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
         cause = RobotStatus.CAUSE_COMMAND_EXPIRED if self.reason else RobotStatus.CAUSE_NONE
-        return RobotStatus(
-            header(t), self.mode, cause, self.reason, sensed(self.q, t), sensed(self.qd, t), wrench, np.zeros(7), 0, ""
-        )
+        q, qd, torque = sensed(self.q, t), sensed(self.qd, t), sensed(torque, t)
+        return RobotStatus(header(t), self.mode, cause, self.reason, q, qd, wrench, np.zeros(7), 0, "", torque)
 
     def _exam(self, t: int) -> Any:
         return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
@@ -90,6 +97,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     if not report.expect("supervisor/state comes", bool(rest), "100 Hz", len(rest)):
         return
     report.expect("an arm at rest is not stopped", _level(rest) == SupervisorState.LEVEL_OK, "LEVEL_OK", _text(rest))
+    _swing(rig, arm)
     _measures(rig, arm, report)
 
     report.section("limits")
@@ -157,6 +165,15 @@ def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     report.expect("and none of them is a reason to stop", state.level == SupervisorState.LEVEL_OK, "LEVEL_OK", _text(received))
     arm.calm()
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
+
+
+def _swing(rig: Rig, arm: PlayedArm) -> None:
+    """Tilt the tool to and fro by the sixth joint, so that its weight can be measured, as on the way to a first target."""
+    for phase in np.arange(0.0, 2 * np.pi, EXPECTED.swing_radps * EXPECTED.step_s):
+        arm.q[5] = lbr.HOME[5] + EXPECTED.swing_rad * np.sin(phase)
+        arm.qd[5] = EXPECTED.swing_rad * EXPECTED.swing_radps * np.cos(phase)
+        rig.run(EXPECTED.step_s, arm.feed())
+    arm.calm()
 
 
 def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:

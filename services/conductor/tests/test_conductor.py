@@ -161,7 +161,7 @@ class Session:
 
 
 def state(level: int, reason: str, releases: int = 0, refusals: int = 0) -> Any:
-    return SupervisorState(header(0), level, 1, reason, releases, 0.0, -1.0, 0.0, refusals, "")
+    return SupervisorState(header(0), level, 1, reason, releases, 0.0, -1.0, 0.0, refusals, "", 0.0)
 
 
 def never(word: str, ms: int) -> str:

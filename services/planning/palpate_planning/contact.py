@@ -71,6 +71,8 @@ class ContactThresholds:
     """Normal force that counts as contact: more than noise and the drift since the last tare."""
     off_n: float = 0.15
     """Contact ends below this normal force."""
+    joints_n: float = 3.0
+    """Largest error of the force by the joints: beyond it they feel a contact."""
 
 
 THRESHOLDS = ContactThresholds()
@@ -105,11 +107,13 @@ class ContactMeasurement(NamedTuple):
     force: float
     """Normal force [N], positive when the tissue is pressed."""
     load: float
-    """Magnitude of the whole force, normal and lateral [N]."""
+    """Magnitude of the whole force, normal and lateral [N]: the larger of F/T sensor and joints, less the joints' error."""
     skin: tuple[Array, Array]
     """Point of the skin under the indenter and its outward normal, in the frame of the first view (`Wall.skin`)."""
     touching: bool
-    """True in contact; False before the first tare, when the sensor's bias would look like contact."""
+    """True in contact by the F/T sensor; False before the first tare, when the sensor's bias would look like contact."""
+    joints_only: bool = False
+    """True if the joints feel a contact that the F/T sensor does not."""
 
 
 class ContactSensing:
@@ -124,8 +128,8 @@ class ContactSensing:
         self._velocity: Array | None = None
         """Previous velocity of the sphere's centre [m/s], world axes, shape (3,)."""
 
-    def sense(self, reading: SensorReading, t: int) -> ContactMeasurement:
-        """Return the contact at the reading of time `t` [ns]."""
+    def sense(self, reading: SensorReading, t: int, joint_force: float = 0.0) -> ContactMeasurement:
+        """Return the contact at the reading of time `t` [ns]; `joint_force`: force at the tool by the joints alone [N]."""
         X_WI, R_WS = self._kinematics.poses(reading.q)
         wall, foot = self.wall, self.wall.perceived.nearest(X_WI[:3, 3])
         place = wall.at(foot.xy_A, t)
@@ -135,6 +139,7 @@ class ContactSensing:
         force_W = self.weight.contact(R_WS, reading.wrench_S, acceleration)
         force = float(force_W @ foot.n_W)
         self._touching = self.weight.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
+        load, by_joints = float(np.linalg.norm(force_W)), joint_force - THRESHOLDS.joints_n
         return ContactMeasurement(
             reading.q,
             X_WI,
@@ -143,7 +148,8 @@ class ContactSensing:
             place,
             self._radius - foot.distance + place.correction + place.displacement,
             force,
-            float(np.linalg.norm(force_W)),
+            max(load, by_joints),
             wall.skin(foot, place.correction),
             self._touching,
+            by_joints > 0.0 and not self._touching,
         )

@@ -141,7 +141,7 @@ class ExaminationSequence:
         self._requested.receive(now.request)
         if now.motion is not None:
             self._sense.wall.breath.receive(now.motion, now.t)
-        course.contact = self._sense.sense(now.reading, now.t)
+        course.contact = self._sense.sense(now.reading, now.t, now.joint_force)
         status.steady = status.force_limited = False
         status.depth_setpoint = course.contact.depth
         self._stops.watch(now)

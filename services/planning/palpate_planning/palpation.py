@@ -265,7 +265,8 @@ class Palpation:
         if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and motion.segment.touch):
             self._waits.reach(self._number, motion.along.position, at_depth=not motion.segment.touch)
         in_contact = contact.touching and self.stage is not StrokeStage.LIFT
-        motion.regulate(contact, in_contact=in_contact, pushing=self.stage in PUSHING)
+        pushing = self.stage in PUSHING and not (self._recovery.paused or self._recovery.ending)
+        motion.regulate(contact, in_contact=in_contact, pushing=pushing)
         return self._report(t, contact, rate)
 
     # --- the sequence -------------------------------------------------------------------------------------------------

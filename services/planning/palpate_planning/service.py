@@ -104,6 +104,7 @@ class PlanningService(Service):
                 end=_end(requests),
                 lost=self._lost(t, inbox),
                 request=self._request(inbox),
+                joint_force=0.0 if state is None else state.joint_force,
             )
         )
         if step.contact is not None and step.contact.touching:

@@ -86,6 +86,8 @@ class Observation(NamedTuple):
     """The request of the search, if it arrived."""
     averaged: Array | None = None
     """Height of the wall above the surface's vertices in the mean of later images [m], if it arrived."""
+    joint_force: float = 0.0
+    """Force at the tool by the joints alone [N]."""
 
 
 @dataclass(slots=True)

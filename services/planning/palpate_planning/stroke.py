@@ -286,6 +286,8 @@ class Descent:
             self._onset.add(contact.depth, contact.force, now.t, contact.wall.displacement)
         if contact.force >= FELT_N and not near:
             self.failed = Cause(Reason.UNEXPECTED_CONTACT, "contact force above the skin")
+        elif contact.joints_only and contact.force < FELT_N:
+            self.failed = Cause(Reason.UNEXPECTED_CONTACT, "the joints feel a contact that the F/T sensor does not", "ft/wrench")
         elif contact.force >= FELT_N or (there and contact.touching):
             self._found = True
             self.learn(now)

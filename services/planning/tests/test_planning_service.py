@@ -39,7 +39,7 @@ def status(t: int, q: np.ndarray, w: np.ndarray, mode: int = RobotStatus.MODE_AC
     force, torque = (Vector3(*map(float, part)) for part in (w[:3], w[3:]))
     zero = np.zeros(7)
     cause = RobotStatus.CAUSE_DEVICE if reason else RobotStatus.CAUSE_NONE
-    return RobotStatus(header(t), mode, cause, reason, np.array(q), zero, Wrench(force, torque), zero, 0, "")
+    return RobotStatus(header(t), mode, cause, reason, np.array(q), zero, Wrench(force, torque), zero, 0, "", zero)
 
 
 def sent(outbox: Any) -> dict[str, Any]:
@@ -174,7 +174,9 @@ def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
     elif cause == "operator":
         inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
     elif cause == "soft":
-        soft = SupervisorState(header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "")
+        soft = SupervisorState(
+            header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "", 9.0
+        )
         inbox.put("supervisor/state", soft, 10_000_000)
     else:
         inbox.gone.add("robot")

@@ -35,6 +35,9 @@ class Plant(Protocol):
     """Joint positions [rad], a fresh array at every step."""
     v: Array
     """Joint velocities [rad/s], a fresh array at every step."""
+    friction: Array
+    """Torque of friction and of the driver's damping in the last step [N m], a fresh array: the drives' torque less this is on
+    the links."""
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""

@@ -22,11 +22,14 @@ from math import cos, sin
 from typing import Final
 
 import numpy as np
+import pinocchio as pin
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, DrawnArm, DrawnForce
-from palpate_robot.plant import DT
+from palpate_models.robot.arm import urdf
+from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, DrawnArm, DrawnForce, DrawnTorque
+from palpate_models.scenario.schema import Robot
+from palpate_robot.plant import DT, STICK_RADPS
 
 RIPPLES: Final = 320
 """Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear [A]."""
@@ -77,6 +80,25 @@ class JointSensor:
             noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, len(self._deviation)))
             self._noise = list(noise.reshape(-1, len(self.q))[::-1])
         return self.q + self._noise.pop(), self.v + self._noise.pop()
+
+
+class TorqueSensors:
+    """Torque sensors between the gears and the links, as an LBR has them; see `TorqueErrors` for the equation."""
+
+    def __init__(self, robot: Robot, drawn: DrawnTorque, rng: np.random.Generator) -> None:
+        self._drawn, self._rng = drawn, rng
+        self._missing = pin.buildModelFromXML(urdf(robot, geometry=False))
+        for i, scale in enumerate(drawn.link_mass.tolist(), start=1):  # gravity is linear in the masses
+            self._missing.inertias[i].mass *= scale - 1.0
+        self._data = self._missing.createData()
+
+    def read(self, q: Array, v: Array, torque: Array, readings: int) -> Array:
+        """Return the mean of some readings [N m], shape (7,): of the torque on the links, at joints `q` [rad] and `v` [rad/s]."""
+        given, drawn = self._drawn.given, self._drawn
+        loaded = torque + pin.computeGeneralizedGravity(self._missing, self._data, q)
+        friction = (given.friction_nm + given.load_friction * np.abs(loaded)) * (v / (np.abs(v) + STICK_RADPS))
+        noise = given.noise_nm / np.sqrt(readings) * self._rng.standard_normal(len(q))
+        return np.asarray(drawn.gain * loaded + drawn.zero_nm + friction + noise)
 
 
 _BLOCK: Final = 1024

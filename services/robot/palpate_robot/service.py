@@ -36,7 +36,7 @@ from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.plant import DT, PlantFactory
-from palpate_robot.sensors import FtSensor, JointSensor
+from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 from palpate_robot.stop_requests import StopRequests
 
 _TICK = round(DT * NS)
@@ -56,12 +56,13 @@ class RobotService(Service):
         """Start at rest at home. `plant` creates the physics."""
         robot, arm = known.robot, arm_of(known.robot)
         drawn = draw_errors(known.errors, known.seed, arm.joints)
-        streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(2)
-        joint_rng, ft_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+        streams = np.random.SeedSequence([known.seed, crc32(b"robot")]).spawn(3)
+        joint_rng, ft_rng, torque_rng = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._robot, self._names, self._links = robot, list(arm.joint_names), link_names(robot)
         self._plant = plant(robot, drawn=drawn.arm)
         self._sensor = FtSensor(drawn.force, ft_rng, DT)
         self._joints = JointSensor(drawn.arm, joint_rng, self._plant.q, self._plant.gravity_torque())
+        self._torque_sensors = TorqueSensors(robot, drawn.torque, torque_rng)
         self._driver = Driver(arm, known.limits.force_emergency_n)
         self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
@@ -75,6 +76,9 @@ class RobotService(Service):
         self._recent: list[Array] = []
         self._readings: list[list[float]] = []
         """Positions and velocities, and F/T readings, since the last status."""
+        self._driven: list[Array] = [self._plant.gravity_torque()]
+        self._friction: list[Array] = [np.zeros(arm.joints)]
+        """Torques of the drives and of friction since the last status [N m]."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -125,8 +129,11 @@ class RobotService(Service):
             gravity = plant.gravity_torque()
             torque = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
             damping = driver.damping(joints.v, gravity)
-            plant.step(gravity + torque, self._force_W if self._pressed else None, self._moment_W, damping)
-            joints.update(plant.q, plant.v, gravity + torque)
+            driven = gravity + torque
+            plant.step(driven, self._force_W if self._pressed else None, self._moment_W, damping)
+            joints.update(plant.q, plant.v, driven)
+            self._driven.append(driven)
+            self._friction.append(plant.friction)
             self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * joints.v
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
@@ -180,6 +187,11 @@ class RobotService(Service):
         ticks = len(self._readings)
         mean = np.add.reduce(np.concatenate(self._recent).reshape(ticks, -1)) / ticks
         fx, fy, fz, mx, my, mz = (np.add.reduce(self._readings) / ticks).tolist()
+        if self._driven:
+            torque = (np.add.reduce(self._driven) - np.add.reduce(self._friction)) / len(self._driven)
+            self._measured_torque = self._torque_sensors.read(self._plant.q, self._plant.v, torque, len(self._driven))
+        self._driven.clear()
+        self._friction.clear()
         self._recent.clear()
         self._readings.clear()
         return RobotStatus(
@@ -193,6 +205,7 @@ class RobotService(Service):
             self._applied,
             driver.rejected,
             driver.culprit,
+            self._measured_torque,
         )
 
     def _link_poses(self, stamp: Message) -> Message:

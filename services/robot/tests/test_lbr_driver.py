@@ -121,17 +121,17 @@ def test_stops_hold_and_a_release_goes_on(rig: Rig, who: str) -> None:
     if who == "operator":
         rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough")]
     else:
-        rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 2, 1, "41 N", 0, 41.0, 0.0, 0.0, 0, "")]
+        rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 2, 1, "41 N", 0, 41.0, 0.0, 0.0, 0, "", 0.0)]
     rig.tick(20)
     assert hold_cause(rig)[0] == RobotStatus.CAUSE_STOP_REQUESTED
-    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0, "")]
+    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0, "", 0.0)]
     rig.tick(20)
     assert rig.status.mode == RobotStatus.MODE_ACTIVE
 
 
 def test_a_stop_is_not_undone_by_a_release_of_the_same_moment(rig: Rig) -> None:
     rig.inbox.events["operator/request"] = [OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough")]
-    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0, "")]
+    rig.inbox.events["supervisor/state"] = [SupervisorState(header(rig.t), 0, 0, "", 1, 0.0, 0.0, 0.0, 0, "", 0.0)]
     rig.tick(20)
     assert hold_cause(rig)[0] == RobotStatus.CAUSE_STOP_REQUESTED
 

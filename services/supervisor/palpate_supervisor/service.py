@@ -14,9 +14,12 @@ from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
+from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
+from palpate_supervisor.judge import SensorJudge
 from palpate_supervisor.latch import Latch
+from palpate_supervisor.senses import Measurement
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import Breach, Level, LimitWatch, StopCause
 
@@ -54,9 +57,13 @@ class SupervisorService(Service):
         self._sense = ToolSense(known.robot)
         self._watch = LimitWatch(known.limits, inverse(np.array(known.X_WA)))
         self._surface: RestSurface | None = None
+        arm = arm_of(known.robot)
+        still = Measurement(arm.home_rad.copy(), np.zeros(arm.joints), np.zeros(6), np.zeros(arm.joints))
+        ToolSense(known.robot).sense(still, 0.01)  # compiles it before the first deadline
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it before the first deadline
         self._max_age = contract().topics["planning/setpoint"].expiry
         """Age limit of watched topics [ns]: the expiry of set-points. Control and driver check their own inputs faster."""
+        self._judge = SensorJudge()
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
@@ -89,7 +96,7 @@ class SupervisorService(Service):
         latch, tool = self._latch, self._tool
         state = SupervisorState(
             header(t), int(latch.level), int(latch.cause), latch.reason, latch.releases, tool.force, self._depth, tool.speed,
-            latch.refusals, latch.culprit,
+            latch.refusals, latch.culprit, tool.joint_force,
         )  # fmt: skip
         return {"supervisor/state": state}
 
@@ -136,20 +143,26 @@ class SupervisorService(Service):
         return []
 
     def _measure(self, t: int, status: Any) -> list[Breach]:
-        values = {"position": status.position, "velocity": status.velocity, "wrench": wrench(status.wrench)}
-        for name, value in values.items():
+        # Arrays of messages are read-only, a different type for numba.
+        measured = Measurement(
+            np.array(status.position), np.array(status.velocity), wrench(status.wrench), np.array(status.measured_torque)
+        )
+        for name, value in measured._asdict().items():
             if not np.isfinite(value).all():
                 reason = f"robot/status: {name} = {value}: must be finite"
                 return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit="robot/status")]
-        self._tool = tool = self._sense.sense(*values.values())
+        stamp = nanoseconds(status.header.stamp)
+        if stamp != self._stamp:
+            since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS
+            self._stamp, self._stamped = stamp, t
+            self._tool = self._sense.sense(measured, since_s)
+        tool = self._tool
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
         depth, above = (TUNING.no_depth_m, False) if self._surface is None else self._surface.depth(tool.p_W)
         self._depth = min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
-        stamp = nanoseconds(status.header.stamp)
-        if stamp != self._stamp:
-            self._stamp, self._stamped = stamp, t
-        found = self._watch.judge(tool, depth if above else None, stamp, t)
+        known = depth if above else None
+        found = self._watch.judge(tool, known, stamp, t) + self._judge.judge(self._sense.comparison, known)
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
             reason = f"robot/status repeats a measurement of age {age}"

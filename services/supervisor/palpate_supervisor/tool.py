@@ -11,9 +11,9 @@ import pinocchio as pin
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import nearest_vertex
 from palpate_models.robot.arm import urdf
+from palpate_models.robot.observer import MomentumObserver
 from palpate_models.scenario.schema import Robot
-
-_WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
+from palpate_supervisor.senses import Comparison, ForceSenses, Measurement
 
 
 @dataclass(frozen=True)
@@ -39,7 +39,9 @@ class Tool(NamedTuple):
     speed: float
     """Speed of the centre [m/s]."""
     force: float
-    """Magnitude of the external force [N]: the reading minus tool weight and sensor bias."""
+    """Magnitude of the external force [N]: the larger of both senses. By the F/T sensor: minus tool weight and first bias."""
+    joint_force: float = 0.0
+    """The same by the joints alone [N]."""
 
 
 class ToolSense:
@@ -48,6 +50,12 @@ class ToolSense:
     def __init__(self, robot: Robot) -> None:
         self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
         self._data = self._model.createData()
+        self._observer = MomentumObserver(self._model, "indenter")
+        self._senses = ForceSenses(self._model.nv)
+        self._mass = robot.tool_mass_kg
+        self._velocity_W: Array | None = None
+        self.comparison: Comparison
+        """Of the two senses, after the latest measurement."""
         self._indenter = self._model.getFrameId("indenter")
         self._sensor = self._model.getFrameId("ft_sensor")
         self._p_WI: Array = self._data.oMf[self._indenter].translation
@@ -56,19 +64,35 @@ class ToolSense:
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
         self._bias_S, self._rested, self._moved = np.zeros(3), 0, False
 
-    def sense(self, q: Array, qd: Array, wrench_S: Array) -> Tool:
-        """Return the tool state at joint positions [rad] and velocities [rad/s], shapes (n,), and the F/T reading, shape (6,)."""
+    def sense(self, measured: Measurement, dt_s: float) -> Tool:
+        """Return the tool state of a measurement that comes `dt_s` [s] after the one before."""
         model, data = self._model, self._data
-        pin.forwardKinematics(model, data, q, qd)
+        q, qd, wrench_S, torque = measured
+        pin.forwardKinematics(model, data, q)
         pin.updateFramePlacement(model, data, self._indenter)
         pin.updateFramePlacement(model, data, self._sensor)
-        speed = float(np.linalg.norm(pin.getFrameVelocity(model, data, self._indenter, _WORLD_AXES).linear))
+        self._observer.update(q, qd, torque, dt_s)
+        velocity_W = self._observer.J_W @ qd
+        before_W = velocity_W if self._velocity_W is None else self._velocity_W
+        self._velocity_W = velocity_W
+        speed = _norm(velocity_W)
         force_S = wrench_S[:3] - self._R_SW @ self._weight_W
-        self._moved = self._moved or speed > TUNING.still_mps or bool(np.linalg.norm(force_S) > TUNING.largest_n)
+        self._moved = self._moved or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
         if not self._moved:
             self._rested += 1
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
-        return Tool(self._p_WI.copy(), speed, float(np.linalg.norm(force_S - self._bias_S)))
+        acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
+        load_S = self._R_SW @ (self._weight_W - self._mass * acceleration_W)
+        observed = self._observer
+        self.comparison = self._senses.compare(
+            measured, observed.residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, starting=not self._moved
+        )
+        ft = _norm(force_S - self._bias_S)
+        return Tool(self._p_WI.copy(), speed, max(ft, self.comparison.joint_force), self.comparison.joint_force)
+
+
+def _norm(x: Array) -> float:
+    return float(x @ x) ** 0.5
 
 
 class RestSurface:

@@ -66,6 +66,7 @@ class StopCause(IntEnum):
     OPERATOR = 8
     DRIVER = 9
     UNHEEDED = 10
+    SENSOR = 11
 
 
 @dataclass(frozen=True, slots=True)
@@ -101,7 +102,7 @@ class LimitWatch:
         `depth` [m] is below the perceived surface. It is None without a surface and where the tool is not over it: there,
         workspace and force are the limits.
         """
-        p_W, speed, force = tool
+        p_W, speed, force = tool.p_W, tool.speed, tool.force
         found = self._force(force, stamp, t) + self._speed(speed, force) + self._workspace(p_W)
         return found if depth is None else found + self._depth(depth)
 

@@ -6,6 +6,7 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pinocchio as pin
 import pytest
 
 from palpate_bus.contract import MS
@@ -14,11 +15,13 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Limits
 from palpate_supervisor import latch as latch_module
 from palpate_supervisor import service as service_module
 from palpate_supervisor.latch import Latch
+from palpate_supervisor.senses import Measurement
 from palpate_supervisor.service import SupervisorService, create
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
 from palpate_supervisor.watch import TUNING, Breach, Level, LimitWatch, StopCause
@@ -26,6 +29,9 @@ from palpate_supervisor.watch import TUNING, Breach, Level, LimitWatch, StopCaus
 KNOWN = exam_input(load_scenario("clean"))
 
 ABOVE = np.array([0.56, 0.0, 1.0])
+_MODEL = pin.buildModelFromXML(urdf(KNOWN.robot, geometry=False))
+HOLDING = np.array(pin.computeGeneralizedGravity(_MODEL, _MODEL.createData(), np.array(lbr.HOME)))
+"""Joint torques that hold the arm at home [N m]."""
 
 
 def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
@@ -110,9 +116,9 @@ def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
     q = np.array(lbr.HOME)
     weight = KNOWN.robot.tool_mass_kg * GRAVITY
     hanging = np.array([0.0, 0.0, weight, 0.0, 0.0, 0.0])  # tool straight down: +z reads its weight
-    tool = sense.sense(q, np.zeros(7), hanging)
+    tool = sense.sense(Measurement(q, np.zeros(7), hanging, HOLDING), 0.01)
     assert tool.force == pytest.approx(0.0, abs=0.01)
-    pressed = sense.sense(q, np.zeros(7), hanging - np.array([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]))
+    pressed = sense.sense(Measurement(q, np.zeros(7), hanging - np.array([0.0, 0.0, 7.0, 0.0, 0.0, 0.0]), HOLDING), 0.01)
     assert pressed.force == pytest.approx(7.0, abs=0.01)
 
 
@@ -122,25 +128,31 @@ def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
     hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
     bias = np.array([3.0, -2.0, 1.0, 0.0, 0.0, 0.0])
     for noise in (0.2, -0.2):
-        sense.sense(q, still, hanging + bias + noise)
-    assert sense.sense(q, slow, hanging + bias).force == pytest.approx(0.0, abs=0.01)
+        sense.sense(Measurement(q, still, hanging + bias + noise, HOLDING), 0.01)
+    assert sense.sense(Measurement(q, slow, hanging + bias, HOLDING), 0.01).force == pytest.approx(0.0, abs=1.2), "a jerk"
     pressed = hanging + bias - np.array([0.0, 0.0, 9.0, 0.0, 0.0, 0.0])
-    assert sense.sense(q, still, pressed).force == pytest.approx(9.0, abs=0.01), "a tool that has moved may be pressed at rest"
+    assert sense.sense(Measurement(q, still, pressed, HOLDING), 0.01).force == pytest.approx(9.0, abs=0.01), (
+        "a tool that has moved may be pressed at rest"
+    )
 
 
 def test_a_press_before_the_arm_moves_is_no_bias() -> None:
     sense = ToolSense(KNOWN.robot)
     pressed = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY - 9.0, 0.0, 0.0, 0.0])
     for _ in range(3):
-        assert sense.sense(np.array(lbr.HOME), np.zeros(7), pressed).force == pytest.approx(9.0, abs=0.01)
+        assert sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), pressed, HOLDING), 0.01).force == pytest.approx(
+            9.0, abs=0.01
+        )
 
 
 def test_speed_is_that_of_the_sphere() -> None:
     sense = ToolSense(KNOWN.robot)
     q, qd = np.array(lbr.HOME), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2, 0.5])
     step = 1e-5
-    a, b = (sense.sense(q + s * qd, qd, np.zeros(6)).p_W for s in (-step, step))
-    assert sense.sense(q, qd, np.zeros(6)).speed == pytest.approx(float(np.linalg.norm(b - a)) / (2 * step), rel=1e-4)
+    a, b = (sense.sense(Measurement(q + s * qd, qd, np.zeros(6), np.zeros(7)), 0.01).p_W for s in (-step, step))
+    assert sense.sense(Measurement(q, qd, np.zeros(6), np.zeros(7)), 0.01).speed == pytest.approx(
+        float(np.linalg.norm(b - a)) / (2 * step), rel=1e-4
+    )
 
 
 def test_depth_over_a_dome_is_that_of_geometry() -> None:
@@ -326,10 +338,10 @@ def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
 
 
 def status(stamp: int, force: float) -> RobotStatus:
-    """The arm stands, with a force that presses the tool up."""
-    weight = load_scenario("healthy").robot.tool_mass_kg * GRAVITY
-    wrench = Wrench(Vector3(0.0, 0.0, weight + force), Vector3(0.0, 0.0, 0.0))
-    return RobotStatus(header(stamp), 1, 0, "", np.array(lbr.HOME), np.zeros(7), wrench, np.zeros(7), 0, "")
+    """The arm stands, with a force that presses the tool up; the F/T sensor and the torques have noise."""
+    weight, noise = load_scenario("healthy").robot.tool_mass_kg * GRAVITY, 1e-3 * (stamp // (10 * MS) % 2)
+    wrench = Wrench(Vector3(0.0, 0.0, weight + force + noise), Vector3(0.0, 0.0, 0.0))
+    return RobotStatus(header(stamp), 1, 0, "", np.array(lbr.HOME), np.zeros(7), wrench, np.zeros(7), 0, "", HOLDING + noise)
 
 
 def after(service: SupervisorService, t: int, **messages: Any) -> Any:

@@ -166,6 +166,8 @@ class DartPlant:
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
         """Joint velocities [rad/s], a fresh array at every step."""
+        self.friction: Array
+        """Torque of friction and damping in the last step [N m], a fresh array at every step."""
         self.reset(arm.home_rad if q is None else q)
 
     @staticmethod
@@ -184,6 +186,7 @@ class DartPlant:
         self._arm.setPositions(np.asarray(q, dtype=float))
         self._arm.setVelocities(np.zeros(self._arm.getNumDofs()) if v is None else np.asarray(v, dtype=float))
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
+        self.friction = np.zeros_like(self.v)
         self._cached_state = None
         self._arm.setForces(self.gravity_torque())
         self._arm.computeForwardDynamics()  # so that the sensor reads the tool's weight before the first step
@@ -196,9 +199,12 @@ class DartPlant:
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
         joints = zip(self._set_damping, self.v.tolist(), damping.tolist(), self._viscous, self._coulomb, strict=True)
+        slopes = []
         for set_damping, v, extra, viscous, coulomb in joints:
             speed = abs(v)
-            set_damping(viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS))
+            slope = viscous + extra + coulomb / (speed if speed > STICK_RADPS else STICK_RADPS)
+            set_damping(slope)
+            slopes.append(slope)
         self._arm.setForces(torque)
         if force_W is not None:
             self._indenter.addExtForce(force_W)  # at its origin, in world axes
@@ -214,6 +220,7 @@ class DartPlant:
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
+        self.friction = slopes * self.v
         self._cached_state = None
 
     def _is_clear(self) -> bool:

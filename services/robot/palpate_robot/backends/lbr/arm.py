@@ -58,6 +58,8 @@ class MeasuredArm:
         """Measured positions [rad], shape (7,)."""
         self.v = np.zeros(lbr.HOME.shape)
         """Velocities [rad/s], shape (7,), see `VELOCITY_LAG_S`."""
+        self.torque = np.zeros(lbr.HOME.shape)
+        """Measured joint torques, gravity included [N m], shape (7,)."""
         self.session = SessionState.IDLE
         self.received: int | None = None
         """Arrival of the newest state [ns], None before the first."""
@@ -71,8 +73,9 @@ class MeasuredArm:
         """
         q = np.array(state.measured_joint_position)
         stamp = int(state.time_stamp_sec) * 1_000_000_000 + int(state.time_stamp_nano_sec)
-        if not np.isfinite(q).all():
-            self._fault = f"LBRState: measured_joint_position = {q}: must be finite"
+        torque = np.array(state.measured_torque)
+        if not np.isfinite((q, torque)).all():
+            self._fault = f"LBRState: measured_joint_position = {q}, measured_torque = {torque}: must be finite"
             return False
         if self._stamp is not None and 0 <= self._stamp - stamp < CLOCK_SET_NS:
             return False
@@ -81,7 +84,7 @@ class MeasuredArm:
             self.v = self.v + dt / (VELOCITY_LAG_S + dt) * ((q - self.q) / dt - self.v)
         else:
             self.v = np.zeros(lbr.HOME.shape)
-        self.q, self._stamp, self.received = q, stamp, t
+        self.q, self.torque, self._stamp, self.received = q, torque, stamp, t
         try:
             self.session, self._fault = SessionState(state.session_state), _fault(state)
         except ValueError as error:  # not a value of FRI

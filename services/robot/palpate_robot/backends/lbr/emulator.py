@@ -74,7 +74,7 @@ from palpate_robot.backends.lbr.port import (
     SafetyState,
     SessionState,
 )
-from palpate_robot.sensors import FtSensor, JointSensor
+from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 
 PERIODS_MS: Final = range(1, 101)
 MONITORING_S: Final = 0.2
@@ -216,10 +216,13 @@ class Emulator:
         drawn = draw_errors(known.errors, known.seed)
         self._options = options
         self._plant = DartPlant(known.robot, drawn=drawn.arm)
-        streams = np.random.SeedSequence([known.seed, 0x4C4252]).spawn(3)
-        joints, ft, load = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+        streams = np.random.SeedSequence([known.seed, 0x4C4252]).spawn(4)
+        joints, ft, load, torque = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
         self._ft = FtSensor(drawn.force, ft, options.period_ms * 1e-3)
         self._joints = JointSensor(drawn.arm, joints, self._plant.q, self._plant.gravity_torque())
+        self._torque_sensors = TorqueSensors(known.robot, drawn.torque, torque)
+        self._link_torque: Array = self._plant.gravity_torque()
+        """Mean torque on the links in the last send period [N m]."""
         self.session = FriSession(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
         self._radius, self._links = known.robot.indenter_radius_m, link_names(known.robot)
         self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
@@ -235,17 +238,20 @@ class Emulator:
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
         active = self.session.state is SessionState.COMMANDING_ACTIVE
         damping = 2 * 0.7 * np.sqrt(np.full(7, options.stiffness_nm)) if active else BRAKE
+        total = np.zeros(7)
         for _ in range(options.period_ms):
             spring = options.stiffness_nm * (drive.position - joints.q)
             error = self._load_error if active else 0.0
             torque = plant.gravity_torque() + drive.torque + spring + error
             plant.step(torque, self.force_W, self.moment_W, damping)
             joints.update(plant.q, plant.v, torque)
+            total += torque - plant.friction
+        self._link_torque = total / options.period_ms
 
     def state(self, now: int) -> Any:
         """Return LBRState at wall time `now` [ns]."""
         session, drive = self.session, self._applied
-        gravity = self._plant.gravity_torque()
+        plant, readings = self._plant, self._options.period_ms
         ipo = self.measured if session.state >= SessionState.COMMANDING_WAIT else np.full(7, np.nan)
         return LBRState(
             sample_time=self._options.period_ms * 1e-3,
@@ -261,7 +267,7 @@ class Emulator:
             time_stamp_nano_sec=now % 1_000_000_000,
             measured_joint_position=self.measured,
             commanded_joint_position=drive.position,
-            measured_torque=gravity + drive.torque,
+            measured_torque=self._torque_sensors.read(plant.q, plant.v, self._link_torque, readings),
             commanded_torque=drive.torque,
             external_torque=np.zeros(7),
             ipo_joint_position=ipo,

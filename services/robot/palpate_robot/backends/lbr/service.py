@@ -123,8 +123,8 @@ class LbrService(Service):
         self._links: Message | None = None
         self._force = 0.0
         self._applied = np.zeros(7)
-        self._sums, self._summed = np.zeros(20), 0
-        self._means = np.zeros(20)
+        self._sums, self._summed = np.zeros(27), 0
+        self._means = np.zeros(27)
         self._states = self._commands = 0
         self._peak_force = 0.0
         self._peak_torque = np.zeros(7)
@@ -194,7 +194,7 @@ class LbrService(Service):
             self._wrench_at = t
         if fresh:
             self._states += 1
-            self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench))
+            self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque))
             self._summed += 1
         return fresh
 
@@ -238,7 +238,7 @@ class LbrService(Service):
         driver, measured = self._driver, t
         if self._summed:
             self._means = self._sums / self._summed
-            self._sums, self._summed = np.zeros(20), 0
+            self._sums, self._summed = np.zeros(27), 0
         elif self._arm.received is not None:
             measured = self._arm.received  # no new measurement
         means = self._means
@@ -246,8 +246,8 @@ class LbrService(Service):
         if not driver.held and fault is not None:
             cause, reason = HoldCause.DEVICE, fault
         return RobotStatus(
-            header(measured), int(driver.mode), int(cause), reason, means[:7], means[7:14], _wrench(means[14:]),
-            self._applied.copy(), driver.rejected, driver.culprit,
+            header(measured), int(driver.mode), int(cause), reason, means[:7], means[7:14], _wrench(means[14:20]),
+            self._applied.copy(), driver.rejected, driver.culprit, means[20:],
         )  # fmt: skip
 
     def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:

@@ -156,6 +156,8 @@ class MujocoPlant:
         """Joint positions [rad], a fresh array at every step."""
         self.v: Array
         """Joint velocities [rad/s], a fresh array at every step."""
+        self.friction: Array
+        """Torque of friction and damping, mean of the last step [N m], a fresh array at every step."""
         self.reset(arm.home_rad if q is None else q)
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
@@ -167,7 +169,7 @@ class MujocoPlant:
         mujoco.mj_fwdPosition(model, data)
         self._joint_torque[:] = self.gravity_torque()
         mujoco.mj_forward(model, data)  # so that the sensor reads the tool's weight before the first step
-        self.q, self.v = self._qpos.copy(), self._qvel.copy()
+        self.q, self.v, self.friction = self._qpos.copy(), self._qvel.copy(), np.zeros_like(self._qvel)
 
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
@@ -180,11 +182,13 @@ class MujocoPlant:
         self._force_W[:] = 0.0 if force_W is None else force_W
         self._moment_W[:] = 0.0 if force_W is None else moment_W
         viscous = self._viscous + damping
+        self.friction = np.zeros_like(self.v)
         for _ in range(SUBSTEPS):
             before = v.copy()
             self._joint_damping[:] = viscous + self._coulomb / np.maximum(np.abs(before), STICK_RADPS)
             mujoco.mj_fwdVelocity(model, data)
             mujoco.mj_step2(model, data)
+            self.friction += self._joint_damping * v / SUBSTEPS
             # MuJoCo's sensors use the acceleration before implicit damping; the arm moved with the one after it.
             np.multiply(v - before, SUBSTEPS / DT, out=self._qacc)
             mujoco.mj_rnePostConstraint(model, data)

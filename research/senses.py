@@ -1,0 +1,116 @@
+"""F/T sensor against joints in recorded examinations: false alarms, and the smallest lie of the F/T sensor that is seen.
+
+Run: `python -m research.senses FOLDER...`, each FOLDER that of a `palpate run --record normal`. The supervisor's senses and judge
+run again over `robot/status`. A lie changes the recorded reading from a moment on: the examination itself does not react to it.
+"""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
+from palpate_bus.messages.geometry import wrench
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.recordings import open_recording
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario.load import load_scenario
+from palpate_models.scenario.schema import Robot
+from palpate_supervisor.judge import SensorJudge
+from palpate_supervisor.senses import Comparison, Measurement
+from palpate_supervisor.tool import ToolSense
+
+PERIOD_S: Final = 0.01
+PRESSED_N: Final = 3.0
+"""Force by the joints from which a stroke counts as a press."""
+TOPICS: Final = contract().topics
+WITHIN_S: Final = 10.0
+"""Time in which a lie has to be seen."""
+
+
+class Sample(NamedTuple):
+    """A measurement and the depth of the tool below the perceived surface [m], None without one."""
+
+    t: float
+    measured: Measurement
+    depth: float | None
+
+
+Lie = Callable[[float, Array, float], Array]
+"""Reading of the F/T sensor at a time since the lie began [s], given the true one and the size of the lie."""
+_NOISE: Final = np.random.default_rng(0)
+_Z: Final = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+LIES: Final[Mapping[str, tuple[Lie, tuple[float, ...]]]] = {
+    "gain less [1]": (lambda t, w, x: (1 - x) * w, (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 0.9)),
+    "gain more [1]": (lambda t, w, x: (1 + x) * w, (0.1, 0.2, 0.3, 0.4, 0.5, 0.7, 1.0)),
+    "bias [N]": (lambda t, w, x: w + x * _Z, (1.0, 2.0, 2.5, 3.0, 3.5, 4.0, 5.0)),
+    "drift [N/s]": (lambda t, w, x: w + x * t * _Z, (0.1, 0.2, 0.3, 0.5, 1.0)),
+    "noise [N]": (lambda t, w, x: w + x * _NOISE.standard_normal(6), (0.3, 0.5, 0.7, 1.0, 1.5)),
+}
+
+
+def samples(folder: Path) -> Iterator[Sample]:
+    """Yield the measurements of a run."""
+    depth = None
+    for message in open_recording(folder / "recording_mcap").messages(("robot/status", "supervisor/state")):
+        value = codec.decode(message.payload, TOPICS[message.topic].type)
+        if message.topic == "supervisor/state":
+            depth = value.depth if value.depth > -1.0 else None
+            continue
+        measured = Measurement(value.position, value.velocity, wrench(value.wrench), value.measured_torque)
+        yield Sample(nanoseconds(value.header.stamp) / NS, measured, depth)
+
+
+def judged(robot: Robot, run: list[Sample], lie: Callable[[int, Array], Array] | None = None) -> Iterator[tuple[Comparison, str]]:
+    """Yield the comparison of each sample, and the culprit of the first breach, empty without one."""
+    sense, judge = ToolSense(robot), SensorJudge()
+    for i, (_, measured, depth) in enumerate(run):
+        told = measured if lie is None else measured._replace(wrench_S=lie(i, measured.wrench_S))
+        sense.sense(told, PERIOD_S)
+        found = judge.judge(sense.comparison, depth)
+        yield sense.comparison, found[0].culprit if found else ""
+
+
+def seen_after(robot: Robot, run: list[Sample], lie: Lie, size: float, begin: int) -> float | None:
+    """Return the time from the begin of a lie to its stop [s], None if it is not seen in time."""
+    run = run[: begin + round(WITHIN_S / PERIOD_S)]
+
+    def told(i: int, w: Array) -> Array:
+        return lie((i - begin) * PERIOD_S, w, size) if i >= begin else w
+
+    for i, (_, culprit) in enumerate(judged(robot, run, told)):
+        if culprit:
+            return (i - begin) * PERIOD_S
+    return None
+
+
+def main() -> None:
+    """Print the tables."""
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("folders", nargs="+", type=Path)
+    hours = 0.0
+    for folder in parser.parse_args().folders:
+        robot, run = load_scenario(str(folder / "scenario.yaml")).robot, list(samples(folder))
+        hours += len(run) * PERIOD_S / 3600
+        report(folder.name, robot, run)
+    print(f"{hours:.2f} h; without a false alarm their rate is below {3 / hours:.1f} per hour (95 %)")
+
+
+def report(name: str, robot: Robot, run: list[Sample]) -> None:
+    """Print the largest comparisons of a run, its false alarms, and for each lie when each size is seen."""
+    found = list(judged(robot, run))
+    largest = {field: round(max(getattr(c, field) for c, _ in found), 2) for field in Comparison._fields}
+    print(f"{name}: largest {largest}; false alarms: {sorted({culprit for _, culprit in found} - {''})}")
+    begin = next(i for i, (c, _) in enumerate(found) if c.joint_force > PRESSED_N)
+    for lie_name, (lie, sizes) in LIES.items():
+        after = {size: seen_after(robot, run, lie, size, begin) for size in sizes}
+        print(f"  {lie_name}: " + ", ".join(f"{size:g}: {'-' if s is None else f'{s:.2f} s'}" for size, s in after.items()))
+
+
+if __name__ == "__main__":
+    main()

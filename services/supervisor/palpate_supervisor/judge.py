@@ -1,0 +1,85 @@
+"""Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from palpate_supervisor.senses import Comparison
+from palpate_supervisor.watch import Breach, Level, StopCause
+
+FT, JOINTS = "ft/wrench", "joint_states"
+
+
+@dataclass(frozen=True)
+class JudgeTuning:
+    """Limits of the comparison. `research/senses.py` has the largest values of undisturbed examinations."""
+
+    disagreement_n: float = 3.0
+    disagreements: int = 5
+    """Measurements in a row beyond it: wrong joints turn the weight of the tool at once, and are recognised in this time."""
+    remainder_sd: float = 10.0
+    """External torque that no force at the tool explains."""
+    blamed_sd: float = 3.5
+    """Above it a disagreement is blamed on the joints, below it on the F/T sensor."""
+    offset_nm: float = 6.0
+    drift_n: float = 4.0
+    gain: float = 0.3
+    """Largest relative error of the gain of the F/T sensor."""
+    excitation_n2: float = 5.0
+    """Least information on the gain for the self-test."""
+    noise_n: float = 1.5
+    tested_above_m: float = 0.015
+    """The self-test must be complete before the tool is this low above the perceived surface."""
+    never_ns: int = 2**62
+    """A soft stop of a wrong F/T sensor does not escalate: the retreat does not use it, and the joints still limit the force."""
+
+
+TUNING = JudgeTuning()
+
+
+class SensorJudge:
+    """Finds the sensor that is wrong."""
+
+    def __init__(self) -> None:
+        self._tested = False
+        self._disagreed = 0
+
+    def judge(self, comparison: Comparison, depth: float | None) -> list[Breach]:
+        """Return the breaches; `depth` [m] is that of the tool below the perceived surface, None while there is none."""
+        c = comparison
+        self._disagreed = self._disagreed + 1 if c.disagreement > TUNING.disagreement_n else 0
+        limit_sd = TUNING.remainder_sd if self._disagreed < TUNING.disagreements else TUNING.blamed_sd
+        if c.remainder > limit_sd:
+            return _joints(f"torques that no force at the tool explains, {c.remainder:.1f} standard deviations")
+        if c.offset_nm > TUNING.offset_nm:
+            return _joints(f"torque {c.offset_nm:.1f} N m off in free air, limit {TUNING.offset_nm:g} N m")
+        return self._judge_ft(c, depth)
+
+    def _judge_ft(self, c: Comparison, depth: float | None) -> list[Breach]:
+        if self._disagreed >= TUNING.disagreements:
+            return _ft(f"{c.disagreement:.1f} N from the force by the joints, limit {TUNING.disagreement_n:g} N")
+        if c.noise > TUNING.noise_n:
+            return _ft(f"noise of {c.noise:.1f} N, limit {TUNING.noise_n:g} N")
+        if c.drift > TUNING.drift_n:
+            return _ft(f"bias changed by {c.drift:.1f} N in free air, limit {TUNING.drift_n:g} N")
+        return self._test(c, depth)
+
+    def _test(self, c: Comparison, depth: float | None) -> list[Breach]:
+        """Weigh the tool: it is known, and its weight and inertia change in sensor axes on the way to the first target."""
+        if c.excitation >= TUNING.excitation_n2:
+            self._tested = True
+            if abs(c.gain - 1) > TUNING.gain:
+                return _ft(f"gain {c.gain:.2f} by the weight of the tool, allowed 1 +- {TUNING.gain:g}")
+        elif not self._tested and depth is not None and depth > -TUNING.tested_above_m:
+            return _ft("self-test incomplete before the first touch: the tool was not moved enough to weigh it")
+        return []
+
+
+def _ft(reason: str) -> list[Breach]:
+    """Planning retreats: it needs no force for that."""
+    return [Breach(Level.SOFT_STOP, StopCause.SENSOR, f"F/T sensor: {reason}", TUNING.never_ns, culprit=FT)]
+
+
+def _joints(reason: str) -> list[Breach]:
+    """The driver holds: a retreat would rely on the joints."""
+    return [Breach(Level.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=JOINTS)]

@@ -1,0 +1,198 @@
+"""Two senses of the force at the tool, F/T sensor and joint torques, and how they compare.
+
+Both are tared in free air. The F/T sensor S reads in its axes
+
+    w = G R_SW (F + m (g - a)) + b
+
+with the contact force F, the weight and inertia of the tool of mass m, and a bias b. The joints' residual is
+
+    r_i = (J^T F)_i + o_i + c_i v_i / (|v_i| + v_0)
+
+with an offset o_i (zero of the sensor, masses of the links: it changes with the posture) and friction c_i, both learned in free
+air by gradient descent. Weighted least squares gives the force that the joints feel,
+
+    F = (J W J^T + 1 / F_max^2)^-1 J W (r - o - c v / (|v| + v_0)),    W = diag(1 / sd^2)
+
+In a direction that no joint feels (a singular posture) the prior F_max decides: zero instead of amplified noise. The gain G is
+the regression of the reading on the known weight and inertia while the tool moves freely.
+"""
+
+from __future__ import annotations
+
+from math import exp
+from typing import Final, NamedTuple
+
+import numpy as np
+
+from palpate_models.numerics.compiled import compiled
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.observer import GAIN_PER_S
+
+
+class SensesTuning(NamedTuple):
+    """Limits of free air, and time constants of the tare there. A tuple, since a compiled function reads it."""
+
+    fast_mps: float = 0.1
+    """A tool that is faster does not touch anything: strokes are at 0.03 m/s."""
+    free_ft_n: float = 1.0
+    """Largest tared force in free air by the F/T sensor."""
+    free_joints_n: float = 1.5
+    """The same by the joints."""
+    offset_rad: float = 0.3
+    """Travel of the joints, summed, over which their offsets are learned: gravity errors change with the posture."""
+    tare_s: float = 1.0
+    """Time over which F/T bias and joint offsets are learned at rest."""
+    start_s: float = 0.1
+    """The same before the arm first moves."""
+    friction_gain: float = 0.1
+    """Part of the joints' deviation that a sample adds to their friction."""
+    slow_radps: float = 0.003
+    """v_0: joint speed at which friction is half of its value."""
+    torque_sd_nm: float = 0.3
+    """Standard deviation of a joint's external torque."""
+    force_max_n: float = 100.0
+    """Prior of the force by the joints."""
+    lag_s: float = 1 / GAIN_PER_S
+    """Time constant of the observer; F/T reading and friction are made as late."""
+    smooth_s: float = 0.05
+    """Low-pass of the disagreement and of the joints' force."""
+    load_s: float = 0.1
+    """Low-pass of reading and load in the regression of the gain."""
+    noise_s: float = 0.2
+    """Averaging time of the noise."""
+
+
+TUNING: Final = SensesTuning()
+Arrays = tuple[Array, Array, Array]
+
+
+class Measurement(NamedTuple):
+    """Means of a status period."""
+
+    q: Array
+    """Joint positions [rad], shape (n,)."""
+    qd: Array
+    """Joint velocities [rad/s], shape (n,)."""
+    wrench_S: Array
+    """Reading of the F/T sensor, in its axes, force [N] then moment [N m], shape (6,)."""
+    torque: Array
+    """Measured joint torques, gravity included [N m], shape (n,)."""
+
+
+class Comparison(NamedTuple):
+    """Senses after a measurement, forces in N. All but gain and excitation are small if both senses are true."""
+
+    joint_force: float
+    """Magnitude of the tared force by the joints."""
+    disagreement: float
+    """Magnitude of the difference of the tared forces."""
+    remainder: float
+    """Largest external torque of a joint that no force at the tool explains, in standard deviations."""
+    offset_nm: float
+    """Largest offset of a joint."""
+    drift: float
+    """Change of the F/T bias since the arm first moved."""
+    gain: float
+    """Reading of the F/T sensor over the known weight and inertia of the tool."""
+    excitation: float
+    """Information in the gain: sum of the squared changes of the load [N^2]."""
+    noise: float
+    """Root mean square change of the F/T reading from one sample to the next."""
+
+
+class ForceSenses:
+    """Compares the senses at every measurement."""
+
+    def __init__(self, joints: int) -> None:
+        self._joints = np.zeros((4, joints))
+        """Rows: offset, friction, the late sign of the speed, and its mean."""
+        self._tool = np.zeros((10, 3))
+        """Rows of `_compare`."""
+        self._sums = np.zeros(3)
+        self._started = False
+
+    def compare(
+        self, measured: Measurement, residual: Array, J_W: Array, load_S: Array, R_WS: Array, speed: float, dt_s: float, *,
+        starting: bool,
+    ) -> Comparison:  # fmt: skip
+        """Return the comparison.
+
+        Args:
+            measured: by the robot.
+            residual: external joint torques [N m], shape (n,).
+            J_W: Jacobian of the indenter's centre, shape (3, n).
+            load_S: weight and inertia of the tool in sensor axes [N], shape (3,).
+            R_WS: orientation of the sensor, shape (3, 3).
+            speed: of the indenter's centre [m/s].
+            dt_s: time since the last measurement [s].
+            starting: True while the arm has not moved and nothing touches it.
+        """
+        reading_S = measured.wrench_S[:3]
+        if not self._started:
+            self._started = True
+            unloaded_S = reading_S - load_S
+            self._joints[0] = residual
+            self._tool[:3], self._tool[5:] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
+        state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W)
+        return Comparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, starting, TUNING))
+
+
+@compiled
+def _share(dt_s: float, time_s: float) -> float:
+    """Return the weight of a new sample in a running mean over `time_s`."""
+    return dt_s / (time_s + dt_s)
+
+
+@compiled
+def _norm(x: Array) -> float:
+    return float(np.sqrt((x * x).sum()))
+
+
+@compiled
+def _compare(
+    state: Arrays, motion: Arrays, ft: Arrays, speed: float, dt_s: float, starting: bool, tuning: SensesTuning
+) -> tuple[float, float, float, float, float, float, float, float]:
+    """Return the first fields of `Comparison`, and update `state`: the rows of `joints` and `tool`, and `sums`.
+
+    `tool`: F/T bias, first bias and late F/T force (S), difference and force by the joints (W), smooth reading, smooth load and
+    their means in free air, last reading (S). `sums`: reading times load, load squared, squared change of the reading [N^2].
+    """
+    (joints, tool, sums), (qd, residual, J_W), (reading_S, load_S, R_WS) = state, motion, ft
+    offset, friction, sign, mean_sign = joints[0], joints[1], joints[2], joints[3]
+    bias_S, first_S, late_S, difference_W, joints_W = tool[0], tool[1], tool[2], tool[3], tool[4]
+    lag, smooth = _share(dt_s, tuning.lag_s), _share(dt_s, tuning.smooth_s)
+    late_S += lag * (reading_S - load_S - late_S)
+    sign += lag * (qd / (np.abs(qd) + tuning.slow_radps) - sign)
+    ft_S = late_S - bias_S
+
+    deviation = residual - offset - friction * sign
+    J = J_W / tuning.torque_sd_nm
+    torque = deviation / tuning.torque_sd_nm
+    force_W = np.linalg.solve(J @ J.T + np.eye(3) / tuning.force_max_n**2, J @ torque)
+    remainder = np.abs(torque - force_W @ J).max()
+
+    at_rest = _norm(ft_S) < tuning.free_ft_n and _norm(force_W) < tuning.free_joints_n
+    if starting or at_rest or speed > tuning.fast_mps:
+        slow = _share(dt_s, tuning.start_s if starting else tuning.tare_s)
+        bias_S += slow * ft_S
+        travel = np.abs(qd).sum() * dt_s / tuning.offset_rad
+        settled = 1 - (1 - slow) * exp(-travel)
+        offset += settled * deviation
+        mean_sign += settled * (sign - mean_sign)
+        friction += tuning.friction_gain * (sign - mean_sign) * deviation
+        tool[5] += _share(dt_s, tuning.load_s) * (reading_S - tool[5])
+        tool[6] += _share(dt_s, tuning.load_s) * (load_S - tool[6])
+        tool[7] += slow * (tool[5] - tool[7])
+        tool[8] += slow * (tool[6] - tool[8])
+        load = tool[6] - tool[8]
+        sums[0] += (load * (tool[5] - tool[7])).sum()
+        sums[1] += (load * load).sum()
+    sums[2] += _share(dt_s, tuning.noise_s) * (((reading_S - tool[9]) ** 2).sum() - sums[2])
+    tool[9] = reading_S
+    if starting:
+        first_S[:] = bias_S
+    difference_W += smooth * (R_WS @ ft_S - force_W - difference_W)
+    joints_W += smooth * (force_W - joints_W)
+    gain = sums[0] / sums[1] if sums[1] > 0.0 else 1.0
+    drift = _norm(bias_S - first_S)
+    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], np.sqrt(sums[2])

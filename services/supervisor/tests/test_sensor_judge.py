@@ -1,0 +1,117 @@
+"""The judge of F/T sensor and joints, on an arm that moves freely and then presses: nominal dynamics, noise, friction, bias."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import cache
+
+import numpy as np
+import pinocchio as pin
+import pytest
+
+from palpate_models.numerics.frames import GRAVITY
+from palpate_models.robot import lbr
+from palpate_models.robot.arm import urdf
+from palpate_models.scenario.load import exam_input, load_scenario
+from palpate_supervisor.judge import FT, JOINTS, SensorJudge
+from palpate_supervisor.senses import Comparison, Measurement
+from palpate_supervisor.tool import ToolSense
+
+ROBOT = exam_input(load_scenario("clean")).robot
+DT, LIE_S, PRESS_S, END_S = 0.01, 8.0, 7.0, 12.0
+UP = np.array((0.0, 0.0, 1.0, 0.0, 0.0, 0.0))
+Lie = Callable[[float, Measurement], Measurement]
+
+
+@cache
+def measurements() -> tuple[Measurement, ...]:
+    """At rest for a second, then six of free motion, then a press of up to 8 N; the joints have friction of 0.2 N m."""
+    model = pin.buildModelFromXML(urdf(ROBOT, geometry=False))
+    data, sensor, rng = model.createData(), model.getFrameId("ft_sensor"), np.random.default_rng(1)
+    t = np.arange(0.0, END_S, DT)
+    angle = np.where((t > 1.0) & (t < PRESS_S), 1 - np.cos(2 * np.pi * (t - 1.0) / 3.0), 0.0)
+    q = np.array(lbr.HOME) + 0.25 * np.outer(angle, (0.6, 1.0, -0.5, 0.8, 0.7, 1.0, 0.3))
+    qd = np.gradient(q, DT, axis=0)
+    qdd = np.gradient(qd, DT, axis=0)
+    found = []
+    for i in range(len(t)):
+        force_W = np.array((0.0, 0.0, 4.0 * (1 - np.cos(np.pi * (t[i] - PRESS_S))) if t[i] > PRESS_S else 0.0))
+        J = pin.computeFrameJacobian(model, data, q[i], model.getFrameId("indenter"), pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)[:3]
+        pin.forwardKinematics(model, data, q[i], qd[i], qdd[i])
+        R_WS = pin.updateFramePlacement(model, data, sensor).rotation
+        a_W = pin.getFrameClassicalAcceleration(model, data, sensor, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED).linear
+        friction = 0.2 * np.sign(qd[i]) * (np.abs(qd[i]) > 1e-6)
+        torque = pin.rnea(model, data, q[i], qd[i], qdd[i]) - J.T @ force_W + friction + rng.normal(0.0, 0.03, 7)
+        load_W = force_W - ROBOT.tool_mass_kg * (a_W + GRAVITY * UP[:3])
+        wrench = np.concatenate((R_WS.T @ load_W + (1.0, -0.5, 0.7) + rng.normal(0.0, 0.03, 3), np.zeros(3)))
+        found.append(Measurement(q[i], qd[i], wrench, torque))
+    return tuple(found)
+
+
+def first_breach(lie: Lie = lambda t, true: true) -> tuple[float, str, Comparison] | None:
+    """Return time [s], culprit and comparison of the first breach."""
+    sense, judge = ToolSense(ROBOT), SensorJudge()
+    for i, true in enumerate(measurements()):
+        sense.sense(lie(i * DT, true), DT)
+        depth = -0.2 if i * DT < PRESS_S else 0.0
+        for breach in judge.judge(sense.comparison, depth):
+            return i * DT, breach.culprit, sense.comparison
+    return None
+
+
+def wrong_ft(change: Callable[[float, np.ndarray], np.ndarray], since_s: float = LIE_S) -> Lie:
+    return lambda t, true: true._replace(wrench_S=change(t, true.wrench_S)) if t >= since_s else true
+
+
+def test_true_senses_agree() -> None:
+    assert first_breach() is None
+
+
+RNG = np.random.default_rng(3)
+
+
+@pytest.mark.parametrize(
+    ("lie", "within_s"),
+    [
+        (wrong_ft(lambda t, w: 0.0 * w), 0.3),
+        (wrong_ft(lambda t, w: -w), 0.3),
+        (wrong_ft(lambda t, w: w + 5.0 * UP), 0.3),
+        (wrong_ft(lambda t, w: 0.1 * w), 0.3),
+        (wrong_ft(lambda t, w: 2.0 * w), 0.3),
+        (wrong_ft(lambda t, w: w + RNG.normal(0.0, 2.0, 6)), 0.3),
+        (wrong_ft(lambda t, w: w + (t - LIE_S) * UP), 4.0),
+        (wrong_ft(lambda t, w: 0.1 * w, 0.0), PRESS_S - LIE_S),
+        (wrong_ft(lambda t, w: -w, 0.0), PRESS_S - LIE_S),
+        (wrong_ft(lambda t, w: 1e-2 * RNG.standard_normal(6), 0.0), PRESS_S - LIE_S),
+    ],
+)
+def test_a_wrong_force_sensor_is_named(lie: Lie, within_s: float) -> None:
+    found = first_breach(lie)
+    assert found is not None
+    t, culprit, _ = found
+    assert culprit == FT
+    assert t - LIE_S <= within_s
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        lambda m: m._replace(torque=-m.torque),
+        lambda m: m._replace(torque=0.0 * m.torque),
+        lambda m: m._replace(torque=1.3 * m.torque),
+        lambda m: m._replace(q=m.q + 0.1),
+        lambda m: m._replace(q=m.q[::-1].copy(), qd=m.qd[::-1].copy()),
+    ],
+)
+def test_wrong_joints_are_named(change: Callable[[Measurement], Measurement]) -> None:
+    found = first_breach(lambda t, true: change(true) if t >= LIE_S else true)
+    assert found is not None
+    assert found[1] == JOINTS
+    assert found[0] - LIE_S <= 0.3
+
+
+def test_a_tool_that_was_not_weighed_touches_nothing() -> None:
+    judge, silent = SensorJudge(), Comparison(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1)
+    assert not judge.judge(silent, -0.1)
+    (breach,) = judge.judge(silent, -0.01)
+    assert breach.culprit == FT
