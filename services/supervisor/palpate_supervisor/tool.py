@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -92,7 +93,7 @@ class ToolSense:
 
 
 def _norm(x: Array) -> float:
-    return float(x @ x) ** 0.5
+    return sqrt(float(x @ x))
 
 
 class RestSurface:

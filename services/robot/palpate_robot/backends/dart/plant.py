@@ -220,7 +220,7 @@ class DartPlant:
         else:
             self._world.step()  # clears torques and external forces, too
         self.q, self.v = self._arm.getPositions(), self._arm.getVelocities()
-        self.friction = slopes * self.v
+        self.friction = np.array(slopes) * self.v
         self._cached_state = None
 
     def _is_clear(self) -> bool:
