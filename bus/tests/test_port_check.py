@@ -155,7 +155,7 @@ def test_a_message_is_held_against_the_contract_once() -> None:
 def status(t: int, force: float, stamp: int | None = None) -> Any:
     q = np.full(7, 1e-9 * t)
     wrench = Wrench(Vector3(force, 0.0, 0.0), Vector3(1e-9 * t, 0.0, 0.0))
-    return RobotStatus(header(t if stamp is None else stamp), 1, 0, "", q, q, wrench, q, 0, "")
+    return RobotStatus(header(t if stamp is None else stamp), 1, 0, "", q, q, wrench, q, 0, "", q)
 
 
 def test_a_frozen_value_is_refused_until_it_changes() -> None:
