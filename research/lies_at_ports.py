@@ -1,4 +1,4 @@
-"""How soon ports refuse lies, without an examination per lie: recorded messages of a healthy run, changed by the liar.
+"""Time until ports refuse each lie, without an examination per lie: recorded messages of a healthy run, changed by the liar.
 
     palpate run clean --composed --record full --out out/healthy
     python -m research.lies_at_ports out/healthy
