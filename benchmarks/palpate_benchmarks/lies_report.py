@@ -83,6 +83,7 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
     good = sum(f.good for f in findings)
     wallclock = sum(f.mode == "wall clock" for f in findings)
     lines = [f"{good} of {len(findings)} cases passed, {wallclock} of them in wall-clock mode.", "", *lines, ""]
+    lines += [f"- **!** {f.where}: {f.ended}" for f in findings if not f.good]
     lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]
     out = {topic.name: left_out(topic) for topic in contract().topics.values() if left_out(topic)} | LEFT_OUT
     reasons = {why: [name for name in out if out[name] == why] for why in out.values()}
