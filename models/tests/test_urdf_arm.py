@@ -122,6 +122,13 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, 
         read_arm(write(tmp_path, **changes))  # type: ignore[arg-type]
 
 
+def test_a_home_posture_is_found(tmp_path: Path) -> None:
+    arm, faults = read_arm(write(tmp_path, home_rad=None))  # type: ignore[arg-type]
+    assert arm is not None, faults
+    assert arm.posture(arm.home_rad)[1] == pytest.approx([0.0, 0.0, -1.0], abs=0.05)
+    assert ((arm.lower_rad < arm.home_rad) & (arm.home_rad < arm.upper_rad)).all()
+
+
 def test_a_capsule_encloses_its_points() -> None:
     rng = np.random.default_rng(1)
     for scale in rng.uniform(0.02, 0.5, (20, 3)):

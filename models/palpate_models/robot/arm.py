@@ -65,8 +65,7 @@ def mounted(robot: Robot) -> int:
     The first joint turns about the vertical, so the second keeps its height.
     """
     arm = arm_of(robot)
-    p = arm.placed(np.zeros(arm.joints))[1]
-    height = float(p[2] if arm.R_BL is None else (arm.R_BL @ p)[2])
+    height = float(arm.posture(np.zeros(arm.joints))[0][1, 2])
     thickness = max((capsule.radius for capsule in arm.capsules[2]), default=0.0)
     return 2 if height - thickness > MOUNT_CLEARANCE_M else 3
 

@@ -95,13 +95,14 @@ class Arm:
         """Half of each joint's range, shape (n,)."""
         return (self.upper_rad - self.lower_rad) / 2
 
-    def placed(self, q: Array) -> Array:
-        """Return origins of joints and flange at `q` [rad] in the axes of the base link [m], shape (n + 1, 3)."""
+    def posture(self, q: Array) -> tuple[Array, Array]:
+        """Return origins of joints and flange [m], shape (n + 1, 3), and the flange's z axis at `q` [rad] in axes of the base."""
         R, p, found = np.eye(3), np.zeros(3), []
         for origin, turn in zip(self.origin_m, Rotation.from_rotvec(q[:, None] * self.axis).as_matrix(), strict=True):
             p, R = p + R @ origin, R @ turn
             found.append(p)
-        return np.array([*found, p + R @ self.flange_m])
+        R_BL = np.eye(3) if self.R_BL is None else self.R_BL
+        return np.array([*found, p + R @ self.flange_m]) @ R_BL.T, R_BL @ R[:, 2]
 
     @cached_property
     def elbow(self) -> tuple[int, float]:
@@ -111,7 +112,7 @@ class Arm:
             angles = np.linspace(self.lower_rad[joint], self.upper_rad[joint], 721)
             q = np.tile(self.home_rad, (len(angles), 1))
             q[:, joint] = angles
-            reach = np.array([np.linalg.norm(p[-3] - p[1]) for p in map(self.placed, q)])
+            reach = np.array([np.linalg.norm(p[-3] - p[1]) for p, _ in map(self.posture, q)])
             if np.ptp(reach) > best[0] + 1e-9:
                 best = (float(np.ptp(reach)), joint, round(float(angles[reach.argmax()]), 6))
         return best[1:]

@@ -6,13 +6,14 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import Final
 from xml.etree import ElementTree
 
 import numpy as np
+from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +39,18 @@ class ArmTuning:
     largest_link_m: float = 2.0
     """A larger mesh is in other units."""
     smallest_link_m: float = 0.005
+    home_starts: int = 24
+    """Postures from which a home posture is sought."""
+    home_forward: float = 0.4
+    """Place of the flange at home in front of the base, over the length of the arm."""
+    home_height: float = 0.35
+    """The same above the base."""
+    home_bend: float = 0.02
+    """Weight of the joints' angles at home."""
+    home_spread: float = 0.003
+    """Of postures whose cost is that much above the best, the one with the highest elbow is taken."""
+    home_upright: float = 0.999
+    """Least cosine between the flange's z axis and straight down at home."""
     inertia_tolerance: float = 1e-3
     """Relative excess of a principal moment over the sum of the others that counts as rounding."""
 
@@ -132,7 +145,7 @@ class _Reader:
             for k, (group, origin, links) in enumerate(zip(groups, origins, [[g[0][0]] for g in groups], strict=True))
         )
         capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
-        home = np.array(self._given.home_rad)
+        home = np.zeros(n) if self._given.home_rad is None else np.array(self._given.home_rad)
         if len(home) != n:
             self.faults.append(f"home_rad: {len(home)} values, want {n}")
         if self.faults:
@@ -141,7 +154,7 @@ class _Reader:
         axes = np.array([X[:3, :3] @ axis for X, axis in zip(frames[1:], given_axes, strict=True)])
         lower, upper, velocity, torque = limits
         given = self._given
-        outside = np.flatnonzero((home < lower) | (home > upper))
+        outside = np.flatnonzero((home < lower) | (home > upper)) if given.home_rad else ()
         for k in outside:
             joint = moving[k].get("name")
             self.faults.append(f"home_rad: {home[k]:.3f} of {joint} is outside {lower[k]:.3f} to {upper[k]:.3f} rad")
@@ -165,6 +178,12 @@ class _Reader:
             seeds_rad=given.seeds_rad,
             R_BL=R_BF,
         )
+        if given.home_rad is None and not self.faults:
+            found = ready_posture(arm)
+            if found is None:
+                self.faults.append("home_rad: no posture with the flange straight down was found; give one")
+            else:
+                arm = replace(arm, home_rad=found)
         return (None if self.faults else arm), self.faults
 
     def _flange_name(self, moving: list[ElementTree.Element]) -> str:
@@ -354,6 +373,27 @@ class _Reader:
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
             self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; give a scale in the URDF")
         return np.asarray(hull)
+
+
+def ready_posture(arm: Arm) -> Array | None:
+    """Return joint positions [rad], shape (n,), with the flange straight down above the base's front; None if none is found."""
+    rng = np.random.default_rng(0)
+    near, half = arm.middle_rad, np.minimum(arm.half_range_rad, np.pi)
+    starts = near + rng.uniform(-1, 1, (TUNING.home_starts, arm.joints)) * np.minimum(half, 1.6)
+    reach = float(np.linalg.norm(np.diff(arm.posture(near)[0], axis=0), axis=1).sum())
+    aim = reach * np.array((TUNING.home_forward, 0.0, TUNING.home_height))
+
+    def gap(q: Array) -> Array:
+        p, z = arm.posture(q)
+        return np.concatenate(((p[-1] - aim) / reach, z - (0.0, 0.0, -1.0), TUNING.home_bend * (q - near) / np.pi))
+
+    margin = 0.1 * half
+    bounds = (np.maximum(arm.lower_rad, near - np.pi) + margin, np.minimum(arm.upper_rad, near + np.pi) - margin)
+    found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds) for start in starts]
+    least = min(float(one.cost) for one in found)
+    good = [one.x for one in found if one.cost < least + TUNING.home_spread and arm.posture(one.x)[1][2] < -TUNING.home_upright]
+    highest = max(good, key=lambda q: float(arm.posture(q)[0][arm.elbow[0], 2]), default=None)
+    return None if highest is None else np.round(highest, 3)
 
 
 def enclosing_capsule(points: Array) -> Capsule:

@@ -26,8 +26,8 @@ class ArmFile(Section):
     """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
     flange: str
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
-    home_rad: Joints
-    """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view."""
+    home_rad: Joints | None = None
+    """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view. Sought if missing."""
     base_xy_m: Vec2 = (0.0, 0.0)
     """Position of the base in world; `palpate arm place` finds it."""
     base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9

@@ -230,7 +230,7 @@ def _turned(model: Arm, azimuth: float) -> list[Array]:
     seeds = []
     for q in np.array(model.seeds_rad or (model.home_rad,)):
         q[0] = 0.0
-        x, y, _ = model.placed(q)[-1] if model.R_BL is None else model.R_BL @ model.placed(q)[-1]
+        x, y, _ = model.posture(q)[0][-1]
         q[0] = azimuth - np.arctan2(y, x)
         seeds.append(q)
     return seeds
