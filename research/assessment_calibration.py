@@ -40,6 +40,7 @@ from palpate_assessment.detection import FEATURES, FELT, SURE, Candidate
 from palpate_assessment.findings import causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
+from palpate_assessment.standard import USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -91,10 +92,10 @@ def weigh(seed: int) -> WeighedPatient:
     gathered = examined(patient)
     known = truth_of_run(patient, gathered).felt
     gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
-    service, calibration = AssessmentService(exam_input(patient)), learned()
+    service = AssessmentService(exam_input(patient))
     assess(service, gathered)
-    observations = observe(service.samples, calibration)
-    judged = None if observations is None else weigh_all(observations, calibration)
+    observations = observe(service.samples, USUAL)
+    judged = None if observations is None else weigh_all(observations)
     assert known is not None
     assert judged is not None
     candidates = [candidate for candidate in judged[1] if candidate.beyond > -SURE]

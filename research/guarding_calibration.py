@@ -33,6 +33,7 @@ from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import Candidate
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
+from palpate_assessment.standard import USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -78,8 +79,8 @@ def weigh(case: Case) -> list[Weighed]:
     service = AssessmentService(exam_input(scenario))
     assess(service, gathered)
     calibration = learned()
-    observations = observe(service.samples, calibration)
-    judged = None if observations is None else weigh_all(observations, calibration)
+    observations = observe(service.samples, USUAL)
+    judged = None if observations is None else weigh_all(observations)
     assert known is not None
     assert judged is not None
     _, candidates, _ = judged

@@ -27,8 +27,10 @@ from palpate.quick.errors import loop_errors
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import detect
-from palpate_assessment.model import Bump, errors, fixed
+from palpate_assessment.model import errors, fixed
 from palpate_assessment.observations import Observations, observe
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.scenario.load import load_scenario
@@ -69,7 +71,7 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
 def ideal(o: Observations, length: float) -> float:
     """Return the ideal observer's greatest |t| of a scan."""
     apart, lever = cdist(o.xy, o.xy, "sqeuclidean"), np.outer(o.per_metre, o.per_metre)
-    S = fixed(replace(o, depth_uncertainty=np.zeros(len(o.y))), learned())
+    S = fixed(replace(o, depth_uncertainty=np.zeros(len(o.y))))
     S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
     S += ERRORS.field_m**2 * lever * np.exp(-0.5 * apart / FIELD_LENGTH_M**2)
     for sd, part in zip(
@@ -86,7 +88,7 @@ def ideal(o: Observations, length: float) -> float:
 def ours(o: Observations) -> float:
     """Return the assessment's greatest logit of a scan; -20 where it weighs nothing."""
     calibration = learned()
-    _, candidates = detect(o, calibration)
+    _, candidates = detect(o)
     return float(calibration.logit(np.array([c.features for c in candidates])).max()) if candidates else -20.0
 
 
@@ -123,7 +125,7 @@ def main() -> None:
         scores, contrasts = [], []
         for seed in range(args.first_seed, args.first_seed + args.patients):
             made, contrast = patient(length, seed)
-            observations = observe(felt_samples(made, ERRORS, seed), learned())
+            observations = observe(felt_samples(made, ERRORS, seed), USUAL)
             assert observations is not None
             scores.append((ideal(observations, length), ours(observations)))
             contrasts.append(contrast)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from itertools import chain
-from math import sqrt
 from pathlib import Path
 from typing import Any, Final
 
@@ -50,11 +49,12 @@ def collected(recording: Recording) -> Collected:
     if not samples:
         return gathered
     centre, size, spacing = region(samples)
-    reach = max(0.8 * spacing, sqrt(recording.indenter_radius_m * recording.depth_m))
-    grid = map_grid(recording.surface, centre, size, reach, reach / 3)
-    found = assess(samples, grid, reach, _FALSE_FINDINGS)
+    standard = recording.standard
+    reach = max(0.8 * spacing, 0.4 * standard.footprint_m)
+    grid = map_grid(recording.surface, centre, size, standard.lengths.pitch_m, standard.lengths.node_m)
+    found = assess(samples, grid, reach, _FALSE_FINDINGS, standard)
     if found is not None:
-        gathered.stiffness_map = map_message(0, found, recording.depth_m)
+        gathered.stiffness_map = map_message(0, found, recording.depth_m, standard)
         gathered.findings = findings_message(0, found.findings, found.candidates)
         if not recording.abdomen:
             for one in chain(gathered.findings.findings, gathered.findings.candidates):

@@ -12,7 +12,9 @@ import numpy as np
 
 from palpate.recording.cutting import windows
 from palpate.recording.faults import Fault
+from palpate.recording.loading import Loading, loading
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.standard import USUAL, PressStandard
 from palpate_models.numerics.frames import Array
 
 PROBES_APART_S: Final = 10.0
@@ -105,13 +107,36 @@ class Recording:
         if not self.touches:
             return []
         nominal = self.depth_m if depth_m is None else depth_m
-        samples: list[ForceSample] = []
+        presses = self._presses
+        ends = [min(nominal, float(touch.depth.max())) for touch in presses.values()]
+        loads = self._loading(tuple(ends))
+        samples = [
+            _pressed(touch, number, *load)
+            for (number, touch), load in zip(presses.items(), zip(loads.force, loads.noise, ends, strict=True), strict=True)
+        ]
         for number, touch in enumerate(self.touches, start=1):
             if touch.kind is ContactKind.SLIDE:
                 samples += _slid(touch, number, 0.4 * sqrt(self.indenter_radius_m * nominal))
-            elif touch.depth.max() > 0:
-                samples.append(_pressed(touch, number, nominal))
-        return samples
+        return sorted(samples, key=lambda sample: sample.stroke)
+
+    @property
+    def standard(self) -> PressStandard:
+        """The press that the map is of: the abdomen's, or of another body the recorded ones at their nominal depth."""
+        if self.abdomen:
+            return USUAL
+        loads = self._loading(tuple(min(self.depth_m, float(touch.depth.max())) for touch in self._presses.values()))
+        exponent, spread = (loads.exponent, loads.exponent_sd) if self._presses else (self.exponent, 0.0)
+        return PressStandard.of(self.samples(), self.indenter_radius_m, exponent, spread)
+
+    @property
+    def _presses(self) -> dict[int, Contact]:
+        """Presses and probes that reached any depth, by number."""
+        touches = enumerate(self.touches, start=1)
+        return {number: touch for number, touch in touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0}
+
+    def _loading(self, ends: tuple[float, ...]) -> Loading:
+        touches = list(self._presses.values())
+        return loading([t.depth for t in touches], [t.force for t in touches], ends, [t.force_noise for t in touches])
 
 
 def force_at(touch: Contact, nominal: float) -> tuple[float, float, float, int]:
@@ -126,9 +151,9 @@ def force_at(touch: Contact, nominal: float) -> tuple[float, float, float, int]:
     return float(weights @ touch.force[near]), touch.force_noise * float(np.linalg.norm(weights)), depth, int(near[-1])
 
 
-def _pressed(touch: Contact, number: int, nominal: float) -> ForceSample:
+def _pressed(touch: Contact, number: int, force: float, noise: float, depth: float) -> ForceSample:
     """Return the sample of a press or probe."""
-    force, noise, depth, last = force_at(touch, nominal)
+    last = int(np.flatnonzero(touch.depth >= 0.95 * depth)[0])
     time = PROBES_APART_S * number if touch.time is None else float(touch.time[last])
     return ForceSample(
         time=time,
@@ -136,8 +161,8 @@ def _pressed(touch: Contact, number: int, nominal: float) -> ForceSample:
         normal=touch.normal[last],
         velocity=np.zeros(3),
         depth=depth,
-        force=force,
-        force_noise=noise,
+        force=float(force),
+        force_noise=float(noise),
         time_in_contact=0.0 if touch.time is None else time - float(touch.time[0]),
         force_limited=False,
         stroke=number,

@@ -17,14 +17,15 @@ from scipy.optimize import minimize
 from palpate.search.hand import SurrogateHand
 from palpate.search.trial import case, search
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import LENGTHS_M, SURFACE_M, TARE_N, WHITE_SD, natural
+from palpate_assessment.model import natural
+from palpate_assessment.standard import LENGTHS, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.choice import policy
 from palpate_search.posterior import Posterior
 
 NAMES: Final = (
-    *(f"natural variation over {1e3 * length:.0f} mm" for length in LENGTHS_M),
+    *(f"natural variation over {1e3 * length:.0f} mm" for length in LENGTHS.fields_m),
     "strips",
     "bone",
     "depth, shared by neighbours",
@@ -43,9 +44,9 @@ def felt(seed: int, presses: int) -> tuple[Array, Array, Array]:
     xy = np.array([one.xy for one in made])
     depth, force, unsure = np.array([(one.depth, max(one.force, 0.1), one.depth_uncertainty) for one in made]).T
     error = exponent / depth * unsure
-    near = np.exp(-0.5 * ((xy[:, None] - xy) ** 2).sum(axis=2) / SURFACE_M**2)
-    parts = [*natural(xy, xy), np.outer(error, error) * near, np.diag(error**2), np.ones((len(xy), len(xy)))]
-    noise = np.diag((made[0].noise_n ** 2 + TARE_N**2) / force**2 + WHITE_SD**2)
+    near = np.exp(-0.5 * ((xy[:, None] - xy) ** 2).sum(axis=2) / USUAL.errors.surface_m**2)
+    parts = [*natural(xy, xy, USUAL), np.outer(error, error) * near, np.diag(error**2), np.ones((len(xy), len(xy)))]
+    noise = np.diag((made[0].noise_n ** 2 + USUAL.tare_n**2) / force**2 + USUAL.errors.white_sd**2)
     return np.log(force) - exponent * np.log(depth / press.DEPTH_M), np.array(parts), noise
 
 

@@ -9,15 +9,16 @@ from enum import IntEnum
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.special import logit
 
-from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted
 from palpate_assessment.detection import Candidate, detect
 from palpate_assessment.findings import Z90, Area, areas
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
-from palpate_assessment.observations import FEWEST, Observations, observe
+from palpate_assessment.observations import USABLE, Observations, observe
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.standard import USUAL, PressStandard
 from palpate_models.numerics.frames import Array
 
 _MOST_CONTRADICTED = 0.3
@@ -53,14 +54,16 @@ class AssessedMap:
     samples: int
 
 
-def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_findings: float) -> AssessedMap | None:
+def assess(
+    samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_findings: float, standard: PressStandard = USUAL
+) -> AssessedMap | None:
     """Map and findings of a scan; None while there are too few samples.
 
-    `reach`: distance within which a sample speaks for a node [m]. `false_findings`: how many a healthy examination may have.
+    `reach`: distance within which a sample speaks for a node [m]. `false_findings`: how many a healthy examination may have;
+    without an anatomy, how probable it may be that a finding is none.
     """
-    calibration = learned()
-    o = observe(samples, calibration)
-    judged = None if o is None else weigh_all(o, calibration)
+    o = observe(samples, standard)
+    judged = None if o is None else weigh_all(o)
     if o is None or judged is None:
         return None
     regression, candidates, reasons = judged
@@ -68,53 +71,57 @@ def assess(samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_fi
     unassessed = reasons[nearest]
     unassessed[apart > reach] = UnassessedReason.NOT_REACHED
     weighed = areas(regression, candidates, grid, unassessed == UnassessedReason.ASSESSED)
-    threshold = calibration.threshold(false_findings)
+    threshold = standard.calibration.threshold(false_findings) if standard.anatomy else float(logit(1.0 - false_findings))
     findings = [area for area in weighed if area.logit >= threshold]
     return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])
 
 
-def weigh_all(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate], NDArray[np.int_]] | None:
+def weigh_all(o: Observations) -> tuple[Regression, list[Candidate], NDArray[np.int_]] | None:
     """Return the regression of consistent samples, the candidate lumps, and the `UnassessedReason` of each excluded sample.
 
     None with too few samples.
     """
     reasons = np.where(o.yielded, UnassessedReason.YIELDED, UnassessedReason.ASSESSED)
     telling = np.flatnonzero(~o.yielded)
-    if len(telling) < FEWEST:
+    if len(telling) < USABLE.fewest:
         return None
-    regression, candidates = detect(o.part(telling), calibration)
+    regression, candidates = detect(o.part(telling))
     wrong = contradicted(regression)
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
         reasons[telling[wrong]] = UnassessedReason.CONTRADICTED
-        regression, candidates = detect(o.part(telling[~wrong]), calibration)
+        regression, candidates = detect(o.part(telling[~wrong]))
     return regression, candidates, reasons
 
 
-def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
+def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float, standard: PressStandard = USUAL) -> AssessedMap | None:
     """Return the cheap variant for a growing map: with usual amplitudes, and without findings."""
-    calibration: Calibration = learned()
-    o = observe(samples, calibration)
+    o = observe(samples, standard)
     if o is None:
         return None
     apart, _ = cKDTree(o.xy).query(grid.nodes[:, :2])
     unassessed = np.where(apart <= reach, UnassessedReason.ASSESSED, UnassessedReason.NOT_REACHED).astype(np.uint8)
-    return _assessment(Regression(o, calibration, (), usual_amplitudes(o)), grid, unassessed, [], [])
+    return _assessment(Regression(o, (), usual_amplitudes(o)), grid, unassessed, [], [])
 
 
 def _assessment(
     regression: Regression, grid: MapGrid, unassessed: NDArray[np.uint8], findings: list[Area], candidates: list[Area]
 ) -> AssessedMap:
+    o = regression.observations
     mean, sd = regression.field(grid.nodes[:, :2])
     remarkable = np.any([area.nodes for area in findings], axis=0) if findings else np.zeros(len(mean), dtype=bool)
     rest = (unassessed == UnassessedReason.ASSESSED) & ~remarkable
+    usual = mean[rest if rest.any() else slice(None)]
+    if o.standard.anatomy is None:  # presses were felt themselves, and may be dense in one part of the region
+        away = ~remarkable[cKDTree(grid.nodes[:, :2]).query(o.xy)[1]]
+        usual = o.y[away if away.any() else slice(None)]
     return AssessedMap(
         grid=grid,
         apparent=np.exp(mean),
         lower=np.exp(mean - Z90 * sd),
         upper=np.exp(mean + Z90 * sd),
         unassessed=unassessed,
-        background=float(np.exp(np.median(mean[rest] if rest.any() else mean))),
+        background=float(np.exp(np.median(usual))),
         findings=findings,
         candidates=candidates,
-        samples=len(regression.observations.y),
+        samples=len(o.y),
     )

@@ -13,8 +13,6 @@ from scipy.stats import chi2
 from palpate_assessment.model import Regression, inverse
 from palpate_assessment.observations import Observations
 
-PIECE_M = 0.03
-"""Length of the pieces: what the indenter feels at one place."""
 SURPRISE = 1e-5
 """A piece whose residual is less probable than this contradicts the model: of an examination's hundred pieces, one in a thousand
 examinations where the model holds."""
@@ -34,10 +32,10 @@ def contradicted(regression: Regression) -> NDArray[np.bool_]:
 
 
 def pieces(o: Observations) -> list[NDArray[np.intp]]:
-    """Indices of the samples of each piece: strokes cut at every PIECE_M of travel."""
+    """Indices of the samples of each piece: strokes cut at every `piece_m` of travel."""
     step = np.hypot(*np.diff(o.xy, axis=0, prepend=o.xy[:1]).T)
     travel = np.cumsum(np.where(np.diff(o.stroke, prepend=o.stroke[0]) == 0, step, 0.0))
     start = np.array([travel[o.stroke == stroke].min() for stroke in o.stroke])
-    key = np.column_stack((o.stroke, np.floor((travel - start) / PIECE_M)))
+    key = np.column_stack((o.stroke, np.floor((travel - start) / o.standard.lengths.piece_m)))
     _, group = np.unique(key, axis=0, return_inverse=True)
     return [np.flatnonzero(group.ravel() == g) for g in range(int(group.max()) + 1)]

@@ -2,32 +2,78 @@
 
 A muscle is tensed over a hand's breadth, so that a candidate on it lies on a rise of the smooth fields. Voluntary guarding fades
 during a slow slide, so that the same place becomes softer during a stroke: with w(x) a muscle's shape around the candidate and t
-the time since contact, the strength of f = w(x) exp(-t / RELAXATION_S) with a prior of FADE_SD,
-f' S^-1 y / (f' S^-1 f + FADE_SD^-2).
+the time since contact, the strength of f = w(x) exp(-t / relaxation_s) with a prior of fade_sd,
+f' S^-1 y / (f' S^-1 f + fade_sd^-2).
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
 
 import numpy as np
 from scipy.optimize import Bounds, minimize
 from scipy.spatial import cKDTree
 
-from palpate_assessment.calibration import Calibration
-from palpate_assessment.model import EDGE_M, Bump, Regression, amplitudes, bone
-from palpate_assessment.observations import FEWEST, Observations
+from palpate_assessment.model import KINDS_OF_ERROR, PRIOR, Regression, amplitudes, inverse, usual_amplitudes
+from palpate_assessment.observations import USABLE, Observations
+from palpate_assessment.shapes import Bump, ridge
+from palpate_assessment.standard import ABDOMEN, LENGTHS
 from palpate_models.numerics.frames import Array
 
-MUSCLE_M, MUSCLE_EDGE_M = 0.06, 0.025
-"""Radius of a muscle that is tensed, and how soft its edge is [assumption]."""
-RELAXATION_S = 2.0
-"""Relaxation time of a muscle [s] [A]. A stroke takes five seconds."""
-FADE_SD = 0.3
-"""Prior of the logarithm that fades."""
-SOFTEST = 0.1
-"""Part of the samples that is taken for the relaxed wall."""
+
+@dataclass(frozen=True)
+class Muscle:
+    """A muscle that is tensed [assumption]."""
+
+    radius_m: float = 0.06
+    edge_m: float = 0.025
+    """SD of its edge."""
+    relaxation_s: float = 2.0
+    """Time constant of relaxation. A stroke takes five seconds."""
+    fade_sd: float = 0.3
+    """Prior of the logarithm that fades."""
+    softest: float = 0.1
+    """Part of the samples that is taken for the relaxed wall."""
+
+
+@dataclass(frozen=True)
+class Search:
+    """Search for lumps."""
+
+    tries: int = 120
+    """Evaluations for place, radius and edge of the strongest bump that was tried."""
+    widest: float = 1.3
+    """Largest radius over the largest one of the bumps that are tried first."""
+    most: int = 4
+    """Largest number of lumps."""
+    weakest_t: float = 3.0
+    """Least t with which a lump is weighed."""
+    too_near: float = 0.7
+    """Two lumps are at least this part of the sum of their radii apart."""
+    alike: float = 1.5
+    """Limit of t over t without the most influential stroke; two equal strokes: the root of 2."""
+    angles: int = 8
+    """Directions of the ridges that are tried."""
+    half_lengths: tuple[float, ...] = (0.75, 1.5)
+    """Half of their lengths, over the radius of the largest bump."""
+    narrowest: float = 0.5
+    """Least radius or half width where no anatomy is assumed, over that of the smallest bump."""
+    turns: tuple[float, ...] = (-0.8, -0.4, 0.0, 0.4, 0.8)
+    """Angles [rad] by which a ridge may turn from one piece to the next."""
+    gain: float = 1.6
+    """Gain of the log evidence from which a ridge becomes longer by a piece: the logarithm of the number of turns."""
+    usual: int = 2
+    """Index of the usual radius, which is the length of a piece."""
+    least_gain: float = 0.0
+    """Log Bayes factor, over all places, below which no more lumps are sought where no anatomy is assumed."""
+    crossed: float = 0.5
+    """A stroke crosses a lump whose shape is at least this part of the highest value of any sample: its centre may be outside."""
+
+
+MUSCLE, SEARCH = Muscle(), Search()
 
 
 @dataclass(frozen=True)
@@ -49,25 +95,12 @@ def signs(regression: Regression, lump: Bump) -> Signs:
     """Return the signs of a muscle around a lump of a regression."""
     o = regression.observations
     smooth = regression.smooth(np.vstack(((lump.x, lump.y), o.xy)))
-    fading = regression.whiten(Bump(lump.x, lump.y, MUSCLE_M, MUSCLE_EDGE_M)(o.xy) * np.exp(-o.touched_for / RELAXATION_S))
-    fade = regression.whitened @ fading / (fading @ fading + FADE_SD**-2)
-    return Signs(rise=float(smooth[0] - np.quantile(smooth[1:], SOFTEST)), fade=float(fade))
+    fading = regression.whiten(
+        Bump(lump.x, lump.y, MUSCLE.radius_m, MUSCLE.edge_m)(o.xy) * np.exp(-o.touched_for / MUSCLE.relaxation_s)
+    )
+    fade = regression.whitened @ fading / (fading @ fading + MUSCLE.fade_sd**-2)
+    return Signs(rise=float(smooth[0] - np.quantile(smooth[1:], MUSCLE.softest)), fade=float(fade))
 
-
-RADII_M = (0.008, 0.012, 0.018, 0.026, 0.036)
-PITCH_M = 0.01
-"""Radii and distance of the bumps that are tried, before place, radius and edge of the strongest are found by TRIES more."""
-TRIES = 120
-EDGES_M = (EDGE_M, 0.016)
-"""A lump is felt with the edge of the indenter's footprint, or with a wider one where tissue between spreads the pressure."""
-MOST = 4
-"""Largest number of lumps."""
-WEAKEST = 3.0
-"""Weakest t with which one is weighed."""
-_TOO_NEAR = 0.7
-"""Two lumps are at least this part of the sum of their radii apart."""
-_BORDER_M = 0.010
-"""Centres lie at most so far beyond the samples."""
 
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
@@ -75,9 +108,6 @@ FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", 
 """Features of a candidate's probability: strength, confidence that its contrast is FELT or more, size and its difference from
 the usual one, sign, and the share of its strength that may be bone."""
 SOFTER = FEATURES.index("softer")
-ALIKE, HALF = 1.5, 0.5
-"""Limit of t over t without the most influential stroke (two equal strokes: the root of 2); and the share of the highest bump
-value of any sample above which a stroke crosses a lump, whose centre may be outside the samples."""
 SURE = 4.0
 """Standard deviations below FELT from which a candidate is rejected: 0 of 35 such candidates of tuning patients were lumps."""
 
@@ -93,12 +123,14 @@ class Candidate:
     """E over its standard deviation, as far as more than one stroke says it (`agreed`)."""
     signs: Signs
     """Signs of a tensed muscle around it."""
+    evidence: float = 0.0
+    """Log Bayes factor against the lumps found before it alone, where no anatomy is assumed."""
 
     @property
     def features(self) -> Array:
         """The FEATURES, shape (f,)."""
-        size = np.log(self.bump.radius / RADII_M[2])
-        under = float(bone(np.array([[self.bump.x, self.bump.y]]))[0])
+        size = np.log(self.bump.radius / LENGTHS.radii_m[2])
+        under = float(ABDOMEN.bone(np.array([[self.bump.x, self.bump.y]]))[0])
         return np.array((abs(self.t), self.beyond, size, size**2, float(self.log_contrast < 0), under**2 * abs(self.t)))
 
     @property
@@ -115,18 +147,33 @@ def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array
     return regression.whitened @ seen / power, regression.whitened @ seen / np.sqrt(power)
 
 
-def detect(o: Observations, calibration: Calibration) -> tuple[Regression, list[Candidate]]:
+def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
     """Return the regression with the detected lumps, and these lumps, each evaluated with the others in the model."""
-    lumps: tuple[Bump, ...] = ()
-    regression = Regression(o, calibration, lumps, amplitudes(o, calibration, lumps))
-    for _ in range(MOST):
-        bump, strength = strongest(regression)
-        if bump is None or strength < WEAKEST:
+    steps = [Regression(o, (), amplitudes(o, ()))]
+    for _ in range(SEARCH.most):
+        last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmasked(steps[-1]))
+        found = [strongest(last), *([] if o.standard.anatomy else [strongest_ridge(last)])]
+        lumps = [(*last.lumps, bump) for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
+        more = [Regression(o, some, amplitudes(o, some, last.log_amplitudes)) for some in lumps]
+        if not more:
             break
-        lumps = (*lumps, bump)
-        found = amplitudes(o, calibration, lumps, regression.log_amplitudes)
-        regression = Regression(o, calibration, lumps, found)
-    return regression, [weigh(regression, lump) for lump in lumps]
+        best = more[0] if o.standard.anatomy else max(more, key=partial(gained, steps[-1]))
+        if o.standard.anatomy is None and gained(steps[-1], best) < SEARCH.least_gain:
+            break
+        steps.append(best)
+    weighed = [weigh(steps[-1], lump) for lump in steps[-1].lumps]
+    if o.standard.anatomy is None:
+        weighed = [replace(c, evidence=gained(*both)) for c, both in zip(weighed, pairwise(steps), strict=True)]
+    return steps[-1], weighed
+
+
+def unmasked(regression: Regression) -> Array:
+    """Return log-amplitudes of a regression, those of natural variation at most their medians: a lump that is not in it yet
+    counts as natural variation, and would hide itself.
+    """
+    fields = len(regression.log_amplitudes) - KINDS_OF_ERROR
+    usual = usual_amplitudes(regression.observations)
+    return np.concatenate((np.minimum(regression.log_amplitudes, usual)[:fields], regression.log_amplitudes[fields:]))
 
 
 def weigh(regression: Regression, lump: Bump) -> Candidate:
@@ -137,57 +184,137 @@ def weigh(regression: Regression, lump: Bump) -> Candidate:
     return Candidate(lump, float(log_contrast), agreed(without, lump, float(t)), signs(regression, lump))
 
 
+def gained(before: Regression, after: Regression) -> float:
+    """Return the log Bayes factor of the last lump, of the ideal shape or free to differ from it, against those before alone.
+
+    Each has its own amplitudes. What one stroke alone says is not believed (`agreed`). The lump may be at as many places as its
+    area fits into the region, of as many sizes as are tried, and a ridge in as many directions.
+    """
+    lump, without = after.lumps[-1], replace(after, lumps=before.lumps)
+    (log_contrast,), (t,) = matched(without, [lump])
+    believed = 0.5 * agreed(without, lump, float(t)) ** 2
+    gain = 1.0 + (PRIOR.lump_sd * float(t) / float(log_contrast)) ** 2
+    ideal = without.log_evidence - before.log_evidence + believed * (1.0 - 1.0 / gain) - 0.5 * np.log(gain)
+    free = min(after.log_evidence - before.log_evidence, believed)
+    o = after.observations
+    places = max(float(o.hull.volume) / lump.area, 1.0) * len(o.standard.lengths.radii_m) * (SEARCH.angles if lump.path else 1)
+    return float(np.logaddexp(ideal, free) - np.log(2.0 * places))
+
+
 def agreed(regression: Regression, lump: Bump, t: float) -> float:
-    """The strength `t` of a lump, at most ALIKE times what is left of it without the stroke that says it most.
+    """The strength `t` of a lump, at most `alike` times what is left of it without the stroke that says it most.
 
     A hiccup, or a breath that was followed too late, is a few millimetres for a second: three centimetres of one stroke. Such
     errors are rarer and greater than Gaussian ones, so that what one stroke alone says is not believed, unless there is no other.
+    With the precision P of all samples, that of the others is P - P_k P_kk^-1 P_k' for the samples k of a stroke.
     """
     o = regression.observations
     if np.ptp(o.stroke) == 0:
         return t
     height = lump(o.xy)
-    crossing = np.unique(o.stroke[height > HALF * height.max()])
-    others = [np.flatnonzero(o.stroke != stroke) for stroke in crossing]
-    rests = [matched(replace(regression, observations=o.part(rest)), [lump])[1] for rest in others if len(rest) >= FEWEST]
-    left = min((float(np.sign(t) * rest[0]) for rest in rests), default=0.0)
-    return float(np.sign(t)) * min(abs(t), ALIKE * max(left, 0.0))
+    precision = inverse(regression.triangle)
+    y = o.y - regression.level
+    pulls = precision @ np.column_stack((height, y))
+    left = np.inf
+    for stroke in np.unique(o.stroke[height > SEARCH.crossed * height.max()]):
+        own = np.flatnonzero(o.stroke == stroke)
+        if len(o.y) - len(own) < USABLE.fewest:
+            continue
+        lost = np.linalg.solve(precision[np.ix_(own, own)], pulls[own])
+        power = height @ pulls[:, 0] - pulls[own, 0] @ lost[:, 0]
+        match = height @ pulls[:, 1] - pulls[own, 0] @ lost[:, 1]
+        left = min(left, float(np.sign(t) * match / np.sqrt(max(power, 1e-9))))
+    left = left if np.isfinite(left) else 0.0
+    return float(np.sign(t)) * min(abs(t), SEARCH.alike * max(left, 0.0))
 
 
 def strongest(regression: Regression) -> tuple[Bump | None, float]:
-    """Return the bump that stands out most from what the regression explains, and how much (|t|)."""
-    xy = regression.observations.xy
-    low, high = xy.min(axis=0) - _BORDER_M, xy.max(axis=0) + _BORDER_M
-    x, y = (np.arange(a, b + 1e-9, PITCH_M) for a, b in zip(low, high, strict=True))
+    """Return the disc that stands out most from what the regression explains, and how much (|t|)."""
+    lengths = regression.observations.standard.lengths
+    bumps = [Bump(x, y, radius, lengths.edge_m) for x, y in _centres(regression).tolist() for radius in lengths.radii_m]
+    return _best(regression, bumps, lambda p: Bump(p[0], p[1], *np.exp(p[2:])))
+
+
+def strongest_ridge(regression: Regression) -> tuple[Bump | None, float]:
+    """Return the ridge that stands out most from what the regression explains, and how much (t)."""
+    lengths = regression.observations.standard.lengths
+    angles = np.linspace(0.0, np.pi, SEARCH.angles, endpoint=False)
+    halves = np.array([h * lengths.radii_m[-1] * np.array((np.cos(a), np.sin(a))) for a in angles for h in SEARCH.half_lengths])
+    centres = _centres(regression)
+    bumps = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
+    band, t = _best(regression, bumps, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])))
+    return (band, t) if band is None else _grown(regression, band, t)
+
+
+def _centres(regression: Regression) -> Array:
+    """Return centres of the bumps that are tried [m], shape (k, 2)."""
+    xy, pitch = regression.observations.xy, regression.observations.standard.lengths.pitch_m
+    x, y = (np.arange(a - pitch, b + pitch + 1e-9, pitch) for a, b in zip(xy.min(axis=0), xy.max(axis=0), strict=True))
     centres = np.stack(np.meshgrid(x, y), axis=-1).reshape(-1, 2)
-    near = cKDTree(xy).query(centres)[0] <= _BORDER_M
-    bumps = [Bump(float(px), float(py), radius) for px, py in centres[near] for radius in RADII_M]
-    bumps = [bump for bump in bumps if _free(bump, regression.lumps)]
+    return centres[cKDTree(xy).query(centres)[0] <= pitch]
+
+
+def _best(regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bump]) -> tuple[Bump | None, float]:
+    """Return the strongest of some bumps after place, radius and edge were refined, and its strength.
+
+    `shape`: the bump of its parameters: points [m], and the logarithms of radius and edge.
+    """
+    bumps = [bump for bump in bumps if _possible(regression, bump)]
     if not bumps:
         return None, 0.0
-    _, t = matched(regression, bumps)
-    first = bumps[int(np.argmax(np.abs(t)))]
+    xy, lengths = regression.observations.xy, regression.observations.standard.lengths
+    t = _strengths(regression, bumps)
+    first = bumps[int(np.argmax(t))]
 
     def loss(p: Array) -> float:
-        bump = Bump(p[0], p[1], *np.exp(p[2:]))
-        return -abs(float(matched(regression, [bump])[1][0])) if _free(bump, regression.lumps) else 0.0
+        bump = shape(p)
+        return -float(_strengths(regression, [bump])[0]) if _possible(regression, bump) else 0.0
 
-    start = np.array((first.x, first.y, np.log(first.radius), np.log(first.edge)))
-    simplex = start + np.vstack((np.zeros(4), np.diag((0.004, 0.004, 0.25, 0.3))))
-    narrowest, widest = np.log((RADII_M[0], EDGES_M[0])), np.log((RADII_M[-1] * 1.3, EDGES_M[1]))
-    limits = Bounds((*low, *narrowest), (*high, *widest))
+    anatomy = regression.observations.standard.anatomy is not None
+    points = np.array(first.path or ((first.x, first.y),)).ravel()
+    start = np.array((*points, np.log(first.radius), np.log(first.edge)))
+    simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
+    narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy else SEARCH.narrowest), lengths.edge_m))
+    widest = np.log((lengths.radii_m[-1] * SEARCH.widest, lengths.wide_edge_m))
+    low, high = xy.min(axis=0) - lengths.pitch_m, xy.max(axis=0) + lengths.pitch_m
+    limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
     best = minimize(
         loss,
         start,
         method="Nelder-Mead",
         bounds=limits,
-        options={"initial_simplex": simplex, "maxfev": TRIES, "xatol": 1e-4, "fatol": 1e-2},
+        options={"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2},
     )
-    bump = Bump(float(best.x[0]), float(best.x[1]), *map(float, np.exp(best.x[2:])))
-    return bump, -float(best.fun)
+    return shape(best.x), -float(best.fun)
 
 
-def _free(bump: Bump, lumps: Sequence[Bump]) -> bool:
-    """Return True if a bump does not overlap those found before."""
-    apart = [np.hypot(bump.x - one.x, bump.y - one.y) / (bump.radius + one.radius) for one in lumps]
-    return all(a >= _TOO_NEAR for a in apart)
+def _strengths(regression: Regression, bumps: Sequence[Bump]) -> Array:
+    """Return |t| of discs, and t of ridges, which are stiffer than their surroundings: vessels, scars, tendons; shape (k,)."""
+    _, t = matched(regression, bumps)
+    return np.where([bool(bump.path) for bump in bumps], t, np.abs(t))
+
+
+def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
+    """Return a ridge, longer at its ends by pieces in any forward direction while the evidence grows, and its |t|."""
+    step = regression.observations.standard.lengths.radii_m[SEARCH.usual]
+    turns = [np.array(((np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a)))) for a in SEARCH.turns]
+    grows = True
+    while grows:
+        grows = False
+        for forward in (1, -1):
+            corners = np.array(band.path)[::forward]
+            along = (corners[-1] - corners[-2]) / np.linalg.norm(corners[-1] - corners[-2])
+            longer = [ridge(np.vstack((corners, corners[-1] + step * turn @ along)), band.radius, band.edge) for turn in turns]
+            longer = [one for one in longer if _possible(regression, one)]
+            found = _strengths(regression, longer) if longer else np.zeros(1)
+            if 0.5 * found.max() ** 2 > 0.5 * t**2 + SEARCH.gain:
+                band, t, grows = longer[int(np.argmax(found))], float(found.max()), True
+    return band, t
+
+
+def _possible(regression: Regression, bump: Bump) -> bool:
+    """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
+    o = regression.observations
+    if o.standard.anatomy is None and not o.encloses(np.array(bump.path or ((bump.x, bump.y),))):
+        return False
+    return all(bump.apart(one) >= SEARCH.too_near for one in regression.lumps)

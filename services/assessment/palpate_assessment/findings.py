@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import label
-from scipy.special import expit
+from scipy.special import expit, log_ndtr
 
 from palpate_assessment.calibration import Calibration
 from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.grid import MapGrid
-from palpate_assessment.model import UNLIKE, Regression
+from palpate_assessment.model import Regression
 from palpate_models.numerics.frames import Array
 
 Mask = NDArray[np.bool_]
@@ -24,6 +24,19 @@ WEIGHED = 0.01
 """Probability from which an area is reported as a candidate."""
 HALF = 0.5
 """The outline is where the log-contrast is this part of its peak."""
+
+
+@dataclass(frozen=True)
+class StatedPrior:
+    """Assumptions about a body of which nothing is known."""
+
+    structures: float = 0.5
+    """Expected number of structures in the region, of each size equally many, anywhere."""
+    contrast: float = 1.1
+    """Least contrast of a structure."""
+
+
+STATED = StatedPrior()
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,10 @@ class Area:
     """The same as log-odds, by which the operating point is chosen."""
     guarding: float
     """Probability that it is a tensed muscle."""
+    strength: float
+    """Its log-contrast over the SD of that."""
+    length: float
+    """Length of a ridge [m]; 0 for a disc."""
 
 
 def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid, assessed: Mask) -> list[Area]:
@@ -54,11 +71,15 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
 
     What is there, but surely of less contrast than a lump, is none: a navel, say, where everything else is known well.
     """
-    candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
+    if regression.observations.standard.anatomy is not None:
+        candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
     if not candidates:
         return []
-    features, signs = np.array([c.features for c in candidates]), np.array([c.signs.features for c in candidates])
-    logits, guarding = causes(regression.calibration, features, signs)
+    if regression.observations.standard.anatomy is None:
+        logits, guarding = np.array([stated(c) for c in candidates]), np.zeros(len(candidates))
+    else:
+        features, signs = np.array([c.features for c in candidates]), np.array([c.signs.features for c in candidates])
+        logits, guarding = causes(regression.observations.standard.calibration, features, signs)
     found: list[Area] = []
     for index in np.argsort(-logits):
         if expit(logits[index]) < WEIGHED:
@@ -67,6 +88,13 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
         if area is not None and not any((area.nodes & other.nodes).any() for other in found):
             found.append(area)
     return found
+
+
+def stated(candidate: Candidate) -> float:
+    """Return the logit that a candidate is a structure under the stated prior."""
+    contrast = abs(candidate.log_contrast)
+    sd = max(contrast / max(abs(candidate.t), 1e-9), 1e-9)
+    return candidate.evidence + float(log_ndtr((contrast - np.log(STATED.contrast)) / sd) + np.log(STATED.structures))
 
 
 def causes(calibration: Calibration, features: Array, signs: Array) -> tuple[Array, Array]:
@@ -88,9 +116,9 @@ def _area(
     `probability`: as of `causes`.
     """
     logit, guarding = probability
-    xy = grid.nodes[:, :2]
+    xy, standard = grid.nodes[:, :2], regression.observations.standard
     bump, sign = candidate.bump, float(np.sign(candidate.log_contrast))
-    near = np.flatnonzero(bump(xy, 0.5 * bump.radius + 0.01) > 1e-3)
+    near = np.flatnonzero(bump(xy, 0.5 * bump.radius + standard.lengths.pitch_m) > 1e-3)
     if not len(near):
         return None
     mean, covariance = regression.contrast(bump, xy[near])
@@ -104,7 +132,7 @@ def _area(
     weight = grid.area[nodes] / grid.area[nodes].sum()
     inside = nodes[near]
     middle = float(weight @ mean[inside])
-    sd = float(np.hypot(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight), UNLIKE * middle))
+    sd = float(np.hypot(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight), standard.errors.unlike * middle))
     return Area(
         nodes=nodes,
         centroid=weight @ grid.nodes[nodes],
@@ -115,4 +143,6 @@ def _area(
         confidence=float(expit(logit)),
         logit=logit,
         guarding=guarding,
+        strength=abs(candidate.t),
+        length=bump.length,
     )

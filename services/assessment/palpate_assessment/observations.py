@@ -3,30 +3,43 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import ConvexHull, cKDTree
 
-from palpate_assessment.calibration import Calibration
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.standard import PressStandard
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario import press
 
-SHALLOWEST_M, WEAKEST_N = 0.002, 0.1
-"""Least depth and force of a usable sample."""
-USABLE_SHARE = 0.6
-"""Least depth of a force-limited sample, as a share of the depth of the press: at 6 of 10 mm the exponent of the conversion
-adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
-FEWEST = 10
-"""Least number of samples."""
+
+@dataclass(frozen=True)
+class Usable:
+    """Samples that are used."""
+
+    depth: float = 0.2
+    """Least depth, as a share of the nominal one."""
+    force: float = 0.02
+    """Least force, as a share of the usual one."""
+    limited_depth: float = 0.6
+    """Least depth of a force-limited sample, as a share of the nominal one: at 6 of 10 mm the exponent of the conversion
+    adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
+    fewest: int = 10
+    """Least number of samples."""
+    neighbours: int = 9
+    """Presses, itself among them, whose median is the usual force at a place."""
+
+
+USABLE = Usable()
 
 
 @dataclass(frozen=True)
 class Observations:
     """y = z(x) + errors at m samples, z being the logarithm of apparent stiffness [N]."""
 
+    standard: PressStandard
     xy: Array
     """Place of each sample [m], shape (m, 2), in A: ahead of the indenter's middle by `lead_s` of its travel."""
     time: Array
@@ -41,8 +54,8 @@ class Observations:
     per_metre: Array
     """|d y / d depth| = n / depth [1/m], by which an error of the depth counts."""
     per_newton: Array
-    """1 / F [1/N], by which an error of the force's zero counts: F is the stroke's median force, since a sample's own force
-    must not explain itself."""
+    """1 / F [1/N], by which an error of the force's zero counts: F is the median force of the stroke, or of a press and
+    its neighbours, since a sample's own force must not explain itself."""
     noise: Array
     """Standard deviation of the force's white noise, over the force [1]."""
     depth_uncertainty: Array
@@ -55,30 +68,48 @@ class Observations:
         """True where two samples are of one stroke, shape (m, m)."""
         return np.asarray(self.stroke[:, None] == self.stroke)
 
+    @cached_property
+    def hull(self) -> ConvexHull:
+        """Convex hull of the samples; its volume is the area [m^2]."""
+        return ConvexHull(self.xy)
+
+    def encloses(self, places: Array) -> bool:
+        """Return True if places [m], shape (k, 2), are all within the samples' convex hull."""
+        sides = self.hull.equations
+        return bool((places @ sides[:, :2].T + sides[:, 2] <= 0).all())
+
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Return some of the samples."""
-        return Observations(**{field.name: getattr(self, field.name)[chosen] for field in fields(self)})
+        return replace(self, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "standard"})
 
 
-def observe(samples: Sequence[ForceSample], calibration: Calibration) -> Observations | None:
+def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observations | None:
     """Return the usable samples; None if they are too few."""
-    good = [s for s in samples if s.depth >= SHALLOWEST_M and s.force >= WEAKEST_N]
-    if len(good) < FEWEST:
+    shallowest, weakest = USABLE.depth * standard.depth_m, USABLE.force * standard.force_n
+    good = [s for s in samples if s.depth >= shallowest and s.force >= weakest]
+    calibration = standard.calibration
+    if len(good) < USABLE.fewest:
         return None
     position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
     depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])
-    log_depth, stroke = np.log(depth / press.DEPTH_M), np.array([s.stroke for s in good])
-    usual = {int(one): float(np.median(force[stroke == one])) for one in np.unique(stroke)}
+    log_depth, stroke = np.log(depth / standard.depth_m), np.array([s.stroke for s in good])
+    xy = (position + calibration.lead_s * velocity)[:, :2]
+    if standard.anatomy is None:  # each press is a stroke
+        usual = np.median(force[cKDTree(xy).query(xy, USABLE.neighbours)[1]], axis=1)
+    else:
+        medians = {int(one): float(np.median(force[stroke == one])) for one in np.unique(stroke)}
+        usual = np.array([medians[int(one)] for one in stroke])
     return Observations(
-        xy=(position + calibration.lead_s * velocity)[:, :2],
+        standard=standard,
+        xy=xy,
         time=np.array([s.time for s in good]),
         stroke=stroke,
         y=np.log(force) - calibration.exponent * log_depth - calibration.conversion,
         touched_for=np.array([s.time_in_contact for s in good]),
         log_depth=log_depth,
         per_metre=calibration.exponent / depth,
-        per_newton=np.array([1.0 / usual[int(one)] for one in stroke]),
+        per_newton=1.0 / usual,
         noise=np.array([s.force_noise for s in good]) / force,
         depth_uncertainty=np.array([s.depth_uncertainty for s in good]),
-        yielded=np.array([s.force_limited for s in good]) & (depth < USABLE_SHARE * press.DEPTH_M),
+        yielded=np.array([s.force_limited for s in good]) & (depth < USABLE.limited_depth * standard.depth_m),
     )

@@ -10,13 +10,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from palpate_assessment.assess import AssessedMap, assess, growing
-from palpate_assessment.calibration import learned
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_assessment.seen_breath import SeenBreath
 from palpate_assessment.skin import KnownSkin
+from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap
 from palpate_bus.messages.codec import Message
@@ -25,7 +25,6 @@ from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.scenario import press
 from palpate_models.scenario.checkpoint import Checkpoint, read_checkpoint
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Following, Scenario
@@ -239,10 +238,10 @@ def sample_message(sample: ForceSample) -> Message:
     )
 
 
-def map_message(t: int, result: AssessedMap, common_depth: float) -> Message:
+def map_message(t: int, result: AssessedMap, common_depth: float, standard: PressStandard = USUAL) -> Message:
     """`palpation_msgs/StiffnessMap`: its force is what sliding at `common_depth` [m] would feel."""
-    calibration = learned()
-    sliding = float(np.exp(calibration.conversion) * (common_depth / press.DEPTH_M) ** calibration.exponent)
+    calibration = standard.calibration
+    sliding = float(np.exp(calibration.conversion) * (common_depth / standard.depth_m) ** calibration.exponent)
     finding = np.full(len(result.apparent), -1, dtype=np.int32)
     for i, area in enumerate(result.findings):
         finding[area.nodes] = i

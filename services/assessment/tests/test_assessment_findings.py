@@ -13,9 +13,11 @@ from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import Candidate, Signs, signs
 from palpate_assessment.findings import causes
-from palpate_assessment.model import Bump, Regression, amplitudes
+from palpate_assessment.model import Regression, amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import USUAL
 from palpate_bus.messages import StiffnessMap
 
 REACH, FALSE_FINDINGS = 0.010, 0.02
@@ -154,10 +156,10 @@ WALL = natural(3, 0.08)
 
 
 def seen(samples: list[ForceSample]) -> Signs:
-    o = observe(samples, learned())
+    o = observe(samples, USUAL)
     assert o is not None
     lumps = (Bump(*MIDDLE, 0.03),)
-    return signs(Regression(o, learned(), lumps, amplitudes(o, learned(), lumps)), lumps[0])
+    return signs(Regression(o, lumps, amplitudes(o, lumps)), lumps[0])
 
 
 def letting_go(samples: list[ForceSample]) -> list[ForceSample]:

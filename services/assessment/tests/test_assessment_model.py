@@ -11,13 +11,15 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.check import contradicted, pieces
 from palpate_assessment.detection import Candidate, Signs, agreed, matched, strongest
-from palpate_assessment.model import ILIAC_M, LENGTHS_M, Bump, Regression, amplitudes, usual_amplitudes
+from palpate_assessment.model import Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import ABDOMEN, LENGTHS, USUAL
 
 
 def observations(samples: list[ForceSample]) -> Observations:
-    o = observe(samples, learned())
+    o = observe(samples, USUAL)
     assert o is not None
     return o
 
@@ -29,19 +31,19 @@ def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observat
 
 @pytest.mark.parametrize("stroke_m", [0.0005, 0.0015])
 def test_errors_of_the_strokes_are_found_from_the_data(stroke_m: float) -> None:
-    found = amplitudes(observed(stroke_m), learned(), ())
-    assert np.exp(found[len(LENGTHS_M) + 2]) == pytest.approx(stroke_m, rel=0.6)
+    found = amplitudes(observed(stroke_m), ())
+    assert np.exp(found[len(LENGTHS.fields_m) + 2]) == pytest.approx(stroke_m, rel=0.6)
 
 
 def test_a_rougher_wall_has_greater_amplitudes() -> None:
-    smooth, rough = (np.exp(2 * amplitudes(observed(sd=sd), learned(), ())[: len(LENGTHS_M)]).sum() for sd in (0.05, 0.3))
+    smooth, rough = (np.exp(2 * amplitudes(observed(sd=sd), ())[: len(LENGTHS.fields_m)]).sum() for sd in (0.05, 0.3))
     assert rough > 4 * smooth
 
 
 def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() -> None:
     wall = natural(0, 0.15)
     o = observed()
-    regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+    regression = Regression(o, (), amplitudes(o, ()))
     mean, sd = regression.field(o.xy)
     assert mean == pytest.approx(LEVEL + wall(o.xy), abs=0.05)
     _, far = regression.field(o.xy + np.array((0.3, 0.0)))
@@ -51,7 +53,7 @@ def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() ->
 def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observations(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002))
-    (log_contrast,), (t,) = matched(Regression(o, learned(), (), usual_amplitudes(o)), [bump])
+    (log_contrast,), (t,) = matched(Regression(o, (), usual_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
 
@@ -60,7 +62,7 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
 def test_the_edge_with_which_a_lump_is_felt_is_found(edge: float) -> None:
     lump = Bump(0.005, -0.01, 0.02, edge)
     o = observations(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01))
-    found, t = strongest(Regression(o, learned(), (), usual_amplitudes(o)))
+    found, t = strongest(Regression(o, (), usual_amplitudes(o)))
     assert found is not None
     assert found.edge == pytest.approx(edge, rel=0.2)
     assert found.radius == pytest.approx(lump.radius, rel=0.15)
@@ -77,7 +79,7 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     strengths = []
     for samples in (hiccup, lumpy):
         o = observations(samples)
-        regression = Regression(o, learned(), (), usual_amplitudes(o))
+        regression = Regression(o, (), usual_amplitudes(o))
         (t,) = matched(regression, [bump])[1]
         strengths.append((float(t), agreed(regression, bump, float(t))))
     assert strengths[0][1] < 0.5 * strengths[0][0]
@@ -89,7 +91,7 @@ def test_what_the_first_line_alone_says_of_a_place_beyond_it_is_not_believed() -
     samples = lines(level, noise=0.005)
     first = [s.stroke == 0 and abs(s.position[0] - 0.02) < 0.0155 for s in samples]
     o = observations([replace(s, force=1.2 * s.force) if spoiled else s for s, spoiled in zip(samples, first, strict=True)])
-    regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+    regression = Regression(o, (), amplitudes(o, ()))
     (t,) = matched(regression, [beyond])[1]
     assert t > 3
     assert abs(agreed(regression, beyond, float(t))) < 0.5
@@ -97,9 +99,9 @@ def test_what_the_first_line_alone_says_of_a_place_beyond_it_is_not_believed() -
 
 def test_a_lump_in_the_model_takes_its_contrast() -> None:
     bump = Bump(0.0, 0.0, 0.02)
-    o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), learned())
+    o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), USUAL)
     assert o is not None
-    regression = Regression(o, learned(), (bump,), usual_amplitudes(o))
+    regression = Regression(o, (bump,), usual_amplitudes(o))
     mean, covariance = regression.contrast(bump, np.zeros((1, 2)))
     assert np.exp(mean[0]) == pytest.approx(2.0, rel=0.15)
     assert covariance[0, 0] > 0
@@ -112,7 +114,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
     found = []
     for samples in (steady, [replace(s, force=s.force + float(zeros[s.stroke])) for s in steady]):
         o = observations(samples)
-        regression = Regression(o, learned(), (), amplitudes(o, learned(), ()))
+        regression = Regression(o, (), amplitudes(o, ()))
         found.append((np.exp(regression.log_amplitudes[-2]), regression.field(np.zeros((1, 2)))[1][0]))
     (small, sure), (large, unsure) = found
     assert large > 1.3 * small
@@ -128,11 +130,11 @@ def test_every_sample_is_in_one_piece_of_one_stroke() -> None:
 
 def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observations(lines(level))
-    assert not contradicted(Regression(o, learned(), (), usual_amplitudes(o))).any()
+    assert not contradicted(Regression(o, (), usual_amplitudes(o))).any()
 
 
 def test_what_may_be_bone_is_less_probably_a_lump() -> None:
-    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0, Signs(0.0, 0.0)) for x, y in ((0.0, 0.0), ILIAC_M))
+    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0, Signs(0.0, 0.0)) for x, y in ((0.0, 0.0), ABDOMEN.iliac_m))
     logits = learned().logit(np.array((open_wall.features, spine.features)))
     assert logits[1] < logits[0] - 0.5
 

@@ -22,7 +22,9 @@ from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, bone, natural
+from palpate_assessment.model import lump_covariance, natural
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import ABDOMEN, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.presses import LEAST_MEASURED_M, PRESS_S, Budget, Press, Task, press_duration
@@ -167,7 +169,7 @@ class Posterior:
         k, n = self.likeliest, len(self.presses)
         seen = self._field[k, :n]
         mean = np.log(USUAL_N) + self._whitened[k, :n] @ seen
-        variance = LEVEL_SD**2 + self._parts[k, :-1].sum() + self._parts[k, -1] * bone(self.task.places) ** 2
+        variance = LEVEL_SD**2 + self._parts[k, :-1].sum() + self._parts[k, -1] * ABDOMEN.bone(self.task.places) ** 2
         variance = variance + sum((bump(self.task.places) ** 2 for bump in self.accepted), np.zeros(1))
         return mean, np.maximum(variance - (seen**2).sum(axis=0), 1e-6)
 
@@ -191,10 +193,11 @@ class Posterior:
         wrong = np.array([wrong for _, wrong in self._models])
         if n:
             apart = ((old - xy) ** 2).sum(axis=1)
-            shared = SURFACE_SHARE**2 * error * np.array(self._error) * np.exp(-0.5 * apart / SURFACE_M**2)
+            shared = SURFACE_SHARE**2 * error * np.array(self._error) * np.exp(-0.5 * apart / USUAL.errors.surface_m**2)
             with_old = with_old + wrong[:, None] ** 2 * shared
             with_old += calibration.exponent_sd**2 * log_depth * np.array(self._log_depth)
-        white = WHITE_SD**2 + (felt.noise_n**2 + TARE_N**2) / force**2 + (calibration.exponent_sd * log_depth) ** 2
+        white = USUAL.errors.white_sd**2 + (felt.noise_n**2 + USUAL.tare_n**2) / force**2
+        white += (calibration.exponent_sd * log_depth) ** 2
         itself = with_itself[:, 0] + white + (STROKE_SHARE**2 + SURFACE_SHARE**2) * (wrong * error) ** 2
         new_bump = self._shapes(xy)[0]
         for k in range(len(self._models)):
@@ -246,8 +249,8 @@ class Posterior:
 
     def _natural(self, a: Array, b: Array) -> Array:
         """Return the covariance of the field without a lump under each model, shape (models, k, l)."""
-        parts = np.array(natural(a, b))
-        known = sum((bump.covariance(a, b) for bump in self.accepted), np.zeros((len(a), len(b))))
+        parts = np.array(natural(a, b, USUAL))
+        known = sum((lump_covariance(bump, a, b, USUAL) for bump in self.accepted), np.zeros((len(a), len(b))))
         return np.asarray(LEVEL_SD**2 + np.tensordot(self._parts, parts, 1) + known)
 
     def _shapes(self, xy: Array) -> Array:

@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Final
 
 import numpy as np
 
-from palpate_assessment.model import Bump
+from palpate_assessment.shapes import Bump
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_bus.messages.codec import Message

@@ -16,7 +16,9 @@ from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import SURFACE_M, TARE_N, WHITE_SD, Bump, natural
+from palpate_assessment.model import natural
+from palpate_assessment.shapes import Bump
+from palpate_assessment.standard import USUAL
 from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario.press import DEPTH_M
 from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
@@ -164,7 +166,7 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     calibration = learned()
     y = np.log(force) - calibration.exponent * np.log(depth / DEPTH_M) - np.log(USUAL_N)
     lever, away = calibration.exponent / depth, np.log(depth / DEPTH_M)
-    parts = natural(xy, xy)
+    parts = natural(xy, xy, USUAL)
     log_joint = []
     out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(CENTRED.size) + 1e-9, axis=1)
     prior = np.where(out, OUTSIDE, 1.0)
@@ -175,8 +177,8 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
             S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(NATURAL_SD, parts, strict=False))
             S = S + BONE_SD**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
             apart = ((xy[:, None] - xy) ** 2).sum(axis=2)
-            S += (SURFACE_SHARE * u) ** 2 * np.outer(lever, lever) * np.exp(-0.5 * apart / SURFACE_M**2)
-            S += np.diag((STROKE_SHARE * u * lever) ** 2 + WHITE_SD**2 + (0.02**2 + TARE_N**2) / force**2)
+            S += (SURFACE_SHARE * u) ** 2 * np.outer(lever, lever) * np.exp(-0.5 * apart / USUAL.errors.surface_m**2)
+            S += np.diag((STROKE_SHARE * u * lever) ** 2 + USUAL.errors.white_sd**2 + (0.02**2 + USUAL.tare_n**2) / force**2)
             row = [np.log(1 - LUMP_PROBABILITY) + multivariate_normal(np.zeros(len(y)), S).logpdf(y)]
             for x, y0, radius, p in zip(*posterior.centres.T, posterior.radii, prior, strict=True):
                 b = Bump(x, y0, radius, EDGE_M)(xy)

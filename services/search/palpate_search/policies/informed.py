@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_assessment.calibration import learned
-from palpate_assessment.model import WHITE_SD
+from palpate_assessment.standard import USUAL
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
@@ -108,7 +108,8 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
 
     def rate(some: NDArray[np.intp], depth: float) -> Array:
         """Return information per second of presses at some of the places, shape (k,)."""
-        noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2 + WHITE_SD**2
+        noise = (exponent / depth * posterior.noise_m) ** 2 + (spread * np.log(depth / press.DEPTH_M)) ** 2
+        noise += USUAL.errors.white_sd**2
         gain = information(unexplained[some], contrast, contrast_variance, probability, variance[some] + noise)
         return np.asarray(gain / duration[some])
 

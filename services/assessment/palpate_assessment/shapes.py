@@ -1,0 +1,76 @@
+"""Shapes in which lumps and ridges are felt."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+from scipy.spatial.distance import cdist
+from scipy.special import erfc
+
+from palpate_assessment.standard import LENGTHS
+from palpate_models.numerics.frames import Array
+
+
+def smooth(a: Array, b: Array, length: float | Array) -> Array:
+    """Return the squared-exponential covariance between places a (k, 2) and b (l, 2), shape (k, l)."""
+    return np.asarray(np.exp(-0.5 * cdist(a / length, b / length, "sqeuclidean")))
+
+
+@dataclass(frozen=True)
+class Bump:
+    """The shape in which a lump is felt: 1 inside, 0 outside, with a soft edge. A ridge is a band about its path."""
+
+    x: float
+    y: float
+    """Centre [m]."""
+    radius: float
+    """Of a disc, or half the width of a ridge [m]."""
+    edge: float = LENGTHS.edge_m
+    """Standard deviation of its edge [m]."""
+    path: tuple[tuple[float, float], ...] = ()
+    """Corners of a ridge's middle line [m]; empty for a disc."""
+
+    @property
+    def length(self) -> float:
+        """Length of a ridge's path [m], 0 for a disc."""
+        return float(np.linalg.norm(np.diff(np.array(self.path).reshape(-1, 2), axis=0), axis=1).sum())
+
+    @property
+    def area(self) -> float:
+        """Area of the shape [m^2]."""
+        return float(np.pi * self.radius**2 + 2 * self.radius * self.length)
+
+    def distance(self, xy: Array) -> Array:
+        """Return the distance of places from the centre or the path [m], shape (k, 2) -> (k,)."""
+        if not self.path:
+            return np.hypot(xy[:, 0] - self.x, xy[:, 1] - self.y)
+        corners = np.array(self.path)
+        start, along = corners[:-1], np.diff(corners, axis=0)
+        off = xy[:, None] - start
+        share = np.clip((off * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+        return np.asarray(np.linalg.norm(off - share[:, :, None] * along, axis=2).min(axis=1))
+
+    def __call__(self, xy: Array, beyond: float = 0.0) -> Array:
+        """Return the shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
+        return np.asarray(0.5 * erfc((self.distance(xy) - self.radius - beyond) / (np.sqrt(2) * self.edge)))
+
+    def apart(self, other: Bump) -> float:
+        """Return the distance between two bumps over the sum of their radii."""
+        points = np.array(other.path or ((other.x, other.y),))
+        return float(self.distance(_filled(points)).min()) / (self.radius + other.radius)
+
+
+def _filled(corners: Array) -> Array:
+    """Return points along a path, shape (k, 2)."""
+    if len(corners) < 2:
+        return corners
+    share = np.linspace(0.0, 1.0, 8)[:, None]
+    return np.concatenate([a + share * (b - a) for a, b in pairwise(corners)])
+
+
+def ridge(corners: Array, radius: float, edge: float) -> Bump:
+    """Return the ridge about a path, shape (k, 2) [m]."""
+    x, y = _filled(corners).mean(axis=0)
+    return Bump(float(x), float(y), radius, edge, tuple((float(a), float(b)) for a, b in corners))

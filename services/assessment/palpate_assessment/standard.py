@@ -1,0 +1,165 @@
+"""The standard press that a map is of, and what is assumed before anything was pressed.
+
+A press feels over the radius of its footprint, sqrt(2 R d - d^2) for a sphere of radius R at depth d, so all lengths scale with
+it. Forces scale with the force of the press.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field, fields
+from functools import cached_property
+from math import sqrt
+from typing import Any, Self
+
+import numpy as np
+from scipy.special import expit
+
+from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.sampling import ForceSample
+from palpate_models.numerics.frames import Array
+from palpate_models.scenario import press
+
+
+@dataclass(frozen=True)
+class Anatomy:
+    """Prior of ribs, iliac crests and muscles of an abdomen, in A."""
+
+    arch_m: float = 0.18
+    """Height of the costal arch above the umbilicus, on the midline."""
+    arch_slope: float = 0.7
+    """Its descent per metre off the midline."""
+    arch_width_m: float = 0.025
+    """Uncertainty of both."""
+    iliac_m: tuple[float, float] = (0.135, -0.12)
+    """Position of the iliac spines: lateral, and above the umbilicus."""
+    iliac_width_m: float = 0.04
+    """Width of the bone around them."""
+    bone_m: float = 0.022
+    """Length over which bone changes the force."""
+    strip_m: tuple[float, float] = (0.018, 0.08)
+    """Lengths of muscles and linea alba, across and along the body."""
+
+    def bone(self, xy: Array) -> Array:
+        """Return the prior of ribs or iliac crests under places of the abdomen [m], shape (k, 2) -> (k,)."""
+        lateral, up = np.abs(xy[:, 0]), xy[:, 1]
+        ribs = expit((up - self.arch_m + self.arch_slope * lateral) / self.arch_width_m)
+        spine = np.exp(-0.5 * ((lateral - self.iliac_m[0]) ** 2 + (up - self.iliac_m[1]) ** 2) / self.iliac_width_m**2)
+        return np.asarray(np.maximum(ribs, spine))
+
+
+@dataclass(frozen=True)
+class Lengths:
+    """Lengths [m] for the footprint of the abdomen's standard press."""
+
+    fields_m: tuple[float, ...] = (0.012, 0.022, 0.045, 0.09, 0.18)
+    """Of the fields that natural variation is made of."""
+    smooth_m: float = 0.045
+    """Fields of this length and more are smooth: alike over a hand's breadth."""
+    edge_m: float = 0.007
+    """SD of the edge with which a lump at the skin is felt: half the footprint."""
+    wide_edge_m: float = 0.016
+    """SD of the edge of a lump under tissue that spreads the pressure."""
+    free_m: float = 0.012
+    """Length over which a lump differs from the ideal shape."""
+    radii_m: tuple[float, ...] = (0.008, 0.012, 0.018, 0.026, 0.036)
+    """Of the lumps that are tried first."""
+    pitch_m: float = 0.01
+    """Distance between their centres, and how far these may be outside the samples."""
+    refined_m: float = 0.004
+    """First step of the refined centre."""
+    piece_m: float = 0.03
+    """Length of the pieces in which a stroke is checked: what the indenter feels at one place."""
+    node_m: float = 0.005
+    """Pitch of the map."""
+
+
+@dataclass(frozen=True)
+class ErrorPrior:
+    """Errors of equipment and method."""
+
+    breathing_s: float = 1.0
+    """Correlation time of residual breathing."""
+    least_depth_m: float = 0.0001
+    """Prior median of the depth's errors for strokes that claim to have none."""
+    surface_m: float = 0.015
+    """Correlation length of the surface error that strokes share (without offset and tilt)."""
+    surface_share: float = 0.8
+    """Its share of the depth uncertainty. A scan cannot separate it from stiffness."""
+    wide_m: float = 0.15
+    """The same of the offset and tilt that remain after touches."""
+    wide_share: float = 0.7
+    onset_m: float = 0.00015
+    """Error common to all touches: 0.11 mm with typical equipment, RMS over twelve examinations, 0.29 mm with poor, over ten
+    (tuning seeds) [C]. The contact model does not fit every wall exactly, and skin that was pressed before is lower."""
+    tare: float = 0.012
+    """Prior median of the zero of a stroke's force, over the force of the press: 0.06 N with typical equipment, 0.12 N with poor
+    (tuning seeds 0 to 9) [C]."""
+    shared_tare: float = 1.0
+    """Variance of the zero of the force that all strokes share, over that of a single one: with poor equipment 0.08 N [C]."""
+    white_sd: float = 0.01
+    """Prior median of the independent error of a sample, over its force."""
+    slide_sd: float = 0.015
+    """SD of the log difference of slide and press from place to place, besides the common one."""
+    unlike: float = 0.1
+    """SD of the difference of press and slide over a lump, as a share of its log-contrast."""
+
+
+OWN_ZERO = ErrorPrior(
+    least_depth_m=0.00003, surface_share=0.0, wide_share=0.0, onset_m=0.0, shared_tare=0.0, slide_sd=0.0, unlike=0.0
+)
+"""Errors of presses whose depth counts from their own onset, and which are themselves what the map is of."""
+ABDOMEN = Anatomy()
+LENGTHS = Lengths()
+
+
+@dataclass(frozen=True)
+class PressStandard:
+    """The press that a map is of; by default that of the abdomen's examination."""
+
+    radius_m: float = 0.015
+    """Radius of the spherical indenter."""
+    depth_m: float = press.DEPTH_M
+    """Nominal depth."""
+    force_n: float = 5.0
+    """Usual force."""
+    anatomy: Anatomy | None = ABDOMEN
+    """None for a body of which nothing is known: long shapes are tried too, and probabilities are of a stated prior."""
+    calibration: Calibration = field(default_factory=learned)
+    """Exponent and conversion of the tissue."""
+    errors: ErrorPrior = ErrorPrior()
+
+    @classmethod
+    def of(cls, samples: Sequence[ForceSample], radius_m: float, exponent: float, exponent_sd: float = 0.0) -> Self:
+        """Return the standard of presses of another body: their own depth, force and exponent, and no anatomy."""
+        depth_m = float(np.median([sample.depth for sample in samples]))
+        force_n = float(np.median([sample.force for sample in samples]))
+        tissue = {"exponent": exponent, "exponent_sd": exponent_sd, "conversion": 0.0, "conversion_sd": 0.0, "lead_s": 0.0}
+        return cls(radius_m, depth_m, force_n, None, learned().model_copy(update=tissue), OWN_ZERO)
+
+    @property
+    def footprint_m(self) -> float:
+        """Radius of the contact of a sphere at the nominal depth, at most its own."""
+        d = min(self.depth_m, self.radius_m)
+        return sqrt(2 * self.radius_m * d - d**2)
+
+    @property
+    def tare_n(self) -> float:
+        """Prior median of the zero of a stroke's force [N]."""
+        return self.errors.tare * self.force_n
+
+    @cached_property
+    def lengths(self) -> Lengths:
+        """Lengths for this footprint."""
+        scale = self.footprint_m / _USUAL_FOOTPRINT_M
+        return Lengths(**{f.name: _scaled(getattr(LENGTHS, f.name), scale) for f in fields(Lengths)})
+
+
+def _scaled(length: Any, scale: float) -> Any:
+    """Return a length, or each of several, times a scale."""
+    return tuple(one * scale for one in length) if isinstance(length, tuple) else length * scale
+
+
+USUAL = PressStandard()
+"""The press of the abdomen's examination."""
+_USUAL_FOOTPRINT_M = USUAL.footprint_m
