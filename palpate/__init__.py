@@ -25,15 +25,15 @@ if TYPE_CHECKING:
     from palpate.interface.studies import StudyResult, study
     from palpate.quick.patient import Patient, Touch
     from palpate.recording.read import read_recording
-    from palpate.recording.recording import Recording
+    from palpate.recording.recording import PalpationRecording
     from palpate_models.scenario.load import ScenarioError
     from palpate_models.scenario.schema import Scenario
 
 __all__ = [
     "Assessment",
     "Examination",
+    "PalpationRecording",
     "Patient",
-    "Recording",
     "Scenario",
     "ScenarioError",
     "StiffnessMap",
@@ -50,7 +50,7 @@ _HOMES = {
     "Assessment": "palpate.interface.assessment",
     "Examination": "palpate.interface.examination",
     "Patient": "palpate.quick.patient",
-    "Recording": "palpate.recording.recording",
+    "PalpationRecording": "palpate.recording.recording",
     "Scenario": "palpate_models.scenario.schema",
     "ScenarioError": "palpate_models.scenario.load",
     "StiffnessMap": "palpate.interface.assessment",

@@ -22,7 +22,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_supervisor.judge import SensorJudge
-from palpate_supervisor.senses import Comparison, Measurement
+from palpate_supervisor.senses import ForceComparison, Measurement
 from palpate_supervisor.tool import ToolSense
 
 PERIOD_S: Final = 0.01
@@ -66,7 +66,9 @@ def samples(folder: Path) -> Iterator[Sample]:
         yield Sample(nanoseconds(value.header.stamp) / NS, measured, depth)
 
 
-def judged(robot: Robot, run: list[Sample], lie: Callable[[int, Array], Array] | None = None) -> Iterator[tuple[Comparison, str]]:
+def judged(
+    robot: Robot, run: list[Sample], lie: Callable[[int, Array], Array] | None = None
+) -> Iterator[tuple[ForceComparison, str]]:
     """Yield the comparison of each sample, and the culprit of the first breach, empty without one."""
     sense, judge = ToolSense(robot), SensorJudge()
     for i, (_, measured, depth) in enumerate(run):
@@ -104,7 +106,7 @@ def main() -> None:
 def report(name: str, robot: Robot, run: list[Sample]) -> None:
     """Print the largest comparisons of a run, its false alarms, and for each lie when each size is seen."""
     found = list(judged(robot, run))
-    largest = {field: round(max(getattr(c, field) for c, _ in found), 2) for field in Comparison._fields}
+    largest = {field: round(max(getattr(c, field) for c, _ in found), 2) for field in ForceComparison._fields}
     print(f"{name}: largest {largest}; false alarms: {sorted({culprit for _, culprit in found} - {''})}")
     begin = next(i for i, (c, _) in enumerate(found) if c.joint_force > PRESSED_N)
     for lie_name, (lie, sizes) in LIES.items():

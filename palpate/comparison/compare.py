@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import bootstrap, spearmanr
 
-from palpate.comparison.palpated import Palpated
+from palpate.comparison.palpated import ComparedPalpation
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
@@ -38,7 +38,7 @@ Interval = tuple[float, float]
 
 
 @dataclass(frozen=True)
-class Agreement:
+class MapAgreement:
     """Figures of a comparison; ratios are of B over A."""
 
     places: int
@@ -69,16 +69,16 @@ class Agreement:
 class Compared:
     """A comparison and its values at k places, for the figure."""
 
-    figures: Agreement
-    a: Palpated
-    b: Palpated
+    figures: MapAgreement
+    a: ComparedPalpation
+    b: ComparedPalpation
     """In the frame of A."""
     of_a: Array
     """Map of A at the places [N], shape (k,)."""
     of_b: Array
 
 
-def compare(a: Palpated, b: Palpated, register: bool | None = None) -> Compared:
+def compare(a: ComparedPalpation, b: ComparedPalpation, register: bool | None = None) -> Compared:
     """Compare two palpations. `register`: True to move B onto A, False not to, None to do it where the surfaces disagree.
 
     Raises UserError if they overlap at too few places.
@@ -100,7 +100,7 @@ def compare(a: Palpated, b: Palpated, register: bool | None = None) -> Compared:
     inside = (of_b >= lower) & (of_b <= upper)
     levelled = force * float(np.exp(-np.median(np.log(force / of_a))))
     felt_inside = (levelled >= lower) & (levelled <= upper)
-    figures = Agreement(
+    figures = MapAgreement(
         places=int(there.sum()),
         registered=bool(wanted),
         X_AB=X.tolist(),
@@ -117,14 +117,14 @@ def compare(a: Palpated, b: Palpated, register: bool | None = None) -> Compared:
     return Compared(figures, a, moved, of_a, of_b)
 
 
-def _on(palpated: Palpated, values: Array) -> Callable[[Array], Array]:
+def _on(palpated: ComparedPalpation, values: Array) -> Callable[[Array], Array]:
     """Return values of the map's nodes as a function of xy in A [m], shape (p, 2) -> (p,); NaN where it is not scanned."""
     nodes, scanned = palpated.map.vertices[:, :2], palpated.map.scanned
     between = LinearNDInterpolator(nodes, np.where(scanned, values, np.nan))
     return lambda xy: np.asarray(between(xy))
 
 
-def _apart(a: Palpated, b: Palpated) -> float:
+def _apart(a: ComparedPalpation, b: ComparedPalpation) -> float:
     """Return the RMS distance of the surfaces along z [m]; infinite if they do not overlap."""
     height = LinearNDInterpolator(a.map.vertices[:, :2], a.map.vertices[:, 2])
     apart = np.asarray(height(b.map.vertices[:, :2])) - b.map.vertices[:, 2]
@@ -132,7 +132,7 @@ def _apart(a: Palpated, b: Palpated) -> float:
     return float(np.sqrt(np.mean(apart[there] ** 2))) if there.mean() > 0.5 else float("inf")
 
 
-def _registration(a: Palpated, b: Palpated) -> Array:
+def _registration(a: ComparedPalpation, b: ComparedPalpation) -> Array:
     """Return the pose of the frame of B in that of A, shape (4, 4), at which surfaces and maps agree best."""
     height = LinearNDInterpolator(a.map.vertices[:, :2], a.map.vertices[:, 2])
     force = _on(a, np.log(a.map.apparent))
@@ -167,7 +167,7 @@ def _interval(inside: NDArray[np.bool_]) -> Interval:
     return float(found.confidence_interval.low), float(found.confidence_interval.high)
 
 
-def _dice(a: Palpated, b: Palpated) -> float | None:
+def _dice(a: ComparedPalpation, b: ComparedPalpation) -> float | None:
     """Return the overlap of the findings on the nodes of A that both have scanned."""
     apart, nearest = cKDTree(b.map.vertices[:, :2]).query(a.map.vertices[:, :2])
     pitch = float(np.median(np.asarray(cKDTree(b.map.vertices[:, :2]).query(b.map.vertices[:, :2], 2)[0])[:, 1]))

@@ -9,7 +9,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from palpate.comparison.compare import Compared
-from palpate.comparison.palpated import Palpated
+from palpate.comparison.palpated import ComparedPalpation
 from palpate_models.numerics.frames import Array
 
 
@@ -43,7 +43,7 @@ def draw_outcomes(path: Path, real: Array, simulated: Array, more: Array) -> Non
     figure.savefig(path, dpi=110)
 
 
-def _map(axes: Axes, side: Palpated) -> None:
+def _map(axes: Axes, side: ComparedPalpation) -> None:
     scanned, (x, y, _) = side.map.scanned, 1e3 * side.map.vertices.T
     level = float(np.median(side.map.apparent[scanned]))
     ratio = side.map.apparent[scanned] / level

@@ -17,7 +17,7 @@ from palpate_models.numerics.frames import Array, apply
 
 
 @dataclass(frozen=True, eq=False)
-class Palpated:
+class ComparedPalpation:
     """Map of a body, and the forces that were measured; k places, in the body frame A."""
 
     name: str
@@ -29,12 +29,12 @@ class Palpated:
     force: Array
     """Measured there [N], shape (k,): at the depth of the map, or of the comparison if the recording has its curve."""
 
-    def moved(self, X: Array) -> Palpated:
+    def moved(self, X: Array) -> ComparedPalpation:
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
         return replace(self, map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
 
 
-def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None) -> Palpated:
+def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None) -> ComparedPalpation:
     """Return the palpation of a results folder or a recording; of a recording, the forces at `depth_m` [m] if it is given.
 
     Raises UserError if there is no map.
@@ -55,4 +55,6 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
             force = np.array([sample.force for sample in at_depth])
     if message is None:
         raise UserError(f"{path}: there is no map to compare: its samples are too few")
-    return Palpated(path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force)
+    return ComparedPalpation(
+        path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force
+    )

@@ -23,7 +23,7 @@ from palpate.exam_state import exam_state
 from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
 from palpate.recording.assessed import collected
-from palpate.recording.recording import Recording
+from palpate.recording.recording import PalpationRecording
 from palpate.report.evidence import map_of, samples_of
 from palpate.report.results import finding_row, sample_columns
 from palpate.report.rows import FindingRow
@@ -124,7 +124,7 @@ class Assessment:
         return f"<p>{len(self.samples)} samples</p>{findings_html(self.findings)}{picture}"
 
 
-def assess(touches: Touch | Iterable[Touch] | Recording) -> Assessment:
+def assess(touches: Touch | Iterable[Touch] | PalpationRecording) -> Assessment:
     """Return map and findings of touches, computed by the assessment service of the scenario as in an examination.
 
     The service receives the same inputs as in an examination: the perceived surface, and force and depth over time.
@@ -158,7 +158,7 @@ def assess(touches: Touch | Iterable[Touch] | Recording) -> Assessment:
     >>> bool(found.findings.ratio[0] > 1.8)
     True
     """
-    if isinstance(touches, Recording):
+    if isinstance(touches, PalpationRecording):
         return _assessment(collected(touches), {})
     felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
     if not felt:

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 
 from palpate.exam_state import exam_state
 from palpate.recording.faults import Remedy
-from palpate.recording.recording import Contact, ContactKind, Recording
+from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.report.rows import FaultRow, RecordedRow, Report
@@ -34,7 +34,7 @@ _SHOWN: Final = 5000
 _FALSE_FINDINGS: Final = Exam().false_findings
 
 
-def collected(recording: Recording) -> Collected:
+def collected(recording: PalpationRecording) -> Collected:
     """Return samples, map and findings of a recording, and its readings, as a conductor collects them."""
     samples = recording.samples()
     gathered = Collected(exam_states=_states(recording), samples=[sample_message(sample) for sample in samples])
@@ -71,7 +71,7 @@ def region(samples: list[ForceSample]) -> tuple[tuple[float, float], tuple[float
     return (x, y), (width, height), spacing
 
 
-def _states(recording: Recording) -> list[Any]:
+def _states(recording: PalpationRecording) -> list[Any]:
     """Return `exam/state` of some of the readings, in A."""
     every = max(1, sum(len(touch.depth) for touch in recording.touches) // _SHOWN)
     return [
@@ -98,7 +98,7 @@ def _state(touch: Contact, k: int, number: int, setpoint: float) -> Any:
     )
 
 
-def scenario_of(recording: Recording) -> Scenario:
+def scenario_of(recording: PalpationRecording) -> Scenario:
     """Return what a report says about an examination: name, region, depth, tool."""
     samples = recording.samples()
     centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
@@ -115,7 +115,7 @@ def scenario_of(recording: Recording) -> Scenario:
     return Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
 
 
-def write_assessed(folder: Path, recording: Recording) -> tuple[Report, Path]:
+def write_assessed(folder: Path, recording: PalpationRecording) -> tuple[Report, Path]:
     """Write the results of a recording into a folder, as those of a run; return report and page."""
     gathered, scenario = collected(recording), scenario_of(recording)
     times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]

@@ -26,7 +26,7 @@ _LOADED: Final = 0.95
 
 
 @dataclass(frozen=True)
-class Onset:
+class ContactOnset:
     """Begin of a contact by its loading: F = stiffness (s - at)^power."""
 
     at: float
@@ -39,7 +39,7 @@ class Onset:
     """RMS of the force that is not explained, over its RMS."""
 
 
-def onset(inward: Array, force: Array, power: float, sigma: float) -> Onset | None:
+def onset(inward: Array, force: Array, power: float, sigma: float) -> ContactOnset | None:
     """Return the onset of a loading by weighted regression of F^(1/power) on s; None with too few readings.
 
     `inward` [m], `force` [N], shape (k,); `sigma`: SD of the force [N].
@@ -59,7 +59,7 @@ def onset(inward: Array, force: Array, power: float, sigma: float) -> Onset | No
     rest = F - (slope * np.maximum(s - at, 0)) ** power
     variance = max(float(rest @ rest) / max(len(s) - 2, 1), sigma**2)
     sd = np.sqrt(variance * (1 / w.sum() + (middle - at) ** 2 / spread)) / slope
-    return Onset(float(at), float(sd), slope**power, float(np.sqrt(rest @ rest / (F @ F))))
+    return ContactOnset(float(at), float(sd), slope**power, float(np.sqrt(rest @ rest / (F @ F))))
 
 
 def power_of(loadings: Sequence[tuple[Array, Array]], sigma: float) -> float:

@@ -12,7 +12,7 @@ import pandas as pd
 import yaml
 from matplotlib.figure import Figure
 
-from palpate.recording.mapping import Columns, ForceSource, Mapping, Tool, Topics, Transform, Units
+from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
 from palpate.recording.probes import probes
 from palpate.recording.readings import KINDS, TABLES, ReadingError, Readings, from_bag, from_table, moved, opened, read_table
@@ -86,7 +86,7 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
         raise ReadingError(
             f"{name}: neither a column of time nor one of a probe's number is recognised; write the mapping by hand"
         )
-    columns = Columns(
+    columns = MappedColumns(
         position=position,
         force=force or (str(single),),
         time=time,
@@ -108,7 +108,7 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
         unit = "ns" if step > 1e5 else "us" if step > 500 else "ms" if step > 0.5 else "s"
         lines.append(f"sure: time in {unit}: a row every {step:.3g}")
     units = Units.model_validate({"length": length, "time": unit})
-    return Mapping(table=columns, units=units, tool=Tool(radius_m=_UNKNOWN_RADIUS_M))
+    return Mapping(table=columns, units=units, tool=MappedTool(radius_m=_UNKNOWN_RADIUS_M))
 
 
 def _four(names: list[str], letters: str) -> tuple[str, str, str, str] | None:
@@ -134,7 +134,7 @@ def _of_bag(path: Path, lines: list[str]) -> Mapping:
         raise ReadingError(f"{path}: no topic of type {KINDS['pose']} and no tf; for joint states write topics.pose by hand")
     lines.append(f"{'sure' if len(topics['wrench']) == 1 else 'not sure'}: wrench {topics['wrench'][0]} of {topics['wrench']}")
     lines.append(f"not sure: pose {pose if isinstance(pose, str) else f'tf from {pose.parent} to {pose.child}'}")
-    return Mapping(topics=Topics(wrench=topics["wrench"][0], pose=pose), tool=Tool(radius_m=_UNKNOWN_RADIUS_M))
+    return Mapping(topics=Topics(wrench=topics["wrench"][0], pose=pose), tool=MappedTool(radius_m=_UNKNOWN_RADIUS_M))
 
 
 def _frames(bag: Any) -> tuple[list[str], list[str]]:

@@ -21,7 +21,7 @@ class MappingError(UserError):
     """A mapping that cannot be used. Names file, field and what is allowed."""
 
 
-class Columns(Section):
+class MappedColumns(Section):
     """Columns of a CSV or Parquet table."""
 
     position: Triple
@@ -42,7 +42,7 @@ class Columns(Section):
     """Position of the tool at first contact of the probe."""
 
     @model_validator(mode="after")
-    def _ordered(self) -> Columns:
+    def _ordered(self) -> MappedColumns:
         if (self.time is None) == (self.probe is None):
             raise ValueError("want one of time and probe")
         return self
@@ -100,7 +100,7 @@ class ForceSource(Section):
     """Time by which the force's stamps are later than those of equal positions [s]."""
 
 
-class Tool(Section):
+class MappedTool(Section):
     """The spherical tool."""
 
     radius_m: Annotated[float, Field(ge=0.0005, le=0.1)]
@@ -113,7 +113,7 @@ class Tool(Section):
     """That point in the frame of the tool's pose [m]."""
 
 
-class Body(Section):
+class MappedBody(Section):
     """The body that is palpated."""
 
     pose: Pose | None = None
@@ -128,14 +128,14 @@ class Body(Section):
 class Mapping(Section):
     """Meaning of the columns or topics of a recording, and its tool."""
 
-    table: Columns | None = None
+    table: MappedColumns | None = None
     topics: Topics | None = None
     units: Units = Units()
     force: ForceSource = ForceSource()
-    tool: Tool
+    tool: MappedTool
     gravity_mps2: Vec3 = (0.0, 0.0, -9.81)
     """In the frame of the positions."""
-    body: Body = Body()
+    body: MappedBody = MappedBody()
 
     @model_validator(mode="after")
     def _one_source(self) -> Mapping:

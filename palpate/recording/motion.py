@@ -22,7 +22,7 @@ Mask = NDArray[np.bool_]
 
 
 @dataclass(frozen=True)
-class MotionTuning:
+class FreeMotionTuning:
     """Windows and limits of the analysis."""
 
     block_s: float = 0.25
@@ -43,7 +43,7 @@ class MotionTuning:
     """A delay is none if the correlation without it is at least this share of that with it."""
 
 
-TUNING: Final = MotionTuning()
+TUNING: Final = FreeMotionTuning()
 
 
 def noise(values: Array) -> float:

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from palpate.recording.recording import Contact, ContactKind, Recording
+from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.archive import FILE, read_collected
 from palpate.report.evidence import columns_of, points, xyz
 from palpate_assessment.calibration import learned
@@ -26,7 +26,7 @@ def is_own(path: Path) -> bool:
     return (path / FILE).is_file() and (path / "scenario.yaml").is_file()
 
 
-def own_recording(folder: Path) -> Recording:
+def own_recording(folder: Path) -> PalpationRecording:
     """Return the recording of a run: its strokes at depth. Raises UserError."""
     scenario, collected = load_scenario(str(folder / "scenario.yaml")), read_collected(folder)
     X_AW = inverse(np.array(exam_input(scenario).X_WA))
@@ -56,7 +56,7 @@ def own_recording(folder: Path) -> Recording:
     ]
     surface = np.empty((0, 3)) if collected.surface is None else apply(X_AW, points(collected.surface))
     normals = np.empty((0, 3)) if collected.surface is None else points(collected.surface, "normals") @ X_AW[:3, :3].T
-    return Recording(
+    return PalpationRecording(
         name=scenario.name,
         indenter_radius_m=scenario.robot.indenter_radius_m,
         touches=tuple(touches),

@@ -15,7 +15,7 @@ from palpate.recording.motion import Axis, blocks, pressing_axis
 from palpate.recording.own import is_own, own_recording
 from palpate.recording.probes import contacts_of_probes, probes
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
-from palpate.recording.recording import Recording
+from palpate.recording.recording import PalpationRecording
 from palpate.recording.timed import contacts_over_time
 from palpate.recording.usable import usable
 from palpate_models.numerics.frames import Array, inverse, matrix
@@ -25,7 +25,7 @@ _UPRIGHT: Final = 0.7
 _WRONG_FRAME_DEG: Final = 40.0
 
 
-def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None) -> Recording:
+def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None) -> PalpationRecording:
     """Return the recording of a table, a bag, or the results folder of a run.
 
     Parameters
@@ -54,7 +54,7 @@ def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None
     return recording_of(raw, mapping, path.stem)
 
 
-def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
+def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecording:
     """Return the recording of readings as a file has them. Raises UserError."""
     readings, faults = cleaned(raw, mapping.tool.radius_m)
     readings = moved(readings, mapping)
@@ -69,7 +69,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
         )
     if axis.angle_deg > _WRONG_FRAME_DEG:
         faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg))
-        return Recording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
+        return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
     if axis.flipped:
         faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
         readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
@@ -91,7 +91,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> Recording:
         if any(fault.remedy is Remedy.REFUSED for fault in faults)
         else usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
     )
-    return Recording(
+    return PalpationRecording(
         name=name,
         indenter_radius_m=mapping.tool.radius_m,
         touches=tuple(touches),

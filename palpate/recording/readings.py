@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from rosbags.highlevel import AnyReader
 from scipy.spatial.transform import Rotation, Slerp
 
-from palpate.recording.mapping import SCALES, Columns, Joints, Mapping, Topics, Transform
+from palpate.recording.mapping import SCALES, Joints, MappedColumns, Mapping, Topics, Transform
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
@@ -99,7 +99,7 @@ def _check_parquet(file: io.BytesIO, path: Path) -> None:
 def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
     """Return the readings of a table. Raises ReadingError for a missing column or one that has no numbers."""
     columns, units = mapping.table, mapping.units
-    assert isinstance(columns, Columns)
+    assert isinstance(columns, MappedColumns)
 
     def values(names: tuple[str, ...] | None, unit: str = "") -> Any:
         if names is None:

@@ -76,7 +76,7 @@ class Palpated:
 
 
 @dataclass(frozen=True, eq=False)
-class Recording:
+class PalpationRecording:
     """Contacts of one body."""
 
     name: str

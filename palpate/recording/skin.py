@@ -32,7 +32,7 @@ _PLANE: Final = 4
 
 
 @dataclass(frozen=True)
-class Skin:
+class RecordedSkin:
     """Heights of the tool's centre at first contact over the xy plane of A, on a grid."""
 
     x: Array
@@ -57,14 +57,14 @@ class Skin:
         z, normal, _ = self.at(xy)
         return np.column_stack((xy, z)), normal
 
-    def through(self, points: Array, sd: Array) -> Skin:
+    def through(self, points: Array, sd: Array) -> RecordedSkin:
         """Return the skin moved outward or inward to points of standard deviation `sd` [m], by their weighted mean."""
         off = points[:, 2] - self.at(points[:, :2])[0]
         near = np.abs(off - np.median(off)) <= 5 * np.median(np.abs(off - np.median(off))) + 1e-9
         return replace(self, z=self.z + float(np.average(off[near], weights=sd[near] ** -2)))
 
 
-def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> Skin:
+def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> RecordedSkin:
     """Return the skin of a mesh in the frame of the positions, in units of `scale` [m]. Raises UserError."""
     try:
         vertices, triangles = read_mesh(file)
@@ -75,7 +75,7 @@ def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tupl
     xy = np.stack(np.meshgrid(*stations, indexing="ij"), axis=-1)
     z = LinearNDInterpolator(centres[:, :2], centres[:, 2])(xy)
     z = np.where(np.isfinite(z), z, NearestNDInterpolator(centres[:, :2], centres[:, 2])(xy))
-    return Skin(*stations, z, np.full(z.shape, 0.0))
+    return RecordedSkin(*stations, z, np.full(z.shape, 0.0))
 
 
 def grid_over(xy: Array, margin: float) -> tuple[Array, Array]:
@@ -86,7 +86,7 @@ def grid_over(xy: Array, margin: float) -> tuple[Array, Array]:
     return x, y
 
 
-def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> Skin:
+def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> RecordedSkin:
     """Return the skin through points [m], shape (n, 3), of standard deviation `sd` [m], shape (n,).
 
     `least`: shortest length over which the skin varies [m].
@@ -121,7 +121,7 @@ def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float
     process.kernel_ = process.kernel_.k1  # the noise of the points is not the skin's
     mean, spread = process.predict(xy, return_std=True)
     z = centre[2] + _terms(xy, centre, terms) @ plane + size * mean
-    return Skin(x, y, z.reshape(len(x), len(y)), (size * spread).reshape(len(x), len(y)))
+    return RecordedSkin(x, y, z.reshape(len(x), len(y)), (size * spread).reshape(len(x), len(y)))
 
 
 def _terms(places: Array, centre: Array, count: int) -> Array:

@@ -10,13 +10,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.recording import cutting
-from palpate.recording.cutting import Onset
+from palpate.recording.cutting import ContactOnset
 from palpate.recording.faults import Fault, FaultCode, Remedy
 from palpate.recording.mapping import SCALES, Mapping
 from palpate.recording.motion import TUNING, Axis, delay, free_air, noise, shifted, tared
 from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Palpated
-from palpate.recording.skin import Skin, fitted, grid_over, of_mesh
+from palpate.recording.skin import RecordedSkin, fitted, grid_over, of_mesh
 from palpate_models.numerics.frames import Array, inverse
 
 _TRAVEL: Final = (0.005, 4.0)
@@ -113,7 +113,7 @@ class _Measured:
         """Radius of the footprint [m]."""
         self.stations = grid_over(np.concatenate([p[one, :2] for one in touching]), self.reach)
         self.slides = [cutting.lateral_travel(p[one], outward) > self.reach for one in touching]
-        self.skin: Skin | None = None
+        self.skin: RecordedSkin | None = None
         self.power = 1.0
 
     def palpated(self) -> Palpated:
@@ -151,7 +151,7 @@ class _Measured:
         force = normal_force(self.readings.force[one][: len(p)][down], normal)
         return _Loading(normal, inward[down][whole], force[whole], p[down][-1], float(inward[down][-1]))
 
-    def _skin_points(self, loads: list[_Loading], onsets: list[Onset | None]) -> tuple[Array, Array]:
+    def _skin_points(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> tuple[Array, Array]:
         """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
 
         They are of onsets; of stretches of slides in which the depth changes; and, with less weight, of the other stretches, in
@@ -189,7 +189,7 @@ class _Measured:
             normal, middle = normals[part].mean(axis=0), p[part].mean(axis=0)
             yield _Loading(normal, -(p[part] @ normal), normal_force(F[part], normals[part]), middle, -float(middle @ normal))
 
-    def _pressed(self, one: slice, load: _Loading, begin: Onset) -> Contact:
+    def _pressed(self, one: slice, load: _Loading, begin: ContactOnset) -> Contact:
         p = self.readings.position[one]
         kept = cutting.before_lift(-(p @ load.normal))
         whole = self.readings.whole[one][kept]

@@ -22,9 +22,9 @@ from sklearn.exceptions import ConvergenceWarning
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
-from palpate.recording.recording import Recording
+from palpate.recording.recording import PalpationRecording
 from palpate.truth.surface import TrueBody, TrueSurface
-from palpate.twin.presses import Press, amplitude, presses_of, simulated
+from palpate.twin.presses import FittedPress, amplitude, presses_of, simulated
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.grid import BodyGrid
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
@@ -59,7 +59,7 @@ _ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
-class Wall:
+class FittedWall:
     """A fitted wall; n presses."""
 
     grid: BodyGrid
@@ -67,12 +67,12 @@ class Wall:
     edge_m: float
     onset_m: float
     """Depth at which the recording noticed the contact [m]."""
-    presses: list[Press]
+    presses: list[FittedPress]
     held_out: NDArray[np.bool_]
     """True for presses that were not fitted, shape (n,)."""
 
 
-def fit_wall(recording: Recording, draft: Path) -> Wall:
+def fit_wall(recording: PalpationRecording, draft: Path) -> FittedWall:
     """Return the wall that reproduces the presses of a recording; the file `draft` is overwritten with its surface.
 
     Raises UserError if there are too few presses.
@@ -93,10 +93,10 @@ def fit_wall(recording: Recording, draft: Path) -> Wall:
         ratio = np.array([amplitude(press.force, force) for press, force in zip(presses, forces, strict=True)])
         field.correct(ratio[~held_out])
     nodes = np.column_stack((grid.x_m, grid.y_m))
-    return Wall(replace(grid, k_w_n_per_m3=field(nodes)), stiffness, edge, onset, presses, held_out)
+    return FittedWall(replace(grid, k_w_n_per_m3=field(nodes)), stiffness, edge, onset, presses, held_out)
 
 
-def skin_at(model: PhantomModel, presses: Sequence[Press]) -> tuple[Array, Array]:
+def skin_at(model: PhantomModel, presses: Sequence[FittedPress]) -> tuple[Array, Array]:
     """Return the points of the model's surface under the presses [m] and its normals there, shapes (n, 3)."""
     surface = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
     return surface.points(np.array([press.place[:2] for press in presses]))
@@ -138,7 +138,7 @@ def _spacing(places: Array) -> float:
     return float(np.median(np.asarray(cKDTree(places).query(places, 2)[0])[:, 1]))
 
 
-def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, float]:
+def _form(presses: Sequence[FittedPress], radius: float) -> tuple[Stiffness, float, float]:
     """Return the wall's stiffness without its level, the level k_w [N/m^3], and the onset of contact [m]."""
     curved = [press for press in presses if np.isfinite(press.force).sum() > 2]
     depth = float(np.median([press.depth.max() for press in presses]))
@@ -181,7 +181,7 @@ def _form(presses: Sequence[Press], radius: float) -> tuple[Stiffness, float, fl
     return stiffness, float(level) * usual.k_w_n_per_m3, float(form[2]) * depth
 
 
-def _surface(recording: Recording, stiffness: Stiffness, edge: float, onset: float, level: float) -> BodyGrid:
+def _surface(recording: PalpationRecording, stiffness: Stiffness, edge: float, onset: float, level: float) -> BodyGrid:
     """Return a grid with the surface of the recording, moved outward by the onset [m], and a uniform modulus [N/m^3]."""
     radius = recording.indenter_radius_m
     p = recording.surface + onset * recording.normals

@@ -13,7 +13,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate.recording.recording import Contact, ContactKind, Recording
+from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate_assessment.sampling import ForceSample
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
@@ -41,7 +41,7 @@ LIMITS: Final = PressLimits()
 
 
 @dataclass(frozen=True, eq=False)
-class Press:
+class FittedPress:
     """One press; n readings in the order of time, in A."""
 
     place: Array
@@ -66,7 +66,7 @@ class Press:
         return float(self.force[self.deepest])
 
 
-def presses_of(recording: Recording) -> list[Press]:
+def presses_of(recording: PalpationRecording) -> list[FittedPress]:
     """Return the presses of a recording, thinned evenly to the most that are fitted. Raises UserError if there are too few."""
     slides = {n for n, touch in enumerate(recording.touches, start=1) if touch.kind is ContactKind.SLIDE}
     presses = [_pressed(touch) for touch in recording.touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0]
@@ -80,7 +80,7 @@ def presses_of(recording: Recording) -> list[Press]:
     return [presses[k] for k in chosen]
 
 
-def _pressed(touch: Contact) -> Press:
+def _pressed(touch: Contact) -> FittedPress:
     until = int(np.flatnonzero(touch.depth >= 0.95 * touch.depth.max())[-1]) + 1  # without the retreat
     chosen = np.unique(np.linspace(0, until - 1, LIMITS.readings).round().astype(int))
     chosen = chosen[touch.depth[chosen] > 0]
@@ -89,21 +89,21 @@ def _pressed(touch: Contact) -> Press:
     else:
         time = touch.time[chosen] - touch.time[0]
         chosen, time = chosen[time > 0], time[time > 0]
-    return Press(touch.position.mean(axis=0), time, touch.depth[chosen], touch.force[chosen], touch.time is not None)
+    return FittedPress(touch.position.mean(axis=0), time, touch.depth[chosen], touch.force[chosen], touch.time is not None)
 
 
-def _slid(sample: ForceSample, radius: float) -> Press:
+def _slid(sample: ForceSample, radius: float) -> FittedPress:
     footprint = sqrt(2 * radius * sample.depth)
     share = np.arange(1, LIMITS.slide_steps + 1) / LIMITS.slide_steps
     force = np.where(share == 1, sample.force, np.nan)
     speed = max(float(np.linalg.norm(sample.velocity)), footprint)  # a sample at rest lasts a second
-    return Press(sample.position, share * footprint / speed, sample.depth * (1 - (1 - share) ** 2), force, True)
+    return FittedPress(sample.position, share * footprint / speed, sample.depth * (1 - (1 - share) ** 2), force, True)
 
 
 def simulated(
     model: PhantomModel,
     stiffness: Stiffness,
-    presses: Sequence[Press],
+    presses: Sequence[FittedPress],
     at: tuple[Array, Array],
     radius: float,
     deeper: float = 0.0,

@@ -11,10 +11,10 @@ import yaml
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
-from palpate.recording.recording import Recording
+from palpate.recording.recording import PalpationRecording
 from palpate.report.files import write_text
 from palpate.report.scoring import Map
-from palpate.twin.fit import Wall, fit_wall, skin_at
+from palpate.twin.fit import FittedWall, fit_wall, skin_at
 from palpate.twin.presses import simulated
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.field import lesion_field
@@ -66,7 +66,7 @@ class Quality:
     """Origin of the twin's frame in the body frame of the recording [m]."""
 
 
-def centred(recording: Recording) -> tuple[Recording, Array]:
+def centred(recording: PalpationRecording) -> tuple[PalpationRecording, Array]:
     """Return the recording with the origin on the skin in the middle of the contacts, and that origin [m], shape (3,)."""
     places = np.array([touch.position.mean(axis=0) for touch in recording.touches])
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
@@ -76,7 +76,7 @@ def centred(recording: Recording) -> tuple[Recording, Array]:
 
 
 def write_twin(
-    recording: Recording,
+    recording: PalpationRecording,
     folder: Path,
     found: Map | None = None,
     elastic: bool = False,
@@ -98,7 +98,7 @@ def write_twin(
     return _compared(load_scenario(str(file)), wall, own, folder, origin)
 
 
-def _lumps(vertices: Array, finding: NDArray[np.int32], wall: Wall) -> list[Lesion]:
+def _lumps(vertices: Array, finding: NDArray[np.int32], wall: FittedWall) -> list[Lesion]:
     """Return the findings of a map as ellipses, with the contrast that the fitted modulus has there."""
     lumps = []
     nodes = np.column_stack((wall.grid.x_m, wall.grid.y_m))
@@ -119,7 +119,9 @@ def _lumps(vertices: Array, finding: NDArray[np.int32], wall: Wall) -> list[Lesi
     return lumps
 
 
-def _scenario(recording: Recording, wall: Wall, lesions: list[Lesion], thickness_m: float, elastic: bool) -> dict[str, Any]:
+def _scenario(
+    recording: PalpationRecording, wall: FittedWall, lesions: list[Lesion], thickness_m: float, elastic: bool
+) -> dict[str, Any]:
     """Return the fields of the scenario: the twin at rest, examined where and as deep as it was recorded."""
     places = np.array([press.place[:2] for press in wall.presses])
     low, high = places.min(axis=0), places.max(axis=0)
@@ -147,7 +149,7 @@ def _scenario(recording: Recording, wall: Wall, lesions: list[Lesion], thickness
     }
 
 
-def _elastic(scenario: Scenario, wall: Wall, radius: float) -> tuple[Array, Array]:
+def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array, Array]:
     """Return recorded forces at the greatest depth of some presses, and those of the elastic tier [N], shapes (n,)."""
     service = elastic_service(scenario)
     assert isinstance(service, TissueService)
@@ -166,7 +168,7 @@ def _elastic(scenario: Scenario, wall: Wall, radius: float) -> tuple[Array, Arra
     return np.array([press.felt for press in presses]), np.array(expected)
 
 
-def _compared(scenario: Scenario, wall: Wall, recording: Recording, folder: Path, origin: Array) -> Quality:
+def _compared(scenario: Scenario, wall: FittedWall, recording: PalpationRecording, folder: Path, origin: Array) -> Quality:
     """Press the written twin as the recording was, and draw both."""
     model = build_phantom(scenario.phantom, scenario.seed)
     at = skin_at(model, wall.presses)

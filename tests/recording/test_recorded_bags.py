@@ -11,7 +11,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
-from palpate.recording.mapping import Joints, Mapping, Tool, Topics, Transform
+from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
 from palpate_bus.messages import (
     JointState,
@@ -30,7 +30,7 @@ from palpate_bus.messages.stamps import NS, header
 from palpate_bus.messages.typestore import store
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
-TOOL = Tool(radius_m=0.015, mass_kg=0.5)
+TOOL = MappedTool(radius_m=0.015, mass_kg=0.5)
 SLIDERS = """<robot name="gantry"><link name="world"/><link name="a"/><link name="b"/><link name="tool"/>
 <joint name="x" type="prismatic"><parent link="world"/><child link="a"/><axis xyz="1 0 0"/>{0}</joint>
 <joint name="y" type="prismatic"><parent link="a"/><child link="b"/><axis xyz="0 1 0"/>{0}</joint>

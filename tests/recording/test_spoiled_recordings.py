@@ -11,16 +11,18 @@ import pytest
 
 from palpate.interface.assessment import assess
 from palpate.recording.faults import FaultCode
-from palpate.recording.mapping import Columns, ForceSource, Mapping, Tool, Units
+from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
 from palpate.recording.readings import from_table
-from palpate.recording.recording import Recording
+from palpate.recording.recording import PalpationRecording
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))
 P, F, N = ["x", "y", "z"], ["fx", "fy", "fz"], ["nx", "ny", "nz"]
-OVER_TIME = Mapping(table=Columns(position=tuple(P), force=tuple(F), time="t"), tool=Tool(radius_m=0.015))
-PROBES = Mapping(table=Columns(position=tuple(P), force=tuple(F), normal=tuple(N), probe="probe"), tool=Tool(radius_m=0.015))
+OVER_TIME = Mapping(table=MappedColumns(position=tuple(P), force=tuple(F), time="t"), tool=MappedTool(radius_m=0.015))
+PROBES = Mapping(
+    table=MappedColumns(position=tuple(P), force=tuple(F), normal=tuple(N), probe="probe"), tool=MappedTool(radius_m=0.015)
+)
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def probed(table: pd.DataFrame) -> pd.DataFrame:
     return found
 
 
-def read(table: pd.DataFrame, mapping: Mapping) -> Recording:
+def read(table: pd.DataFrame, mapping: Mapping) -> PalpationRecording:
     return recording_of(from_table(table, mapping, "spoiled"), mapping, "spoiled")
 
 
@@ -143,7 +145,7 @@ MAPPED = {
     "500-hz": (lambda t: resampled(t, 500), OVER_TIME),
     "millimetres": (in_mm, mapped(OVER_TIME, units=Units(length="mm"))),
     "on-the-body": (flipped, mapped(OVER_TIME, force=ForceSource(on="body"))),
-    "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=Tool(radius_m=0.015, point="tip"))),
+    "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=MappedTool(radius_m=0.015, point="tip"))),
     "late": (late, mapped(OVER_TIME, force=ForceSource(delay_s=0.2))),
 }
 

@@ -10,7 +10,7 @@ import pytest
 from palpate.comparison.compare import compare
 from palpate.comparison.figures import draw
 from palpate.comparison.outcomes import read_outcomes, sim_to_real
-from palpate.comparison.palpated import Palpated
+from palpate.comparison.palpated import ComparedPalpation
 from palpate.report.scoring import Map
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, matrix
@@ -23,7 +23,7 @@ def _body(xy: Array) -> tuple[Array, Array]:
     return -4.0 * (x**2 + 2 * y**2), 2.0 + 2.0 * np.exp(-((y - 0.004) ** 2 + (0.3 * x) ** 2) / 5e-5) + 10 * x
 
 
-def _palpated(name: str, scale: float, sd: float, seed: int) -> Palpated:
+def _palpated(name: str, scale: float, sd: float, seed: int) -> ComparedPalpation:
     axis = np.arange(-0.03, 0.0301, 0.002)
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
     height, force = _body(xy)
@@ -34,7 +34,7 @@ def _palpated(name: str, scale: float, sd: float, seed: int) -> Palpated:
     found = Map(np.column_stack((xy, height)), apparent, apparent / band, apparent * band, np.ones(len(xy), bool), finding)
     places = rng.uniform(-0.025, 0.025, (300, 2))
     height, force = _body(places)
-    return Palpated(name, found, 0.01, np.column_stack((places, height)), scale * force)
+    return ComparedPalpation(name, found, 0.01, np.column_stack((places, height)), scale * force)
 
 
 def test_same_body_agrees_within_its_band(tmp_path: Path) -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.recording.recording import Contact, ContactKind, Recording
+from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.scoring import Map
 from palpate.twin.presses import presses_of, simulated
 from palpate.twin.scenario import write_twin
@@ -29,7 +29,7 @@ def _map() -> Map:
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording() -> PalpationRecording:
     """Return probes to 3 mm of a flat body with a stiff ridge, 0.2 m from the origin of their frame."""
     axis = np.linspace(-0.014, 0.014, 8)
     xy = np.stack(np.meshgrid(axis, axis), axis=-1).reshape(-1, 2)
@@ -40,17 +40,17 @@ def recording() -> Recording:
     def contact(place: Array, force: Array) -> Contact:
         return Contact(ContactKind.PROBE, np.tile(place, (8, 1)), np.tile(normals[0], (8, 1)), depth, force, 1e-4, 0.01)
 
-    blank = Recording("body", RADIUS_M, tuple(contact(place, np.ones(8)) for place in places), places, normals)
+    blank = PalpationRecording("body", RADIUS_M, tuple(contact(place, np.ones(8)) for place in places), places, normals)
     ridge = RIDGE.model_copy(update={"centre_m": (0.0, 0.003)})
     body = flat_phantom(0.035, 0.0015, 8e5, [ridge])
     material = Stiffness(length_m=0.004, prony_g=(), prony_tau_s=())
     forces = simulated(body, material, presses_of(blank), (places, normals), RADIUS_M)
     noise = 0.01 * np.random.default_rng(0).standard_normal((64, 8))
     touches = tuple(contact(place + origin, force + e) for place, force, e in zip(places, forces, noise, strict=True))
-    return Recording("body", RADIUS_M, touches, places + origin, normals)
+    return PalpationRecording("body", RADIUS_M, touches, places + origin, normals)
 
 
-def test_twin_reproduces_held_out_forces_and_has_the_lump(recording: Recording, tmp_path: Path) -> None:
+def test_twin_reproduces_held_out_forces_and_has_the_lump(recording: PalpationRecording, tmp_path: Path) -> None:
     quality = write_twin(recording, tmp_path, _map())
     assert quality.variation > 0.15
     assert quality.error_at_depth < 0.08
@@ -65,7 +65,7 @@ def test_twin_reproduces_held_out_forces_and_has_the_lump(recording: Recording, 
     assert (tmp_path / "twin.png").stat().st_size > 10_000
 
 
-def test_too_few_presses_are_refused(recording: Recording, tmp_path: Path) -> None:
-    few = Recording("body", RADIUS_M, recording.touches[:5], recording.surface, recording.normals)
+def test_too_few_presses_are_refused(recording: PalpationRecording, tmp_path: Path) -> None:
+    few = PalpationRecording("body", RADIUS_M, recording.touches[:5], recording.surface, recording.normals)
     with pytest.raises(UserError, match="5 presses"):
         write_twin(few, tmp_path)

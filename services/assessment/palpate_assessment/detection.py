@@ -40,7 +40,7 @@ class Muscle:
 
 
 @dataclass(frozen=True)
-class Search:
+class ShapeSearch:
     """Search for lumps."""
 
     tries: int = 120
@@ -73,7 +73,7 @@ class Search:
     """A stroke crosses a lump whose shape is at least this part of the highest value of any sample: its centre may be outside."""
 
 
-MUSCLE, SEARCH = Muscle(), Search()
+MUSCLE, SEARCH = Muscle(), ShapeSearch()
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from palpate_models.scenario import press
 
 
 @dataclass(frozen=True)
-class Anatomy:
+class AnatomyPrior:
     """Prior of ribs, iliac crests and muscles of an abdomen, in A."""
 
     arch_m: float = 0.18
@@ -109,7 +109,7 @@ OWN_ZERO = ErrorPrior(
     least_depth_m=0.00003, surface_share=0.0, wide_share=0.0, onset_m=0.0, shared_tare=0.0, slide_sd=0.0, unlike=0.0
 )
 """Errors of presses whose depth counts from their own onset, and which are themselves what the map is of."""
-ABDOMEN = Anatomy()
+ABDOMEN = AnatomyPrior()
 LENGTHS = Lengths()
 
 
@@ -123,7 +123,7 @@ class PressStandard:
     """Nominal depth."""
     force_n: float = 5.0
     """Usual force."""
-    anatomy: Anatomy | None = ABDOMEN
+    anatomy: AnatomyPrior | None = ABDOMEN
     """None for a body of which nothing is known: long shapes are tried too, and probabilities are of a stated prior."""
     calibration: Calibration = field(default_factory=learned)
     """Exponent and conversion of the tissue."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from palpate_supervisor.senses import Comparison
+from palpate_supervisor.senses import ForceComparison
 from palpate_supervisor.watch import Breach, Level, StopCause
 
 FT, JOINTS = "ft/wrench", "joint_states"
@@ -44,7 +44,7 @@ class SensorJudge:
         self._tested = False
         self._disagreed = 0
 
-    def judge(self, comparison: Comparison, depth: float | None) -> list[Breach]:
+    def judge(self, comparison: ForceComparison, depth: float | None) -> list[Breach]:
         """Return the breaches; `depth` [m] is that of the tool below the perceived surface, None while there is none."""
         c = comparison
         self._disagreed = self._disagreed + 1 if c.disagreement > TUNING.disagreement_n else 0
@@ -55,7 +55,7 @@ class SensorJudge:
             return _joints(f"torque {c.offset_nm:.1f} N m off in free air, limit {TUNING.offset_nm:g} N m")
         return self._judge_ft(c, depth)
 
-    def _judge_ft(self, c: Comparison, depth: float | None) -> list[Breach]:
+    def _judge_ft(self, c: ForceComparison, depth: float | None) -> list[Breach]:
         if self._disagreed >= TUNING.disagreements:
             return _ft(f"{c.disagreement:.1f} N from the force by the joints, limit {TUNING.disagreement_n:g} N")
         if c.noise > TUNING.noise_n:
@@ -64,7 +64,7 @@ class SensorJudge:
             return _ft(f"bias changed by {c.drift:.1f} N in free air, limit {TUNING.drift_n:g} N")
         return self._test(c, depth)
 
-    def _test(self, c: Comparison, depth: float | None) -> list[Breach]:
+    def _test(self, c: ForceComparison, depth: float | None) -> list[Breach]:
         """Weigh the tool: it is known, and its weight and inertia change in sensor axes on the way to the first target."""
         if c.excitation >= TUNING.excitation_n2:
             self._tested = True

@@ -79,7 +79,7 @@ class Measurement(NamedTuple):
     """Measured joint torques, gravity included [N m], shape (n,)."""
 
 
-class Comparison(NamedTuple):
+class ForceComparison(NamedTuple):
     """Senses after a measurement, forces in N. All but gain and excitation are small if both senses are true."""
 
     joint_force: float
@@ -114,7 +114,7 @@ class ForceSenses:
     def compare(
         self, measured: Measurement, residual: Array, J_W: Array, load_S: Array, R_WS: Array, speed: float, dt_s: float, *,
         starting: bool,
-    ) -> Comparison:  # fmt: skip
+    ) -> ForceComparison:  # fmt: skip
         """Return the comparison.
 
         Args:
@@ -134,7 +134,7 @@ class ForceSenses:
             self._joints[0] = residual
             self._tool[:3], self._tool[5:] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
         state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W)
-        return Comparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, starting, TUNING))
+        return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, starting, TUNING))
 
 
 @compiled

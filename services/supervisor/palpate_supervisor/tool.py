@@ -14,7 +14,7 @@ from palpate_models.numerics.vectors import nearest_vertex
 from palpate_models.robot.arm import urdf
 from palpate_models.robot.observer import MomentumObserver
 from palpate_models.scenario.schema import Robot
-from palpate_supervisor.senses import Comparison, ForceSenses, Measurement
+from palpate_supervisor.senses import ForceComparison, ForceSenses, Measurement
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ class ToolSense:
         self._senses = ForceSenses(self._model.nv)
         self._mass = robot.tool_mass_kg
         self._velocity_W: Array | None = None
-        self.comparison: Comparison
+        self.comparison: ForceComparison
         """Of the two senses, after the latest measurement."""
         self._indenter = self._model.getFrameId("indenter")
         self._sensor = self._model.getFrameId("ft_sensor")

@@ -14,7 +14,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_supervisor.judge import FT, JOINTS, SensorJudge
-from palpate_supervisor.senses import Comparison, Measurement
+from palpate_supervisor.senses import ForceComparison, Measurement
 from palpate_supervisor.tool import ToolSense
 
 ROBOT = exam_input(load_scenario("clean")).robot
@@ -48,7 +48,7 @@ def measurements() -> tuple[Measurement, ...]:
     return tuple(found)
 
 
-def first_breach(lie: Lie = lambda t, true: true) -> tuple[float, str, Comparison] | None:
+def first_breach(lie: Lie = lambda t, true: true) -> tuple[float, str, ForceComparison] | None:
     """Return time [s], culprit and comparison of the first breach."""
     sense, judge = ToolSense(ROBOT), SensorJudge()
     for i, true in enumerate(measurements()):
@@ -111,7 +111,7 @@ def test_wrong_joints_are_named(change: Callable[[Measurement], Measurement]) ->
 
 
 def test_a_tool_that_was_not_weighed_touches_nothing() -> None:
-    judge, silent = SensorJudge(), Comparison(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1)
+    judge, silent = SensorJudge(), ForceComparison(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1)
     assert not judge.judge(silent, -0.1)
     (breach,) = judge.judge(silent, -0.01)
     assert breach.culprit == FT
