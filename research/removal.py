@@ -37,7 +37,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "law": ("palpate_control.impedance",),
     "safety net": ("palpate_control.safety",),
     "driver's limits": ("palpate_robot.driver",),
-    "arm's kinematics": ("palpate_robot.backends.dart.kinematics",),
+    "arm's kinematics": ("palpate_robot.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.tissue", "palpate_tissue.contact"),
     "rest point's triangles": ("palpate_tissue.surface",),
     "path and its splines": (

@@ -22,13 +22,12 @@ from math import cos, sin
 from typing import Final
 
 import numpy as np
-import pinocchio as pin
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import urdf
 from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, DrawnArm, DrawnForce, DrawnTorque
 from palpate_models.scenario.schema import Robot
+from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, STICK_RADPS
 
 RIPPLES: Final = 320
@@ -87,15 +86,12 @@ class TorqueSensors:
 
     def __init__(self, robot: Robot, drawn: DrawnTorque, rng: np.random.Generator) -> None:
         self._drawn, self._rng = drawn, rng
-        self._missing = pin.buildModelFromXML(urdf(robot, geometry=False))
-        for i, scale in enumerate(drawn.link_mass.tolist(), start=1):  # gravity is linear in the masses
-            self._missing.inertias[i].mass *= scale - 1.0
-        self._data = self._missing.createData()
+        self._missing = Kinematics(robot, mass_scale=drawn.link_mass - 1.0)  # gravity is linear in the masses
 
     def read(self, q: Array, v: Array, torque: Array, readings: int) -> Array:
-        """Return the mean of some readings [N m], shape (7,): of the torque on the links, at joints `q` [rad] and `v` [rad/s]."""
+        """Return the mean of some readings [N m], shape (n,): of the torque on the links, at joints `q` [rad] and `v` [rad/s]."""
         given, drawn = self._drawn.given, self._drawn
-        loaded = torque + pin.computeGeneralizedGravity(self._missing, self._data, q)
+        loaded = torque + self._missing.state(q, np.zeros_like(v))[13:]
         friction = (given.friction_nm + given.load_friction * np.abs(loaded)) * (v / (np.abs(v) + STICK_RADPS))
         noise = given.noise_nm / np.sqrt(readings) * self._rng.standard_normal(len(q))
         return np.asarray(drawn.gain * loaded + drawn.zero_nm + friction + noise)

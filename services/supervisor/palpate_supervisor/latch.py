@@ -5,8 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from palpate_bus.messages import RobotStatus
-from palpate_supervisor.watch import Breach, Level, StopCause
+from palpate_supervisor.watch import Breach, DriverHold, Level, StopCause
 
 
 @dataclass(frozen=True)
@@ -28,11 +27,11 @@ RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
 """Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
 HARMLESS = frozenset(
     {
-        (StopCause.FORCE, RobotStatus.CAUSE_NONE),
-        (StopCause.SILENT, RobotStatus.CAUSE_NONE),
-        (StopCause.DRIVER, RobotStatus.CAUSE_COMMAND_EXPIRED),
-        (StopCause.DRIVER, RobotStatus.CAUSE_FORCE_LIMIT),
-        (StopCause.DRIVER, RobotStatus.CAUSE_STOP_REQUESTED),
+        (StopCause.FORCE, DriverHold.NONE),
+        (StopCause.SILENT, DriverHold.NONE),
+        (StopCause.DRIVER, DriverHold.COMMAND_EXPIRED),
+        (StopCause.DRIVER, DriverHold.FORCE_LIMIT),
+        (StopCause.DRIVER, DriverHold.STOP_REQUESTED),
     }
 )
 """Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""

@@ -69,6 +69,15 @@ class StopCause(IntEnum):
     SENSOR = 11
 
 
+class DriverHold(IntEnum):
+    """Values of `palpation_msgs/RobotStatus.cause`, why the driver holds, that a release depends on."""
+
+    NONE = 0
+    COMMAND_EXPIRED = 1
+    FORCE_LIMIT = 7
+    STOP_REQUESTED = 8
+
+
 @dataclass(frozen=True, slots=True)
 class Breach:
     """A limit that is violated now. `cause` is the code to act on; `reason` is text for people."""

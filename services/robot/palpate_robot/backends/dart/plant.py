@@ -30,7 +30,7 @@ from palpate_models.robot.chain import Capsule
 from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.dart.kinematics import Kinematics
+from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal
 
 REACH_M: Final = 1.5

@@ -110,10 +110,11 @@ def _links(chain: Array, mounts: Array, q: Array) -> Array:
 class Kinematics:
     """Poses and velocities at joint positions `q` [rad] and velocities `v` [rad/s], shapes (n,)."""
 
-    def __init__(self, robot: Robot, origin_m: Array | None = None) -> None:
+    def __init__(self, robot: Robot, origin_m: Array | None = None, mass_scale: Array | float = 1.0) -> None:
         """Take the arm on its base with its tool. Compiles, which takes seconds the first time.
 
-        `origin_m`, shape (n, 3), is added to the nominal origin of each joint in the previous link.
+        `origin_m`, shape (n, 3), is added to the nominal origin of each joint; `mass_scale`, shape (n,), scales the
+        mass of each link with what is fixed to it.
         """
         arm, X_WB = arm_of(robot), base_pose(robot)
         n, (mass, centre) = arm.joints, _masses(robot)
@@ -123,7 +124,7 @@ class Kinematics:
         self._chain[1:, :_ORIGIN] = np.eye(3).ravel()
         origin = arm.origin_m + (0.0 if origin_m is None else origin_m)
         self._chain[1:, _ORIGIN:_MASS] = np.hstack((origin, arm.axis, centre))
-        self._chain[1:, _MASS] = mass
+        self._chain[1:, _MASS] = mass * mass_scale
         self.state(np.zeros(n), np.zeros(n))
         self.links(np.zeros(n))
 
