@@ -82,10 +82,10 @@ def seen_after(robot: Robot, run: list[Sample], lie: Lie, size: float, begin: in
     """Return the time from the begin of a lie to its stop [s], None if it is not seen in time."""
     run = run[: begin + round(WITHIN_S / PERIOD_S)]
 
-    def told(i: int, w: Array) -> Array:
+    def lying(i: int, w: Array) -> Array:
         return lie((i - begin) * PERIOD_S, w, size) if i >= begin else w
 
-    for i, (_, culprit) in enumerate(judged(robot, run, told)):
+    for i, (_, culprit) in enumerate(judged(robot, run, lying)):
         if culprit:
             return (i - begin) * PERIOD_S
     return None

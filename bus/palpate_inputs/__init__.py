@@ -44,7 +44,7 @@ class Bounds:
 
     text_kb: int = 512
     """YAML, which is read at about 0.1 MB/s."""
-    document_mb: int = 16
+    document_mb: int = 64
     """JSON, CSV, Python and the description of an FMU."""
     file_mb: int = 256
     """Any other file that is read as a whole."""

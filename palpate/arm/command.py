@@ -83,6 +83,7 @@ def place(
 
 def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:
     """Draw the targets in world [m], shape (n, 3), seen from above, and which are `reached`, shape (n,)."""
+    import numpy as np
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
@@ -94,7 +95,7 @@ def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base
     axes.add_patch(Rectangle((TABLE_X_M[0], TABLE_Y_M[0]), width, length, fill=False, color="#7a8c94", label="table"))
     corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
     axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
-    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (~reached, "#d07000", "out of reach")):
+    for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "out of reach")):
         if chosen.any():
             axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
     axes.set(

@@ -24,7 +24,7 @@ from palpate_tissue.backends.winkler.presses import Course, contracted, press_fo
 
 @dataclass(frozen=True)
 class PressLimits:
-    """What is taken of a recording."""
+    """Bounds on the presses of a recording."""
 
     readings: int = 8
     """Readings of a press at most."""

@@ -8,7 +8,6 @@ from enum import IntEnum
 
 import numpy as np
 
-from palpate_bus.messages import RobotStatus
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import Tool
@@ -91,7 +90,7 @@ class Breach:
     """Distance beyond the limit of depth or workspace."""
     culprit: str = ""
     """Role or topic that is missing or invalid."""
-    hold: int = RobotStatus.CAUSE_NONE
+    hold: int = DriverHold.NONE
     """Cause of the driver's hold."""
 
 
