@@ -72,8 +72,8 @@ def judged(
     """Yield the comparison of each sample, and the culprit of the first breach, empty without one."""
     sense, judge = ToolSense(robot), SensorJudge()
     for i, (_, measured, depth) in enumerate(run):
-        told = measured if lie is None else measured._replace(wrench_S=lie(i, measured.wrench_S))
-        sense.sense(told, PERIOD_S)
+        reading = measured if lie is None else measured._replace(wrench_S=lie(i, measured.wrench_S))
+        sense.sense(reading, PERIOD_S)
         found = judge.judge(sense.comparison, depth)
         yield sense.comparison, found[0].culprit if found else ""
 
