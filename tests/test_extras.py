@@ -33,6 +33,8 @@ NEEDS = {
     "palpate.interface.studies": "study",
     "palpate.fmu": "fmu",
     "palpate.recording": "library",
+    "palpate.comparison": "library",
+    "palpate.twin": "library",
     "palpate.live.dashboard": "dashboard",
     "palpate.fuzz": "bench",
     "palpate.search": "library",
@@ -49,6 +51,7 @@ NEEDS = {
     "palpate_inputs": BARE,
     "palpate_plugins": BARE,
     "palpate_models": "models group",
+    "palpate_models.robot.urdf_arm": "run",  # meshes of arms
     "palpate_planning.placement": "planning group",
     "palpate_robot": "models group",  # modules that its backends share
     "palpate_robot.backends.dart": "robot group",
@@ -72,6 +75,7 @@ NEEDS = {
     "palpate_search": "search group",
     "palpate_dashboard": "dashboard group",
     "palpate_fmu": "tissue-fmu group",
+    "palpate_fmu.reading": BARE,
     "palpate_benchmarks": "bench",
     "palpate_validation": "bench",
     "palpate_reproduction": "bench",
@@ -95,10 +99,10 @@ DISTRIBUTION = {
 """Distributions by the name of the import, where it differs."""
 OPTIONAL = {"zenoh_ros2_sdk"}
 """Imported only if find_spec finds it; in no extra."""
-ON_DEMAND = {"playwright": "dashboard", "palpate_robot.plant.Plant": "run"}
+ON_DEMAND = {"playwright": "dashboard", "palpate_models.robot.urdf_arm.load_arm": "run", "palpate_robot.plant.Plant": "run"}
 """Imports of a single function, and the extra that its callers need."""
-NOT_IMPORTED = {"bokeh", "stable-baselines3", "torch", "ziglang"}
-"""Run as a program, or imported by another library or by research: Dask uses bokeh, training a policy torch."""
+NOT_IMPORTED = {"bokeh", "example-robot-data", "stable-baselines3", "torch", "ziglang"}
+"""Run as a program, imported by another library or by research, or data: Dask uses bokeh, training a policy torch."""
 
 
 def need_of(module: str) -> str:

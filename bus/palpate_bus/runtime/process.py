@@ -22,8 +22,8 @@ WORKER_NICENESS = 15
 BACKGROUND_NICENESS = 3
 """Of observers, and in lockstep of services slower than the 1 kHz loop, which are batch work as well.
 
-The loop waits for them, so with a higher value a run starves next to other work. Toy services, 2 s of simulated time on two loaded
-cores next to two busy processes, interleaved: with 15 no end within 100 s, and a lost message; with 3 in 6.5 and 11.5 s.
+The loop waits for them, so with a higher value a run starves next to other work. Toy services, 2 s of simulated time on two
+loaded cores next to two busy processes, interleaved: with 15 no end within 100 s, and a lost message; with 3 in 6.5 and 11.5 s.
 """
 _NICENESS_BY_PERIOD = ((100 * MS, 10), (10 * MS, 5))
 STOPPED: Final = frozenset({psutil.STATUS_STOPPED, psutil.STATUS_TRACING_STOP})

@@ -8,8 +8,9 @@ from __future__ import annotations
 import sys
 from dataclasses import dataclass, replace
 from functools import cache
+from importlib import import_module
 from pathlib import Path
-from typing import Final
+from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
@@ -84,6 +85,14 @@ def _resolved(name: str, folder: Path) -> Path:
     if found is None and package == "example-robot-data":
         raise UserError("this arm needs the package example-robot-data: pip install 'palpate[arms]'")
     return found or folder / package / rest
+
+
+def _coal() -> Any:
+    """Return the module coal, which reads meshes of many formats; only arms from a URDF need it. Raises UserError without it."""
+    try:
+        return import_module("coal")
+    except ImportError as error:
+        raise UserError("the meshes of an arm need coal: pip install 'palpate[run]'") from error
 
 
 def _numbers(element: ElementTree.Element | None, attribute: str, default: str = "0 0 0") -> Array:
@@ -356,15 +365,13 @@ class _Reader:
 
     def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:
         """Return the vertices of the convex hull of a mesh [m]."""
-        import coal  # noqa: PLC0415 - only arms from a URDF need it
-
         name = mesh.get("filename", "")
         path = _resolved(name, self._path.parent)
         if not path.is_file():
             self.faults.append(f"link {link}: mesh {name} is not there")
             return np.zeros((0, 3))
         try:
-            vertices = np.array(coal.MeshLoader().load(str(path), _numbers(mesh, "scale", "1 1 1")).vertices())
+            vertices = np.array(_coal().MeshLoader().load(str(path), _numbers(mesh, "scale", "1 1 1")).vertices())
             hull = vertices[ConvexHull(vertices).vertices]
         except (RuntimeError, ValueError, QhullError) as error:
             self.faults.append(f"link {link}: mesh {name} cannot be read: {error}")

@@ -53,7 +53,7 @@ class Rig:
         self.inbox.events["operator/request"] = [REQUEST(header(self.t), request, "test")]
 
     def supervise(self, level: int, releases: int = 0) -> None:
-        state = SUPERVISOR(header(self.t), level, SUPERVISOR.CAUSE_FORCE, "force 41 N", releases, 41.0, 0.0, 0.0, 0, "")
+        state = SUPERVISOR(header(self.t), level, SUPERVISOR.CAUSE_FORCE, "force 41 N", releases, 41.0, 0.0, 0.0, 0, "", 0.0)
         self.inbox.events["supervisor/state"] = [state]
 
     def tick(self, ticks: int = 1) -> None:

@@ -26,7 +26,7 @@ import numpy as np
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.observer import GAIN_PER_S
+from palpate_supervisor.observer import GAIN_PER_S
 
 
 class SensesTuning(NamedTuple):

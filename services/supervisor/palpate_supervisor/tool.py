@@ -12,8 +12,8 @@ import pinocchio as pin
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import nearest_vertex
 from palpate_models.robot.arm import urdf
-from palpate_models.robot.observer import MomentumObserver
 from palpate_models.scenario.schema import Robot
+from palpate_supervisor.observer import MomentumObserver
 from palpate_supervisor.senses import ForceComparison, ForceSenses, Measurement
 
 
