@@ -75,7 +75,6 @@ NEEDS = {
     "palpate_search": "search group",
     "palpate_dashboard": "dashboard group",
     "palpate_fmu": "tissue-fmu group",
-    "palpate_fmu.reading": BARE,
     "palpate_benchmarks": "bench",
     "palpate_validation": "bench",
     "palpate_reproduction": "bench",
@@ -99,7 +98,13 @@ DISTRIBUTION = {
 """Distributions by the name of the import, where it differs."""
 OPTIONAL = {"zenoh_ros2_sdk"}
 """Imported only if find_spec finds it; in no extra."""
-ON_DEMAND = {"playwright": "dashboard", "palpate_models.robot.urdf_arm.load_arm": "run", "palpate_robot.plant.Plant": "run"}
+ON_DEMAND = {
+    "playwright": "dashboard",
+    "palpate_fmu.reading.FmuError": "fmu",
+    "palpate_fmu.reading.opened_fmu": "fmu",
+    "palpate_models.robot.urdf_arm.load_arm": "run",
+    "palpate_robot.plant.Plant": "run",
+}
 """Imports of a single function, and the extra that its callers need."""
 NOT_IMPORTED = {"bokeh", "example-robot-data", "stable-baselines3", "torch", "ziglang"}
 """Run as a program, imported by another library or by research, or data: Dask uses bokeh, training a policy torch."""

@@ -108,7 +108,7 @@ def test_trailing_padding_is_accepted_and_trailing_data_is_not() -> None:
 @pytest.mark.parametrize(
     ("torque", "reason"),
     [
-        (np.zeros(6), "torque: has shape"),
+        (np.zeros((2, 3)), "torque: has shape"),
         (np.array(["a"] * 7), "torque: has"),
         (np.zeros(7, complex), "torque: has complex128"),
         (None, "torque: has object"),

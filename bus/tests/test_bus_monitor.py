@@ -130,8 +130,8 @@ def backwards(message: Any) -> None:
 
 
 FAULTS = [
-    ("joint_states", set_nan, Kind.NAN, "-3.2..3.2 [rad]", "nan"),
-    ("joint_states", degrees, Kind.UNIT, "-3.2..3.2 [rad]", "57, plausible if it is in deg"),
+    ("joint_states", set_nan, Kind.NAN, "-6.4..6.4 [rad]", "nan"),
+    ("joint_states", degrees, Kind.UNIT, "-6.4..6.4 [rad]", "57, plausible if it is in deg"),
     ("ft/wrench", far, Kind.RANGE, "-200..200 [N]", "10000"),
     ("ft/wrench", other_frame, Kind.FRAME, "'ft_sensor'", "'world'"),
     ("ft/wrench", backwards, Kind.STAMP, "at least 1999000000 ns", "5 ns: backwards"),

@@ -15,7 +15,7 @@ from rosbags.interfaces import Nodetype
 
 from palpate.fuzz.target import Broken, FuzzTarget
 from palpate_bus.contract import contract
-from palpate_bus.messages import codec
+from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.messages.typestore import array_dtype
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_bus.settings import Settings
@@ -152,7 +152,12 @@ def _chunk(data: bytes) -> bool:
     return True
 
 
-CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [random_payload(CHUNK_TYPE, rng) for _ in range(4)])
+def _small_chunk() -> bytes:
+    columns = (np.array([0], kind) for kind in (np.uint16, np.int64, np.uint32))
+    return codec.encode(RecordChunk("robot", 0, ["clock"], *columns, np.array([2], np.uint32), np.zeros(2, np.uint8)), CHUNK_TYPE)
+
+
+CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [_small_chunk(), *(random_payload(CHUNK_TYPE, rng) for _ in range(3))])
 
 
 _VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")

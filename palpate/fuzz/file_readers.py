@@ -308,7 +308,7 @@ _REPORT = json.dumps({
     **dict.fromkeys(Report.model_fields, 1), "run": "a", "scenario": "lump", "clean_world": False, "runtime": "composed",
     "platform": {}, "run_hash": None, "digests": {}, "failure": None, "failure_code": None, "lost": {"camera": 3.5},
     "depth": _DEPTHS, "assessed": True, "findings": [], "candidates": [], "unassessed_m2": {}, "truth": None, "scores": None,
-    "blame": {}, "services": {"search": {"facts": {"presses": 3}}},
+    "blame": {}, "recorded": None, "services": {"search": {"facts": {"presses": 3}}},
 }).encode()  # fmt: skip
 
 
