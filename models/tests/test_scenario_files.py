@@ -94,7 +94,7 @@ def test_a_setting_is_read_like_a_file() -> None:
 @pytest.mark.parametrize(
     ("setting", "said"),
     [
-        ("exam.depth_m=10", r"exam\.depth_m = 10: .* 0\.02 \(in metres\)"),
+        ("exam.depth_m=10", r"exam\.depth_m = 10: .* 0\.05 \(in metres\)"),
         ("exam.region_m=[60, 60]", r"exam\.region_m\.0 = 60: .* 1 \(in metres\)"),
         ("exam.speed_mps=fast", r"exam\.speed_mps = 'fast': .*\(in metres per second\)"),
         ("exam.region_m=0.1", r"exam\.region_m = 0\.1: want a list"),

@@ -140,9 +140,9 @@ def test_a_force_sensor_that_freezes_is_neither_pressed_deep_nor_called_complete
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
     sense = world.exam._sense.sense
 
-    def freeze(reading: SensorReading, t: int) -> ContactMeasurement:
+    def freeze(reading: SensorReading, t: int, *others: float) -> ContactMeasurement:
         frozen.append(reading.wrench_S)
-        return sense(reading._replace(wrench_S=frozen[0]), t)
+        return sense(reading._replace(wrench_S=frozen[0]), t, *others)
 
     world.exam._sense.sense = freeze  # type: ignore[method-assign]
     world.run(seconds=200.0)
