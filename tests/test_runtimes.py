@@ -173,7 +173,7 @@ def test_in_lockstep_a_reader_that_receives_nan_ends_the_run_and_names_the_sende
     assert_failed(outcome, FailureCode.CONTRACT_BROKEN, "control", "robot")  # who read it and who sent it
     assert outcome.failure is not None
     assert outcome.failure.topics == ("joint_states",)
-    assert "joint_states from robot refused: position = nan; allowed: -3.2..3.2 [rad]" in outcome.failure.text
+    assert "joint_states from robot refused: position = nan; allowed: -6.4..6.4 [rad]" in outcome.failure.text
 
 
 def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
@@ -199,7 +199,7 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
     statuses = {status.name: status for status in codec.decode(received[-1][1], topic.type).status}
     for name in ("palpate/topic/truth/patient", "palpate/tissue"):
         assert statuses[name].level == DiagnosticStatus.ERROR
-        assert "from tissue: not finite" in statuses[name].message
+        assert "from tissue: norm of a quaternion" in statuses[name].message
         assert statuses[name].hardware_id == "tissue"
     assert "truth/patient" in statuses["palpate/topic/truth/patient"].message
     assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
@@ -215,7 +215,7 @@ def test_a_violation_shows_on_diagnostics_and_in_the_dashboard(tmp_path: Path) -
                     drawn.setdefault(chunk.entity_path, []).extend(column)
     assert ["ERROR"] in drawn["/health/topics/truth/patient"]
     assert ["ERROR"] in drawn["/health/services/tissue"]
-    assert any("from tissue: not finite" in str(text) for text in drawn["/log/health/topics/truth/patient"])
+    assert any("from tissue: norm of a quaternion" in str(text) for text in drawn["/log/health/topics/truth/patient"])
     assert "| truth/patient | ERROR |" in str(drawn["/text/services"][-1])
 
 

@@ -131,13 +131,14 @@ def test_options_and_help_are_uniform(word: str) -> None:
             assert Text.from_markup(text).plain == text, f"{path} {option.name}: brackets are not printed"
 
 
-def test_a_variable_that_cannot_be_used_is_a_line(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_variable_that_cannot_be_used_is_a_line(monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]) -> None:
     monkeypatch.setenv("PALPATE_RATE", "7")
     monkeypatch.setattr(sys, "argv", ["palpate", "doctor"])
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == EXIT_BAD_INPUT
-    assert capsys.readouterr().err == "palpate: PALPATE_RATE is '7'; allowed: a number above 0, up to 1\n"
+    sys.stderr.flush()
+    assert capfd.readouterr().err == "palpate: PALPATE_RATE is '7'; allowed: a number above 0, up to 1\n"
 
 
 def test_a_check_that_is_interrupted_has_not_passed(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -14,6 +14,9 @@ from palpate.commands import COMMANDS, EXTRAS
 ROOT = Path(__file__).resolve().parents[2]
 ENVIRONMENT = {**os.environ, "PYTHONPATH": str(ROOT / "tests/run_only"), "COLUMNS": "100"}
 CALLS = {
+    "assess": ["recording.csv"],
+    "compare": ["one.csv", "other.csv"],
+    "fit": ["recording.csv"],
     "dashboard": ["out"],
     "fmu": ["build"],
     "study": ["smoke"],
