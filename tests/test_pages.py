@@ -291,7 +291,7 @@ def test_scenario_and_errors(pages: dict[str, str]) -> None:
     from palpate_models.scenario.errors import table
 
     rows = [line for line in pages["scenario"].splitlines() if line.startswith("| `")]
-    assert any(row.startswith("| `depth_m` | `0.01` | a number at least 0.002, at most 0.02 |") for row in rows)
+    assert any(row.startswith("| `depth_m` | `0.01` | a number at least 0.0002, at most 0.05 |") for row in rows)
     assert "| `xyz_m` | `[0.56, 0.0, 0.93]` |" in pages["scenario"]  # the default of `exam.pose`, not of a pose
     assert "## `phantom.lesions[]`" in pages["scenario"]
     for name, fields in table().items():

@@ -26,6 +26,7 @@ from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
 from palpate_bus.runtime.conductor_link import CONDUCTOR_LOST_LOG
 from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.wire.rmw import topic_key
 from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_conductor.outcome import RunProgress
 
@@ -87,8 +88,10 @@ def test_a_transport_is_faulty_in_its_topic_only_and_from_the_signal_on() -> Non
     qos = contract().qos["control"]
     with session(BusOptions()) as opened:
         transport = FaultyTransport(opened, InjectedFault(TOPIC.name, "nan", at=0))
-        assert isinstance(transport.publisher(TOPIC.name, "a", qos, bytes(16)), FaultySender)
-        assert not isinstance(transport.publisher("joint_states", "b", qos, bytes(16)), FaultySender)
+        assert isinstance(transport.publisher(TOPIC.name, topic_key(TOPIC, 0), qos, bytes(16)), FaultySender)
+        assert not isinstance(
+            transport.publisher("joint_states", topic_key(contract().topics["joint_states"], 0), qos, bytes(16)), FaultySender
+        )
         late = FaultyTransport(opened, InjectedFault("clock", "jump"))
         before = late.now()
         assert before < late.now() < before + NS

@@ -46,7 +46,7 @@ def refused(*words: str) -> str:
     ("words", "said"),
     [
         ("nosuch", ("nosuch: no such scenario", "clean")),
-        ("--set exam.depth_m=0.5", ("exam.depth_m", "0.5", "less than or equal to 0.02")),
+        ("--set exam.depth_m=0.5", ("exam.depth_m", "0.5", "less than or equal to 0.05")),
         ("--set exam.colour=red", ("exam.colour", "red")),
         ("--set phantom.mesh=missing.stl", ("mesh",)),
         ("--set 'phantom.lesions=[{centre_m: [-55, 10]}]'", ("phantom.lesions[0]",)),

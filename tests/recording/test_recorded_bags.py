@@ -52,7 +52,7 @@ def write(folder: Path, table: pd.DataFrame, plugin: StoragePlugin) -> None:
     """Poses at 50 Hz, wrenches at 100 Hz in the axes of a tool that is turned about z, with its weight."""
     turn = Rotation.from_euler("z", 0.7)
     q = Quaternion(*turn.as_quat())
-    weighed = turn.inv().apply((*table[["fx", "fy", "fz"]].to_numpy(), 0, 0, -9.81 * TOOL.mass_kg))
+    weighed = turn.inv().apply(table[["fx", "fy", "fz"]].to_numpy() + np.array((0.0, 0.0, -9.81 * TOOL.mass_kg)))
     with Writer(folder, version=9, storage_plugin=plugin) as bag:
         types = {"/wrench": WrenchStamped, "/tool_pose": PoseStamped, "/tf": TFMessage, "/joints": JointState}
         topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}

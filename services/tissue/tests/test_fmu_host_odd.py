@@ -205,7 +205,7 @@ def test_a_map_may_name_a_topic_without_variables_an_element_or_a_boolean(versio
     ("entries", "words"),
     [
         ({}, "not an FMU"),
-        ({"modelDescription.xml": "<fmi"}, "not an FMU"),
+        ({"modelDescription.xml": "<fmi"}, "not XML"),
         ({"modelDescription.xml": "<html/>"}, "not an FMU: the root"),
         ({"modelDescription.xml": '<fmiModelDescription fmiVersion="1.0"/>'}, "FMI 1.0; want 2.0 or 3.0"),
         ({"modelDescription.xml": '<fmiModelDescription fmiVersion="3.0-beta.2"/>'}, "FMI 3.0-beta.2; want 2.0 or 3.0"),
