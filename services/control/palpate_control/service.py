@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
+from math import isfinite
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
@@ -117,10 +118,11 @@ class ControlService(Service):
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
             return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
-        if not (joints.name == self._names and len(joints.position) == len(joints.velocity) == len(self._names)):
-            wrong = f"joint_states: name = {joints.name}, {len(joints.position)} positions: must be {self._names}"
+        q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
+        if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
+            wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}, finite"
             return self._stop_commands(t, Problem("joint_states", wrong))
-        torque = self._controller.torque(joints.position, joints.velocity, self._reference.at(followed))
+        torque = self._controller.torque(q, qd, self._reference.at(followed))
         np.maximum(self._peak, np.abs(torque), out=self._peak)
         self._torque, self._torque_expires = torque, t + self._torque_expiry
         return self._command(t, torque, self._full_validity)

@@ -97,7 +97,7 @@ class ForceComparison(NamedTuple):
     excitation: float
     """Information in the gain: sum of the squared changes of the load [N^2]."""
     noise: float
-    """Root mean square change of the F/T reading from one sample to the next."""
+    """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise."""
 
 
 class ForceSenses:
@@ -106,7 +106,7 @@ class ForceSenses:
     def __init__(self, joints: int) -> None:
         self._joints = np.zeros((4, joints))
         """Rows: offset, friction, the late sign of the speed, and its mean."""
-        self._tool = np.zeros((10, 3))
+        self._tool = np.zeros((11, 3))
         """Rows of `_compare`."""
         self._sums = np.zeros(3)
         self._started = False
@@ -132,7 +132,7 @@ class ForceSenses:
             self._started = True
             unloaded_S = reading_S - load_S
             self._joints[0] = residual
-            self._tool[:3], self._tool[5:] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
+            self._tool[:3], self._tool[5:10] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
         state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W)
         return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, starting, TUNING))
 
@@ -187,12 +187,13 @@ def _compare(
         load = tool[6] - tool[8]
         sums[0] += (load * (tool[5] - tool[7])).sum()
         sums[1] += (load * load).sum()
-    sums[2] += _share(dt_s, tuning.noise_s) * (((reading_S - tool[9]) ** 2).sum() - sums[2])
-    tool[9] = reading_S
+    change_S = reading_S - tool[9]  # of white noise, the next change is half the other way; a step of the force has none
+    sums[2] += _share(dt_s, tuning.noise_s) * (-2 * (change_S * tool[10]).sum() - sums[2])
+    tool[9], tool[10] = reading_S, change_S
     if starting:
         first_S[:] = bias_S
     difference_W += smooth * (R_WS @ ft_S - force_W - difference_W)
     joints_W += smooth * (force_W - joints_W)
     gain = sums[0] / sums[1] if sums[1] > 0.0 else 1.0
     drift = _norm(bias_S - first_S)
-    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], np.sqrt(sums[2])
+    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], np.sqrt(max(sums[2], 0.0))
