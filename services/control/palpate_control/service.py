@@ -139,6 +139,10 @@ class ControlService(Service):
             names = "joint_position, joint_velocity, joint_stiffness"
             self._refuse(t, f"{names}: {sorted(counts)} values, want {self.model.joints} each")
             return
+        motion = (setpoint.p_WD, setpoint.V_WD, setpoint.F_W, setpoint.stiffness, setpoint.damping_ratio)
+        if not np.isfinite(np.concatenate((*motion, setpoint.q, setpoint.qd, setpoint.joint_stiffness))).all():
+            self._refuse(t, "has values that are not finite")
+            return
         if setpoint.stamp > t + self._setpoint_expiry:  # would expire before it is due and block later ones
             limit = self._setpoint_expiry / MS
             self._refuse(t, f"stamped {(setpoint.stamp - t) / MS:.0f} ms ahead, limit {limit:.0f} ms")
