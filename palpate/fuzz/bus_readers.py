@@ -153,8 +153,10 @@ def _chunk(data: bytes) -> bool:
 
 
 def _small_chunk() -> bytes:
-    columns = (np.array([0], kind) for kind in (np.uint16, np.int64, np.uint32))
-    return codec.encode(RecordChunk("robot", 0, ["clock"], *columns, np.array([2], np.uint32), np.zeros(2, np.uint8)), CHUNK_TYPE)
+    topic, stamp = np.zeros(1, np.uint16), np.zeros(1, np.int64)
+    sequence, length = np.zeros(1, np.uint32), np.array([2], np.uint32)
+    message = RecordChunk("robot", 0, ["clock"], topic, stamp, sequence, length, np.zeros(2, np.uint8))
+    return codec.encode(message, CHUNK_TYPE)
 
 
 CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [_small_chunk(), *(random_payload(CHUNK_TYPE, rng) for _ in range(3))])
