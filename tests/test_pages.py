@@ -7,6 +7,7 @@ import os
 import re
 import runpy
 import shlex
+import shutil
 import subprocess
 import sys
 from itertools import pairwise
@@ -147,11 +148,15 @@ def test_shown_files_are_the_examples(page: Path) -> None:
 
 
 def test_python_of_the_tutorials_runs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)  # pages assume the root of the repository
+    monkeypatch.setattr(sys, "argv", ["make_recording.py", str(tmp_path / "recording.csv")])
+    runpy.run_path(str(EXAMPLES / "make_recording.py"), run_name="__main__")
+    shutil.copy(EXAMPLES / "recording.yaml", tmp_path / "mapping.yaml")
     count = 0
     for page in TUTORIALS:
         for shown in SHOWN.findall(page.read_text(encoding="utf-8")):
             if shown.startswith("# run"):
+                # other pages assume the root of the repository
+                monkeypatch.chdir(tmp_path if "the folder of the recording" in shown else ROOT)
                 (tmp_path / "shown.py").write_text(shown, encoding="utf-8")
                 runpy.run_path(str(tmp_path / "shown.py"))
                 count += 1
