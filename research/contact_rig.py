@@ -26,12 +26,13 @@ from palpate_control.service import create as create_control
 from palpate_models.numerics.frames import Array, matrix
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.schema import Background, Phantom, Stiffness
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import ArmErrors, Errors
 from palpate_models.scenario.load import plant_input, true_pose
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint, joint_setpoint
 from palpate_planning.strokes.path import least_twist, pose
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.service import RobotService
@@ -152,10 +153,10 @@ BEGIN_S, PRESS_S, NUDGE_S, END_S = 0.05, 0.45, 0.8, 1.6
 NUDGE_M, NUDGE_FOR_S = 0.0005, 0.05
 WATCH_S = 0.3
 """The end of the run, over which ringing is measured [s]."""
-EVENTS = ("joint_states", "control/joint_torque", "sim/tool_state", "sim/contact_wrench")
-CONTROL_PATH = EVENTS[:2]
-"""Messages that a real robot sends over its bus."""
-CONTACT_PATH = EVENTS[2:]
+EVENTS = ("joint_states", "control/joint_torque", "sim/tool_state", "sim/contact_wrench", "robot/status")
+CONTROL_PATH = (*EVENTS[:2], "robot/status")
+"""Messages that a real robot sends over its bus; control reads the F/T sensor from the status if it commands positions."""
+CONTACT_PATH = EVENTS[2:4]
 """Messages of the co-simulation only: on hardware robot and tissue touch."""
 
 
@@ -208,15 +209,18 @@ class Ringing:
         return not self.held and self.mean_force > 0.1 and self.swing < max(0.05, 0.05 * self.mean_force)
 
 
+DEFAULT_ARM = Robot().arm
+
+
 @cache
-def scenario(contrast: float) -> Scenario:
-    """A uniform abdomen that does not breathe, `contrast` times as stiff as the default, on a robot without sensor noise."""
+def scenario(contrast: float, arm: str = DEFAULT_ARM) -> Scenario:
+    """A uniform abdomen that does not breathe, `contrast` times as stiff as the default, on a robot almost without sensor noise."""
     wall = Stiffness(k_w_n_per_m3=Stiffness().k_w_n_per_m3 * contrast)
     plain = Scenario()
-    still = Errors(level="none", arm=ArmErrors(position_noise_rad=0.0, velocity_noise_radps=0.0))
+    still = Errors(level="none", arm=ArmErrors(position_noise_rad=1e-9, velocity_noise_radps=1e-9))  # no sensor repeats itself
     held = Breathing(kind="none")
     phantom = Phantom(stiffness=wall, background=Background(cv=0.0, margins=1.0), edge_m=0.006, breathing=held)
-    return plain.model_copy(update={"phantom": phantom, "errors": still})
+    return plain.model_copy(update={"phantom": phantom, "errors": still, "robot": Robot.model_validate({"arm": arm})})
 
 
 @cache
@@ -231,17 +235,19 @@ class _Script:
 
     contrast: float
     stiffness: float
+    arm: str = DEFAULT_ARM
     ready: Array = field(init=False)
     """Joint positions at the start."""
     R: Array = field(init=False)
     top: Array = field(init=False)
 
     def __post_init__(self) -> None:
-        chosen = scenario(self.contrast)
-        kinematics = ArmKinematics(chosen.robot, chosen.limits)
-        self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(lbr.HOME)[:3, :3])
+        chosen = scenario(self.contrast, self.arm)
+        kinematics, home = ArmKinematics(chosen.robot, chosen.limits), arm_of(chosen.robot).home_rad
+        self._tares = chosen.robot.level is CommandLevel.POSITION
+        self.R = least_twist(np.array((0.0, 0.0, -1.0)), kinematics.pose(home)[:3, :3])
         self.top = matrix(true_pose(chosen))[:3, 3] + (0.0, 0.0, chosen.robot.indenter_radius_m)
-        self.ready = kinematics.solve(self._at(-ABOVE_M), lbr.HOME).q
+        self.ready = kinematics.solve(self._at(-ABOVE_M), home).q
 
     def _at(self, depth: float) -> Array:
         return pose(self.R, self.top - (0.0, 0.0, depth))
@@ -256,6 +262,9 @@ class _Script:
         if t % contract().topics[TOPIC].period:
             return {}
         now = t / NS
+        if self._tares and now < BEGIN_S:  # in free motion control learns the bias of the F/T sensor
+            still = np.zeros_like(self.ready)
+            return {TOPIC: joint_setpoint(t, self._at(-ABOVE_M), self.ready, still, still).message()}
         setpoint = cartesian_setpoint(t, self.R, self._at(self.depth(now))[:3, 3], self.ready)
         stiffness = CARTESIAN_STIFFNESS * (1, 1, self.stiffness / CARTESIAN_STIFFNESS[2], 1, 1, 1)
         return {TOPIC: replace(setpoint, stiffness=stiffness).message()}
@@ -272,12 +281,12 @@ def start_posture(contrast: float = 1.0) -> Array:
 
 
 @cache
-def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
+def press(contrast: float, stiffness: float, delays: Delays, arm: str = DEFAULT_ARM) -> Ringing:
     """Press a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
 
     Runs repeat exactly, so one that has been made is remembered.
     """
-    chosen = scenario(contrast)
+    chosen = scenario(contrast, arm)
     time, force, modes = [], [], []
 
     def see_wrench(t: int, outbox: Mapping[str, Any]) -> None:
@@ -288,13 +297,13 @@ def press(contrast: float, stiffness: float, delays: Delays) -> Ringing:
         if "robot/status" in outbox:
             modes.append(outbox["robot/status"].mode)
 
-    script = _Script(contrast, stiffness)
+    script = _Script(contrast, stiffness, arm)
     robot = RobotService(plant_input(chosen), lambda robot, *, drawn: DartPlant(robot, script.ready, drawn))
     run = Composed(
         [
             Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),
             Delayed(deepcopy(_tissue(contrast)), delays.on("sim/tool_state"), see_wrench),
-            Delayed(create_control(chosen), delays.on("joint_states"), script=script),
+            Delayed(create_control(chosen), delays.on("joint_states", "robot/status"), script=script),
         ]
     )
     run.run(lambda: None, round(END_S * NS))

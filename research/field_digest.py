@@ -22,6 +22,7 @@ from rosbags.typesys.msg import get_types_from_msg
 from palpate_bus.recordings import open_recording
 
 ADDED: Final = {
+    "palpation_msgs/msg/JointTorqueCommand": re.compile("position"),
     "palpation_msgs/msg/PalpationTargets": re.compile("reason|[A-Z_]+"),
     "palpation_msgs/msg/ExamState": re.compile("reason|REASON_[A-Z_]+"),
     "palpation_msgs/msg/RobotStatus": re.compile("measured_torque"),

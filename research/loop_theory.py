@@ -24,13 +24,14 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.setpoint import ControlMode, Setpoint
+from palpate_control.admittance import TUNING as ADMITTANCE
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator, Reference
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.arm import urdf
-from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, POSTURE_STIFFNESS
+from palpate_planning.setpoints import CARTESIAN_STIFFNESS, DAMPING_RATIO, NORMAL_STIFFNESS, POSTURE_STIFFNESS
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.contact import shear_stiffness
 from palpate_validation.probing import STILL
@@ -130,9 +131,21 @@ def linearise(contrast: float, stiffness: float, across: float = 1.0) -> LinearL
     )
 
 
+def admittance_gain(contrast: float, yield_s: float = ADMITTANCE.yield_s) -> float:
+    """Return the largest |L| of `palpate_control.admittance` on a wall `contrast` times the default's, for an ideal arm.
+
+    Below 1 the contact is stable with any delay.
+    """
+    z = np.exp(1j * np.geomspace(1e-5, np.pi, 2000))
+    response = tissue_response(contrast)
+    wall = (1 - 1 / z) * np.polyval(response[::-1], 1 / z) + response[-1] * z ** -float(len(response))
+    decay = np.exp(-DT / yield_s)
+    return float(np.abs(wall * (1 - decay) / (z - decay) / NORMAL_STIFFNESS).max())
+
+
 def _torque(model: ArmModel, reference: Reference, q: Array, qd: Array) -> Array:
     """The controller's torques, Coriolis torques taken off [N m], shape (7,); from a fresh one, as it limits their rate."""
-    torque = ImpedanceController(model).torque(q, qd, reference)
+    torque = ImpedanceController(model).command(q, qd, reference)
     return np.asarray(torque - model.coriolis)
 
 

@@ -49,7 +49,7 @@ def abort() -> Clone:
 
 
 def torque() -> Clone:
-    command = JointTorqueCommand(header(0), np.full(7, 50.0), duration_message(10**9), "", "")
+    command = JointTorqueCommand(header(0), np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", "")
     return Clone(topic_key(TORQUE, 0), codec.encode(command, TORQUE.type))
 
 

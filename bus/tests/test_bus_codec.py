@@ -115,7 +115,7 @@ def test_trailing_padding_is_accepted_and_trailing_data_is_not() -> None:
     ],
 )
 def test_a_field_that_does_not_fit_is_named(torque: object, reason: str) -> None:
-    message = JointTorqueCommand(header(0), torque, duration_message(0), "", "")
+    message = JointTorqueCommand(header(0), torque, np.zeros(0), duration_message(0), "", "")
     with pytest.raises(codec.CodecError, match=f"palpation_msgs/msg/JointTorqueCommand.*{reason}"):
         codec.encode(message, "palpation_msgs/msg/JointTorqueCommand")
 
@@ -125,7 +125,9 @@ def test_a_field_that_does_not_fit_is_named(torque: object, reason: str) -> None
 )
 def test_numbers_of_another_kind_or_layout_are_converted(torque: object) -> None:
     name = "palpation_msgs/msg/JointTorqueCommand"
-    decoded = codec.decode(codec.encode(JointTorqueCommand(header(0), torque, duration_message(0), "", ""), name), name)
+    decoded = codec.decode(
+        codec.encode(JointTorqueCommand(header(0), torque, np.zeros(0), duration_message(0), "", ""), name), name
+    )
     np.testing.assert_array_equal(decoded.torque, np.arange(7.0))
 
 

@@ -41,7 +41,7 @@ def wrench(t: int) -> Any:
 
 
 def torque(t: int) -> Any:
-    return JointTorqueCommand(header(t), np.zeros(7), duration_message(50 * MS), "", "")
+    return JointTorqueCommand(header(t), np.zeros(7), np.zeros(0), duration_message(50 * MS), "", "")
 
 
 MAKE = {"joint_states": joint_state, "ft/wrench": wrench, "control/joint_torque": torque}

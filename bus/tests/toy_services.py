@@ -128,7 +128,7 @@ class Control(Service):
                 pass
         joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")
         torque = np.sin(1.1 * joints.position + 1e-9 * t + (setpoint.joint_position if setpoint else 0.0))
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, duration_message(50 * MS), "", "")}
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, np.zeros(0), duration_message(50 * MS), "", "")}
 
 
 class Tissue(Service):

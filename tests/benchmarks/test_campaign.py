@@ -48,7 +48,7 @@ class Sent:
 
 
 def payload() -> bytes:
-    message = JointTorqueCommand(header(7_000_000_000_000), np.arange(7.0), duration_message(50_000_000), "", "")
+    message = JointTorqueCommand(header(7_000_000_000_000), np.arange(7.0), np.zeros(0), duration_message(50_000_000), "", "")
     return codec.encode(message, TOPIC.type)
 
 

@@ -7,7 +7,7 @@ import pytest
 from palpate_bus.messages.stamps import NS
 from research import stability
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, BusDelay, DelayedInbox, Delays, press
-from research.loop_theory import linearise
+from research.loop_theory import admittance_gain, linearise
 
 MS = NS // 1000
 
@@ -93,6 +93,20 @@ def test_the_path_that_hardware_does_not_have_is_not_the_weak_one() -> None:
 
 def test_a_soft_controller_bears_more_delay() -> None:
     assert linearise(1.0, 1000.0).margin_ms(CONTROL_PATH) >= linearise(1.0, 5000.0).margin_ms(CONTROL_PATH)
+
+
+@pytest.mark.parametrize("contrast", [1.0, 10.0], ids=["softest wall", "stiffest wall"])
+@pytest.mark.parametrize("loop_ms", [10, 40])
+def test_an_arm_that_takes_positions_is_stable_with_any_delay(contrast: float, loop_ms: int) -> None:
+    pytest.importorskip("coal")
+    assert admittance_gain(contrast) < 0.9
+    contact = press(contrast, stability.STIFFNESS_NPM, Delays(CONTROL_PATH, loop_ms / 2e3), "ur5")
+    assert contact.stable
+    assert contact.mean_force < 15.0
+
+
+def test_an_admittance_that_yields_at_once_is_not_safe_with_any_delay() -> None:
+    assert admittance_gain(10.0, 0.005) > 1.0
 
 
 @pytest.mark.slow

@@ -254,6 +254,7 @@ class JointTorqueCommand:
     __msgtype__: ClassVar[str]
     header: Header
     torque: NDArray[np.float64]
+    position: NDArray[np.float64]
     valid_for: Duration
     problem: str
     culprit: str

@@ -102,15 +102,16 @@ def pack_text(text: str) -> bytes:
 
 _FLOAT64 = np.dtype(np.float64)
 
+_DURATION = Struct("<iI")
 _WRENCH = Struct("<6d")  # force, torque
 _TOOL = Struct("<3d4d6dd")  # position, orientation, twist, radius
 
 
 @lru_cache(maxsize=64)
-def _command(count: int, start: int) -> Struct:
-    """Return the layout of `count` torques from `start` on, and of seconds and nanoseconds of valid_for."""
+def _numbers(count: int, start: int) -> Struct:
+    """Return the layout of a sequence of `count` float64 from `start` on."""
     gap = padding(start + LENGTH.size, 8) if count else 0
-    return Struct(f"<I{gap}x{8 * count}siI")
+    return Struct(f"<I{gap}x{8 * count}s")
 
 
 @lru_cache(maxsize=64)
@@ -170,11 +171,12 @@ def decode_tool_state(data: bytes) -> tuple[ToolState, int]:
 
 def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
     """Convert `palpation_msgs/JointTorqueCommand`."""
-    torque = fitted(message.torque, _FLOAT64, None, "torque")
-    valid_for, count = message.valid_for, torque.size
-    head = pack_header(message.header, 4)
-    command = _command(count, len(head)).pack(count, torque.tobytes(), valid_for.sec, valid_for.nanosec)
-    return head + command + _pack_texts((message.problem, message.culprit))
+    data = pack_header(message.header, 4)
+    for field in ("torque", "position"):
+        values = fitted(getattr(message, field), _FLOAT64, None, field)
+        data += _numbers(values.size, len(data)).pack(values.size, values.tobytes())
+    valid_for = message.valid_for
+    return data + _DURATION.pack(valid_for.sec, valid_for.nanosec) + _pack_texts((message.problem, message.culprit))
 
 
 @lru_cache(maxsize=64)
@@ -189,12 +191,12 @@ def _pack_texts(texts: tuple[str, ...]) -> bytes:
 def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
     """Convert `palpation_msgs/JointTorqueCommand`."""
     header, start = read_header(data, 4)
-    (count,) = LENGTH.unpack_from(data, start)
-    layout = _command(min(count, len(data)), start)
-    _, torque, sec, nanosec = layout.unpack_from(data, start)
-    problem, end = read_text(data, start + layout.size)
+    torque, start = _read_array(data, start)
+    position, start = _read_array(data, start)
+    sec, nanosec = _DURATION.unpack_from(data, start)
+    problem, end = read_text(data, start + _DURATION.size)
     culprit, end = read_text(data, end)
-    return JointTorqueCommand(header, np.frombuffer(torque), Duration(sec, nanosec), problem, culprit), end
+    return JointTorqueCommand(header, torque, position, Duration(sec, nanosec), problem, culprit), end
 
 
 def encode_joint_state(message: JointState) -> bytes:

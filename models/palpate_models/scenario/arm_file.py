@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from enum import StrEnum
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -19,6 +20,17 @@ Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
 """One value a joint, from the base to the flange."""
 
 
+class CommandLevel(StrEnum):
+    """What an arm is commanded."""
+
+    TORQUE = "torque"
+    """Joint torques without gravity."""
+    POSITION = "position"
+    """Joint positions."""
+    SETPOINT = "setpoint"
+    """The Cartesian set-point of planning; the control law runs in the driver."""
+
+
 class ArmFile(Section):
     """Values that a URDF lacks. Lists have one value a joint, from the base to the flange."""
 
@@ -28,6 +40,8 @@ class ArmFile(Section):
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
     home_rad: Joints | None = None
     """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view. Sought if missing."""
+    level: CommandLevel = CommandLevel.POSITION
+    """What the arm is commanded."""
     base_xy_m: Vec2 = (0.0, 0.0)
     """Position of the base in world; `palpate arm place` finds it."""
     base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
@@ -50,7 +64,7 @@ class ArmFile(Section):
     """Further postures from which inverse kinematics starts, with the first joint at zero."""
 
 
-PLACEMENT: Final = ("base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
+PLACEMENT: Final = ("level", "base_xy_m", "base_height_m", "base_yaw_rad", "joint_friction_nm", "joint_damping_nms")
 """Fields that are defaults of the scenario's section `robot`."""
 
 

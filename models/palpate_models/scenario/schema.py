@@ -17,7 +17,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom
-from palpate_models.scenario.arm_file import placement_of
+from palpate_models.scenario.arm_file import CommandLevel, placement_of
 from palpate_models.scenario.errors import Errors
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 from palpate_plugins import PluginKind, is_file
@@ -111,23 +111,25 @@ class Exam(Section):
         return self.pattern == SEARCH
 
 
-class LbrConnection(Section):
-    """Connection to a real LBR: lbr_fri_ros2_stack over rmw_zenoh."""
+class RobotDriver(Section):
+    """Connection to a real arm through a ROS 2 system over rmw_zenoh; each driver uses the fields that it needs."""
 
     router: str = "tcp/127.0.0.1:7447"
     """zenoh endpoint of the ROS system: its rmw_zenohd, or the emulator."""
     domain: Annotated[int, Field(ge=0, le=232)] = 0
     """ROS domain of the ROS system."""
-    namespace: str = "lbr"
-    """`robot_name` of the stack, which is also its namespace."""
+    namespace: str | None = None
+    """Namespace of the arm's nodes; default: the driver's."""
+    controller: str | None = None
+    """Name of the controller that takes the commands; default: the driver's."""
+    joint_states: str | None = None
+    """Topic of the joint states; default: the driver's."""
     ft_topic: str = "ft_sensor/wrench"
     """Topic of the F/T sensor's driver, geometry_msgs/WrenchStamped."""
     ft_sign: Literal[1, -1] = 1
     """-1 if the driver reports the wrench of the sensor on the tool."""
     ft_yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Rotation of the sensor's x axis about the flange's z axis."""
-    level: Literal["torque", "setpoint"] = "torque"
-    """`setpoint`: the control law runs in the driver's process and `control/joint_torque` is not used."""
     emulated: bool = False
     """True if the arm is the emulator. It then exchanges the `sim/` topics with simulated tissue and camera."""
 
@@ -155,7 +157,10 @@ class Robot(Section):
     arm: str = "lbr"
     """`lbr`, `panda`, `ur5`, `ur10`, `xarm7`, or the path of a YAML file next to a URDF. Other defaults of this section are the
     arm's."""
-    lbr: LbrConnection = LbrConnection()
+    level: CommandLevel = CommandLevel.TORQUE
+    """What the arm is commanded: `torque` or `position` by the role control, or `setpoint`: a driver follows `planning/setpoint`
+    itself. A simulated arm plays `setpoint` as `torque`."""
+    driver: RobotDriver = RobotDriver()
     indenter_radius_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.015
     """Radius of the spherical indenter."""
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35

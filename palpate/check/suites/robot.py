@@ -47,7 +47,10 @@ def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> 
     """Return the inputs with a torque command [N m], shape (7,), on every tick."""
     values = np.asarray(torque, dtype=float)
     valid_ns = rig.rules.topics[COMMAND].expiry
-    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), values, duration_message(valid_ns), "", "")}
+    return {
+        **quiet(rig, level),
+        COMMAND: lambda t: JointTorqueCommand(header(t), values, np.zeros(0), duration_message(valid_ns), "", ""),
+    }
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:

@@ -110,7 +110,7 @@ class ImpedanceController:
         self._net.reset()
         self._designed_for = None
 
-    def torque(self, q: Array, qd: Array, reference: Reference) -> Array:
+    def command(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Return the torque command without gravity [N m], shape (n,), at positions `q` [rad] and velocities `qd` [rad/s]."""
         q, qd = np.array(q, dtype=float), np.array(qd, dtype=float)
         law = self._cartesian if reference.setpoint.mode is ControlMode.CARTESIAN else self._joint

@@ -46,10 +46,13 @@ class ArmModel:
 
     def update(self, q: Array, qd: Array) -> None:
         """Evaluate the model at joint positions `q` [rad] and velocities `qd` [rad/s], shapes (n,)."""
-        model, data, frame = self._model, self._data, self._frame
-        self.J_W = pin.computeFrameJacobian(model, data, q, frame, _AXES)  # also places the frame
-        pin.nonLinearEffects(model, data, q, qd)
+        self.update_kinematics(q)
+        pin.nonLinearEffects(self._model, self._data, q, qd)
         self.update_gravity(q)
+
+    def update_kinematics(self, q: Array) -> None:
+        """Evaluate `R_WI`, `p_WI` and `J_W` only."""
+        self.J_W = pin.computeFrameJacobian(self._model, self._data, q, self._frame, _AXES)
 
     def update_gravity(self, q: Array) -> None:
         """Evaluate `gravity` only, for joint-space control."""

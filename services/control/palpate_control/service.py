@@ -1,4 +1,4 @@
-"""The control service: joint states and set-points in, joint torques out, at 1 kHz."""
+"""The control service: joint states and set-points in, joint torques or positions out, at 1 kHz."""
 
 from __future__ import annotations
 
@@ -12,14 +12,17 @@ import numpy as np
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC, ControlMode, Setpoint
+from palpate_control.admittance import AdmittanceController
 from palpate_control.impedance import ImpedanceController
 from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, urdf
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
 
@@ -32,14 +35,15 @@ class Problem(NamedTuple):
 
 
 NO_PROBLEM: Final = Problem("", "")
+_NONE: Final = np.zeros(0)
 
 
 class ControlService(Service):
-    """Follows set-points by impedance control.
+    """Follows set-points by impedance control, or by admittance control if the arm takes positions.
 
-    Before the first set-point it commands zero torque, so the driver keeps the arm gravity-compensated. After a set-point has
-    expired it sends commands with zero validity and the reason: the driver then enters its safe hold. While joint states are
-    stale it repeats the last torque until that torque's own expiry.
+    Before the first set-point it commands zero torque, so that the driver compensates gravity, or the measured positions.
+    After a set-point has expired it sends commands with zero validity and the reason: the driver then enters its safe hold.
+    While joint states or F/T readings are stale it repeats the last command until that command's own expiry.
 
     Set-points are applied in measurement time: a set-point stamped later than the newest measurement waits for it.
     """
@@ -51,19 +55,23 @@ class ControlService(Service):
         arm = arm_of(robot)
         self._names, self._home, self._still = list(arm.joint_names), arm.home_rad, np.zeros(self.model.joints)
         topics = contract().topics
-        self._controller = ImpedanceController(self.model, limits.joint_margin_rad, contract().roles[self.role].period / NS)
+        zone, period_s = limits.joint_margin_rad, contract().roles[self.role].period / NS
+        self._positions = robot.level is CommandLevel.POSITION
+        self._admittance = AdmittanceController(self.model, robot.tool_mass_kg, zone, period_s) if self._positions else None
+        self._controller = self._admittance or ImpedanceController(self.model, zone, period_s)
         self._reference = Extrapolator(topics[TOPIC].period)
         self._setpoint_expiry = topics[TOPIC].expiry
         self._joint_states_age = topics["joint_states"].max_age
-        self._torque_expiry = topics["control/joint_torque"].expiry
-        self._full_validity = duration_message(self._torque_expiry)
+        self._status_age = topics["robot/status"].max_age
+        self._command_expiry = topics["control/joint_torque"].expiry
+        self._full_validity = duration_message(self._command_expiry)
         self._no_validity = duration_message(0)
         self._setpoint_expires: int | None = None
         self._pending: deque[Setpoint] = deque()
         self._facts = dict.fromkeys(("setpoints", "setpoints_rejected", "ticks_without_joint_states", "ticks_without_command"), 0)
-        self._peak, self._torque = self._still.copy(), self._still
-        self._torque_expires = -1
-        """Expiry of the last torque [ns]."""
+        self._peak, self._last = self._still.copy(), self._still
+        self._last_expires = -1
+        """Expiry of the last command [ns]."""
         self._problem = ""
         self._refused: Problem | None = None  # of the newest set-point
         self._stop_reason: Problem | None = None  # None after a valid set-point
@@ -90,7 +98,7 @@ class ControlService(Service):
                     self._full_validity,
                 )
                 guide.accept(Setpoint.from_message(codec.decode(codec.encode(message, kind), kind)), stamp)
-                self._controller.torque(self._home, rest, guide.at(stamp))
+                self._controller.command(self._home, rest, guide.at(stamp))
         self._controller.reset()
 
     def step(self, t: int, inbox: Inbox) -> Outbox:
@@ -108,7 +116,7 @@ class ControlService(Service):
         while self._pending and self._pending[0].stamp <= followed:
             self._reference.accept(self._pending.popleft(), followed)
         if self._setpoint_expires is None or joints is None:
-            return self._command(t, self._still, self._full_validity)
+            return self._wait(t, joints)
         frozen = t - measured > self._setpoint_expiry  # repeated, or stamped by a wrong clock
         if self._stop_reason or frozen or t > self._setpoint_expires:
             age, limit = (t - measured) / MS, self._setpoint_expiry / MS
@@ -117,15 +125,18 @@ class ControlService(Service):
             return self._stop_commands(t, self._stop_reason or (old if frozen else self._refused or expired))
         if t - received > self._joint_states_age:
             age, limit = (t - received) / MS, self._joint_states_age / MS
-            return self._repeat_torque(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
+            return self._repeat(t, Problem("joint_states", f"joint_states: {age:.0f} ms old, limit {limit:.0f} ms"))
         q, qd = np.asarray(joints.position), np.asarray(joints.velocity)
         if not (joints.name == self._names and q.shape == qd.shape == self._still.shape and isfinite(q.dot(q) + qd.dot(qd))):
             wrong = f"joint_states: name = {joints.name}, position = {q}: must be {self._names}, finite"
             return self._stop_commands(t, Problem("joint_states", wrong))
-        torque = self._controller.torque(q, qd, self._reference.at(followed))
-        np.maximum(self._peak, np.abs(torque), out=self._peak)
-        self._torque, self._torque_expires = torque, t + self._torque_expiry
-        return self._command(t, torque, self._full_validity)
+        if self._admittance is not None and (stale := self._sense(self._admittance, t, inbox)):
+            return self._repeat(t, stale)
+        command = self._controller.command(q, qd, self._reference.at(followed))
+        if self._admittance is None:
+            np.maximum(self._peak, np.abs(command), out=self._peak)
+        self._last, self._last_expires = command, t + self._command_expiry
+        return self._command(t, command, self._full_validity)
 
     def finish(self) -> Mapping[str, Any]:
         """Return counts of set-points and rejections, the last problem, and the largest torque per joint [N m]."""
@@ -162,17 +173,35 @@ class ControlService(Service):
         self._refused = Problem(TOPIC, f"{TOPIC} refused: {why}")
         self._problem = f"at {t} ns: {self._refused.text}"
 
-    def _repeat_torque(self, t: int, problem: Problem) -> Outbox:
-        """Return the last torque until its expiry, then as `_stop_commands`."""
-        if t >= self._torque_expires:
+    def _wait(self, t: int, joints: Message | None) -> Outbox:
+        """Return the command before the first set-point: zero torque, or the positions measured first."""
+        if self._admittance is not None and self._last is self._still:
+            if joints is None:
+                return self._command(t, self._still, self._no_validity)
+            self._last = np.array(joints.position)
+        return self._command(t, self._last, self._full_validity)
+
+    def _sense(self, admittance: AdmittanceController, t: int, inbox: Inbox) -> Problem | None:
+        """Hand the newest F/T reading on; return a problem if it is stale."""
+        for message in inbox.new("robot/status"):
+            admittance.sense(wrench(message.wrench)[:3])
+        received = inbox.stamp("robot/status")
+        if received is None or t - received > self._status_age:
+            age = "none yet" if received is None else f"{(t - received) / MS:.0f} ms old"
+            return Problem("robot/status", f"robot/status: {age}, limit {self._status_age / MS:.0f} ms")
+        return None
+
+    def _repeat(self, t: int, problem: Problem) -> Outbox:
+        """Return the last command until its expiry, then as `_stop_commands`."""
+        if t >= self._last_expires:
             return self._stop_commands(t, problem)
         self._facts["ticks_without_joint_states"] += 1
         self._problem = f"at {t} ns: {problem.text}"
-        return self._command(t, self._torque, duration_message(self._torque_expires - t), problem)
+        return self._command(t, self._last, duration_message(self._last_expires - t), problem)
 
     def _stop_commands(self, t: int, problem: Problem) -> Outbox:
         """Return an expired command with the reason, so that the driver enters its safe hold."""
-        self._torque_expires = -1
+        self._last_expires = -1
         self._stop_reason = problem
         self._facts["ticks_without_command"] += 1
         self._problem = f"at {t} ns: {problem.text}"
@@ -181,9 +210,9 @@ class ControlService(Service):
         self._pending.clear()
         return self._command(t, self._still, self._no_validity, problem)
 
-    @staticmethod
-    def _command(t: int, torque: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:
-        return {"control/joint_torque": JointTorqueCommand(header(t), torque, valid_for, problem.text, problem.culprit)}
+    def _command(self, t: int, values: Array, valid_for: Message, problem: Problem = NO_PROBLEM) -> Outbox:
+        torque, position = (_NONE, values) if self._positions else (values, _NONE)
+        return {"control/joint_torque": JointTorqueCommand(header(t), torque, position, valid_for, problem.text, problem.culprit)}
 
 
 def create(scenario: Scenario) -> ControlService:

@@ -29,7 +29,7 @@ def simulate(
     under_way = deque([np.zeros(7)] * late)
     positions, torques = [], []
     for k in range(ticks):
-        command = controller.torque(plant.q, plant.qd, at(k * MS))
+        command = controller.command(plant.q, plant.qd, at(k * MS))
         under_way.append(command)
         plant.step(under_way.popleft(), external)
         positions.append(plant.tip()[1])
@@ -57,7 +57,7 @@ def test_stiffness_is_what_was_asked_for(axis: int) -> None:
     controller = ImpedanceController(arm)
     acting = np.zeros(7)
     for _ in range(2500):
-        command = controller.torque(plant.q, plant.qd, ref)
+        command = controller.command(plant.q, plant.qd, ref)
         plant.step(acting + plant.tip()[2].T @ wrench)
         acting = command
     R_now, p_now, _ = plant.tip()

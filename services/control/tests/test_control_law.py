@@ -63,7 +63,7 @@ def test_inertia_is_that_of_inverse_dynamics_and_no_velocity_gives_no_coriolis_t
 @pytest.mark.parametrize("q", WORKING)
 def test_no_error_no_torque(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
     for mode in ControlMode:
-        assert unlimited.torque(q, REST, reference(setpoint(arm, q, mode=mode))) == pytest.approx(np.zeros(7), abs=1e-9)
+        assert unlimited.command(q, REST, reference(setpoint(arm, q, mode=mode))) == pytest.approx(np.zeros(7), abs=1e-9)
 
 
 @pytest.mark.parametrize("q", WORKING)
@@ -76,7 +76,7 @@ def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: Impe
         return 0.5 * float(ref.setpoint.stiffness @ error**2)
 
     slope = [(energy(q + dq) - energy(q - dq)) / 2e-6 for dq in 1e-6 * np.eye(7)]
-    np.testing.assert_allclose(unlimited.torque(q, REST, ref), -np.array(slope), rtol=1e-5, atol=1e-4)
+    np.testing.assert_allclose(unlimited.command(q, REST, ref), -np.array(slope), rtol=1e-5, atol=1e-4)
 
 
 @pytest.mark.parametrize("size", [0.05, 0.4])
@@ -88,7 +88,7 @@ def test_no_energy_is_gained_around_a_loop(arm: ArmModel, unlimited: ImpedanceCo
     angle = np.linspace(0, 2 * np.pi, 401)
     across, along = rng.normal(size=(2, 7)) * size
     path = WORKING[0] + np.outer(np.cos(angle), across) + np.outer(np.sin(angle), along)
-    torque = np.array([unlimited.torque(q, REST, ref) for q in path])
+    torque = np.array([unlimited.command(q, REST, ref) for q in path])
     work = ((torque[1:] + torque[:-1]) / 2 * np.diff(path, axis=0)).sum(axis=1)
     assert abs(work.sum()) < 2e-3 * np.abs(work).sum()
 
@@ -98,13 +98,13 @@ def test_damping_takes_energy(arm: ArmModel, unlimited: ImpedanceController) -> 
     for q in WORKING:
         ref = reference(setpoint(arm, q, **NO_POSTURE))
         for qd in rng.normal(size=(20, 7)) * 0.05:
-            torque = unlimited.torque(q, qd, ref) - arm.coriolis
+            torque = unlimited.command(q, qd, ref) - arm.coriolis
             assert torque @ qd <= 1e-12
 
 
 def test_feed_forward_wrench_is_exerted_on_the_environment(arm: ArmModel, unlimited: ImpedanceController) -> None:
     F = np.array([1.0, -2.0, -8.0, 0.1, 0.2, -0.3])
-    torque = unlimited.torque(WORKING[1], REST, reference(setpoint(arm, WORKING[1], F_W=F)))
+    torque = unlimited.command(WORKING[1], REST, reference(setpoint(arm, WORKING[1], F_W=F)))
     np.testing.assert_allclose(torque, arm.J_W.T @ F, atol=1e-9)
 
 
@@ -114,7 +114,7 @@ def test_position_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
     for ref in (far, farther):  # axis-aligned with W, so that the clip of z is the clip of D's z
         ref.motion.R_WD[:] = np.diag([1.0, -1.0, -1.0])
         ref.setpoint.stiffness[:] = np.array([2000.0, 2000.0, 500.0, 0, 0, 0])
-    once, twice = unlimited.torque(q, REST, far), unlimited.torque(q, REST, farther)
+    once, twice = unlimited.command(q, REST, far), unlimited.command(q, REST, farther)
     np.testing.assert_allclose(once, twice, atol=1e-9)
     np.testing.assert_allclose(once, arm.J_W[2] * 500 * impedance.POSITION_CLIP_M, atol=1e-9)
 
@@ -125,7 +125,7 @@ def test_rotation_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
     axis = arm.R_WI[:, 0]
     ref = offset(arm, q, np.concatenate((np.zeros(3), 2.0 * axis)))
     np.testing.assert_allclose(
-        unlimited.torque(q, REST, ref), arm.J_W[3:].T @ axis * 200 * impedance.ROTATION_CLIP_RAD, atol=1e-8
+        unlimited.command(q, REST, ref), arm.J_W[3:].T @ axis * 200 * impedance.ROTATION_CLIP_RAD, atol=1e-8
     )
 
 
@@ -133,7 +133,7 @@ def test_rotation_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
 def test_null_space_torque_does_not_move_the_indenter(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
     posture = q + np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.2, 0.3])
     ref = reference(setpoint(arm, q, **{"q": posture, "joint_stiffness": np.full(7, 50.0)}))
-    torque = unlimited.torque(q, REST, ref)
+    torque = unlimited.command(q, REST, ref)
     assert np.abs(torque).max() == pytest.approx(impedance.NULL_TORQUE_NM)
     to_task = arm.J_W @ np.linalg.inv(arm.inertia(q) + impedance.SLOW_S * np.diag(arm.viscous_friction))
     regularised = np.linalg.inv(to_task @ arm.J_W.T + impedance.REGULARISATION * np.eye(6))
@@ -148,7 +148,7 @@ def test_torque_changes_by_at_most_a_newton_metre_a_millisecond(arm: ArmModel, m
     ref = offset(arm, q, np.array([0.1, 0.1, -0.1, 0.3, 0.3, 0.3]))
     before = np.zeros(7)
     for _ in range(200):
-        after = controller.torque(q, REST, ref)
+        after = controller.command(q, REST, ref)
         assert np.abs(after - before).max() <= ms * safety.TORQUE_RATE_NM + 1e-12
         before = after
     assert np.abs(before).max() > 20
@@ -161,7 +161,7 @@ def test_command_and_gravity_together_stay_within_the_limits(arm: ArmModel, unli
         ref = reference(
             setpoint(arm, q, p_WD=setpoint(arm, q).p_WD + pressed, stiffness=np.array([1e4, 1e4, 1e4, 200.0, 200.0, 200.0]))
         )
-        torque = unlimited.torque(q, REST, ref)
+        torque = unlimited.command(q, REST, ref)
         assert (np.abs(torque) <= TORQUE_LIMIT).all()
         assert (np.abs(torque + arm.gravity) <= TORQUE_LIMIT + 1e-9).all()
         assert max(abs(torque[1]), abs((torque + arm.gravity)[1])) == pytest.approx(TORQUE_LIMIT[1])
@@ -178,7 +178,7 @@ def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint
     for inside in (0.04, 0.02, 0.0, -0.05):
         q[joint] = side * (POSITION_LIMIT[joint] - inside)
         ref = reference(setpoint(arm, q, mode=ControlMode.JOINT))
-        pushes.append(-side * unlimited.torque(q, REST, ref)[joint])
+        pushes.append(-side * unlimited.command(q, REST, ref)[joint])
     assert 0 < pushes[0] < pushes[1] < pushes[2] <= pushes[3]
     assert pushes[3] == pytest.approx(safety.REPULSION_FRACTION * TORQUE_LIMIT[joint])
 
@@ -193,7 +193,7 @@ def test_stretched_out_arm_gives_finite_torque(arm: ArmModel) -> None:
     controller = ImpedanceController(arm)
     ref = offset(arm, np.zeros(7), np.array([0.01, 0.01, 0.01, 0.1, 0.1, 0.1]))
     for _ in range(20):
-        assert np.isfinite(controller.torque(np.zeros(7), REST, ref)).all()
+        assert np.isfinite(controller.command(np.zeros(7), REST, ref)).all()
 
 
 def test_model_refuses_another_robot() -> None:
@@ -212,11 +212,11 @@ def test_the_compiled_law_is_the_one_that_python_reads(arm: ArmModel, seed: int,
     q, qd = WORKING[seed] + 0.1 * rng.normal(size=7), 0.3 * rng.normal(size=7)
     twist, wrench = 0.1 * rng.normal(size=6), rng.normal(size=6)
     ref = reference(setpoint(arm, WORKING[seed], V_WD=twist, F_W=wrench, qd=0.1 * rng.normal(size=7)))
-    compiled = ImpedanceController(arm).torque(q, qd, ref)
+    compiled = ImpedanceController(arm).command(q, qd, ref)
     names = ("cartesian_torque", "cartesian_gains", "friction_torque", "to_axes", "clip")
     for module, function in [(impedance, name) for name in names] + [(safety, "safe_torque")]:
         monkeypatch.setattr(module, function, getattr(module, function).py_func)
-    np.testing.assert_allclose(ImpedanceController(arm).torque(q, qd, ref), compiled, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(ImpedanceController(arm).command(q, qd, ref), compiled, rtol=1e-9, atol=1e-9)
 
 
 def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: ImpedanceController) -> None:
@@ -224,7 +224,7 @@ def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: 
     rng = np.random.default_rng(11)
     q, qd, twist, qd_0 = WORKING[1], *(0.02 * rng.normal(size=n) for n in (7, 6, 7))
     asked = setpoint(arm, q, V_WD=twist, qd=qd_0, q=q + 0.01 * rng.normal(size=7), stiffness=np.array([200.0] * 3 + [20.0] * 3))
-    torque = unlimited.torque(q, qd, reference(asked))
+    torque = unlimited.command(q, qd, reference(asked))
     M, D, J, X = arm.inertia(q), np.diag(arm.viscous_friction), arm.J_W, np.kron(np.eye(2), asked.R_WD.T)
     W = np.linalg.inv(M + impedance.SLOW_S * D)
     J_bar = W @ J.T @ np.linalg.inv(J @ W @ J.T)

@@ -1,9 +1,9 @@
-"""Driver: chooses the joint torque, and enters a safe hold when commands, limits or requests demand it.
+"""Driver: chooses the joint torque or position, and enters a safe hold when commands, limits or requests demand it.
 
 A driver is IDLE until its first valid command, then ACTIVE. On an expired or invalid command, a lost commander, a violated limit
 or a stop request it enters SAFE_HOLD and stays there until released. IDLE and SAFE_HOLD compensate gravity and damp the joints,
 without
-stiffness: pressed tissue pushes the arm away, so the force falls.
+stiffness: pressed tissue pushes the arm away, so the force falls. An arm that takes positions stops and stays where it is.
 """
 
 from __future__ import annotations
@@ -31,6 +31,9 @@ class DriverTuning:
     torque_rate_nm_per_ms: float = 2.0
     """Largest change of a joint command. libfranka aborts beyond 1; our controller keeps to 1. A corrupted command rarely
     passes."""
+    position_jump_rad: float = 0.02
+    """Largest change of a joint position command beyond that at the speed limit, and largest distance of the first one from the
+    measured position [A]."""
     first_torque_nm: float = 20.0
     """Largest first command per joint [A]: the arm is at rest, and a set-point at its position needs almost no torque."""
     validity_ns: int = 50_000_000
@@ -71,9 +74,9 @@ class HoldCause(IntEnum):
 
 @dataclass(slots=True)
 class Command:
-    """Joint torques without gravity [N m], their stamp [ns] and expiry [ns]."""
+    """Joint torques without gravity [N m] or joint positions [rad], their stamp [ns] and expiry [ns]."""
 
-    torque: Array
+    values: Array
     """Owned by the command and never written to."""
     stamp: int
     expires: int
@@ -84,11 +87,11 @@ class Command:
 
 
 class Driver:
-    """Chooses joint torques and damping. All arrays have shape (n,), from the base to the flange."""
+    """Chooses joint torques and damping, or joint positions. All arrays have shape (n,), from the base to the flange."""
 
-    def __init__(self, arm: Arm, force_emergency_n: float) -> None:
-        """`force_emergency_n`: external force at the tool [N] above which the driver holds."""
-        self._arm = arm
+    def __init__(self, arm: Arm, force_emergency_n: float, *, positions: bool = False) -> None:
+        """`force_emergency_n`: force at the tool [N] above which the driver holds; `positions`: commands are positions."""
+        self._arm, self._positions = arm, positions
         self._still = np.zeros(arm.joints)
         self._still.setflags(write=False)
         self._force_emergency = force_emergency_n
@@ -102,7 +105,7 @@ class Driver:
         self._brake = 0
         self._checked: Command | None = None
         self._before: Array | None = None
-        """Torques of the last checked command; None if no command was accepted since the driver was IDLE."""
+        """Values of the last checked command; None if no command was accepted since the driver was IDLE."""
         still = np.zeros(arm.joints)  # compiles the functions of a tick
         _within(still, still, arm.lower_rad, arm.upper_rad, arm.velocity_radps)
         _acceptable(still, still, still, arm.torque_nm, TUNING.torque_rate_nm_per_ms)
@@ -127,7 +130,7 @@ class Driver:
             self._before = None
 
     def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:
-        """Return the joint torques at `t` [ns] without gravity [N m]; zero outside ACTIVE, where `damping` acts instead.
+        """Return the values to apply at `t` [ns]; zero outside ACTIVE, where `damping` acts instead, or the arm stays.
 
         Args:
             t: time [ns].
@@ -149,11 +152,11 @@ class Driver:
             self._check_joints(t, q, v)
         if command is not None and not self.held:
             if command.stamp > self._since:
-                self._take(t, command, gravity)
+                self._take(t, command, q, gravity)
             elif self.mode is DriverMode.ACTIVE:  # not checked, so it must not be applied
                 age = (t - command.stamp) / 1e6
                 self.hold(t, HoldCause.COMMAND_EXPIRED, f"the newest command of control is {age:.0f} ms old", _COMMAND)
-        return command.torque if command is not None and self.mode is DriverMode.ACTIVE else self._still
+        return command.values if command is not None and self.mode is DriverMode.ACTIVE else self._still
 
     def damping(self, v: Array, gravity: Array) -> Array:
         """Return the joint damping of this tick [N m s/rad]; in a hold it is limited by the torque limits."""
@@ -177,7 +180,7 @@ class Driver:
             elif not -v_max <= v_i <= v_max:
                 self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
 
-    def _take(self, t: int, command: Command, gravity: Array) -> None:
+    def _take(self, t: int, command: Command, q: Array, gravity: Array) -> None:
         """Accept a command, ignores it (already expired while IDLE), or holds."""
         no_command = command.expires <= command.stamp  # also if the sender's clock is ahead
         expires = min(command.expires, command.stamp + TUNING.validity_ns)
@@ -189,29 +192,33 @@ class Driver:
                 self.hold(t, HoldCause.COMMAND_EXPIRED, reason, command.culprit or _COMMAND)
             return
         if command is not self._checked:
-            self._check(t, command, gravity)
+            self._check(t, command, q, gravity)
             self._checked = command
         if self.mode is DriverMode.IDLE:
             self.mode = DriverMode.ACTIVE
 
-    def _check(self, t: int, command: Command, gravity: Array) -> None:
-        shape, want = np.shape(command.torque), (self._arm.joints,)
+    def _check(self, t: int, command: Command, q: Array, gravity: Array) -> None:
+        shape, want = np.shape(command.values), (self._arm.joints,)
         if shape != want:
-            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: torque of shape {shape}, want {want}")
+            what = "position" if self._positions else "torque"
+            self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {what} of shape {shape}, want {want}")
             return
         if command.stamp > t + TUNING.ahead_ns:
             ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6
             reason = f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f} ms"
             self._reject(t, HoldCause.INVALID_COMMAND, reason)
             return
-        first = self._before is None
-        before = self._still if self._before is None else self._before
         interval_ms = 1.0
         if self._checked is not None:
             interval_ms = min(max((command.stamp - self._checked.stamp) / 1e6, 1.0), TUNING.validity_ns / 1e6)
+        if self._positions:
+            self._check_positions(t, command.values, q, interval_ms * 1e-3)
+            return
+        first = self._before is None
+        before = self._still if self._before is None else self._before
         change = TUNING.first_torque_nm if first else TUNING.torque_rate_nm_per_ms * interval_ms
-        if not _acceptable(command.torque, gravity, before, self._arm.torque_nm, change):
-            numbers = (command.torque.tolist(), before.tolist(), gravity.tolist())
+        if not _acceptable(command.values, gravity, before, self._arm.torque_nm, change):
+            numbers = (command.values.tolist(), before.tolist(), gravity.tolist())
             joints = zip(self._arm.joint_names, self._arm.torque_nm.tolist(), *numbers, strict=True)
             for joint, limit, torque, last, weight in joints:
                 if torque - torque != 0.0:  # NaN or infinite
@@ -230,7 +237,26 @@ class Driver:
                     )
                     self._reject(t, HoldCause.INVALID_COMMAND, start if first else rate)
                     return
-        self._before = command.torque
+        self._before = command.values
+
+    def _check_positions(self, t: int, wanted: Array, q: Array, interval_s: float) -> None:
+        """Check positions [rad] against joint limits and against those before, or the measured `q` [rad]."""
+        arm, before = self._arm, q if self._before is None else self._before
+        change = TUNING.position_jump_rad + (0.0 if self._before is None else interval_s) * arm.velocity_radps
+        far = ~(np.abs(wanted - before) <= change)  # also for NaN
+        outside = ~((wanted >= arm.lower_rad) & (wanted <= arm.upper_rad))
+        for k in np.flatnonzero(far | outside)[:1]:
+            joint = f"control/joint_torque: {arm.joint_names[k]} = {wanted[k]:.4f} rad"
+            if not np.isfinite(wanted[k]):
+                self._reject(t, HoldCause.INVALID_COMMAND, f"{joint}, must be finite")
+            elif outside[k]:
+                limits = f"{arm.lower_rad[k]:.4f} and {arm.upper_rad[k]:.4f} rad"
+                self._reject(t, HoldCause.POSITION_LIMIT, f"{joint}, limits {limits}")
+            else:
+                jump = f"{1e3 * interval_s:.0f} ms after {before[k]:.4f} rad, limit {change[k]:.4f} rad"
+                self._reject(t, HoldCause.INVALID_COMMAND, f"{joint}, {jump}")
+            return
+        self._before = wanted
 
     def _reject(self, t: int, cause: HoldCause, reason: str) -> None:
         self.rejected += 1

@@ -32,10 +32,12 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, link_names, urdf
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
 from palpate_robot.plant import DT, PlantFactory
+from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 from palpate_robot.stop_requests import StopRequests
 
@@ -63,7 +65,9 @@ class RobotService(Service):
         self._sensor = FtSensor(drawn.force, ft_rng, DT)
         self._joints = JointSensor(drawn.arm, joint_rng, self._plant.q, self._plant.gravity_torque())
         self._torque_sensors = TorqueSensors(robot, drawn.torque, torque_rng)
-        self._driver = Driver(arm, known.limits.force_emergency_n)
+        positions = robot.level is CommandLevel.POSITION
+        self._driver = Driver(arm, known.limits.force_emergency_n, positions=positions)
+        self._loop = PositionLoop(arm, self._joints.q) if positions else None
         self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
@@ -127,21 +131,29 @@ class RobotService(Service):
         self._read_contact(t, inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()
-            torque = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
-            damping = driver.damping(joints.v, gravity)
+            values = driver.update(t, joints.q, joints.v, gravity, self._external_force, command, lost=inbox.lost("control"))
+            torque, damping = self._act(values, gravity)
             driven = gravity + torque
             plant.step(driven, self._force_W if self._pressed else None, self._moment_W, damping)
             joints.update(plant.q, plant.v, driven)
             self._driven.append(driven)
             self._friction.append(plant.friction)
-            self._applied = torque if driver.mode is DriverMode.ACTIVE else -damping * joints.v
+            self._applied = torque if self._loop is None and driver.mode is DriverMode.ACTIVE else torque - damping * joints.v
+
+    def _act(self, values: Array, gravity: Array) -> tuple[Array, Array]:
+        """Return torque without gravity [N m] and damping [N m s/rad] of a step, for the values that the driver applies."""
+        if self._loop is None:
+            return values, self._driver.damping(self._joints.v, gravity)
+        command = values if self._driver.mode is DriverMode.ACTIVE else None
+        return self._loop.torque(command, self._joints.q, gravity), self._loop.damping
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
         message = inbox.latest("control/joint_torque")
         if message is not None and message is not self._command_message:
             stamp = nanoseconds(message.header.stamp)
             expires = stamp + nanoseconds(message.valid_for)
-            self._command = Command(np.array(message.torque), stamp, expires, message.problem, message.culprit)
+            values = message.torque if self._loop is None else message.position
+            self._command = Command(np.array(values), stamp, expires, message.problem, message.culprit)
             self._command_message = message
         return self._command
 

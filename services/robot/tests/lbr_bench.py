@@ -11,6 +11,7 @@ from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_models.robot import lbr
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.lbr.emulator import Emulator, Options
@@ -81,8 +82,8 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     chosen = Options(**options)
     port = DirectPort(Emulator(plant_input(scenario), chosen), chosen.period_ms)
     inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
-    connection = exam.robot.lbr.model_copy(update={"level": level, "emulated": True})
-    robot = exam.robot.model_copy(update={"lbr": connection})
+    connection = exam.robot.driver.model_copy(update={"emulated": True})
+    robot = exam.robot.model_copy(update={"driver": connection, "level": CommandLevel(level)})
     return LbrService(exam.model_copy(update={"robot": robot}), port, inner), port
 
 
@@ -117,7 +118,7 @@ class Rig:
                 error = self.target - joints.position
                 torque = GAIN * error - 0.5 * np.sqrt(GAIN) * joints.velocity
                 self.torque = np.clip(torque, self.torque - 1.0, self.torque + 1.0)  # as the driver wants it
-                command = JointTorqueCommand(header(self.t), self.torque, duration_message(50 * MS), "", "")
+                command = JointTorqueCommand(header(self.t), self.torque, np.zeros(0), duration_message(50 * MS), "", "")
                 self.inbox.messages["control/joint_torque"] = command
             self.outbox = self.driver.step(self.t, self.inbox)
             self.status = self.outbox.get("robot/status", self.status)

@@ -157,10 +157,10 @@ def test_a_load_that_is_wrong_by_a_newton_metre_is_carried(rig: Rig) -> None:
     assert np.abs(rig.plant.q - lbr.HOME).max() < 0.05
 
 
-@pytest.mark.parametrize(("name", "value"), [("level", "pose"), ("ft_sign", "2"), ("domain", "x")])
+@pytest.mark.parametrize(("name", "value"), [("domain", "-1"), ("ft_sign", "2"), ("domain", "x")])
 def test_a_field_of_the_connection_that_cannot_be_is_named(name: str, value: str) -> None:
-    with pytest.raises(ScenarioError, match=f"robot.lbr.{name}"):
-        load_scenario("clean", [f"robot.lbr.{name}={value}"])
+    with pytest.raises(ScenarioError, match=f"robot.driver.{name}"):
+        load_scenario("clean", [f"robot.driver.{name}={value}"])
 
 
 START = 5_000_000_000

@@ -22,7 +22,7 @@ from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.collector import Collector
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input, seen
-from palpate_models.scenario.schema import LbrConnection
+from palpate_models.scenario.schema import RobotDriver
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
 from palpate_robot.backends.lbr.service import TAKE_OVER_NS
@@ -160,7 +160,7 @@ def test_over_zenoh_every_command_has_its_sender(tmp_path: Path) -> None:
     topic, command = "lbr/command/torque", LBRTorqueCommand(np.zeros(7), np.zeros(7))
     commands = node.subscription(topic, TORQUE_COMMAND)
     watchdog, new = node.publisher(topic, TORQUE_COMMAND), node.publisher(topic, TORQUE_COMMAND)
-    port = ZenohPort(LbrConnection(router=endpoint))
+    port = ZenohPort(RobotDriver(router=endpoint))
     try:
         begin = time.monotonic()
         while not (first := port.rivals()) and time.monotonic() - begin < 20.0:
@@ -184,7 +184,7 @@ def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/lbr.sock"
     words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "clean", "--listen", endpoint]
     emulator = subprocess.Popen(words, stderr=subprocess.DEVNULL, env={**os.environ, "OMP_NUM_THREADS": "1"})
-    port = ZenohPort(LbrConnection(router=endpoint, emulated=True))
+    port = ZenohPort(RobotDriver(router=endpoint, emulated=True))
     torque = np.zeros(7)
     torque[0] = 6.0
     try:

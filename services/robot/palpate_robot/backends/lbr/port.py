@@ -16,7 +16,7 @@ from palpate_bus.messages import codec
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import LbrConnection
+from palpate_models.scenario.schema import RobotDriver
 
 _STATE = """\
 float64 sample_time
@@ -40,6 +40,8 @@ float64 tracking_performance
 """
 STATE = "lbr_fri_idl/msg/LBRState"
 TORQUE_COMMAND = "lbr_fri_idl/msg/LBRTorqueCommand"
+NAMESPACE = "lbr"
+"""Default of the stack's `robot_name`, which is also its namespace."""
 DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat64[7] torque\n"}
 
 
@@ -145,9 +147,9 @@ class LbrPort(ABC):
 class ZenohPort(LbrPort):
     """Connection over zenoh, with the keys of rmw_zenoh."""
 
-    def __init__(self, connection: LbrConnection) -> None:
+    def __init__(self, connection: RobotDriver) -> None:
         """Connect. Raises BusConfigError."""
-        name = connection.namespace.strip("/")
+        name = (connection.namespace or NAMESPACE).strip("/")
         self._node = RosNode("palpate_robot.backends.lbr", connection.domain, BusOptions(router=connection.router))
         self._states = self._node.subscription(f"{name}/state", STATE)
         self._wrenches = self._node.subscription(connection.ft_topic.strip("/"), WRENCH)

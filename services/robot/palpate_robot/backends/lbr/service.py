@@ -29,6 +29,7 @@ from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, GravityModel, MeasuredArm
@@ -109,11 +110,11 @@ class LbrService(Service):
         self._model = GravityModel(exam.robot)
         self._driver = Driver(lbr.ARM, exam.limits.force_emergency_n)
         self._stop_requests = StopRequests(self._driver)
-        lbr_side = exam.robot.lbr
-        self._emulated = lbr_side.emulated
-        yaw = np.deg2rad(lbr_side.ft_yaw_deg)
+        given = exam.robot.driver
+        self._emulated = given.emulated
+        yaw = np.deg2rad(given.ft_yaw_deg)
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
-        self._R_ST = lbr_side.ft_sign * turn
+        self._R_ST = given.ft_sign * turn
         self._command: Command | None = None
         self._command_message: Message | None = None
         self._commanding_since: int | None = None
@@ -269,9 +270,9 @@ def _wrench(values: Array) -> Message:
 
 
 def create(scenario: Scenario) -> LbrService:
-    """Return the driver of a scenario, connected to the ROS side that `robot.lbr` names."""
+    """Return the driver of a scenario, connected to the ROS side that `robot.driver` names."""
     if Settings.read().runtime != "wallclock":
         raise BusConfigError("services.robot = lbr drives hardware and cannot run in simulated time: use --wallclock")
     exam = exam_input(scenario)
-    inner = InnerLoop(load_control(scenario)) if exam.robot.lbr.level == "setpoint" else None
-    return LbrService(exam, ZenohPort(exam.robot.lbr), inner)
+    inner = InnerLoop(load_control(scenario)) if exam.robot.level is CommandLevel.SETPOINT else None
+    return LbrService(exam, ZenohPort(exam.robot.driver), inner)

@@ -24,9 +24,9 @@ from palpate_bus.contract import contract
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import LbrConnection
+from palpate_models.scenario.schema import RobotDriver
 from palpate_robot.backends.lbr.arm import STATE_AGE_NS, MeasuredArm
-from palpate_robot.backends.lbr.port import STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
+from palpate_robot.backends.lbr.port import NAMESPACE, STATE, TORQUE_COMMAND, LBRTorqueCommand, SessionState
 
 log = logging.getLogger("watchdog")
 
@@ -76,9 +76,9 @@ class Watchdog:
 def main() -> int:
     """Run until a signal; return the exit status."""
     parser = argparse.ArgumentParser(description="Damps the arm when the driver's commands stop.")
-    parser.add_argument("--router", default=LbrConnection().router, help="zenoh endpoint of the ROS side")
+    parser.add_argument("--router", default=RobotDriver().router, help="zenoh endpoint of the ROS side")
     parser.add_argument("--domain", type=int, default=0, help="its ROS domain")
-    parser.add_argument("--namespace", default=LbrConnection().namespace, help="the stack's robot_name")
+    parser.add_argument("--namespace", default=NAMESPACE, help="the stack's robot_name")
     given = parser.parse_args()
     logging.basicConfig(level="INFO", format="%(asctime)s watchdog %(levelname)s %(message)s", stream=sys.stderr)
     running = [True]

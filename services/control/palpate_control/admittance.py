@@ -1,0 +1,126 @@
+"""Admittance control of an arm that takes joint positions: set-point and F/T reading in, joint positions out.
+
+The tool yields from the desired position p_D by y, in axes of the desired indenter frame D:
+
+    T dy/dt + y = F / K,    F = F_measured + F_ff,    p_command = p_D + R_WD y
+
+with the stiffness K of the set-point, the force of the environment on the tool, and the feed-forward force of the set-point. At
+rest that is the law of `impedance`: K (p_D - p) + F_ff is the force on the environment. The orientation does not yield.
+
+It is the admittance 1 / (B s + K) with B = T K and no mass. On a wall whose force answers with Z(s) and an arm that follows with
+G(s) after a delay d, the loop is L = Z G e^(-d s) / (K (T s + 1)) (Colgate and Hogan, Int. J. Control 1988, doi
+10.1080/00207178808906161; Keemink et al., IJRR 2018, doi 10.1177/0278364918768950). Where |L| < 1 at all frequencies, no delay
+makes it unstable (small gain).
+
+The joints follow by inverse kinematics on commanded positions, with damped least squares and the posture in the null space.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from math import exp
+
+import numpy as np
+import pinocchio as pin
+
+from palpate_bus.setpoint import ControlMode
+from palpate_control.model import ArmModel
+from palpate_control.reference import Reference
+from palpate_models.numerics.frames import GRAVITY, Array
+
+
+@dataclass(frozen=True)
+class AdmittanceTuning:
+    """Constants of the law."""
+
+    yield_s: float = 0.15
+    """T. The stiffest wall gives |L| < 1 with any delay."""
+    yield_max_m: float = 0.03
+    """Largest y, per axis."""
+    tare_s: float = 0.5
+    """Time constant with which the bias of the F/T sensor is learned in free motion."""
+    follow_per_s: float = 50.0
+    """Gain of the inverse kinematics on the error of pose and of joint positions."""
+    posture_per_s: float = 2.0
+    """The same on the posture in the null space."""
+    damping: float = 0.02
+    """Of the least squares [m or 1]: near a singularity the joints slow down."""
+
+
+TUNING = AdmittanceTuning()
+
+
+class AdmittanceController:
+    """The law for one arm; it keeps the commanded joint positions."""
+
+    def __init__(self, model: ArmModel, tool_mass_kg: float, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
+        """Create a controller called every `period_s` that stays `limit_zone` [rad] away from joint limits where it starts there.
+
+        `tool_mass_kg`: mass below the F/T sensor.
+        """
+        self.model, self._dt = model, period_s
+        self._lower, self._upper = model.position_lower + limit_zone, model.position_upper - limit_zone
+        self._weight_W = np.array((0.0, 0.0, -tool_mass_kg * GRAVITY))
+        self._bias: Array | None = None
+        self._reading: Array | None = None
+        self._fresh = False
+        self.reset()
+
+    def reset(self) -> None:
+        """Start again from the measured position, as after a pause without commands."""
+        self._q: Array | None = None
+        self._yield = np.zeros(3)
+
+    def sense(self, force_S: Array) -> None:
+        """Take an F/T reading: force in the sensor's axes, not tared [N], shape (3,)."""
+        self._reading, self._fresh = force_S, True
+
+    def command(self, q: Array, qd: Array, reference: Reference) -> Array:
+        """Return the joint positions to command [rad], shape (n,), at measured positions `q` [rad]; `qd` is not used."""
+        if self._q is None:
+            self._q = np.array(q, dtype=float)
+        model, motion = self.model, reference.motion
+        model.update_kinematics(self._q)
+        if reference.setpoint.mode is ControlMode.JOINT:
+            self._tare(model.R_WI)
+            rate = motion.qd + TUNING.follow_per_s * (motion.q - self._q)
+        else:
+            rate = self._cartesian(reference)
+        rate = rate / max(1.0, float(np.max(np.abs(rate) / model.velocity_limit)))
+        low, high = np.minimum(self._lower, self._q), np.maximum(self._upper, self._q)
+        self._q = np.clip(self._q + self._dt * rate, low, high)
+        return self._q
+
+    def _cartesian(self, reference: Reference) -> Array:
+        """Return joint velocities [rad/s] that follow the pose less what the force makes it yield."""
+        assert self._q is not None
+        model, (setpoint, motion) = self.model, reference
+        R_WD = motion.R_WD
+        force_D = R_WD.T @ (self._force(model.R_WI) + motion.F_W[:3])
+        K = setpoint.stiffness[:3]
+        goal = np.clip(force_D / np.maximum(K, 1e-9), -TUNING.yield_max_m, TUNING.yield_max_m)
+        step = (1 - exp(-self._dt / TUNING.yield_s)) * (goal - self._yield)
+        self._yield = self._yield + step
+        error = np.concatenate((motion.p_WD + R_WD @ self._yield - model.p_WI, pin.log3(R_WD @ model.R_WI.T)))
+        twist = motion.V_WD + TUNING.follow_per_s * error
+        twist[:3] += R_WD @ step / self._dt
+        J = model.J_W
+        rate: Array = J.T @ np.linalg.solve(J @ J.T + TUNING.damping**2 * np.eye(6), twist)
+        if model.joints > len(J):
+            posture = motion.qd + TUNING.posture_per_s * (motion.q - self._q)
+            rate += posture - np.linalg.pinv(J) @ (J @ posture)
+        return rate
+
+    def _force(self, R_WS: Array) -> Array:
+        """Return the force of the environment on the tool [N], world axes, shape (3,); zero before the first tare."""
+        if self._bias is None or self._reading is None:
+            return np.zeros(3)
+        return np.asarray(R_WS @ (self._reading - self._bias) - self._weight_W)
+
+    def _tare(self, R_WS: Array) -> None:
+        """Learn the bias: in free motion nothing but the tool loads the sensor."""
+        if self._reading is None or not self._fresh:
+            return
+        self._fresh = False
+        bias = self._reading - R_WS.T @ self._weight_W
+        self._bias = bias if self._bias is None else self._bias + (bias - self._bias) * min(self._dt * 10 / TUNING.tare_s, 1.0)

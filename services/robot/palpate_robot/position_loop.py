@@ -1,0 +1,76 @@
+"""Position loop of a simulated arm that takes joint positions: commands in, torques of the drives out.
+
+A command is followed after a latency, by a critically damped reference r within limits of speed and acceleration; the drives are
+
+    tau = gravity + k (r' - q - h v) + d (dr/dt - v)
+
+discretised as stable proportional-derivative control (Tan, Liu and Turk, IEEE CG&A 2011, doi 10.1109/MCG.2011.30): r' is the
+reference at the end of the step h, and the terms in v are implicit, so any gains are stable.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.chain import Arm
+from palpate_robot.plant import DT
+
+
+@dataclass(frozen=True)
+class PositionLoopTuning:
+    """Constants of the loop [A]: those of a geared arm with a servo at 500 Hz."""
+
+    stiffness_per_torque: float = 100.0
+    """k over the torque limit [1/rad]: 15 N on an outstretched arm turn its shoulder by 0.7 mrad."""
+    settling_s: float = 0.02
+    """d / k: time constant with which an error of position decays."""
+    latency_s: float = 0.010
+    """From a command to the motion that it begins."""
+    reference_radps: float = 100.0
+    """Frequency of the reference."""
+    acceleration_factor: float = 2.0
+    """Limit of acceleration over that of free motion."""
+
+
+TUNING = PositionLoopTuning()
+
+
+class PositionLoop:
+    """Torques that follow position commands. Arrays have shape (n,)."""
+
+    def __init__(self, arm: Arm, q: Array, tuning: PositionLoopTuning = TUNING) -> None:
+        """Start at rest at measured positions `q` [rad]."""
+        self._stiffness = tuning.stiffness_per_torque * arm.torque_nm
+        self._rate = tuning.settling_s * self._stiffness
+        self.damping = self._rate + DT * self._stiffness
+        """Damping to take implicitly [N m s/rad]."""
+        self._limits = (arm.velocity_radps, tuning.acceleration_factor * arm.acceleration_radps2, arm.torque_nm)
+        self._frequency = tuning.reference_radps
+        self._goal, self._r, self._rd = q, q.copy(), np.zeros_like(q)
+        self._late = deque([q] * round(tuning.latency_s / DT))
+        """Commands that have not taken effect yet."""
+
+    def torque(self, command: Array | None, q: Array, gravity: Array) -> Array:
+        """Return the explicit part of the torques without gravity [N m] for a step at measured positions `q` [rad].
+
+        Without a command the arm stops as fast as it may and stays.
+        """
+        speed, acceleration, limit = self._limits
+        if command is None:
+            wanted = -self._rd / DT
+        else:
+            self._late.append(command)
+            before, self._goal = self._goal, self._late.popleft()
+            error, error_rate = self._goal - self._r, (self._goal - before) / DT - self._rd
+            wanted = self._frequency**2 * error + 2 * self._frequency * error_rate
+        self._rd = np.clip(self._rd + DT * np.clip(wanted, -acceleration, acceleration), -speed, speed)
+        self._r = self._r + DT * self._rd
+        if command is None:
+            self._goal = self._r
+            self._late = deque([self._r] * len(self._late))
+        wanted_torque = self._stiffness * (self._r - q) + self._rate * self._rd
+        return np.asarray(np.clip(wanted_torque + gravity, -limit, limit) - gravity)
