@@ -13,29 +13,75 @@ from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.schema import Robot
 
-MASS = 0.35
+MASS, REST = 0.35, np.zeros(7)
 BIAS = np.array((1.5, -2.0, 3.0))
-REST = np.zeros(7)
+PUSH = np.array((0.0, 0.0, 10.0))
+SETTLED = round(8 * TUNING.yield_s * 1e3)
 
 
 class Contact:
-    """A controller that has learned the bias of its sensor in free motion, and an arm that does what it commands."""
+    """A controller, its F/T sensor, and an arm that does what it commands."""
 
-    def __init__(self, q: np.ndarray = WORKING[1]) -> None:
+    def __init__(self, posture: int = 1) -> None:
+        self.asked, self.q = WORKING[posture], np.array(WORKING[posture])
         self.model = ArmModel(urdf(Robot()))
-        self.law, self.q = AdmittanceController(self.model, MASS), np.array(q)
-        self.start = self.follow(1000, ControlMode.JOINT, np.zeros(3))
+        self.law = AdmittanceController(self.model, MASS)
 
-    def follow(self, ticks: int, mode: ControlMode, force_W: np.ndarray, **changes: object) -> np.ndarray:
-        """Return where the tool is after some ticks under a force on it."""
-        asked = reference(setpoint(self.model, self.asked, mode=mode, **changes)) if ticks else None
+    def follow(self, mode: ControlMode, force_W: np.ndarray, ticks: int = SETTLED, **changes: object) -> np.ndarray:
+        """Return where the tool is [m] after some ticks under a force on it [N]."""
+        asked = reference(setpoint(self.model, self.asked, mode=mode, **changes))
         for _ in range(ticks):
-            self.model.update_kinematics(self.q)
-            self.law.sense(self.model.R_WI.T @ (force_W - (0, 0, MASS * GRAVITY)) + BIAS)
+            self.law.sense(self.tool()[1].T @ (force_W - (0, 0, MASS * GRAVITY)) + BIAS)
             self.q = self.law.command(self.q, REST, asked)
-        self.model.update_kinematics(self.q)
-        return self.model.p_WI.copy()
+        return self.tool()[0]
 
-    @property
-    def asked(self) -> np.ndarray:
-        return WORKING[1]
+    def tool(self) -> tuple[np.ndarray, np.ndarray]:
+        self.model.update_kinematics(self.q)
+        return self.model.p_WI.copy(), self.model.R_WI.copy()
+
+
+@pytest.mark.parametrize("posture", range(3))
+def test_at_rest_the_tool_yields_by_force_over_stiffness(posture: int) -> None:
+    contact = Contact(posture)
+    start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)
+    K = np.full(6, 4000.0)
+    np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, np.zeros(3), stiffness=K), start, atol=2e-5)
+    pushed = contact.follow(ControlMode.CARTESIAN, PUSH, stiffness=K)
+    np.testing.assert_allclose(pushed - start, PUSH / K[0], atol=2e-5)
+    fed = contact.follow(ControlMode.CARTESIAN, PUSH, stiffness=K, F_W=np.concatenate((-0.9 * PUSH, np.zeros(3))))
+    np.testing.assert_allclose(fed - start, 0.1 * PUSH / K[0], atol=2e-5)
+
+
+def test_without_a_tare_no_force_moves_the_tool() -> None:
+    contact = Contact()
+    start = contact.tool()[0]
+    np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, PUSH), start, atol=1e-5)
+
+
+def test_it_yields_no_further_than_its_limit() -> None:
+    contact = Contact()
+    start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)
+    R_WD = contact.tool()[1]
+    far_D = R_WD.T @ (contact.follow(ControlMode.CARTESIAN, 100 * PUSH) - start)
+    assert np.abs(far_D).max() == pytest.approx(TUNING.yield_max_m, abs=1e-3)
+
+
+@pytest.mark.parametrize("mode", list(ControlMode))
+def test_no_set_point_turns_a_joint_faster_or_further_than_it_may(mode: ControlMode) -> None:
+    contact = Contact()
+    far = contact.asked + 3.0
+    for _ in range(400):
+        before = contact.q
+        contact.follow(mode, np.zeros(3), 1, q=far, p_WD=np.array((2.0, 0.0, 2.0)))
+        assert (np.abs(contact.q - before) <= 1.001e-3 * contact.model.velocity_limit).all()
+    assert (np.abs(contact.q) <= contact.model.position_upper).all()
+
+
+def test_after_a_reset_it_starts_where_the_arm_is() -> None:
+    contact = Contact()
+    contact.follow(ControlMode.CARTESIAN, PUSH, 50)
+    contact.law.reset()
+    contact.q = WORKING[1] + 0.2
+    before = contact.q
+    contact.follow(ControlMode.JOINT, np.zeros(3), 1)
+    assert (np.abs(contact.q - before) <= 1.001e-3 * contact.model.velocity_limit).all()
