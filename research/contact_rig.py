@@ -214,7 +214,7 @@ DEFAULT_ARM = Robot().arm
 
 @cache
 def scenario(contrast: float, arm: str = DEFAULT_ARM) -> Scenario:
-    """A uniform abdomen that does not breathe, `contrast` times as stiff as the default, on a robot almost without sensor noise."""
+    """A uniform abdomen that does not breathe, `contrast` times the default's stiffness, on a robot with almost no noise."""
     wall = Stiffness(k_w_n_per_m3=Stiffness().k_w_n_per_m3 * contrast)
     plain = Scenario()
     still = Errors(level="none", arm=ArmErrors(position_noise_rad=1e-9, velocity_noise_radps=1e-9))  # no sensor repeats itself
