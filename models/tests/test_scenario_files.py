@@ -156,7 +156,7 @@ def test_the_table_has_every_field_and_none_that_is_not() -> None:
         for row in rows.values():
             assert set(row) == {"typical", "poor", "mark", "source"}
             assert row["mark"] in {"V", "S", "C", "A"}
-    assert set(table()) == set(Errors.model_fields) - {"level"}
+    assert set(table()) == set(Errors.model_fields) - {"level", "chosen"}
 
 
 def test_poor_equipment_is_nowhere_better_than_typical() -> None:

@@ -71,7 +71,7 @@ def study(
     source
         Name of a study (`palpate study list`) or path of a YAML file.
     split
-        tune: patients for choosing thresholds; test: patients to report.
+        tune: patients for choosing thresholds; test: patients to report; shift: patients and equipment of other kinds.
     number
         Patients per population; by default the study's number.
     methods

@@ -171,7 +171,7 @@ class Loop:
         self._drawn = drawn or mine
         self.begin_s = errors.begin_s
         """Start time of the first stroke [s]."""
-        self.aside_m = self._drawn.aside_m
+        self.aside_m = self._drawn.aside_m + scenario.errors.chosen.indenter_m
         """True less estimated position of the tool, xy of A [m], shape (2,)."""
         self.uncertainty_m = errors.uncertainty_m
         """Reported standard deviation of depth [m]."""
@@ -202,6 +202,10 @@ class Loop:
     def gains(self, outward: Array) -> Array:
         """Return rows that map a force to the measured normal force, for outward normals, both of shape (p, 3)."""
         return self._sensor.gains(outward)
+
+    def lagging(self, force: float) -> float:
+        """Return what the sensor reads of a normal force [N] at the end of a period; called once per period."""
+        return self._sensor.lagging(force)
 
     def tare(self, k: int) -> None:
         """Tare the sensor by its readings in air just before the k-th period."""
@@ -269,7 +273,8 @@ class _TaredSensor:
         self._sensor = FtSensor(drawn, generator(scenario.seed, "loop force"), PERIOD_S)
         self._begin = round(begin_s / PERIOD_S)
         self._normal: list[float] = []
-        self._tare = 0.0
+        self._tare, self._felt = 0.0, 0.0
+        self._lag = exp(-PERIOD_S / drawn.lag_s) if drawn.lag_s else 0.0
         self.tare(0)
         reads, lever = drawn.sensitivity[2], FT_TO_INDENTER_M
         self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
@@ -286,6 +291,10 @@ class _TaredSensor:
         x /= np.linalg.norm(x, axis=1, keepdims=True)
         axes = np.stack((x, np.cross(z, x), z), axis=1)
         return np.asarray(-np.einsum("i,pij->pj", self._row, axes))
+
+    def lagging(self, force: float) -> float:
+        self._felt = force + self._lag * (self._felt - force)
+        return self._felt
 
     def tare(self, k: int) -> None:
         self._read(self._begin + k)

@@ -288,6 +288,7 @@ def scores_text(s: scoring.Scores) -> str:
     parts = [f"{s.matched} matched, {s.missed} missed"]
     parts += [f"{s.not_palpable} not palpable in the region"] if s.not_palpable else []
     parts += [f"{s.false_findings} false" + (f" ({s.on_guarding} on guarding)" if s.on_guarding else "")]
+    parts += [f"{s.on_structure} on structures"] if s.on_structure else []
     parts += [f"place within {s.place_error_m * 1e3:.1f} mm"] if s.place_error_m is not None else []
     parts += [f"Dice {s.dice:.2f}"] if s.dice is not None else []
     parts += [f"size off by {100 * s.size_error:.0f} %"] if s.size_error is not None else []

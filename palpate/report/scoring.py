@@ -91,6 +91,8 @@ class FindingScore:
     """True if its band includes the true ratio."""
     on_guarding: bool
     """True if it is false and overlaps guarded muscle; for a candidate, if its centroid lies on it."""
+    on_structure: bool = False
+    """True if it matches no lump and overlaps a structure of the wall; for a candidate, if its centroid lies on it. Not false."""
 
 
 @dataclass(frozen=True)
@@ -117,6 +119,8 @@ class Scores:
     coverage_90_in_lumps: float | None
     """The same within the areas of lumps."""
     findings: tuple[FindingScore, ...]
+    on_structure: int = 0
+    """Findings on structures of the wall, such as scars: neither matched nor false."""
     coverage_90_on_guarding: float | None = None
     """The same on guarded muscle."""
     candidates: tuple[FindingScore, ...] = ()
@@ -135,14 +139,15 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidate
     dice = np.array([[_dice(felt, mask, places, lump) for lump in felt.lumps] for mask in masks])
     partner = _match(found, dice, _within(found, truth))
     excess = felt.excess(places)
-    guarded = felt.inside(felt.guarded, places)
+    guarded, structured = (felt.inside(area, places) for area in (felt.guarded, felt.structured))
     rows = []
     for i, (finding, mask) in enumerate(zip(found, masks, strict=True)):
         lump = partner.get(i)
         known = mask & np.isfinite(excess)
         ratio = float(np.exp(np.average(excess[known], weights=felt.cells[known]))) if known.any() else None
-        on_guarding = lump is None and bool((mask & guarded).any())
-        rows.append(_finding_score(finding, lump, None if lump is None else float(dice[i, lump]), ratio, on_guarding, truth))
+        on_structure, on_guarding = (lump is None and bool((mask & area).any()) for area in (structured, guarded))
+        over = (on_guarding and not on_structure, on_structure)
+        rows.append(_finding_score(finding, lump, None if lump is None else float(dice[i, lump]), ratio, over, truth))
     matched = [row for row in rows if row.lump is not None]
     palpable = sum(lump.palpable for lump in felt.lumps)
     held = [row.ratio_held for row in matched]
@@ -151,8 +156,9 @@ def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidate
         matched=len(matched),
         missed=palpable - len(matched),
         not_palpable=len(felt.lumps) - palpable,
-        false_findings=len(rows) - len(matched),
+        false_findings=sum(row.lump is None and not row.on_structure for row in rows),
         on_guarding=sum(row.on_guarding for row in rows),
+        on_structure=sum(row.on_structure for row in rows),
         place_error_m=_mean([row.place_error_m for row in matched]),
         absolute_error_m=_mean([row.absolute_error_m for row in matched]),
         dice=None if found_map is None else _mean([row.dice for row in matched]),
@@ -213,8 +219,10 @@ def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth
         lump = next((int(j) for j in np.flatnonzero(within) if int(j) not in taken), None)
         taken = taken | {lump} if lump is not None else taken
         centroid = truth.touched.places(candidate.centroid[None, :2])
-        on_guarding = lump is None and bool(felt.inside(felt.guarded, centroid)[0])
-        rows.append(_finding_score(candidate, lump, None, None, on_guarding, truth))
+        on_structure, on_guarding = (
+            lump is None and bool(felt.inside(area, centroid)[0]) for area in (felt.structured, felt.guarded)
+        )
+        rows.append(_finding_score(candidate, lump, None, None, (on_guarding and not on_structure, on_structure), truth))
     return tuple(rows)
 
 
@@ -228,8 +236,9 @@ def _match(found: Sequence[Found], dice: Array, within: Mask) -> dict[int, int]:
 
 
 def _finding_score(
-    finding: Found, index: int | None, dice: float | None, true_ratio: float | None, on_guarding: bool, truth: Truth
+    finding: Found, index: int | None, dice: float | None, true_ratio: float | None, over: tuple[bool, bool], truth: Truth
 ) -> FindingScore:
+    """Return the score of a finding that matches the lump `index`; `over`: it is false on guarding, it is on a structure."""
     place = absolute = size = None
     if index is not None:
         lump = truth.felt.lumps[index]
@@ -248,7 +257,8 @@ def _finding_score(
         true_ratio=true_ratio,
         ratio_error=None if true_ratio is None else finding.ratio / true_ratio - 1,
         ratio_held=None if true_ratio is None else finding.band[0] <= true_ratio <= finding.band[1],
-        on_guarding=on_guarding,
+        on_guarding=over[0],
+        on_structure=over[1],
     )
 
 

@@ -15,11 +15,13 @@ from pathlib import Path
 from typing import Any, Final, NamedTuple
 
 from palpate.run.roles import checked
+from palpate.study.shift import Family, shifted
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
+from palpate_errors import UserError
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.errors import Errors
-from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario
+from palpate_models.scenario.load import as_settings, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Section
 from palpate_plugins import PluginError, is_file
@@ -72,7 +74,7 @@ class Request(NamedTuple):
     settings: Sequence[str] = ()
     """Overrides `a.b=c` of every scenario, applied last."""
     secret: str | None = None
-    """Content of the file of secret seeds, which replaces the study's salt in the split `test`."""
+    """Content of the file of secret seeds, which replaces the study's salt, except in the split `tune`."""
 
 
 def command_of(name: str, request: Request, methods: Sequence[str] = (), services: Sequence[str] = ()) -> str:
@@ -90,7 +92,7 @@ def command_of(name: str, request: Request, methods: Sequence[str] = (), service
 
 
 def patient_seeds(study: str, population: str, split: Split, count: int, salt: str) -> list[int]:
-    """Return the distinct seeds of the first patients of a population: 0 to 999 for tuning, others for tests.
+    """Return the distinct seeds of the first patients of a population: 0 to 999 for tuning, others for the other splits.
 
     The first seeds do not depend on `count`.
     """
@@ -136,9 +138,10 @@ def secret_of(path: Path, study: Study) -> str:
 
 
 def _check_secret(study: Study, request: Request) -> None:
-    if study.seeds_sha256 is not None and request.split == "test" and request.secret is None:
+    if study.seeds_sha256 is not None and request.split != "tune" and request.secret is None:
         raise StudyError(
-            f"{study.name}: seeds_sha256 = {study.seeds_sha256}: the split test needs the file of that hash, --seeds-file FILE"
+            f"{study.name}: seeds_sha256 = {study.seeds_sha256}: "
+            f"the split {request.split} needs the file of that hash, --seeds-file FILE"
         )
 
 
@@ -146,15 +149,13 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
     salt = study.salt if request.secret is None else request.secret
     errors = study.error_levels()
     usable: dict[str, Scenario] = {}
-    for name, population in study.populations.items():
-        count = getattr(population.number, request.split)
-        if count and request.number is not None:
-            count = request.number
+    for name, family, population, planned in _populations(study, request.split):
+        count = request.number if planned and request.number is not None else planned
         for number, seed in enumerate(patient_seeds(study.name, name, request.split, count, salt)):
             for level, wrong in errors.items():
                 for key, method in study.methods.items():
                     where = f"{study.name}: populations.{name} by methods.{key}"
-                    scenario = _scenario(where, (population, method, wrong), (number, seed), request.settings)
+                    scenario = _scenario(where, (population, method, wrong), (number, seed), request.settings, family)
                     if where not in usable:  # the search for installed services takes 0.1 s
                         usable[where] = _usable(where, scenario)
                     scenario = scenario.model_copy(update={"services": usable[where].services, "search": usable[where].search})
@@ -175,10 +176,23 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                     )
 
 
+def _populations(study: Study, split: Split) -> Iterator[tuple[str, Family | None, Population, int]]:
+    """Yield name, family, population and number of patients; in the split `shift` each family of a population is one."""
+    for name, population in study.populations.items():
+        if split == "shift":
+            yield from ((f"{name}-{family}", family, population, count) for family, count in population.number.shift.items())
+        else:
+            yield name, None, population, getattr(population.number, split)
+
+
 def _scenario(
-    where: str, parts: tuple[Population, Method, Errors | None], patient: tuple[int, int], settings: Sequence[str]
+    where: str,
+    parts: tuple[Population, Method, Errors | None],
+    patient: tuple[int, int],
+    settings: Sequence[str],
+    family: Family | None = None,
 ) -> Scenario:
-    """Return the scenario of a patient, given by number and seed."""
+    """Return the scenario of a patient, given by number and seed, changed as the family says."""
     population, method, wrong = parts
     number, seed = patient
     changes: dict[str, Any] = dict(population.settings)
@@ -190,8 +204,10 @@ def _scenario(
     changes |= method.settings
     changes |= {f"services.{role}": name for role, name in method.services.items()}
     try:
+        if family is not None:
+            changes |= shifted(load_scenario(population.scenario, as_settings(changes), seed), family, number)
         return load_scenario(population.scenario, [*as_settings(changes), *settings], seed)
-    except ScenarioError as error:
+    except UserError as error:
         raise StudyError(f"{where}: {error}") from error
 
 

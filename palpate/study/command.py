@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 from time import monotonic
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
 from rich.console import Console
@@ -17,9 +17,9 @@ from palpate.run.options import ServiceChoices, Settings
 if TYPE_CHECKING:
     from palpate.study.cases import Case
     from palpate.study.folder import Folder, Manifest, RunRecord
-    from palpate.study.spec import Study
+    from palpate.study.spec import Split, Study
 
-SPLITS = ("tune", "test")
+SPLITS = ("tune", "test", "shift")
 SHOWN = 10
 """Maximum number of incomplete cases that are listed."""
 
@@ -52,7 +52,9 @@ def list_studies() -> None:
 @app.command()
 def run(  # noqa: PLR0913 - the options of a command
     name: Annotated[str, typer.Argument(metavar="NAME|FILE", help="A study (see `palpate study list`) or a YAML file.")],
-    split: Annotated[str, typer.Option(help="tune: patients to choose thresholds on; test: those to report.")] = "test",
+    split: Annotated[
+        str, typer.Option(help="tune: patients to choose thresholds on; test: those to report; shift: of other kinds.")
+    ] = "test",
     number: Annotated[int | None, typer.Option(min=1, help="Patients of each population, instead of the study's own.")] = None,
     workers: Annotated[int | None, typer.Option(min=1, help="Cases at a time on this machine; by default one a core.")] = None,
     scheduler: Annotated[str | None, typer.Option(metavar="ADDRESS", help="A Dask scheduler, such as tcp://host:8786.")] = None,
@@ -60,7 +62,7 @@ def run(  # noqa: PLR0913 - the options of a command
     method: Annotated[list[str] | None, typer.Option(help="Only this method; may be repeated.")] = None,
     services: ServiceChoices = None,
     settings: Settings = None,
-    seeds_file: Annotated[Path | None, typer.Option(help="File of secret seeds for the split test.")] = None,
+    seeds_file: Annotated[Path | None, typer.Option(help="File of secret seeds for the splits test and shift.")] = None,
     keep: Annotated[
         bool, typer.Option("--keep", help="Keep cases from another version of the code instead of refusing.")
     ] = False,
@@ -105,7 +107,7 @@ def run(  # noqa: PLR0913 - the options of a command
     try:
         study = _chosen(load_study(name), method, services)
         secret = None if seeds_file is None else secret_of(seeds_file, study)
-        request = Request("tune" if split == "tune" else "test", number, settings or (), secret)
+        request = Request(cast("Split", split), number, settings or (), secret)
         cases = cases_of(study, request)
         own = part_of(cases, shard) if shard else cases
         path = out or default_folder(study.name, split)

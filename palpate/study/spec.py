@@ -20,6 +20,7 @@ from typing import Annotated, Any, Final, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from palpate.run.roles import OBSERVERS, WORKERS
+from palpate.study.shift import Family
 from palpate_errors import UserError
 from palpate_inputs import parse_yaml, read_text
 from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
@@ -27,8 +28,9 @@ from palpate_models.scenario.errors import Errors, Level, table
 from palpate_models.scenario.load import explain
 from palpate_models.section import Length, Section
 
-Split = Literal["tune", "test"]
-"""`tune`: patients for choosing thresholds. `test`: patients whose figures are reported."""
+Split = Literal["tune", "test", "shift"]
+"""`tune`: patients for choosing thresholds. `test`: patients whose figures are reported. `shift`: patients and equipment from
+other sources than the population's (`palpate.study.shift`), reported apart."""
 Tier = Literal["whole", "quick"]
 """`whole`: the composed run of all services. `quick`: the indenter without an arm (`palpate.quick`)."""
 Runtime = Literal["lockstep", "wallclock"]
@@ -48,6 +50,8 @@ class Numbers(Section):
 
     tune: Annotated[int, Field(ge=0, le=1000)] = 0
     test: Annotated[int, Field(ge=0, le=1_000_000)] = 0
+    shift: dict[Family, Annotated[int, Field(ge=0, le=1_000_000)]] = Field(default_factory=dict)
+    """By family."""
 
 
 class Grid(Section):
@@ -123,9 +127,9 @@ class Study(Section):
     description: str = ""
     tier: Tier = "whole"
     salt: str = ""
-    """Changes every patient of the split `test`."""
+    """Changes every patient of the splits `test` and `shift`."""
     seeds_sha256: Annotated[str, Field(pattern=r"^[0-9a-f]{64}$")] | None = None
-    """For a held-out study: SHA-256 of the file of secret seeds, which the split `test` needs."""
+    """For a held-out study: SHA-256 of the file of secret seeds, which the splits `test` and `shift` need."""
     populations: Annotated[dict[Name, Population], Field(min_length=1)]
     errors: dict[Name, Errors] = Field(default_factory=dict)
     """Equipment errors by name; without any, those of the scenarios."""

@@ -55,6 +55,7 @@ CASES: Final = pa.schema(
         "missed": pa.int64(),
         "false_findings": pa.int64(),
         "on_guarding": pa.int64(),
+        "on_structure": pa.int64(),
         "score": pa.float64(),
         "coverage_area": pa.float64(),
         "coverage_lumps": pa.float64(),
@@ -95,10 +96,12 @@ FINDINGS: Final = pa.schema(
         "area_true_m2": pa.float64(),
         "ratio_true": pa.float64(),
         "on_guarding": pa.bool_(),
+        "on_structure": pa.bool_(),
     }
 )
 """One row per finding and per candidate. `lump`: the matched lump, -1 if none. `guarding`: reported probability of a tensed
-muscle. `on_guarding`: True if it lies on one and matches no lump."""
+muscle. `on_guarding`: True if it lies on one and is false. `on_structure`: True if it lies on a structure of the wall and
+matches no lump."""
 LUMPS: Final = pa.schema(
     {
         "case_id": pa.string(),
@@ -160,6 +163,7 @@ def _case(study: str, outcome: Outcome, hits: Sequence[Record]) -> Record:
             "missed": scores.missed,
             "false_findings": scores.false_findings,
             "on_guarding": scores.on_guarding,
+            "on_structure": scores.on_structure,
             "coverage_area": _number(scores.coverage_90),
             "coverage_lumps": _number(scores.coverage_90_in_lumps),
             "coverage_ratio": _number(scores.ratio_coverage_90),
@@ -206,6 +210,7 @@ def _finding(outcome: Outcome, index: int, found: tuple[FindingRow, bool], score
         "area_true_m2": nan if lump is None or truth is None else truth.lumps[lump].area_m2,
         "ratio_true": nan if score is None else _number(score.true_ratio),
         "on_guarding": None if score is None else score.on_guarding,
+        "on_structure": None if score is None else score.on_structure,
     }
 
 

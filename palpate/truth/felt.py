@@ -13,7 +13,7 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
-from scipy.ndimage import label
+from scipy.ndimage import label, maximum
 from scipy.spatial import Delaunay
 
 from palpate.truth.pressed import Pressed
@@ -70,6 +70,11 @@ class Felt:
         guard = np.nan_to_num(between(np.log(pressed.force / pressed.relaxed))(self.raster)).reshape(xx.shape)
         self.guarded: Mask = guard >= max(0.5 * float(guard.max()), PALPABLE)
         """Mask of guarding: at least half of its maximum effect, shape (ny, nx)."""
+        changed = np.abs(np.nan_to_num(between(np.log(pressed.force / pressed.plain))(self.raster)).reshape(xx.shape))
+        parts, count = label(changed >= PALPABLE)
+        most = np.append(np.inf, maximum(changed, parts, np.arange(1, count + 1)))
+        self.structured: Mask = changed >= 0.5 * most[parts]
+        """Mask of structures: at least half of the maximum effect of each connected one that is palpable, shape (ny, nx)."""
 
     def force(self, xy: Array) -> Array:
         """Return apparent stiffness [N] at points [m], shape (p, 2) -> (p,); NaN outside the pressed places."""

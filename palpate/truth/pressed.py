@@ -20,7 +20,7 @@ from palpate_models.numerics.cache import content_key, remembered
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
-from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.patient.schema import Lesion, Phantom, Structure
 from palpate_models.scenario.schema import Exam, Scenario
 
 if TYPE_CHECKING:
@@ -51,6 +51,8 @@ class Pressed:
     """Without one lump each [N], shape (l, p)."""
     relaxed: Array
     """Without guarding [N], shape (p,)."""
+    plain: Array
+    """Without structures [N], shape (p,)."""
 
 
 class Copies:
@@ -71,6 +73,12 @@ class Copies:
             return None
         return self._copy(self.phantom.model_copy(update={"guarding": ()}))
 
+    def plain(self) -> TissueBackend | None:
+        """Return the patient without structures; None if there are none."""
+        if not self.phantom.structures:
+            return None
+        return self._copy(self.phantom.model_copy(update={"structures": ()}))
+
     def _copy(self, phantom: Phantom) -> TissueBackend | None:
         from palpate.truth.tissue import true_tissue  # noqa: PLC0415 - imports a service, which reading results does not need
 
@@ -83,13 +91,13 @@ def press_patient(scenario: Scenario) -> Pressed | None:
     Takes seconds; cached in the user's cache folder by patient, tier and indenter.
     """
     copies, radius = Copies(scenario), scenario.robot.indenter_radius_m
-    lesions = copies.phantom.lesions
+    lesions, structures = copies.phantom.lesions, copies.phantom.structures
     body = copies.with_lesions(lesions)
     if body is None:
         return None
     model = body.model
     skin = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
-    places, normals = _places(skin, scenario.exam, lesions)
+    places, normals = _places(skin, scenario.exam, (*lesions, *structures))
     arrays = (model.vertices, model.areas, model.stiffness, model.background, model.stiffening, model.tension)
     words = (copies.phantom, scenario.services.tissue, radius)
     key = content_key("pressed", _code(scenario), *arrays, places, *words)
@@ -114,10 +122,12 @@ def press_patient(scenario: Scenario) -> Pressed | None:
             alone.append(felt if others is None else press(others, shared, felt))
         slack = copies.relaxed()
         relaxed = force if slack is None else press(slack, np.ones(len(places), dtype=bool), force)
-        return np.stack((force, limited, healthy, relaxed, *alone))
+        bare = copies.plain()
+        plain = force if bare is None else press(bare, np.asarray(_near(places, structures).any(axis=0)), force)
+        return np.stack((force, limited, healthy, relaxed, plain, *alone))
 
     rows = np.asarray(remembered(key, compute))
-    return Pressed(places, rows[0], rows[1] > 0, rows[2], rows[4:], rows[3])
+    return Pressed(places, rows[0], rows[1] > 0, rows[2], rows[5:], rows[3], rows[4])
 
 
 def _code(scenario: Scenario) -> list[Path]:
@@ -129,21 +139,21 @@ def _code(scenario: Scenario) -> list[Path]:
     return sorted([*files, Path(__file__), *([chosen.resolve()] if chosen.suffix == ".py" else [])])
 
 
-def _places(skin: TrueSurface, exam: Exam, lesions: Sequence[Lesion]) -> tuple[Array, Array]:
-    """Return places on the skin [m] and outward unit normals, shape (p, 3): a grid, finer near outlines of lumps."""
+def _places(skin: TrueSurface, exam: Exam, areas: Sequence[Lesion | Structure]) -> tuple[Array, Array]:
+    """Return places on the skin [m] and outward unit normals, shape (p, 3): a grid, finer near outlines."""
     centre, half = np.asarray(exam.centre_m), 0.5 * np.asarray(exam.region_m) + PITCH_M
     count = np.ceil(half / FINE_PITCH_M - 1e-9).astype(int)
     count += count % 2  # the coarse grid is every second point of the fine one, up to the border
     i, j = (a.ravel() for a in np.meshgrid(*(np.arange(-n, n + 1) for n in count)))
     xy = centre + np.column_stack((i, j)) * half / count
     coarse = (i % 2 == 0) & (j % 2 == 0)
-    edge = np.any([np.abs(edge_distance(xy, lesion)) <= PITCH_M for lesion in lesions], axis=0) if lesions else coarse
+    edge = np.any([np.abs(edge_distance(xy, area)) <= PITCH_M for area in areas], axis=0) if areas else coarse
     places, normals = skin.points(xy[coarse | edge])
     on_skin = np.isfinite(places).all(axis=1) & np.isfinite(normals).all(axis=1)
     return places[on_skin], normals[on_skin]
 
 
-def _near(places: Array, lesions: Sequence[Lesion]) -> NDArray[np.bool_]:
-    """Return True where each lump may be palpable, shape (l, p)."""
-    near = [edge_distance(places[:, :2], lesion) <= REACH_M + (lesion.depth_m or 0.0) for lesion in lesions]
-    return np.array(near, dtype=bool).reshape(len(lesions), len(places))
+def _near(places: Array, areas: Sequence[Lesion | Structure]) -> NDArray[np.bool_]:
+    """Return True where each area may be palpable, shape (l, p)."""
+    near = [edge_distance(places[:, :2], area) <= REACH_M + (area.depth_m or 0.0) for area in areas]
+    return np.array(near, dtype=bool).reshape(len(areas), len(places))

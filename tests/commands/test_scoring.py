@@ -43,6 +43,7 @@ def truth(
     lumps: Sequence[Disc],
     contrast: float = 3.0,
     guarded: Disc | None = None,
+    scarred: Disc | None = None,
     slope: float = 0.0,
     touched: Touched = NOWHERE,
     limited: bool = False,
@@ -51,8 +52,9 @@ def truth(
     xy = places[:, :2]
     factors = np.array([factor(xy, lump, contrast) for lump in lumps]).reshape(len(lumps), len(xy))
     tense = np.ones(len(xy)) if guarded is None else factor(xy, guarded, 2.0)
-    force = 2.0 * tense * factors.prod(axis=0)
-    pressed = Pressed(places, force, np.full(len(xy), limited), 2.0 * tense, force / factors, force / tense)
+    scar = np.ones(len(xy)) if scarred is None else factor(xy, scarred, 2.0)
+    force = 2.0 * tense * scar * factors.prod(axis=0)
+    pressed = Pressed(places, force, np.full(len(xy), limited), 2.0 * tense * scar, force / factors, force / tense, force / scar)
     body = TrueBody(*plane(slope=slope), np.eye(4))
     return Truth(body, Felt(pressed, TrueSurface(body), EXAM), touched, np.eye(4))
 
@@ -186,6 +188,17 @@ def test_a_finding_on_guarding_is_false_and_counted_apart() -> None:
     assert [row.on_guarding for row in weighed] == [True, False]
     over_both = truth([guarded], guarded=guarded)
     assert (score([guarded], over_both).matched, score([guarded], over_both).on_guarding) == (1, 0)
+
+
+def test_a_finding_on_a_structure_is_neither_matched_nor_false() -> None:
+    scarred, away = (np.array((0.05, 0.0)), 0.02), (np.array((-0.05, 0.0)), 0.02)
+    true = truth([], scarred=scarred)
+    s = score([scarred, away], true)
+    assert (s.matched, s.false_findings, s.on_structure) == (0, 1, 1)
+    weighed = scoring.score([], None, true, found([scarred, away])).candidates
+    assert [row.on_structure for row in weighed] == [True, False]
+    over_both = score([scarred], truth([scarred], scarred=scarred))
+    assert (over_both.matched, over_both.on_structure) == (1, 0)
 
 
 def test_findings_are_compared_where_the_tool_truly_touched() -> None:

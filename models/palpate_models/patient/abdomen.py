@@ -18,14 +18,22 @@ COSTAL_EDGE_M = 0.04
 """Width of the transition from belly to rib cage."""
 
 
+def _in_skeleton(x: Array, y: Array, skeleton: Skeleton) -> tuple[Array, Array]:
+    """Return the coordinates in the frame in which the skeleton is symmetric [m]."""
+    aside = x - skeleton.lateral_m
+    return aside, y - skeleton.tilt * aside
+
+
 def above_costal_arch(x: Array, y: Array, skeleton: Skeleton) -> Array:
     """Return the height [m] of points above the costal arch, negative on the belly."""
+    x, y = _in_skeleton(x, y, skeleton)
     return np.asarray(y - skeleton.costal_arch_m + skeleton.costal_slope * np.abs(x))
 
 
 def iliac_bump(x: Array, y: Array, skeleton: Skeleton) -> Array:
     """Return the relative rise over the iliac spines, 1 at each."""
     across, along = skeleton.iliac_crest_m
+    x, y = _in_skeleton(x, y, skeleton)
     square = (np.abs(x) - across) ** 2 + (y - along) ** 2
     return np.asarray(np.exp(-square / (2 * skeleton.iliac_radius_m**2)))
 

@@ -64,6 +64,11 @@ class Breathing(Section):
     cough_m: tuple[NonNegative, Annotated[float, Field(le=MOST_M)]] = (0.010, 0.020)
     """Range of the displacement by a cough, uniform [A]. The tension of the wall during a cough is not modelled."""
 
+    pulse_m: Annotated[float, Field(ge=0, le=0.005)] = 0.0
+    """Peak to peak displacement by the pulse of the aorta, with the profile of a breath [A]."""
+    pulse_per_min: Annotated[float, Field(ge=30, le=180)] = 70.0
+    """Heart rate."""
+
     @model_validator(mode="before")
     @classmethod
     def _usual(cls, values: Any) -> Any:
@@ -85,20 +90,23 @@ class BreathingCurve:
         A (1 + cos(pi (x - T_i) / T_e)) / 2      for T_i <= x < T_i + T_e
         0                                        for T_i + T_e <= x < T_i + T_e + T_p
 
-    (raised cosines [A]), continuous with its derivative. The current breath at time t is the last one that starts at or before
-    t - L floor((t - s_0) / L): the table repeats after L = `repeats_s`. The first start s_0 is before time 0.
+    (raised cosines [A]), continuous with its derivative, to which the pulse adds P (1 - cos(2 pi f t)) / 2. The current breath at
+    time t is the last one that starts at or before t - L floor((t - s_0) / L): the table repeats after L = `repeats_s`. The first
+    start s_0 is before time 0.
     """
 
     def __init__(self, breathing: Breathing, seed: int) -> None:
         """Equal settings and seed give equal breaths."""
         self.table: Array = np.empty((0, 5)) if breathing.kind == "none" else _breaths(breathing, seed)
         """Start [s], inspiration [s], expiration [s], pause [s] and amplitude [m] of each breath or cough, shape (n, 5)."""
-        self.largest_m = float(self.table[:, 4].max(initial=0.0))
+        self._pulse_m = breathing.pulse_m if len(self.table) else 0.0
+        self._pulse_radps = 2 * math.pi * breathing.pulse_per_min / 60
+        self.largest_m = float(self.table[:, 4].max(initial=0.0)) + self._pulse_m
         """Maximum excursion [m]."""
         self.repeats_s = float(self.table[:, 1:4].sum())
         """Length of the table [s]; 0 without breathing."""
         moving = self.table[:, 1:3].sum(axis=1)
-        self.mean_m = float(self.table[:, 4] @ moving / 2 / self.repeats_s) if self.repeats_s else 0.0
+        self.mean_m = float(self.table[:, 4] @ moving / 2 / self.repeats_s) + self._pulse_m / 2 if self.repeats_s else 0.0
         """Mean excursion [m]: half of the amplitude during a breath, zero in its pause."""
         self._rows = self.table.tolist()
         self._starts = self.table[:, 0].tolist()
@@ -107,6 +115,10 @@ class BreathingCurve:
         """Return the outward displacement [m], never negative, at time `t_s` [s] where the profile is 1."""
         if not self._rows:
             return 0.0
+        return self._breath(t_s) + self._pulse_m * (1 - math.cos(self._pulse_radps * t_s)) / 2
+
+    def _breath(self, t_s: float) -> float:
+        """Return the part of the breath [m]."""
         t_s -= self.repeats_s * math.floor((t_s - self._starts[0]) / self.repeats_s)
         start, inspiration, expiration, _, amplitude = self._rows[max(bisect_right(self._starts, t_s) - 1, 0)]
         since = t_s - start

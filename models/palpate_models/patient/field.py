@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient.guarding import Guarding
-from palpate_models.patient.schema import Background, Lesion
+from palpate_models.patient.schema import Background, Lesion, Structure
 
 _SHARE = 0.64
 _FADE_M = 0.030
@@ -96,9 +96,21 @@ def background_factor(points: Array, background: Background, half_length: float,
     return np.asarray(variation * margin)
 
 
-def edge_distance(xy: Array, area: Lesion | Guarding) -> Array:
-    """Distance [m] of points (n, 2) from an area's elliptic outline, to first order; negative inside; (n,)."""
-    offset = xy - np.asarray(area.centre_m)
+def _offset(xy: Array, line: Array) -> Array:
+    """Return the vectors to points (n, 2) from the nearest point of a polyline (k, 2) [m], shape (n, 2)."""
+    if len(line) == 1:
+        return np.asarray(xy - line[0])
+    begin, along = line[:-1], np.diff(line, axis=0)
+    from_begin = xy[:, None] - begin
+    share = np.clip((from_begin * along).sum(axis=2) / np.maximum((along**2).sum(axis=1), 1e-12), 0.0, 1.0)
+    offsets = from_begin - share[..., None] * along
+    nearest = (offsets**2).sum(axis=2).argmin(axis=1)
+    return np.asarray(offsets[np.arange(len(xy)), nearest])
+
+
+def edge_distance(xy: Array, area: Lesion | Guarding | Structure) -> Array:
+    """Distance [m] of points (n, 2) from an area's outline, to first order; negative inside; (n,)."""
+    offset = _offset(xy, np.array(area.line_m if isinstance(area, Structure) else [area.centre_m]))
     radii = np.asarray(area.radii_m)
     rho = np.sqrt(((offset / radii) ** 2).sum(axis=1))
     slope = np.sqrt(((offset / radii**2) ** 2).sum(axis=1))
@@ -124,3 +136,27 @@ def lesion_field(xy: Array, lesions: Sequence[Lesion], front: NDArray[np.bool_] 
         label[(share >= 0.5) & (stronger | (label < 0))] = index
         factor[stronger] = own[stronger]
     return factor, label
+
+
+def structure_at_skin(structure: Structure) -> Structure:
+    """Return the structure through the wall that is felt as this one, as `at_skin` of a lump of its length and width."""
+    if structure.depth_m is None:
+        return structure
+    line, width = np.array(structure.line_m), min(structure.radii_m)
+    longer = float(np.linalg.norm(np.diff(line, axis=0), axis=1).sum()) / 2
+    lump = Lesion(
+        centre_m=structure.line_m[0],
+        radii_m=(longer + max(structure.radii_m), width),
+        contrast=structure.factor,
+        edge_m=structure.edge_m,
+        depth_m=structure.depth_m,
+    )
+    felt = at_skin(lump)
+    grown = felt.radii_m[1] / width
+    radii = (structure.radii_m[0] * grown, structure.radii_m[1] * grown)
+    return structure.model_copy(update={"radii_m": radii, "factor": felt.contrast, "edge_m": felt.edge_m, "depth_m": None})
+
+
+def structure_share(xy: Array, structure: Structure) -> Array:
+    """Return the share of its full effect that a structure through the wall has at points (n, 2), shape (n,)."""
+    return smoothstep(0.5 - edge_distance(xy, structure) / structure.edge_m)

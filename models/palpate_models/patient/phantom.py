@@ -14,7 +14,7 @@ from scipy.spatial import Delaunay
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.abdomen import lattice, parametric_surface
-from palpate_models.patient.field import background_factor, lesion_field
+from palpate_models.patient.field import background_factor, lesion_field, structure_at_skin, structure_share
 from palpate_models.patient.grid import read_grid
 from palpate_models.patient.healthy import healthy_wall
 from palpate_models.patient.mesh import boundary_vertices, load_mesh, vertex_normals
@@ -46,7 +46,7 @@ class PhantomModel:
     stiffness: Array
     """Instantaneous foundation modulus k_w [N/m^3], shape (n,), with lesions."""
     background: Array
-    """The same without lesions, shape (n,)."""
+    """The same without lesions, shape (n,); structures are part of it."""
     stiffening: Array
     """Stiffening with depth [1/m], shape (n,): see `Stiffness.stiffening_per_m`."""
     tension: Array
@@ -100,6 +100,14 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
     if phantom.anatomy is not None:
         wall = healthy_wall(vertices, phantom.size_m, phantom.anatomy, phantom.stiffness.stiffening_per_m, seed)
         background, stiffening = background * wall.stiffness, wall.stiffening
+    for index, structure in enumerate(map(structure_at_skin, phantom.structures)):
+        share = np.where(normals[:, 2] > 0, structure_share(vertices[:, :2], structure), 0.0)
+        if not share.any():
+            raise MeshError(
+                f"phantom.structures[{index}]: line_m {structure.line_m}: no point of the abdomen's front belongs to it"
+            )
+        factor = 1 + (structure.factor - 1) * share
+        background, young = background * factor, None if young is None else young * factor
     contrast, lesion = lesion_field(vertices[:, :2], phantom.lesions, front=normals[:, 2] > 0)
     for index in sorted(set(range(len(phantom.lesions))) - set(lesion.tolist())):
         centre, radii = phantom.lesions[index].centre_m, phantom.lesions[index].radii_m

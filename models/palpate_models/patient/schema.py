@@ -31,6 +31,10 @@ class Skeleton(Section):
     """Position (x, y) of the left iliac spine; the right one is its mirror image."""
     iliac_radius_m: Length = 0.025
     """Standard deviation of the Gaussian rise over the spine."""
+    lateral_m: Annotated[float, Field(ge=-0.05, le=0.05)] = 0.0
+    """Distance of the skeleton's midline from the umbilicus, to the patient's left."""
+    tilt: Annotated[float, Field(ge=-0.4, le=0.4)] = 0.0
+    """Slope of the skeleton in the frontal plane: bones are higher by this share of their distance to the left of its midline."""
 
 
 class Muscles(Section):
@@ -158,6 +162,39 @@ class Lesion(Section):
         return self
 
 
+class StructureKind(StrEnum):
+    """Kinds of structures."""
+
+    SCAR = "scar"
+    HERNIA = "hernia"
+    DIASTASIS = "diastasis"
+    MESH = "mesh"
+    STOOL = "stool"
+
+
+class Structure(Section):
+    """A part of the wall that is stiffer or softer than its surroundings and not a lump: all points near a polyline."""
+
+    kind: StructureKind
+    line_m: Annotated[tuple[Vec2, ...], Field(min_length=1)]
+    """Points of the polyline in the abdomen's xy plane, from the umbilicus. One point with `radii_m` is an ellipse."""
+    radii_m: tuple[Length, Length] = (0.005, 0.005)
+    """Half widths of the half-effect outline about the polyline, along x and along y."""
+    factor: Annotated[float, Field(ge=0.1, le=20)]
+    """Stiffness relative to the stiffness without the structure. Not 1."""
+    edge_m: Positive = 0.006
+    """Width of the smooth edge."""
+    depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
+    """Depth of its top below the skin; every tier takes what the skin shows of it (`palpate_models.patient.field`). None: it goes
+    through the wall."""
+
+    @model_validator(mode="after")
+    def _factor(self) -> Self:
+        if self.factor == 1:
+            raise ValueError("factor = 1 is not a structure; want 0.1 to 20 and not 1")
+        return self
+
+
 class Background(Section):
     """Natural variation of a healthy abdomen's stiffness: log-normal, with a Gaussian correlation."""
 
@@ -221,6 +258,8 @@ class Phantom(Section):
     background: Background = Background()
     lesions: tuple[Lesion, ...] = ()
     """Lumps, stiffer or softer than their surroundings."""
+    structures: tuple[Structure, ...] = ()
+    """Scars, hernias and other structures of the wall, which are not lumps."""
     guarding: tuple[Guarding, ...] = ()
     """Areas of contracted muscle."""
     breathing: Breathing = Breathing()

@@ -155,6 +155,19 @@ class TorqueErrors(Section):
     """Relative error of each link's mass: standard deviation of its logarithm."""
 
 
+class ChosenErrors(Section):
+    """Constant errors of sensor and tool that are chosen, in addition to the drawn ones. No level has them."""
+
+    force_gain: Annotated[float, Field(ge=-0.5, le=0.5)] = 0.0
+    """Relative error of the sensitivity of the force sensor, equal for all axes."""
+    force_lag_s: Annotated[float, Field(ge=0, le=1)] = 0.0
+    """Time constant of the force sensor, a lag of first order."""
+    askew_rad: tuple[Annotated[float, Field(ge=-0.2, le=0.2)], Annotated[float, Field(ge=-0.2, le=0.2)]] = (0.0, 0.0)
+    """Rotation of sensor and tool against their nominal mount, about the sensor's x and y axes: readings are in rotated axes."""
+    indenter_m: tuple[Annotated[float, Field(ge=-0.02, le=0.02)], Annotated[float, Field(ge=-0.02, le=0.02)]] = (0.0, 0.0)
+    """Lateral displacement of the indenter against its nominal position in x and y, such as that of an askew tool."""
+
+
 class Errors(Section):
     """Errors of sensors, calibrations and arm."""
 
@@ -168,6 +181,7 @@ class Errors(Section):
     """Registered pose of the patient (`exam.pose`); the error is in the abdomen frame."""
     arm: ArmErrors = ArmErrors()
     torque: TorqueErrors = TorqueErrors()
+    chosen: ChosenErrors = ChosenErrors()
 
     @model_validator(mode="before")
     @classmethod
@@ -220,6 +234,8 @@ class DrawnForce:
     """Additional bias of the warm sensor, shape (6,)."""
     sensitivity: Array
     """Reading over true wrench, shape (6, 6), in SI units."""
+    lag_s: float = 0.0
+    """Time constant of the reading."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -284,24 +300,30 @@ def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
     """Draw the equipment of the patient with this seed; `joints`: number of the arm's. Fields are drawn independently."""
     streams = np.random.SeedSequence([seed, crc32(b"errors")]).spawn(6)
     force, camera, hand_eye, registration, arm, torque = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
+    drawn = draw_arm(errors.arm, arm, joints)
+    if any(errors.chosen.indenter_m):  # the last joint turns about the tool's axis
+        drawn.origin_m[-1, :2] += errors.chosen.indenter_m
     return DrawnErrors(
-        _force(errors.force, force),
+        _force(errors.force, errors.chosen, force),
         _camera(errors.camera, camera),
         _pose(errors.hand_eye, hand_eye),
         _pose(errors.registration, registration),
-        draw_arm(errors.arm, arm, joints),
+        drawn,
         _torque(errors.torque, torque, joints),
     )
 
 
-def _force(given: ForceErrors, rng: np.random.Generator) -> DrawnForce:
+def _force(given: ForceErrors, chosen: ChosenErrors, rng: np.random.Generator) -> DrawnForce:
     scale = np.repeat((1.0, MOMENT_PER_FORCE_M), 3)
     bias = np.repeat((given.bias_n, given.bias_nm), 3) * rng.uniform(-1.0, 1.0, 6)
     warm_up = given.warm_up_n * scale * rng.standard_normal(6)
     share = np.full((6, 6), given.cross_talk)
     np.fill_diagonal(share, given.gain)
     sensitivity = np.eye(6) + share * rng.standard_normal((6, 6)) * np.outer(scale, 1 / scale)
-    return DrawnForce(given, bias, warm_up, sensitivity)
+    if chosen != ChosenErrors():
+        turn = matrix(Pose(rpy_rad=(*chosen.askew_rad, 0.0)))[:3, :3].T
+        sensitivity = (1 + chosen.force_gain) * sensitivity @ np.kron(np.eye(2), turn)
+    return DrawnForce(given, bias, warm_up, sensitivity, chosen.force_lag_s)
 
 
 def _camera(given: CameraErrors, rng: np.random.Generator) -> DrawnCamera:

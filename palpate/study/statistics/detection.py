@@ -14,6 +14,8 @@ from statsmodels.stats.rates import confint_poisson
 from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate, percentiles, wilson
 from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
+SURE: Final = 0.5
+
 
 class Rates(Row):
     """Rates of reported findings, without another threshold."""
@@ -36,12 +38,16 @@ class Rates(Row):
     """Per examination."""
     false_findings_of_healthy: Estimate
     """Per examination of a person without a lump."""
+    sure_on_structures: Estimate | None = None
+    """Share of persons without a lump who had a finding on a structure of the wall with a confidence above SURE."""
 
 
 def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
     """Return the rates of one method. A failed case finds no lump, and is a false alarm in a person without one."""
     cases = variant.cases
     ill, healthy = cases[cases["ill"]], cases[cases["healthy"]]
+    findings = variant.findings
+    sure = findings[findings["reported"] & findings["on_structure"].eq(True) & (findings["confidence"] > SURE)]
     done = cases["status"] == "done"
     return Rates(
         completed=wilson(int((~cases["failed"]).sum()), len(cases), "patients"),
@@ -53,6 +59,7 @@ def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
         lump_sensitivity=_of_lumps(cases, bootstrap),
         false_findings=_each(cases, bootstrap),
         false_findings_of_healthy=_each(healthy, bootstrap),
+        sure_on_structures=wilson(int(healthy["patient"].isin(sure["patient"]).sum()), len(healthy), "patients"),
     )
 
 

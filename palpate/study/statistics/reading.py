@@ -23,7 +23,7 @@ COLUMNS: Final = {
     "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
 }
 """Columns that the statistics read from each table."""
-LATER: Final = ("guarding", "on_guarding")
+LATER: Final = ("guarding", "on_guarding", "on_structure")
 """Columns of findings that are missing in tables of an earlier version."""
 PATIENT: Final = ["study", "population", "split", "number"]
 """Columns that identify a patient: methods, tiers and levels of errors examine the same patients."""

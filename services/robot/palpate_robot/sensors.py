@@ -11,14 +11,14 @@ The six-axis force/torque sensor reads
 
     reading = S w + b + a (1 - exp(-t / T)) + x(t) + white noise
 
-with the true wrench w, a sensitivity S (gain errors, cross-talk), the bias b at power-on, the warm-up a, and x(t), which a tare
-does not remove: an Ornstein-Uhlenbeck process plus a random walk.
+with the true wrench w, after a lag of first order if the sensor has one, a sensitivity S (gain errors, cross-talk), the bias b at
+power-on, the warm-up a, and x(t), which a tare does not remove: an Ornstein-Uhlenbeck process plus a random walk.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from math import cos, sin
+from math import cos, exp, sin
 from typing import Final
 
 import numpy as np
@@ -110,6 +110,9 @@ class FtSensor:
         given = drawn.given
         self._drawn = drawn
         self._sensitivity = np.ascontiguousarray(drawn.sensitivity)
+        self._lag = exp(-period_s / drawn.lag_s) if drawn.lag_s else 0.0
+        self._felt: Array | None = None
+        """The lagging wrench; None before the first reading."""
         self._deviation = np.repeat((given.noise_n, given.noise_nm), 3)
         self._scale = np.repeat((1.0, MOMENT_PER_FORCE_M), 3)
         self._rng = rng
@@ -127,6 +130,10 @@ class FtSensor:
         """Return a reading of the true wrench."""
         if not self._errors:
             self._errors = list(self.block()[::-1])
+        if self._lag:
+            true = np.asarray(wrench)
+            self._felt = true if self._felt is None else true + self._lag * (self._felt - true)
+            wrench = self._felt.tolist()
         reading: list[float] = (self._sensitivity.dot(wrench) + self._errors.pop()).tolist()
         return reading
 
