@@ -26,7 +26,7 @@ Settings = dict[str, Any]
 
 
 class Family(StrEnum):
-    """What is changed."""
+    """Parts of patient and equipment that are changed."""
 
     RELAXATION = "relaxation"
     CONTACT = "contact"
@@ -163,7 +163,7 @@ def _wide(usual: Skeleton, by: float, rng: Rng) -> Mapping[str, Any]:
 
 
 def _asymmetric(usual: Skeleton, by: float, rng: Rng) -> Mapping[str, Any]:
-    """The spines are higher and lower by up to `by`, and the midline is beside the navel."""
+    """The spines are higher and lower by up to `by`, and the midline is to the side of the navel."""
     sides = rng.choice((-1.0, 1.0), 2)
     return {"tilt": float(sides[0] * by / usual.iliac_crest_m[0]), "lateral_m": float(sides[1] * rng.uniform(0.005, 0.020))}
 
@@ -179,7 +179,7 @@ def _with(make: Callable[[Skeleton, Rng], list[Structure]]) -> Callable[..., Set
 
 
 def _scar(line: Array, rng: Rng) -> list[Structure]:
-    """Return a scar along points (k, 2) [m], which wavers by some millimetres."""
+    """Return a scar along points (k, 2) [m], that wavers by some millimetres."""
     wavy = line + rng.normal(0.0, 0.002, line.shape)
     half = float(rng.uniform(0.003, 0.007))
     points: tuple[Vec2, ...] = tuple((x, y) for x, y in wavy.tolist())
@@ -293,7 +293,7 @@ def _chosen(**values: Any) -> Callable[..., Settings]:
 
 
 def _askew(_: Phantom, __: Anatomy, rng: Rng) -> Settings:
-    """A tool that leans to a random side: the sensor's axes turn, and the indenter is beside the flange's axis."""
+    """A tool that leans to a random side: the sensor's axes turn, and the indenter is to the side of the flange's axis."""
     turn = rng.uniform(0, 2 * np.pi)
     about_x, about_y = float(_ASKEW_RAD * np.cos(turn)), float(_ASKEW_RAD * np.sin(turn))
     aside = [_LEVER_M * about_y, -_LEVER_M * about_x]
