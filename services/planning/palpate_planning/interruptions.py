@@ -178,11 +178,15 @@ class Recovery:
         if self._soft_stops >= RECOVERY.soft_stops_max:
             self.failed = cause._replace(text=f"{cause.text}, {self._soft_stops} times")
 
+    def take_up(self, s: float, back: float) -> None:
+        """Take the stroke up again `back` [m] before path length s."""
+        self.resume_at = max(s - back, 0.0)
+
     def repeat(self, segment: Segment, s: float, back: float, cause: Cause) -> None:
         """Take the stroke up again `back` [m] before path length s; skip its rest after too many repeats at one place."""
         again = self._repeats > 0 and s < self._spoiled_at + RECOVERY.one_place_m
         self._spoiled_at, self._repeats = s, self._repeats + 1 if again else 1
-        self.resume_at = max(s - back, 0.0)
+        self.take_up(s, back)
         if self._repeats > RECOVERY.repeats_max:
             self.give_up_place(segment, s, cause)
 

@@ -132,6 +132,19 @@ def test_a_part_disturbed_by_a_cough_is_repeated() -> None:
     assert world.exam.status.targets_skipped == 0
 
 
+def test_coughs_in_one_place_cost_no_target() -> None:
+    world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
+    for _ in range(2 * RECOVERY.repeats_max):
+        world.run(lambda: world.exam.status.phase is Phase.SCAN)
+        world.calm = False
+        for _ in range(100):
+            world.step()
+        world.calm = True
+    world.run()
+    assert world.exam.status.phase is Phase.DONE
+    assert not world.exam.skipped
+
+
 def test_the_rest_of_an_abandoned_stroke_is_passed_above_the_skin() -> None:
     """The next motion starts at the end of the stroke, and the set-point must not jump there."""
     world = World(known(region_m=(0.05, 0.0125)), excursion=breathing)
@@ -139,10 +152,9 @@ def test_the_rest_of_an_abandoned_stroke_is_passed_above_the_skin() -> None:
         world.run(lambda: world.exam.status.phase is Phase.SCAN)
         for _ in range(10):
             world.step()
-        world.calm = False
-        for _ in range(100):
-            world.step()
-        world.calm = True
+        felt, world.force = world.force, lambda depth: 0.0  # contact is lost
+        world.run(lambda: world.exam.status.phase is not Phase.SCAN)
+        world.force = felt
     world.run()
     assert world.exam.status.phase is Phase.ABORTED, "more than a tenth of the targets is lost"
     assert {cause.reason for cause in world.exam.skipped.values()} == {Reason.WALL_NOT_TRACKED}
