@@ -1,4 +1,4 @@
-"""Validation of lumps below the skin: the formula of `palpate_models.patient.field` against the elastic tier."""
+"""Validation of lumps below the skin: both tiers against axisymmetric finite elements."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ SETUP = BuriedSetup()
 
 @dataclass(frozen=True)
 class Buried:
-    """A lump, and the force over its middle relative to the force without it, on the elastic tier."""
+    """A lump, and the force over its middle relative to the force without it."""
 
     radius_m: float
     depth_m: float
@@ -45,6 +45,21 @@ class Buried:
         return Lesion(centre_m=(0.0, 0.0), radii_m=(self.radius_m, self.radius_m), contrast=self.contrast, depth_m=self.depth_m)
 
 
+FINITE_ELEMENTS = tuple(
+    Buried(*row)
+    for row in (
+        (0.010, 0.000, 2.0, 1.1392), (0.010, 0.000, 4.0, 1.3353), (0.010, 0.000, 8.0, 1.5686), (0.010, 0.005, 2.0, 1.1135),
+        (0.010, 0.005, 4.0, 1.2540), (0.010, 0.005, 8.0, 1.4092), (0.010, 0.010, 2.0, 1.0714), (0.010, 0.010, 4.0, 1.1562),
+        (0.010, 0.010, 8.0, 1.2452), (0.010, 0.020, 2.0, 1.0240), (0.010, 0.020, 4.0, 1.0519), (0.010, 0.020, 8.0, 1.0804),
+        (0.015, 0.000, 2.0, 1.2920), (0.015, 0.000, 4.0, 1.6904), (0.015, 0.000, 8.0, 2.1382), (0.015, 0.005, 2.0, 1.2164),
+        (0.015, 0.005, 4.0, 1.4824), (0.015, 0.005, 8.0, 1.7735), (0.015, 0.010, 2.0, 1.1334), (0.015, 0.010, 4.0, 1.2870),
+        (0.015, 0.010, 8.0, 1.4425), (0.015, 0.020, 2.0, 1.0474), (0.015, 0.020, 4.0, 1.0995), (0.015, 0.020, 8.0, 1.1496),
+        (0.020, 0.000, 2.0, 1.4251), (0.020, 0.000, 4.0, 2.0111), (0.020, 0.000, 8.0, 2.7095), (0.020, 0.005, 2.0, 1.3111),
+        (0.020, 0.005, 4.0, 1.7049), (0.020, 0.005, 8.0, 2.1488), (0.020, 0.010, 2.0, 1.1931), (0.020, 0.010, 4.0, 1.4156),
+        (0.020, 0.010, 8.0, 1.6397), (0.020, 0.020, 2.0, 1.0726), (0.020, 0.020, 4.0, 1.1501), (0.020, 0.020, 8.0, 1.2219),
+    )
+)  # fmt: skip
+"""Results of axisymmetric finite elements, which share nothing with the tiers: `research/felt_contrast.py`."""
 ELASTIC_TIER = tuple(
     Buried(*row)
     for row in (
@@ -78,7 +93,7 @@ def on_surface_tier(lump: Buried) -> float:
     return lumpy / plain
 
 
-def measure(lumps: tuple[Buried, ...] = ELASTIC_TIER) -> Array:
+def measure(lumps: tuple[Buried, ...] = FINITE_ELEMENTS) -> Array:
     """Return the force ratios on the surface tier, shape (n,)."""
     return np.array([on_surface_tier(lump) for lump in lumps])
 
@@ -86,46 +101,49 @@ def measure(lumps: tuple[Buried, ...] = ELASTIC_TIER) -> Array:
 def section(found: Array | None = None) -> PageSection:
     """Return the comparison with its bounds."""
     found = measure() if found is None else found
-    elastic = np.array([lump.ratio for lump in ELASTIC_TIER])
-    error = np.log(found / elastic)
-    skin = np.array([lump.depth_m == 0 for lump in ELASTIC_TIER])
+    reference = {lump.lesion.model_dump_json(): lump.ratio for lump in FINITE_ELEMENTS}
+    both = [(lump.ratio, reference[name]) for lump in ELASTIC_TIER if (name := lump.lesion.model_dump_json()) in reference]
+    surface = np.log(found / [lump.ratio for lump in FINITE_ELEMENTS])
+    elastic = np.log([tier / fe for tier, fe in both])
+    against = "finite elements"
     checks = (
-        Check("error of the force ratio, RMS, lumps from 5 mm below the skin", _percent(error[~skin]), "%", high=4.0,
-              against="elastic tier"),
-        Check("largest error there", 100 * float(np.abs(error[~skin]).max()), "%", high=10.0, against="elastic tier"),
-        Check("largest error of lumps that touch the skin", 100 * float(np.abs(error[skin]).max()), "%", against="elastic tier"),
-        Check("lumps with a ratio on the same side of 1", float((np.sign(np.log(found)) == np.sign(np.log(elastic))).mean()),
-              "of all", low=1.0, against="elastic tier"),
+        Check(f"surface tier: largest error of the force ratio, {len(surface)} lumps", _largest(surface), "%", high=10.0,
+              against=against),
+        Check("surface tier: error, RMS", 100 * float(np.sqrt((surface**2).mean())), "%", against=against),
+        Check(f"elastic tier: largest error of the force ratio, {len(elastic)} lumps", _largest(elastic), "%", high=10.0,
+              against=against),
     )  # fmt: skip
     text = (
-        "The force over the middle of a lump below the skin over the force without it, sphere of 15 mm pressed 10 mm: the "
-        "surface tier, which has a formula for it, against the elastic tier, whose lumps are ellipsoids in a slab of 0.12 "
-        "m (its figures depend on its elements by some percent of the effect). The formula's constants were fitted to "
-        "these lumps, so the errors are those of the fit; for large lumps that touch the skin the force is "
-        "too small."
+        "The force over the middle of a lump below the skin over the force without it, sphere of 15 mm pressed 10 mm, against "
+        "axisymmetric finite elements (`research/felt_contrast.py`): round lumps of 10 to 20 mm, tops 0 to 20 mm deep, contrasts "
+        "of 2 to 8, in a linear slab of 0.12 m. The surface tier has a formula for lumps below the skin, and four of its "
+        "constants were fitted to this table, so its errors are those of the fit; the elastic tier was not fitted."
     )
     data = {
         "lumps": [
-            {"radius_m": b.radius_m, "depth_m": b.depth_m, "contrast": b.contrast, "elastic": b.ratio} for b in ELASTIC_TIER
+            {"radius_m": b.radius_m, "depth_m": b.depth_m, "contrast": b.contrast, "finite_elements": b.ratio}
+            for b in FINITE_ELEMENTS
         ],
         "surface": found,
     }
     return PageSection("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4), data)
 
 
-def _percent(error: Array) -> float:
-    return 100 * float(np.sqrt((error**2).mean()))
+def _largest(error: Array) -> float:
+    return 100 * float(np.abs(error).max())
 
 
 def draw(figure: Figure, found: Array) -> None:
-    """Draw the force ratio on the surface tier against that on the elastic tier."""
+    """Draw the force ratio on the surface tier against that of finite elements."""
     axes = figure.subplots()
-    for k, radius in enumerate(sorted({lump.radius_m for lump in ELASTIC_TIER})):
-        own = [i for i, lump in enumerate(ELASTIC_TIER) if lump.radius_m == radius]
-        axes.plot([ELASTIC_TIER[i].ratio for i in own], found[own], "o", ms=4, color=COLOURS[k], label=f"R = {1e3 * radius:g} mm")
-    ends = (0.75, 3.2)
+    for k, radius in enumerate(sorted({lump.radius_m for lump in FINITE_ELEMENTS})):
+        own = [i for i, lump in enumerate(FINITE_ELEMENTS) if lump.radius_m == radius]
+        axes.plot(
+            [FINITE_ELEMENTS[i].ratio for i in own], found[own], "o", ms=4, color=COLOURS[k], label=f"R = {1e3 * radius:g} mm"
+        )
+    ends = (0.95, 3.0)
     axes.plot(ends, ends, color=INK, lw=0.6)
-    axes.set(xlabel="force ratio, elastic tier", ylabel="force ratio, surface tier", xscale="log", yscale="log")
+    axes.set(xlabel="force ratio, finite elements", ylabel="force ratio, surface tier", xscale="log", yscale="log")
     axes.set_xticks((1, 2, 3), ("1", "2", "3"))
     axes.set_yticks((1, 2, 3), ("1", "2", "3"))
     axes.minorticks_off()

@@ -52,7 +52,7 @@ SECTIONS: dict[str, Callable[[], PageSection]] = {
     "random cycles": lambda: energy.section(energy.measure(8)),
     "population": population.section,
     "bone": persons.section,
-    "buried lumps against the elastic tier": buried.section,
+    "buried lumps against finite elements": buried.section,
 }
 SLOW_SECTIONS = {
     "all living people": people.section,
