@@ -42,7 +42,7 @@ def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:
     random = np.random.default_rng(0)
     grid = np.stack(np.meshgrid(np.linspace(-0.18, 0.18, 50), np.linspace(-0.2, 0.2, 60)), axis=-1).reshape(-1, 2)
     triangles = random.integers(0, 3000, 17_700).astype(np.uint32)
-    names = [f"lbr_A{i}" for i in range(1, 8)]
+    names = [f"joint_{i}" for i in range(1, 8)]
     found = []
 
     def add(topic: str, message: Any, t: int, sequence: int) -> None:

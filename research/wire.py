@@ -206,7 +206,7 @@ def _secure() -> list[float]:
 
 def _joint_state(t: int) -> JointState:
     values = np.arange(7, dtype=np.float64)
-    return JointState(header(t), [f"lbr_A{i}" for i in range(1, 8)], values, values, values)
+    return JointState(header(t), [f"joint_{i}" for i in range(1, 8)], values, values, values)
 
 
 if __name__ == "__main__":

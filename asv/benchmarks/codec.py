@@ -15,7 +15,7 @@ def example(name: str) -> tuple[str, Any]:
     """Type and example of a message: a joint state of 300 B, or a depth image of 640 x 480 floats."""
     if name == "joint_state":
         values = np.random.default_rng(0).random(7)
-        return "sensor_msgs/msg/JointState", JointState(header(1), [f"lbr_A{i}" for i in range(1, 8)], *[values] * 3)
+        return "sensor_msgs/msg/JointState", JointState(header(1), [f"joint_{i}" for i in range(1, 8)], *[values] * 3)
     pixels = np.frombuffer(random.Random(0).randbytes(640 * 480 * 4), np.uint8)
     return "sensor_msgs/msg/Image", Image(header(1, "camera"), 480, 640, "32FC1", 0, 2560, pixels)
 

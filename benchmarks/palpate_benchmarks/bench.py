@@ -116,7 +116,7 @@ def codec_cost(repeats: int = 2000) -> dict[str, float]:
     from palpate_bus.messages.stamps import header
 
     kind, values = "sensor_msgs/msg/JointState", np.arange(7.0)
-    message = JointState(header(1), [f"lbr_A{i}" for i in range(1, 8)], values, values, values)
+    message = JointState(header(1), [f"joint_{i}" for i in range(1, 8)], values, values, values)
     encode, decode = codec.encoder(kind), codec.decoder(kind)
     payload = encode(message)
     return {

@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
 
 app = typer.Typer(name="arm", help="Check an arm, and find a place for its base.", no_args_is_help=True)
-Name = Annotated[str, typer.Argument(help="lbr, panda, ur5, ur10, xarm7, or a YAML file next to a URDF.")]
+Name = Annotated[str, typer.Argument(help="Name of an arm, or a YAML file next to a URDF.")]
 
 
 @app.command()
@@ -24,10 +24,9 @@ def check(arm: Name) -> None:
     from rich.table import Table
 
     from palpate.console import EXIT_BAD_INPUT, say
-    from palpate_models.robot import lbr
-    from palpate_models.robot.urdf_arm import read_arm
+    from palpate_models.robot.arm import checked_arm
 
-    found, faults = (lbr.ARM, []) if arm == lbr.ARM.name else read_arm(arm)
+    found, faults = checked_arm(arm)
     for fault in faults:
         say(f"{arm}: {fault}")
     if found is None:

@@ -23,6 +23,9 @@ def check_command(  # noqa: PLR0913 - the options of a command
         ),
     ] = None,
     scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds their breath.")] = "clean",
+    given: Annotated[
+        list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="Change a field of the scenario.")
+    ] = None,
     motion: Annotated[bool, typer.Option("--motion", help="It may move; most checks of the robot need this.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
@@ -45,7 +48,9 @@ def check_command(  # noqa: PLR0913 - the options of a command
 
     if role not in SUITES:
         raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
-    settings = RigSettings(load_scenario(scenario, STILL), 1e3 * slack, motion or role != "robot" or service is not None)
+    settings = RigSettings(
+        load_scenario(scenario, [*STILL, *(given or ())]), 1e3 * slack, motion or role != "robot" or service is not None
+    )
     if service is not None:
         report = check_here(role, service, settings)
     else:

@@ -14,7 +14,7 @@ from scipy.spatial.transform import Rotation
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
 from palpate_models.robot.lbr import ARM
-from palpate_models.robot.urdf_arm import load_arm
+from palpate_models.robot.urdf_arm import load_arm, read_arm
 from palpate_models.scenario.schema import Robot
 
 FLANGE_TO_FT_M: Final = 0.030
@@ -32,6 +32,11 @@ STANDOFF_MASS_FRACTION: Final = 0.6
 def arm_of(robot: Robot) -> Arm:
     """Return the arm of a robot. Raises UserError that names file, link or joint, and what is wrong."""
     return ARM if robot.arm == ARM.name else load_arm(robot.arm)
+
+
+def checked_arm(name: str) -> tuple[Arm | None, list[str]]:
+    """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
+    return (ARM, []) if name == ARM.name else read_arm(name)
 
 
 def base_pose(robot: Robot) -> Array:

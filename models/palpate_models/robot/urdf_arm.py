@@ -14,14 +14,14 @@ from typing import Any, Final
 from xml.etree import ElementTree
 
 import numpy as np
-from scipy.optimize import least_squares
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError
 from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
+from palpate_models.robot.chain import Arm, Capsule, Inertia
+from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_posture
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 
 
@@ -40,18 +40,6 @@ class ArmTuning:
     largest_link_m: float = 2.0
     """A larger mesh is in other units."""
     smallest_link_m: float = 0.005
-    home_starts: int = 24
-    """Postures from which a home posture is sought."""
-    home_forward: float = 0.4
-    """Place of the flange at home in front of the base, over the length of the arm."""
-    home_height: float = 0.35
-    """The same above the base."""
-    home_bend: float = 0.02
-    """Weight of the joints' angles at home."""
-    home_spread: float = 0.003
-    """Of postures whose cost is that much above the best, the one with the highest elbow is taken."""
-    home_upright: float = 0.999
-    """Least cosine between the flange's z axis and straight down at home."""
     inertia_tolerance: float = 1e-3
     """Relative excess of a principal moment over the sum of the others that counts as rounding."""
 
@@ -310,8 +298,8 @@ class _Reader:
         local = R_BF.T @ about @ R_BF
         return Inertia(
             float(total),
-            _point(R_BF.T @ (centre - origin)),
-            _point(np.diag(local)),
+            as_point(R_BF.T @ (centre - origin)),
+            as_point(np.diag(local)),
             (float(local[0, 1]), float(local[0, 2]), float(local[1, 2])),
         )
 
@@ -380,57 +368,6 @@ class _Reader:
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
             self.faults.append(f"link {link}: mesh {name} is {size:.3g} m long: its unit is not metres; give a scale in the URDF")
         return np.asarray(hull)
-
-
-def ready_posture(arm: Arm) -> Array | None:
-    """Return joint positions [rad], shape (n,), with the flange straight down above the base's front; None if none is found."""
-    rng = np.random.default_rng(0)
-    near, half = arm.middle_rad, np.minimum(arm.half_range_rad, np.pi)
-    starts = near + rng.uniform(-1, 1, (TUNING.home_starts, arm.joints)) * np.minimum(half, 1.6)
-    reach = float(np.linalg.norm(np.diff(arm.posture(near)[0], axis=0), axis=1).sum())
-    aim = reach * np.array((TUNING.home_forward, 0.0, TUNING.home_height))
-
-    def gap(q: Array) -> Array:
-        p, z = arm.posture(q)
-        return np.concatenate(((p[-1] - aim) / reach, z - (0.0, 0.0, -1.0), TUNING.home_bend * (q - near) / np.pi))
-
-    margin = 0.1 * half
-    bounds = (np.maximum(arm.lower_rad, near - np.pi) + margin, np.minimum(arm.upper_rad, near + np.pi) - margin)
-    found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds) for start in starts]
-    least = min(float(one.cost) for one in found)
-    good = [one.x for one in found if one.cost < least + TUNING.home_spread and arm.posture(one.x)[1][2] < -TUNING.home_upright]
-    highest = max(good, key=lambda q: float(arm.posture(q)[0][arm.elbow[0], 2]), default=None)
-    return None if highest is None else np.round(highest, 3)
-
-
-def enclosing_capsule(points: Array) -> Capsule:
-    """Return a small capsule that encloses points, shape (n, 3), along the principal axis of their spread."""
-    middle = (points.max(axis=0) + points.min(axis=0)) / 2
-    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
-    best: tuple[float, Capsule] | None = None
-    for axis in axes:
-        along = (points - middle) @ axis
-        across = points - middle - np.outer(along, axis)
-        centre = (across.max(axis=0) + across.min(axis=0)) / 2
-        centre = centre - (centre @ axis) * axis
-        off = np.linalg.norm(across - centre, axis=1)
-        radius = float(off.max()) * (1 + 1e-9)
-        cap = np.sqrt(radius**2 - off**2)
-        start, end = float((along + cap).min()), float((along - cap).max())
-        if start > end:
-            start = end = (start + end) / 2
-            radius = float(np.linalg.norm(points - middle - centre - start * axis, axis=1).max())
-        volume = np.pi * radius**2 * (end - start) + 4 / 3 * np.pi * radius**3
-        capsule = Capsule(_point(middle + centre + start * axis), _point(middle + centre + end * axis), radius)
-        if best is None or volume < best[0]:
-            best = (volume, capsule)
-    assert best is not None
-    return best[1]
-
-
-def _point(values: Array) -> Point:
-    x, y, z = (float(v) for v in values)
-    return x, y, z
 
 
 def _unit(axis: Array) -> Array:

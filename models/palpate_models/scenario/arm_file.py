@@ -16,6 +16,8 @@ from palpate_models.section import NonNegative, Section, Vec2
 FOLDER: Final = Path(__file__).parent / "arms"
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
 
+DEFAULT_ARM: Final = "lbr"
+"""The arm whose tables are built in."""
 Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
 """One value a joint, from the base to the flange."""
 
@@ -72,7 +74,7 @@ def arm_path(name: str) -> Path:
     """Return the YAML file of an arm: a path, or a name of `FOLDER`. Raises UserError."""
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     if not path.is_file():
-        known = ", ".join(("lbr", *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
+        known = ", ".join((DEFAULT_ARM, *sorted(file.stem for file in FOLDER.glob("*.yaml"))))
         raise UserError(f"robot.arm: {name}: no such file; want {known}, or the path of a YAML file")
     return path
 

@@ -17,7 +17,7 @@ from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_va
 
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom
-from palpate_models.scenario.arm_file import CommandLevel, placement_of
+from palpate_models.scenario.arm_file import DEFAULT_ARM, CommandLevel, placement_of
 from palpate_models.scenario.errors import Errors
 from palpate_models.section import Force, Length, NonNegative, Pose, Positive, Section, Vec2, Vec3
 from palpate_plugins import PluginKind, is_file
@@ -154,9 +154,8 @@ class RosCamera(Section):
 class Robot(Section):
     """Robot, tool and its sensor."""
 
-    arm: str = "lbr"
-    """`lbr`, `panda`, `ur5`, `ur10`, `xarm7`, or the path of a YAML file next to a URDF. Other defaults of this section are the
-    arm's."""
+    arm: str = DEFAULT_ARM
+    """Name of an arm, or the path of a YAML file next to a URDF. Other defaults of this section are the arm's."""
     level: CommandLevel = CommandLevel.TORQUE
     """What the arm is commanded: `torque` or `position` by the role control, or `setpoint`: a driver follows `planning/setpoint`
     itself. A simulated arm plays `setpoint` as `torque`."""
@@ -166,7 +165,7 @@ class Robot(Section):
     tool_mass_kg: Annotated[float, Field(ge=0.05, le=2)] = 0.35
     """Nominal mass below the F/T sensor: stand-off and indenter."""
     base_height_m: Annotated[float, Field(ge=0.2, le=1.5)] = 1.17
-    """Height of the base. The three defaults of its placement are the optimum of `palpate arm place lbr`."""
+    """Height of the base. The three defaults of its placement are the optimum of `palpate arm place`."""
     base_xy_m: Vec2 = (0.03, 0.02)
     """Position of the base in world."""
     base_yaw_rad: float = 0.0

@@ -1,4 +1,4 @@
-"""Role control: the impedance controller. The suite plays an arm that stands still at the ready posture."""
+"""Role control: impedance or admittance control. The suite plays an arm that stands still at the ready posture."""
 
 from __future__ import annotations
 
@@ -9,81 +9,93 @@ import numpy as np
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, sensed
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
+from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
+from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.robot.arm import arm_of
+from palpate_models.robot.chain import Arm
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
+from palpate_models.scenario.arm_file import CommandLevel
 
-TORQUE = "control/joint_torque"
+COMMAND = "control/joint_torque"
 VALID = contract().topics["planning/setpoint"].expiry
 
 
-def joints(q: Any = lbr.HOME, names: tuple[str, ...] = lbr.JOINT_NAMES) -> Source:
-    """Return the source of an arm at rest at `q` [rad]."""
-    position = np.asarray(q, dtype=float)
-    return lambda t: JointState(header(t), list(names), sensed(position, t), sensed(np.zeros(7), t), np.zeros(7))
+class Played:
+    """The arm of a scenario at rest, and set-points for it."""
 
+    def __init__(self, rig: Rig) -> None:
+        self.robot = rig.settings.scenario.robot
+        self.arm: Arm = arm_of(self.robot)
+        self.home, self.rest = self.arm.home_rad, np.zeros(self.arm.joints)
+        self.positions = self.robot.level is CommandLevel.POSITION
+        self.unit = "rad" if self.positions else "N m"
 
-def joint_target(q: Any, stiffness: float) -> Source:
-    """Return the source of a set-point of mode JOINT."""
-    target = np.asarray(q, dtype=float)
-    zero = Vector3(0.0, 0.0, 0.0)
+    def values(self, message: Any) -> Array:
+        """Return the torques [N m] or positions [rad] of a command, shape (n,)."""
+        return np.asarray(message.position if self.positions else message.torque)
 
-    def source(t: int) -> Any:
+    def joints(self, q: Any = None, names: tuple[str, ...] | None = None) -> Source:
+        """Return the source of an arm at rest at `q` [rad]."""
+        position = np.asarray(self.home if q is None else q, dtype=float)
+        listed = list(names or self.arm.joint_names)
+        return lambda t: JointState(header(t), listed, sensed(position, t), sensed(self.rest, t), self.rest)
+
+    def status(self, t: int) -> Any:
+        """Return the status of the arm: nothing but the tool loads its F/T sensor."""
+        weight_W = np.array((0.0, 0.0, -self.robot.tool_mass_kg * GRAVITY))
+        force = tool_pose(self.home, self.robot)[:3, :3].T @ weight_W
+        wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
+        q, qd, torque = sensed(self.home, t), sensed(self.rest, t), sensed(self.rest, t)
+        return RobotStatus(header(t), RobotStatus.MODE_ACTIVE, 0, "", q, qd, wrench, self.rest, 0, "", torque)
+
+    def joint_target(self, q: Any, stiffness: float) -> Source:
+        """Return the source of a set-point of mode JOINT."""
         pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
-        return ImpedanceSetpoint(
-            header(t, "world"), ImpedanceSetpoint.MODE_JOINT, pose, Twist(zero, zero), Wrench(zero, zero),
-            np.zeros(6), np.ones(6), target, np.zeros(7), np.full(7, stiffness), duration_message(VALID),
-        )  # fmt: skip
+        kind, target = ImpedanceSetpoint.MODE_JOINT, np.asarray(q, dtype=float)
+        return self._setpoint(kind, pose, np.zeros(6), target, np.full_like(self.rest, stiffness))
 
-    return source
+    def pose_target(self, X_WI: Array, stiffness: float) -> Source:
+        """Return the source of a set-point of mode CARTESIAN, with the current null-space posture."""
+        K = np.array([stiffness] * 3 + [100.0] * 3)
+        return self._setpoint(ImpedanceSetpoint.MODE_CARTESIAN, pose_message(X_WI[:3, :3], X_WI[:3, 3]), K, self.home, self.rest)
 
+    def _setpoint(self, mode: int, pose: Any, K: Array, q: Array, K_q: Array) -> Source:
+        zero = Vector3(0.0, 0.0, 0.0)
+        twist, force, valid = Twist(zero, zero), Wrench(zero, zero), duration_message(VALID)
+        return lambda t: ImpedanceSetpoint(header(t, "world"), mode, pose, twist, force, K, np.ones(6), q, self.rest, K_q, valid)
 
-def pose_target(X_WI: Array, stiffness: float) -> Source:
-    """Return the source of a set-point of mode CARTESIAN, with the current null-space posture."""
-    pose = pose_message(X_WI[:3, :3], X_WI[:3, 3])
-    zero = Vector3(0.0, 0.0, 0.0)
-
-    def source(t: int) -> Any:
-        return ImpedanceSetpoint(
-            header(t, "world"), ImpedanceSetpoint.MODE_CARTESIAN, pose, Twist(zero, zero), Wrench(zero, zero),
-            np.array([stiffness] * 3 + [100.0] * 3), np.ones(6), lbr.HOME.copy(), np.zeros(7), np.zeros(7),
-            duration_message(VALID),
-        )  # fmt: skip
-
-    return source
-
-
-def feed(setpoint: Source | None = None, arm: Source | None = None) -> Feed:
-    """Return the inputs of the controller."""
-    sources: dict[str, Source] = {"joint_states": arm or joints()}
-    if setpoint is not None:
-        sources["planning/setpoint"] = setpoint
-    return sources
+    def feed(self, setpoint: Source | None = None, joints: Source | None = None) -> Feed:
+        """Return the inputs of the controller."""
+        sources: dict[str, Source] = {"joint_states": joints or self.joints(), "robot/status": self.status}
+        if setpoint is not None:
+            sources["planning/setpoint"] = setpoint
+        return sources
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
     """Check signs, limits, expiry and reactions to garbage."""
+    arm = Played(rig)
     report.section("law")
-    idle = rig.run(0.3, feed())[TORQUE]
-    quiet = max((float(np.max(np.abs(item.message.torque))) for item in idle), default=np.inf)
+    idle = rig.run(0.3, arm.feed())[COMMAND]
+    wanted = arm.home if arm.positions else arm.rest
+    off = max((float(np.max(np.abs(arm.values(item.message) - wanted))) for item in idle), default=np.inf)
     report.expect(
-        "without a set-point it commands no torque",
-        quiet < 1e-9 or _ceased(idle),
-        "0 N m, or expired commands",
-        f"{quiet:.3g} N m",
+        "without a set-point it commands no torque, or the arm's position",
+        off < 1e-6 or _ceased(idle),
+        f"{wanted.round(2)} {arm.unit}, or expired commands",
+        f"{off:.3g} {arm.unit} off",
     )
-    _joint_sign(rig, report)
-    _cartesian_sign(rig, report)
-    _limits(rig, report)
+    _joint_sign(rig, arm, report)
+    _cartesian_sign(rig, arm, report)
+    _limits(rig, arm, report)
     report.section("expiry")
-    _expiry(rig, report)
+    _expiry(rig, arm, report)
     report.section("garbage")
-    _garbage(rig, report)
+    _garbage(rig, arm, report)
     report.section("silence")
-    _silence(rig, report)
+    _silence(rig, arm, report)
 
 
 def _ceased(received: list[ReceivedMessage]) -> bool:
@@ -91,113 +103,120 @@ def _ceased(received: list[ReceivedMessage]) -> bool:
     return all(nanoseconds(item.message.valid_for) == 0 for item in received[-5:])
 
 
-def _torque(rig: Rig, sources: Feed, seconds: float = 0.3) -> Array:
-    """Return the mean of the last commands [N m], shape (7,)."""
-    received = rig.run(seconds, sources)[TORQUE][-20:]
-    return np.mean([item.message.torque for item in received], axis=0) if received else np.full(7, np.nan)
+def _command(rig: Rig, arm: Played, sources: Feed, seconds: float = 0.3) -> Array:
+    """Return the mean of the last commands [N m or rad], shape (n,)."""
+    received = rig.run(seconds, sources)[COMMAND][-20:]
+    return np.mean([arm.values(item.message) for item in received], axis=0) if received else np.full_like(arm.rest, np.nan)
 
 
-def _joint_sign(rig: Rig, report: ConformanceReport) -> None:
+def _joint_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
     wrong = []
-    for joint in range(7):
-        target = lbr.HOME.copy()
+    for joint, name in enumerate(arm.arm.joint_names):
+        target = arm.home.copy()
         target[joint] += 0.05
-        torque = _torque(rig, feed(joint_target(target, 100.0)))
-        others = np.delete(np.abs(torque), joint).max()
-        if not (abs(torque[joint] - 5.0) < 1.0 and others < 1.0):
-            wrong.append(f"{lbr.JOINT_NAMES[joint]}: {torque.round(2)}")
+        command = _command(rig, arm, arm.feed(arm.joint_target(target, 100.0)))
+        off = np.abs(command - (target if arm.positions else 100.0 * (target - arm.home)))
+        if not np.all(off < (0.005 if arm.positions else 1.0)):
+            wrong.append(f"{name}: {command.round(2)}")
     report.expect(
-        "mode JOINT: stiffness times offset, on that joint alone",
+        "mode JOINT: stiffness times offset on that joint alone, or the position",
         not wrong,
-        "+5 N m for +0.05 rad at 100 N m/rad",
-        "; ".join(wrong) or "all seven",
+        "the position" if arm.positions else "+5 N m for +0.05 rad at 100 N m/rad",
+        "; ".join(wrong) or "all joints",
     )
 
 
-def _cartesian_sign(rig: Rig, report: ConformanceReport) -> None:
-    X_WI = tool_pose(lbr.HOME, rig.settings.scenario.robot)
-    J = tool_jacobian(lbr.HOME, rig.settings.scenario.robot)
+def _cartesian_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+    X_WI = tool_pose(arm.home, arm.robot)
+    J = tool_jacobian(arm.home, arm.robot)
     wrong = []
     for axis, name in enumerate("xyz"):
         target = X_WI.copy()
         target[axis, 3] += 0.01
-        force = np.zeros(6)
-        force[axis] = 10.0
-        torque, wanted = _torque(rig, feed(pose_target(target, 1000.0))), J.T @ force
-        if not np.linalg.norm(torque - wanted) < 0.15 * np.linalg.norm(wanted):
-            wrong.append(f"{name}: {torque.round(2)}, not {wanted.round(2)}")
+        command = _command(rig, arm, arm.feed(arm.pose_target(target, 1000.0)))
+        if arm.positions:
+            got, wanted, allowed = tool_pose(command, arm.robot)[:3, 3], target[:3, 3], 0.001
+        else:
+            got, wanted = command, J.T[:, axis] * 10.0
+            allowed = 0.15 * float(np.linalg.norm(wanted))
+        if not np.linalg.norm(got - wanted) < allowed:
+            wrong.append(f"{name}: {got.round(3)}, not {wanted.round(3)}")
     report.expect(
-        "mode CARTESIAN: the torques of stiffness times offset, J^T F",
+        "mode CARTESIAN: the torques of stiffness times offset, J^T F, or the positions of the pose",
         not wrong,
-        "10 N for 10 mm at 1000 N/m, within 15 %",
+        "the pose, within 1 mm" if arm.positions else "10 N for 10 mm at 1000 N/m, within 15 %",
         "; ".join(wrong) or "x, y and z",
     )
 
 
-def _limits(rig: Rig, report: ConformanceReport) -> None:
-    far = lbr.HOME + np.array([1.0, 1.0, 1.0, 1.0, 1.0, -1.0, 1.0])
-    rig.run(0.6, feed(joint_target(far, 2000.0)))
-    rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
-    worst = np.max(np.abs([item.message.torque for item in rig.log[TORQUE]]), axis=0)
-    ok = bool(np.all(worst <= lbr.TORQUE_LIMIT))
-    report.expect("torques stay within the joints' limits for any set-point", ok, f"{lbr.TORQUE_LIMIT} N m", worst.round(1))
+def _limits(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+    rig.run(0.6, arm.feed(arm.joint_target(arm.home + np.where(arm.home > arm.arm.middle_rad, -1.0, 1.0), 2000.0)))
+    rig.run(0.6, arm.feed(arm.joint_target(arm.home, 100.0)))
+    values = np.array([arm.values(item.message) for item in rig.log[COMMAND]])
+    if arm.positions:
+        ok = bool(np.all((values >= arm.arm.lower_rad) & (values <= arm.arm.upper_rad)))
+        report.expect(
+            "positions stay within the joints' limits for any set-point", ok, "the arm's", np.abs(values).max(axis=0).round(2)
+        )
+        return
+    worst, limit = np.max(np.abs(values), axis=0), arm.arm.torque_nm
+    ok = bool(np.all(worst <= limit))
+    report.expect("torques stay within the joints' limits for any set-point", ok, f"{limit} N m", worst.round(1))
 
 
-def _expiry(rig: Rig, report: ConformanceReport) -> None:
-    rig.run(0.3, feed(joint_target(lbr.HOME, 100.0)))
+def _expiry(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+    rig.run(0.3, arm.feed(arm.joint_target(arm.home, 100.0)))
     ended = rig.t
-    received = rig.run(0.6 + rig.slack / 1e9, feed())[TORQUE]
+    received = rig.run(0.6 + rig.slack / 1e9, arm.feed())[COMMAND]
     expired = next((item.t - ended for item in received if nanoseconds(item.message.valid_for) == 0), None)
     limit = VALID + 12 * MS + rig.slack
     silent = received[-1].t - ended if received else 0
     ok = (expired is not None and expired <= limit and _ceased(received)) or (expired is None and silent <= limit)
     got = f"after {expired / MS:.0f} ms" if expired is not None else f"last command after {silent / MS:.0f} ms"
     report.expect("stops commanding when set-points cease", ok, f"expired commands or none within {limit / MS:.0f} ms", got)
-    torque = _torque(rig, feed(joint_target(lbr.HOME, 100.0)))
-    received = rig.log[TORQUE]
-    report.expect(
-        "commands again on a new set-point",
-        not _ceased(received) and bool(np.all(np.isfinite(torque))),
-        "valid commands",
-        f"{torque.round(2)} N m",
-    )
+    command = _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
+    ok = not _ceased(rig.log[COMMAND]) and bool(np.all(np.isfinite(command)))
+    report.expect("commands again on a new set-point", ok, "valid commands", f"{command.round(2)} {arm.unit}")
 
 
-def _garbage(rig: Rig, report: ConformanceReport) -> None:
-    target = lbr.HOME.copy()
+def _garbage(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+    target = arm.home.copy()
     target[0] += 0.05
-    before = _torque(rig, feed(joint_target(target, 100.0)))
-    nothing = np.full(7, np.nan)
-    received = rig.run(0.2, feed(joint_target(nothing, 100.0)))[TORQUE]
-    finite = all(np.all(np.isfinite(item.message.torque)) for item in received)
+    good = arm.joint_target(target, 100.0)
+    before = _command(rig, arm, arm.feed(good))
+    nothing = np.full_like(arm.rest, np.nan)
+    received = rig.run(0.2, arm.feed(arm.joint_target(nothing, 100.0)))[COMMAND]
+    finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
+    got = "as expected" if finite else "NaN"
+    report.expect("a set-point that is not a number makes no such command", finite, "finite commands", got)
+    still = float(np.max(np.abs(arm.values(received[-1].message) - before))) if received else np.inf
+    calm = still < (0.01 if arm.positions else 1.0) or _ceased(received)
     report.expect(
-        "a set-point that is not a number makes no such torque", finite, "finite torques", "as expected" if finite else "NaN"
+        "and is not followed", calm, "the command of the last good set-point, or expired ones", f"{still:.2f} {arm.unit} off"
     )
-    still = float(np.max(np.abs(np.asarray(received[-1].message.torque) - before))) if received else np.inf
-    calm = still < 1.0 or _ceased(received)
+    received = rig.run(0.3 + rig.slack / 1e9, arm.feed(good, arm.joints(nothing)))[COMMAND]
+    finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
     report.expect(
-        "and is not followed", calm, "the torques of the last good set-point, or expired commands", f"{still:.2f} N m off"
+        "joint states that are not numbers: it ceases",
+        finite and _ceased(received),
+        "expired commands or none",
+        _last(arm, received),
     )
-    broken = np.full(7, np.nan)
-    received = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(broken)))[TORQUE]
-    finite = all(np.all(np.isfinite(item.message.torque)) for item in received)
-    report.expect(
-        "joint states that are not numbers: it ceases", finite and _ceased(received), "expired commands or none", _last(received)
-    )
-    wrong = tuple(reversed(lbr.JOINT_NAMES))
-    received = rig.run(0.3 + rig.slack / 1e9, feed(joint_target(target, 100.0), joints(names=wrong)))[TORQUE]
-    report.expect("joint states in another order: it ceases", _ceased(received), "expired commands or none", _last(received))
-    _torque(rig, feed(joint_target(lbr.HOME, 100.0)))
-    report.expect("and recovers with good ones", not _ceased(rig.log[TORQUE]), "valid commands", _last(rig.log[TORQUE]))
+    wrong = tuple(reversed(arm.arm.joint_names))
+    received = rig.run(0.3 + rig.slack / 1e9, arm.feed(good, arm.joints(names=wrong)))[COMMAND]
+    report.expect("joint states in another order: it ceases", _ceased(received), "expired commands or none", _last(arm, received))
+    _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
+    received = rig.log[COMMAND]
+    report.expect("and recovers with good ones", not _ceased(received), "valid commands", _last(arm, received))
 
 
-def _silence(rig: Rig, report: ConformanceReport) -> None:
-    received = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": joint_target(lbr.HOME, 100.0)})[TORQUE]
-    report.expect("no joint states: it ceases", _ceased(received), "expired commands or none", _last(received))
+def _silence(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+    received = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": arm.joint_target(arm.home, 100.0)})[COMMAND]
+    report.expect("no joint states: it ceases", _ceased(received), "expired commands or none", _last(arm, received))
 
 
-def _last(received: list[ReceivedMessage]) -> str:
+def _last(arm: Played, received: list[ReceivedMessage]) -> str:
     if not received:
         return "none"
     message = received[-1].message
-    return f"{np.asarray(message.torque).round(2)} N m, valid for {nanoseconds(message.valid_for) / MS:.0f} ms"
+    return f"{arm.values(message).round(2)} {arm.unit}, valid for {nanoseconds(message.valid_for) / MS:.0f} ms"

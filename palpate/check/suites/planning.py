@@ -12,7 +12,8 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
+from palpate_models.robot.arm import arm_of
+from palpate_models.robot.chain import Arm
 
 SETPOINT, STATE = "planning/setpoint", "exam/state"
 WEIGHT_N = 6.0
@@ -24,7 +25,8 @@ class PerfectFollower:
 
     def __init__(self, rig: Rig) -> None:
         self._rig = rig
-        self.q = lbr.HOME.copy()
+        self.arm: Arm = arm_of(rig.settings.scenario.robot)
+        self.q = self.arm.home_rad.copy()
         self.mode = RobotStatus.MODE_ACTIVE
 
     def feed(self) -> Feed:
@@ -33,7 +35,7 @@ class PerfectFollower:
 
     def _status(self, t: int) -> Any:
         setpoint = self._rig.last(SETPOINT)
-        velocity = np.zeros(7)
+        velocity = np.zeros_like(self.q)
         if setpoint is not None and setpoint.mode == ImpedanceSetpoint.MODE_JOINT and self.mode == RobotStatus.MODE_ACTIVE:
             self.q, velocity = np.array(setpoint.joint_position), np.array(setpoint.joint_velocity)
         weight = Wrench(Vector3(*sensed((0.0, 0.0, WEIGHT_N), t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
@@ -47,10 +49,10 @@ class PerfectFollower:
             sensed(self.q, t),
             sensed(velocity, t),
             weight,
-            np.zeros(7),
+            np.zeros_like(self.q),
             0,
             "",
-            sensed(np.zeros(7), t),
+            sensed(np.zeros_like(self.q), t),
         )
 
 
@@ -62,7 +64,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     received = rig.log[SETPOINT]
     if not report.expect("set-points come", bool(received), "100 Hz", len(received)):
         return
-    _first(received, report)
+    _first(arm.arm, received, report)
     report.section("examination")
     waited = 0.0
     while not rig.log["planning/camera_trigger"] and waited < AWAIT_S:
@@ -78,7 +80,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     wanted = rig.settings.scenario.camera.frames
     if triggers:
         report.expect("as many as in the scenario", triggers[0].message.frames == wanted, wanted, triggers[0].message.frames)
-    _safe(rig.log[SETPOINT], report)
+    _safe(arm.arm, rig.log[SETPOINT], report)
     _phases(rig.log[STATE], report)
     report.section("stop")
     arm.mode = RobotStatus.MODE_SAFE_HOLD
@@ -101,28 +103,28 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     report.expect("continues without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
 
 
-def _first(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _first(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     """Check that the first set-point is at the arm's position."""
     message = received[0].message
     if message.mode == ImpedanceSetpoint.MODE_JOINT:
-        off = float(np.max(np.abs(np.asarray(message.joint_position) - lbr.HOME)))
+        off = float(np.max(np.abs(np.asarray(message.joint_position) - arm.home_rad)))
         report.expect("the first set-point is where the arm is", off < 0.02, "within 0.02 rad", f"{off:.4f} rad")
     else:
         report.skip("the first set-point is where the arm is", "it is not of mode JOINT")
 
 
-def _safe(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _safe(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     joint = [item.message for item in received if item.message.mode == ImpedanceSetpoint.MODE_JOINT]
     q = np.array([m.joint_position for m in joint])
     t = np.array([nanoseconds(m.header.stamp) / 1e9 for m in joint])
-    inside = bool(np.all(np.abs(q) <= lbr.POSITION_LIMIT))
+    inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
     report.expect("joint targets stay within the limits", inside, "the arm's", np.abs(q).max(axis=0).round(2))
     speed: Array = np.abs(np.diff(q, axis=0)) / np.maximum(np.diff(t), 1e-3)[:, None]
-    worst = speed.max(axis=0) if len(speed) else np.zeros(7)
+    worst = speed.max(axis=0) if len(speed) else np.zeros(arm.joints)
     report.expect(
         "and move no faster than the joints can",
-        bool(np.all(worst <= lbr.VELOCITY_LIMIT)),
-        lbr.VELOCITY_LIMIT.round(2),
+        bool(np.all(worst <= arm.velocity_radps)),
+        arm.velocity_radps.round(2),
         worst.round(2),
     )
     valid = [nanoseconds(item.message.valid_for) for item in received]

@@ -20,11 +20,16 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.geometry import rotation
 from palpate_bus.messages.stamps import duration_message, header
-from palpate_models.robot import lbr
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.arm import arm_of
+from palpate_models.robot.chain import Arm
+from palpate_models.scenario.arm_file import CommandLevel
 
 COMMAND = "control/joint_torque"
-PUSH = np.array([6.0, 6.0, 4.0, 4.0, 1.0, 0.6, 0.4])
-"""Torque that moves a joint slightly in `PUSH_S` [N m]: above the friction of the simulated arm."""
+PUSH_FRACTION = 0.02
+"""Torque that moves a joint slightly in `PUSH_S`, over its limit, on top of twice the friction."""
+PUSH_RAD = 0.01
+"""The same for an arm that takes positions."""
 PUSH_S = 0.06
 MOVED_RAD = 2e-4
 DRIFT_RAD = 0.05
@@ -43,21 +48,34 @@ def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
     return {"sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), zero), "supervisor/state": supervisor}
 
 
-def commanding(rig: Rig, torque: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
-    """Return the inputs with a torque command [N m], shape (7,), on every tick."""
-    values = np.asarray(torque, dtype=float)
-    valid_ns = rig.rules.topics[COMMAND].expiry
-    return {
-        **quiet(rig, level),
-        COMMAND: lambda t: JointTorqueCommand(header(t), values, np.zeros(0), duration_message(valid_ns), "", ""),
-    }
+def _arm(rig: Rig) -> Arm:
+    return arm_of(rig.settings.scenario.robot)
+
+
+def _positions(rig: Rig) -> bool:
+    """Return True if the arm takes positions."""
+    return rig.settings.scenario.robot.level is CommandLevel.POSITION
+
+
+def _still(rig: Rig) -> Array:
+    return np.zeros(_arm(rig).joints)
+
+
+def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK) -> Feed:
+    """Return the inputs with a command on every tick: torques [N m], or positions [rad] relative to the present; shape (n,)."""
+    values, none = np.array(push, dtype=float), np.zeros(0)
+    if _positions(rig):
+        values = values + rig.last("joint_states").position
+    torque, position = (none, values) if _positions(rig) else (values, none)
+    valid = duration_message(rig.rules.topics[COMMAND].expiry)
+    return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), torque, position, valid, "", "")}
 
 
 def suite(rig: Rig, report: ConformanceReport) -> None:
     """Check signs, gravity, holds, latches and limits."""
     report.section("joints")
     rest = rig.run(0.5, quiet(rig))
-    _joints(rest["joint_states"], report)
+    _joints(_arm(rig), rest["joint_states"], report)
     report.expect("starts idle, without a command", _mode(rig) == RobotStatus.MODE_IDLE, "MODE_IDLE", _mode_name(rig))
     _description(rig, report)
     if not rig.settings.motion:
@@ -95,19 +113,19 @@ def _mode_name(rig: Rig) -> str:
     )
 
 
-def _joints(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _joints(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
     if not report.expect("joint_states come", len(received) > 0, "messages", f"{len(received)}"):
         return
     last = received[-1].message
     names = list(last.name)
-    report.expect("joint names, in order", names == list(lbr.JOINT_NAMES), ", ".join(lbr.JOINT_NAMES), ", ".join(names))
+    report.expect("joint names, in order", names == list(arm.joint_names), ", ".join(arm.joint_names), ", ".join(names))
     shapes = [np.shape(values) for values in (last.position, last.velocity, last.effort)]
-    report.expect("seven positions, velocities and efforts", shapes == [(7,)] * 3, "3 x (7,)", shapes)
-    q = np.array([item.message.position for item in received if np.shape(item.message.position) == (7,)])
-    inside = bool(np.all(np.abs(q) <= lbr.POSITION_LIMIT))
-    report.expect(
-        "joints within their limits", inside, f"+-{np.rad2deg(lbr.POSITION_LIMIT).round()} deg", np.rad2deg(q[-1]).round(1)
-    )
+    n = arm.joints
+    report.expect("a position, velocity and effort of each joint", shapes == [(n,)] * 3, f"3 x ({n},)", shapes)
+    q = np.array([item.message.position for item in received if np.shape(item.message.position) == (n,)])
+    inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
+    limits = f"{np.rad2deg(arm.lower_rad).round()} to {np.rad2deg(arm.upper_rad).round()} deg"
+    report.expect("joints within their limits", inside, limits, np.rad2deg(q[-1]).round(1))
     drift = float(np.max(np.abs(q[-1] - q[0])))
     report.expect("holds still without commands", drift < DRIFT_RAD, f"drift below {DRIFT_RAD} rad in 0.5 s", f"{drift:.4f} rad")
 
@@ -115,7 +133,7 @@ def _joints(received: list[ReceivedMessage], report: ConformanceReport) -> None:
 def _description(rig: Rig, report: ConformanceReport) -> None:
     described = rig.last("robot_description")
     text = "" if described is None else str(described.data)
-    missing = [name for name in (*lbr.JOINT_NAMES, "indenter") if f'name="{name}"' not in text]
+    missing = [name for name in (*_arm(rig).joint_names, "indenter") if f'name="{name}"' not in text]
     report.expect(
         "robot_description is a URDF of the arm and tool",
         "<robot" in text and not missing,
@@ -125,12 +143,12 @@ def _description(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _gravity(rig: Rig, report: ConformanceReport) -> None:
-    """Check that commands exclude gravity: with zero torque the arm stays where it is."""
-    moved = rig.run(0.4, commanding(rig, np.zeros(7)))["joint_states"]
+    """Check that commands exclude gravity: with zero torque, or at its position, the arm stays where it is."""
+    moved = rig.run(0.4, commanding(rig, _still(rig)))["joint_states"]
     report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
     drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
     report.expect(
-        "zero torque floats: commands exclude gravity",
+        "stays where it is when commanded nothing else: commands exclude gravity",
         drift < DRIFT_RAD,
         f"drift below {DRIFT_RAD} rad in 0.4 s",
         f"{drift:.4f} rad",
@@ -138,32 +156,27 @@ def _gravity(rig: Rig, report: ConformanceReport) -> None:
 
 
 def _signs(rig: Rig, report: ConformanceReport) -> None:
-    """Check that a positive torque accelerates its joint positively and is reported with that sign."""
+    """Check that a positive command moves its joint positively and that its torque is reported with that sign."""
     wrong, unreported = [], []
     settle(rig)
-    for joint in range(7):
+    arm, robot = _arm(rig), rig.settings.scenario.robot
+    for joint, name in enumerate(arm.joint_names):
         release(rig)
-        torque = np.zeros(7)
-        torque[joint] = PUSH[joint]
-        received = rig.run(PUSH_S, commanding(rig, torque))["joint_states"]
+        push = _still(rig)
+        push[joint] = PUSH_RAD if _positions(rig) else PUSH_FRACTION * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
+        received = rig.run(PUSH_S, commanding(rig, push))["joint_states"]
         settle(rig)
         q = np.array([item.message.position[joint] for item in received])
         if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
-            wrong.append(lbr.JOINT_NAMES[joint])
-        if not any(abs(item.message.effort[joint] - torque[joint]) < 0.2 * torque[joint] for item in received):
-            unreported.append(lbr.JOINT_NAMES[joint])
-    report.expect(
-        "a positive torque moves its joint positively",
-        not wrong,
-        "all seven",
-        f"not {', '.join(wrong)}" if wrong else "all seven",
-    )
-    report.expect(
-        "effort reports the applied torque",
-        not unreported,
-        "within 20 % of the command",
-        f"not {', '.join(unreported)}" if unreported else "all seven",
-    )
+            wrong.append(name)
+        if not any(abs(item.message.effort[joint] - push[joint]) < 0.2 * push[joint] for item in received):
+            unreported.append(name)
+    got = f"not {', '.join(wrong)}" if wrong else "all of them"
+    report.expect("a positive command moves its joint positively", not wrong, "all joints", got)
+    if _positions(rig):
+        return
+    got = f"not {', '.join(unreported)}" if unreported else "all of them"
+    report.expect("effort reports the applied torque", not unreported, "within 20 % of the command", got)
 
 
 def settle(rig: Rig) -> None:
@@ -180,7 +193,7 @@ def release(rig: Rig) -> None:
 
 def _activate(rig: Rig) -> None:
     release(rig)
-    rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))
+    rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig)))
 
 
 def _holds(rig: Rig, received: list[ReceivedMessage]) -> ReceivedMessage | None:
@@ -216,14 +229,14 @@ def _expiry(rig: Rig, report: ConformanceReport) -> None:
     )
     v = np.abs(rig.last("joint_states").velocity).max()
     report.expect("and comes to rest", v < 0.1, "below 0.1 rad/s", f"{v:.3f} rad/s")
-    rig.run(0.3, commanding(rig, np.zeros(7)))
+    rig.run(0.3, commanding(rig, _still(rig)))
     latched = _mode(rig) == RobotStatus.MODE_SAFE_HOLD
     report.expect("the hold is latched: new commands do not end it", latched, "MODE_SAFE_HOLD", _mode_name(rig))
 
 
-def _provoke(rig: Rig, report: ConformanceReport, what: str, torque: Any, cause: int) -> None:
+def _provoke(rig: Rig, report: ConformanceReport, what: str, push: Any, cause: int) -> None:
     _activate(rig)
-    received = rig.run(0.1, commanding(rig, torque))["robot/status"]
+    received = rig.run(0.1, commanding(rig, push))["robot/status"]
     received += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
     hold = _holds(rig, received)
     got = _how(hold)
@@ -233,18 +246,22 @@ def _provoke(rig: Rig, report: ConformanceReport, what: str, torque: Any, cause:
 
 
 def _invalid(rig: Rig, report: ConformanceReport) -> None:
-    bad = np.zeros(7)
+    bad = _still(rig)
     bad[3] = np.nan
-    _provoke(rig, report, "a torque that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
-    huge = np.zeros(7)
-    huge[0] = 10 * lbr.TORQUE_LIMIT[0]
+    _provoke(rig, report, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
+    huge = _still(rig)
+    if _positions(rig):
+        huge[0] = 1.0
+        _provoke(rig, report, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND)
+        return
+    huge[0] = 10 * _arm(rig).torque_nm[0]
     _provoke(rig, report, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 
 def _stop(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
-    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7)))["robot/status"]
+    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig)))["robot/status"]
     hold = _holds(rig, received)
     got = _how(hold)
     ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
@@ -253,7 +270,7 @@ def _stop(rig: Rig, report: ConformanceReport) -> None:
 
 def _emergency(rig: Rig, report: ConformanceReport) -> None:
     _activate(rig)
-    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, np.zeros(7), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
+    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
     hold = _holds(rig, received)
     got = _how(hold)
     report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
@@ -322,16 +339,16 @@ def _lost(rig: Rig, report: ConformanceReport) -> None:
 
 def _limits(rig: Rig, report: ConformanceReport) -> None:
     """Check the limits over the whole suite."""
-    efforts = [item.message.effort for item in rig.log["joint_states"] if np.shape(item.message.effort) == (7,)]
-    worst = np.max(np.abs(efforts), axis=0)
-    report.expect(
-        "applied torques never leave their limits",
-        bool(np.all(worst <= lbr.TORQUE_LIMIT)),
-        f"{lbr.TORQUE_LIMIT} N m",
-        worst.round(1),
+    arm, states = (
+        _arm(rig),
+        [item.message for item in rig.log["joint_states"] if np.shape(item.message.effort) == (_arm(rig).joints,)],
     )
-    speeds = np.max(np.abs([item.message.velocity for item in rig.log["joint_states"]]), axis=0)
-    margin = lbr.VELOCITY_LIMIT * 1.05
+    if not _positions(rig):
+        worst = np.max(np.abs([state.effort for state in states]), axis=0)
+        ok = bool(np.all(worst <= arm.torque_nm))
+        report.expect("applied torques never leave their limits", ok, f"{arm.torque_nm} N m", worst.round(1))
+    speeds = np.max(np.abs([state.velocity for state in states]), axis=0)
+    margin = arm.velocity_radps * 1.05
     report.expect(
         "joint speeds never leave their limits", bool(np.all(speeds <= margin)), f"{margin.round(2)} rad/s", speeds.round(2)
     )

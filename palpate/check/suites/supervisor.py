@@ -16,8 +16,7 @@ from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
-from palpate_models.robot import lbr
-from palpate_models.robot.arm import urdf
+from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
 from palpate_models.scenario.load import exam_input
 
@@ -43,8 +42,8 @@ class Expected:
 
 
 EXPECTED = Expected()
-OUTSIDE = ((0.0,) * 7, (2.9, *lbr.HOME[1:]), (0.0, 2.0, 0.0, 0.0, 0.0, 0.0, 0.0), (1.57, 1.57, 0.0, 0.0, 0.0, 0.0, 0.0))
-"""Postures [rad]; at least one is probably outside the workspace."""
+AWAY_RAD = (2.9, -2.9, 1.57, -1.57)
+"""Turns of the first joint away from the patient; at least one of them, or the arm at zero, is probably outside the workspace."""
 STOPPED = (SupervisorState.LEVEL_SOFT_STOP, SupervisorState.LEVEL_EMERGENCY)
 EMERGENCY = (SupervisorState.LEVEL_EMERGENCY,)
 
@@ -61,7 +60,8 @@ class PlayedArm:
 
     def calm(self) -> None:
         """Return to rest."""
-        self.q, self.qd = lbr.HOME.copy(), np.zeros(7)
+        self.home = arm_of(self.robot).home_rad
+        self.q, self.qd = self.home.copy(), np.zeros_like(self.home)
         self.push_N = 0.0
         """Upward force on the tool [N]."""
         self.mode, self.reason = RobotStatus.MODE_ACTIVE, ""
@@ -73,11 +73,11 @@ class PlayedArm:
     def _status(self, t: int) -> Any:
         q, push_W = np.nan_to_num(self.q), np.array((0.0, 0.0, self.push_N))
         force = tool_pose(q, self.robot)[:3, :3].T @ (push_W - np.array((0.0, 0.0, self.robot.tool_mass_kg * GRAVITY)))
-        torque = pin.rnea(self._model, self._data, q, self.qd, np.zeros(7)) - tool_jacobian(q, self.robot)[:3].T @ push_W
+        torque = pin.rnea(self._model, self._data, q, self.qd, np.zeros_like(q)) - tool_jacobian(q, self.robot)[:3].T @ push_W
         wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
         cause = RobotStatus.CAUSE_COMMAND_EXPIRED if self.reason else RobotStatus.CAUSE_NONE
         q, qd, torque = sensed(self.q, t), sensed(self.qd, t), sensed(torque, t)
-        return RobotStatus(header(t), self.mode, cause, self.reason, q, qd, wrench, np.zeros(7), 0, "", torque)
+        return RobotStatus(header(t), self.mode, cause, self.reason, q, qd, wrench, np.zeros_like(q), 0, "", torque)
 
     def _exam(self, t: int) -> Any:
         return exam_state(t, ExamState.PHASE_SCAN, target_count=1)
@@ -127,7 +127,7 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     _workspace(rig, arm, report)
 
     report.section("others")
-    arm.q = np.full(7, np.nan)
+    arm.q = np.full_like(arm.home, np.nan)
     _stops(rig, arm, report, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released with numbers")
     arm.mode, arm.reason = RobotStatus.MODE_SAFE_HOLD, "conformance check"
@@ -168,10 +168,10 @@ def _measures(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 
 
 def _swing(rig: Rig, arm: PlayedArm) -> None:
-    """Tilt the tool to and fro by the sixth joint, so that its weight can be measured, as on the way to a first target."""
+    """Tilt the tool to and fro by the last joint but one, so that its weight can be measured, as on the way to a first target."""
     for phase in np.arange(0.0, 2 * np.pi, EXPECTED.swing_radps * EXPECTED.step_s):
-        arm.q[5] = lbr.HOME[5] + EXPECTED.swing_rad * np.sin(phase)
-        arm.qd[5] = EXPECTED.swing_rad * EXPECTED.swing_radps * np.cos(phase)
+        arm.q[-2] = arm.home[-2] + EXPECTED.swing_rad * np.sin(phase)
+        arm.qd[-2] = EXPECTED.swing_rad * EXPECTED.swing_radps * np.cos(phase)
         rig.run(EXPECTED.step_s, arm.feed())
     arm.calm()
 
@@ -194,10 +194,10 @@ def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
     known = exam_input(rig.settings.scenario)
     low, high = np.array(known.limits.workspace_min_m), np.array(known.limits.workspace_max_m)
     X_AW = inverse(np.array(known.X_WA))
-    for q in OUTSIDE:
-        p_A = apply(X_AW, tool_pose(np.array(q), arm.robot)[:3, 3])
+    for q in (np.zeros_like(arm.home), *(np.append(arm.home[0] + turn, arm.home[1:]) for turn in AWAY_RAD)):
+        p_A = apply(X_AW, tool_pose(q, arm.robot)[:3, 3])
         if bool(np.any(p_A < low - 0.02) or np.any(p_A > high + 0.02)):
-            arm.q = np.array(q)
+            arm.q = q
             _stops(
                 rig, arm, report, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, EXPECTED.react_ms
             )

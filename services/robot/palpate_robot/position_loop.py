@@ -54,10 +54,11 @@ class PositionLoop:
         self._late = deque([q] * round(tuning.latency_s / DT))
         """Commands that have not taken effect yet."""
 
-    def torque(self, command: Array | None, q: Array, gravity: Array) -> Array:
-        """Return the explicit part of the torques without gravity [N m] for a step at measured positions `q` [rad].
+    def torque(self, command: Array | None, q: Array, v: Array, gravity: Array) -> Array:
+        """Return the explicit part of the torques without gravity [N m] for a step at measured `q` [rad] and `v` [rad/s].
 
-        Without a command the arm stops as fast as it may and stays.
+        It is within the torque limits together with gravity and with the implicit damping at the present `v`. Without a command
+        the arm stops as fast as it may and stays.
         """
         speed, acceleration, limit = self._limits
         if command is None:
@@ -72,5 +73,6 @@ class PositionLoop:
         if command is None:
             self._goal = self._r
             self._late = deque([self._r] * len(self._late))
-        wanted_torque = self._stiffness * (self._r - q) + self._rate * self._rd
-        return np.asarray(np.clip(wanted_torque + gravity, -limit, limit) - gravity)
+        damped = self.damping * v
+        drives = self._stiffness * (self._r - q) + self._rate * self._rd - damped + gravity
+        return np.asarray(np.clip(drives, -limit, limit) - gravity + damped)

@@ -145,7 +145,7 @@ class RobotService(Service):
         if self._loop is None:
             return values, self._driver.damping(self._joints.v, gravity)
         command = values if self._driver.mode is DriverMode.ACTIVE else None
-        return self._loop.torque(command, self._joints.q, gravity), self._loop.damping
+        return self._loop.torque(command, self._joints.q, self._joints.v, gravity), self._loop.damping
 
     def _newest_command(self, inbox: Inbox) -> Command | None:
         message = inbox.latest("control/joint_torque")

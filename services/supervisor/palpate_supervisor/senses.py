@@ -40,11 +40,11 @@ class SensesTuning(NamedTuple):
     """The same by the joints."""
     offset_rad: float = 0.3
     """Travel of the joints, summed, over which their offsets are learned: gravity errors change with the posture."""
-    tare_s: float = 1.0
+    tare_s: float = 0.5
     """Time over which F/T bias and joint offsets are learned at rest."""
     start_s: float = 0.1
     """The same before the arm first moves."""
-    friction_gain: float = 0.1
+    friction_gain: float = 0.05
     """Part of the joints' deviation that a sample adds to their friction."""
     slow_radps: float = 0.003
     """v_0: joint speed at which friction is half of its value."""

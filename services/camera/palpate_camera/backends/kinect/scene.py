@@ -28,7 +28,7 @@ from palpate_camera.messages import Pinhole
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot import table
-from palpate_models.robot import visual as lbr_visual
+from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Robot
 
 Image = NDArray[np.float32]
@@ -214,7 +214,7 @@ def links(robot: Robot) -> dict[str, Mesh]:
     """Shape of each link, by link name, in the link's frame."""
     return {
         name: merge(Mesh(part.vertices, part.triangles.astype(np.uint32)) for part in parts)
-        for name, parts in lbr_visual.visual_meshes(robot).items()
+        for name, parts in visual_meshes(robot).items()
     }
 
 

@@ -1,0 +1,85 @@
+"""What an arm's URDF and file leave open, fitted: a ready posture, and a capsule about each link."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Final
+
+import numpy as np
+from scipy.optimize import least_squares
+
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.chain import Arm, Capsule, Point
+
+
+@dataclass(frozen=True)
+class HomeTuning:
+    """The posture that is sought."""
+
+    starts: int = 24
+    """Postures from which a home posture is sought."""
+    forward: float = 0.4
+    """Place of the flange at home in front of the base, over the length of the arm."""
+    height: float = 0.35
+    """The same above the base."""
+    bend: float = 0.02
+    """Weight of the joints' angles at home."""
+    spread: float = 0.003
+    """Of postures whose cost is that much above the best, the one with the highest elbow is taken."""
+    upright: float = 0.999
+    """Least cosine between the flange's z axis and straight down at home."""
+
+
+HOME: Final = HomeTuning()
+
+
+def ready_posture(arm: Arm) -> Array | None:
+    """Return joint positions [rad], shape (n,), with the flange straight down above the base's front; None if none is found."""
+    rng = np.random.default_rng(0)
+    near, half = arm.middle_rad, np.minimum(arm.half_range_rad, np.pi)
+    starts = near + rng.uniform(-1, 1, (HOME.starts, arm.joints)) * np.minimum(half, 1.6)
+    reach = float(np.linalg.norm(np.diff(arm.posture(near)[0], axis=0), axis=1).sum())
+    aim = reach * np.array((HOME.forward, 0.0, HOME.height))
+
+    def gap(q: Array) -> Array:
+        p, z = arm.posture(q)
+        return np.concatenate(((p[-1] - aim) / reach, z - (0.0, 0.0, -1.0), HOME.bend * (q - near) / np.pi))
+
+    margin = 0.1 * half
+    bounds = (np.maximum(arm.lower_rad, near - np.pi) + margin, np.minimum(arm.upper_rad, near + np.pi) - margin)
+    found = [least_squares(gap, np.clip(start, *bounds), bounds=bounds) for start in starts]
+    least = min(float(one.cost) for one in found)
+    good = [one.x for one in found if one.cost < least + HOME.spread and arm.posture(one.x)[1][2] < -HOME.upright]
+    highest = max(good, key=lambda q: float(arm.posture(q)[0][arm.elbow[0], 2]), default=None)
+    return None if highest is None else np.round(highest, 3)
+
+
+def enclosing_capsule(points: Array) -> Capsule:
+    """Return a small capsule that encloses points, shape (n, 3), along the principal axis of their spread."""
+    middle = (points.max(axis=0) + points.min(axis=0)) / 2
+    _, _, axes = np.linalg.svd(points - points.mean(axis=0), full_matrices=False)
+    best: tuple[float, Capsule] | None = None
+    for axis in axes:
+        along = (points - middle) @ axis
+        across = points - middle - np.outer(along, axis)
+        centre = (across.max(axis=0) + across.min(axis=0)) / 2
+        centre = centre - (centre @ axis) * axis
+        off = np.linalg.norm(across - centre, axis=1)
+        radius = float(off.max()) * (1 + 1e-9)
+        cap = np.sqrt(radius**2 - off**2)
+        start, end = float((along + cap).min()), float((along - cap).max())
+        if start > end:
+            start = end = (start + end) / 2
+            radius = float(np.linalg.norm(points - middle - centre - start * axis, axis=1).max())
+        volume = np.pi * radius**2 * (end - start) + 4 / 3 * np.pi * radius**3
+        capsule = Capsule(as_point(middle + centre + start * axis), as_point(middle + centre + end * axis), radius)
+        if best is None or volume < best[0]:
+            best = (volume, capsule)
+    assert best is not None
+    return best[1]
+
+
+def as_point(values: Array) -> Point:
+    """Return three numbers as a tuple."""
+    x, y, z = (float(v) for v in values)
+    return x, y, z
