@@ -1,4 +1,4 @@
-"""What an arm's URDF and file leave open, fitted: a ready posture, and a capsule about each link."""
+"""Fits of values that an arm's URDF and file leave open: a ready posture, and a capsule about each link."""
 
 from __future__ import annotations
 

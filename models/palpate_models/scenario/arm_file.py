@@ -23,7 +23,7 @@ Joints = Annotated[tuple[float, ...], Field(min_length=4, max_length=12)]
 
 
 class CommandLevel(StrEnum):
-    """What an arm is commanded."""
+    """Kind of the commands that an arm takes."""
 
     TORQUE = "torque"
     """Joint torques without gravity."""
@@ -43,7 +43,7 @@ class ArmFile(Section):
     home_rad: Joints | None = None
     """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view. Sought if missing."""
     level: CommandLevel = CommandLevel.POSITION
-    """What the arm is commanded."""
+    """Kind of the commands that the arm takes."""
     base_xy_m: Vec2 = (0.0, 0.0)
     """Position of the base in world; `palpate arm place` finds it."""
     base_height_m: Annotated[float, Field(ge=0.0, le=2.0)] = 0.9
