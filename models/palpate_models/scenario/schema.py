@@ -157,8 +157,8 @@ class Robot(Section):
     arm: str = DEFAULT_ARM
     """Name of an arm, or the path of a YAML file next to a URDF. Other defaults of this section are the arm's."""
     level: CommandLevel = CommandLevel.TORQUE
-    """Kind of the commands that the arm takes: `torque` or `position` by the role control, or `setpoint`: a driver follows `planning/setpoint`
-    itself. A simulated arm plays `setpoint` as `torque`."""
+    """Kind of the commands that the arm takes: `torque` or `position` from the role control, or `setpoint`: its driver follows
+    `planning/setpoint` itself. A simulated arm plays `setpoint` as `torque`."""
     driver: RobotDriver = RobotDriver()
     indenter_radius_m: Annotated[float, Field(ge=0.0005, le=0.1)] = 0.015
     """Radius of the spherical indenter."""
