@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass, replace
+from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pathlib import Path
@@ -125,15 +126,15 @@ class _Reader:
 
     def _arm(self, name: str) -> tuple[Arm | None, list[str]]:
         if self._given.flange not in self._links:
-            near = ", ".join(list(self._links)[-6:])
-            return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; its last links are {near}"]
+            near = get_close_matches(self._given.flange, self._links, 6, 0.4) or list(self._links)[-6:]
+            return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
         chain = self._chain()
         poses, moving = self._placed(chain)
         n = len(moving)
         if n not in (6, 7):
             return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]
         limits = self._limits(moving)
-        R_BF = poses[-1][:3, :3]
+        R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
         frames = [np.eye(4), *(poses[chain.index(self._child(joint))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
@@ -178,7 +179,8 @@ class _Reader:
         if given.home_rad is None and not self.faults:
             found = ready_posture(arm)
             if found is None:
-                self.faults.append("home_rad: no posture with the flange straight down was found; give one")
+                text = "no posture with z of the flange straight down was found; turn its axes by flange_rpy_rad, or give one"
+                self.faults.append(f"home_rad: {text}")
             else:
                 arm = replace(arm, home_rad=found)
         return (None if self.faults else arm), self.faults
@@ -295,6 +297,8 @@ class _Reader:
             tensor + mass * ((r := p - centre) @ r * np.eye(3) - np.outer(r, r))
             for mass, p, tensor in parts  # Steiner
         )
+        if np.linalg.eigvalsh(about)[0] <= 0 and not fixed:
+            self.faults.append(f"link {name}: inertia is not positive: a principal moment is 0 kg m^2")
         local = R_BF.T @ about @ R_BF
         return Inertia(
             float(total),
@@ -310,7 +314,7 @@ class _Reader:
         if mass <= 0:
             self.faults.append(f"link {link}: mass is {mass:g} kg, want more than 0")
         a, b, c = np.linalg.eigvalsh(tensor)
-        if a <= 0:
+        if a < 0:
             self.faults.append(f"link {link}: inertia is not positive: a principal moment is {a:.3g} kg m^2")
         elif c > (a + b) * (1 + TUNING.inertia_tolerance):
             self.faults.append(

@@ -11,7 +11,7 @@ from pydantic import Field, ValidationError
 
 from palpate_errors import UserError
 from palpate_inputs import read_yaml
-from palpate_models.section import NonNegative, Section, Vec2
+from palpate_models.section import NonNegative, Section, Vec2, Vec3
 
 FOLDER: Final = Path(__file__).parent / "arms"
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
@@ -40,6 +40,8 @@ class ArmFile(Section):
     """Path of the URDF, relative to this file, or `package://PACKAGE/PATH`."""
     flange: str
     """Link whose origin is the flange: z out of the arm. Links behind it (a gripper) are left out."""
+    flange_rpy_rad: Vec3 = (0.0, 0.0, 0.0)
+    """Turn from the axes of that link to those of the flange, if its z is not out of the arm."""
     home_rad: Joints | None = None
     """Ready posture: folded back over the base, z of the flange straight down, out of the camera's view. Sought if missing."""
     level: CommandLevel = CommandLevel.POSITION
