@@ -1,4 +1,4 @@
-"""Validation of sampled persons: the statistics of their forces against those of the living people of Remus et al."""
+"""Check of the sampler of persons: the statistics of their forces against those of the living people of Remus et al."""
 
 from __future__ import annotations
 
@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
+from scipy import stats
 
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
@@ -30,6 +31,7 @@ class PopulationSetup:
 
 SETUP = PopulationSetup()
 
+LEFT_OUT = "force at 10 mm of a person left out: places in the 80 % interval of the other nine"
 DEPTHS_M = np.array((0.005, 0.010, 0.020))
 AT_10_MM = 1
 
@@ -99,6 +101,22 @@ def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> Popula
     return PopulationSample(np.repeat(np.arange(persons), SETUP.places), np.array(force))
 
 
+def left_out(people: PopulationSample, depth: int = AT_10_MM) -> NDArray[np.bool_]:
+    """Return for each position whether it is in the 80 % interval that the other people predict for a new person, shape (n,).
+
+    ln F is normal between people and between positions of one person; the interval is Student's, for the mean of a few people.
+    """
+    logs = people.of_people(depth)
+    inside = []
+    for one, own in enumerate(logs):
+        others = [each for number, each in enumerate(logs) if number != one]
+        means = np.array([each.mean() for each in others])
+        within = sum(((each - each.mean()) ** 2).sum() for each in others) / sum(len(each) - 1 for each in others)
+        sd = np.sqrt(means.var(ddof=1) * (1 + 1 / len(means)) + within * (1 - 1 / np.mean([len(each) for each in others])))
+        inside.append(np.abs(own - means.mean()) < stats.t.ppf(0.9, len(means) - 1) * sd)
+    return np.concatenate(inside)
+
+
 def _places(points: Array, rng: np.random.Generator) -> Array:
     """Return randomly chosen points of (m, 3), at least `SETUP.apart_m` from each other, shape (SETUP.places, 3)."""
     chosen: list[Array] = []
@@ -117,7 +135,10 @@ def section(found: PopulationSample | None = None) -> PageSection:
         Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
         for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
     )
+    covered = float(left_out(people).mean())
+    checks += (Check(LEFT_OUT, covered, "of all", against=f"{len(people.force)} places of {len(people.of_people(0))} people"),)
     text = (
+        "This is a check of the sampler, whose moments come from the same ten people, and no validation of other persons. "
         f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {SETUP.places} random places "
         "of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus et "
         "al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
@@ -125,7 +146,9 @@ def section(found: PopulationSample | None = None) -> PageSection:
         "and slim; other builds are not validated."
     )
     data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
-    return PageSection("population", "A population of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data)
+    return PageSection(
+        "population", "Check of the sampler of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data
+    )
 
 
 def draw(figure: Figure, found: PopulationSample, people: PopulationSample) -> None:
