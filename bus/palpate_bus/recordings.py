@@ -28,12 +28,10 @@ from mcap.writer import MCAP0_MAGIC
 from palpate_bus import decompression  # noqa: F401 - bounds what the libraries decompress
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.typestore import CodecError, definition_hash
-from palpate_bus.settings import RECORDING
+from palpate_bus.settings import KEPT_EVERY, RECORDING
 from palpate_errors import UserError
 from palpate_inputs import MB, InputFile, bounds, read_yaml
 
-KEPT_EVERY = "kept_every_ms"
-"""Metadata of a channel: period [ms] in which one message was kept."""
 SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
 UNIX_NS = 10**17

@@ -45,6 +45,8 @@ COMPOSE_VARIABLES = {
 """Default and meaning of the variables that only docker-compose.yml reads."""
 RECORDING = "recording_mcap"
 """Name of the recording in a results folder: a rosbag2 folder."""
+KEPT_EVERY = "kept_every_ms"
+"""Metadata of a channel of a recording: period [ms] in which one message was kept."""
 
 
 class BusConfigError(UserError):

@@ -27,7 +27,8 @@ from palpate_bus import implementations
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.typestore import CodecError, definition_hash
-from palpate_bus.recordings import KEPT_EVERY, SCENARIO, open_recording
+from palpate_bus.recordings import SCENARIO, open_recording
+from palpate_bus.settings import KEPT_EVERY
 from palpate_conductor.collector import Collected
 from palpate_errors import UserError
 from palpate_fmu.reading import DESCRIPTION, binary_folders, read_description, read_variables

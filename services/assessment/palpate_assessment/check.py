@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
+from scipy.special import chdtrc
 
 from palpate_assessment.model import Regression, inverse
 from palpate_assessment.observations import Observations
@@ -27,7 +27,7 @@ def contradicted(regression: Regression) -> NDArray[np.bool_]:
     for piece in pieces(o):
         own = pull[piece]
         surprise = float(own @ np.linalg.solve(precision[np.ix_(piece, piece)], own))
-        marked[piece] = chi2.sf(surprise, len(piece)) < SURPRISE
+        marked[piece] = chdtrc(len(piece), surprise) < SURPRISE
     return marked
 
 

@@ -15,7 +15,7 @@ import yaml
 from mcap.writer import CompressionType, Writer
 
 from palpate_bus.contract import MS
-from palpate_bus.recordings import KEPT_EVERY
+from palpate_bus.settings import KEPT_EVERY
 
 CHUNK_BYTES = 4 * 1024 * 1024
 """Largest size of a chunk, which bounds the memory."""
