@@ -186,7 +186,7 @@ class Scene:
 def _same(old: Mesh, new: Mesh, tolerance: float) -> bool:
     return (
         old.vertices.shape == new.vertices.shape
-        and np.array_equal(old.triangles, new.triangles)
+        and (old.triangles is new.triangles or np.array_equal(old.triangles, new.triangles))
         and bool(np.abs(old.vertices - new.vertices).max(initial=0.0) <= tolerance)
     )
 
@@ -210,15 +210,24 @@ def furniture(robot: Robot) -> Mesh:
     )
 
 
-def links(robot: Robot) -> dict[str, Mesh]:
-    """Shape of each link, by link name, in the link's frame."""
-    return {
-        name: merge(Mesh(part.vertices, part.triangles.astype(np.uint32)) for part in parts)
-        for name, parts in visual_meshes(robot).items()
-    }
+class Links:
+    """The robot's links as one mesh."""
 
+    def __init__(self, robot: Robot) -> None:
+        self._shapes = {
+            name: merge(Mesh(part.vertices, part.triangles.astype(np.uint32)) for part in parts)
+            for name, parts in visual_meshes(robot).items()
+        }
+        """Shape of each link in its frame."""
+        self._names: list[str] = []
+        self._triangles: Triangles = np.empty((0, 3), np.uint32)
+        """Triangles of the links `_names`, which rarely change."""
 
-def placed(shapes: dict[str, Mesh], X_WL: dict[str, Array]) -> Mesh | None:
-    """Return the links of which the pose is known, in world; None when there is none."""
-    parts = [Mesh(apply(X_WL[name], shape.vertices), shape.triangles) for name, shape in shapes.items() if name in X_WL]
-    return merge(parts) if parts else None
+    def placed(self, X_WL: dict[str, Array]) -> Mesh | None:
+        """Return the links of which the pose is known, in world; None when there is none."""
+        names = [name for name in self._shapes if name in X_WL]
+        if not names:
+            return None
+        if names != self._names:
+            self._names, self._triangles = names, merge(self._shapes[name] for name in names).triangles
+        return Mesh(np.concatenate([apply(X_WL[name], self._shapes[name].vertices) for name in names]), self._triangles)

@@ -46,7 +46,7 @@ class CameraService(Service):
             _Picture(self._pinhole, k, X_WCt, furniture, KinectNoise(camera.focal_px, scale, rng, k))
             for k, rng in ((1, noise), (spacing, small))
         )
-        self._links = scene.links(known.robot)
+        self._links = scene.Links(known.robot)
         self._on_since: int | None = None
         self._frames_left = 0
         self._frames_taken = 0
@@ -66,7 +66,7 @@ class CameraService(Service):
         if surface is None:
             return {}
         skin, poses = surface_mesh(surface), inbox.latest("sim/link_poses")
-        robot = None if poses is None else scene.placed(self._links, link_poses(poses))
+        robot = None if poses is None else self._links.placed(link_poses(poses))
         on_s = (t - self._on_since) / NS
         outbox = messages.small(t, self._small.take(on_s, skin, robot, self._bias), self._small.pinhole)
         if self._frames_left:
