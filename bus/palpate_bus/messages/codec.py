@@ -8,6 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -30,12 +31,12 @@ __all__ = [
     "Message",
     "decode",
     "decoder",
-    "decodes_to_itself",
     "definition",
     "encode",
     "encoder",
     "interface_files",
     "message_type",
+    "passer",
     "palpation_definitions",
     "store",
     "type_hash",
@@ -93,17 +94,40 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
 
 @cache
-def decodes_to_itself(name: str) -> bool:
-    """Return True if encoding and decoding returns an equal message: the type has no arrays and no float32.
+def passer(name: str) -> Callable[[Message], Message | None]:
+    """Return a function that gives the message which decoding an encoded one would give, or None if it has to be decoded.
 
-    An array may differ in type or layout from its field, and its owner may write to it later.
+    Arrays are copied, since their owner may write to them later, and are read-only, as decoded ones are.
     """
-    for _, (kind, detail) in store.get_msgdef(name).fields:
+    names = [field for field, _ in store.get_msgdef(name).fields]
+    arrays = [(names.index(field), dtype) for field, dtype, _ in _array_fields(name)]
+    if not _exact(name, but=frozenset(names[k] for k, _ in arrays)):
+        return lambda _: None
+    if not arrays:
+        return lambda message: message
+    make, values_of = message_type(name), attrgetter("__class__", *names)
+
+    def passed(message: Message) -> Message | None:
+        _, *values = values_of(message)
+        for k, dtype in arrays:
+            array = values[k]
+            if array.__class__ is not np.ndarray or array.dtype != dtype:
+                return None
+            values[k] = array = array.copy()
+            array.flags.writeable = False
+        return make(*values)
+
+    return passed
+
+
+def _exact(name: str, but: frozenset[str] = frozenset()) -> bool:
+    """Return True if encoding and decoding gives equal fields: they have no arrays of numbers and no float32, except in `but`."""
+    for field, (kind, detail) in store.get_msgdef(name).fields:
         item_kind, item = detail[0] if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) else (kind, detail)
         if item_kind == Nodetype.NAME:
-            if not decodes_to_itself(item):
+            if not _exact(item):
                 return False
-        elif item[0] == "float32" or (kind != item_kind and item[0] != "string"):
+        elif field not in but and (item[0] == "float32" or (kind != item_kind and item[0] != "string")):
             return False
     return True
 

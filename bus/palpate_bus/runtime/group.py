@@ -1,7 +1,7 @@
 """Services of one process, stepped in the contract's order; messages between them are delivered at once.
 
-A message is encoded once, since the run hash covers its bytes. Readers get the message itself if decoding would give an equal
-one, else the first reader decodes it. `composed` (without transport) and `distributed` (between other processes) drive a group in
+A message is encoded once, since the run hash covers its bytes. Readers get the message itself, with copies of its arrays, if decoding
+would give an equal one, else the first reader decodes it. `composed` (without transport) and `distributed` (between other processes) drive a group in
 the same order: by tick, then by the same_tick edges of the contract among all roles, also those outside the group. So the first
 of all pending steps in this order has all its inputs, and groups that wait for each other do not deadlock.
 """
@@ -12,6 +12,7 @@ from collections.abc import Callable, Sequence
 from math import gcd, lcm
 
 from palpate_bus.contract import Contract
+from palpate_bus.messages import codec
 from palpate_bus.runtime.lockstep import OutputPort, Packet, Sent, Stepper
 from palpate_bus.service import Service
 
@@ -32,6 +33,8 @@ class Group:
             for sender in self.steppers.values()
             for name, port in sender.ports.items()
         }
+        for port, readers in self._readers.items():
+            port.passed = codec.passer(port.topic.type) if readers else None
         self._schedule = self._scheduled(frozenset())
 
     def _scheduled(self, without: frozenset[str]) -> tuple[tuple[Stepper, ...], ...]:

@@ -251,7 +251,7 @@ class TickInbox:
 class OutputPort:
     """One topic that a service writes: its sequence number and the digest over all messages sent."""
 
-    __slots__ = ("_digest", "_exact", "_unchained", "check", "encode", "event", "latched", "period", "sequence", "topic")
+    __slots__ = ("_digest", "_unchained", "check", "encode", "event", "latched", "passed", "period", "sequence", "topic")
 
     def __init__(self, topic: Topic) -> None:
         self.topic = topic
@@ -260,7 +260,8 @@ class OutputPort:
         self.latched = topic.latched
         self.encode = codec.encoder(topic.type)
         self.check = PortCheck(topic, sends=True)
-        self._exact = codec.decodes_to_itself(topic.type)
+        self.passed: Callable[[Message], Message | None] | None = None
+        """Makes the message for readers in this process."""
         self.sequence = 0
         self._digest = hashlib.sha256() if topic.hashed else None
         self._unchained: list[bytes] = []
@@ -273,7 +274,7 @@ class OutputPort:
         payload = self.encode(message)
         if self._digest is not None:
             self._unchained += (_CHAIN.pack(t, sequence, len(payload)), payload)
-        return self, Packet(payload, t, sequence, message if self._exact else None, True)
+        return self, Packet(payload, t, sequence, self.passed(message) if self.passed else None, True)
 
     def chain(self) -> None:
         """Add the messages packed since the last call to the digest."""
