@@ -27,6 +27,9 @@ class MaskMargins:
 
 MARGINS: Final = MaskMargins()
 
+SLACK_M: Final = 1e-6
+"""Rounding of the sphere around a capsule."""
+
 
 class ArmMask:
     """Mask of camera rays that pass the arm."""
@@ -64,17 +67,20 @@ class ArmMask:
 def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
     """Return the mask of segments from 0 to `a`, shape (n, 3), nearer than `reach`, (m,), to those from `p` to `q`, (m, 3).
 
-    Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1].
+    Ericson, Real-Time Collision Detection, section 5.1.9: the nearest points s a and p + t (q - p), with s and t in [0, 1]. Most
+    segments do not even pass the sphere around the other.
     """
     found = np.zeros(len(a), np.bool_)
     for j in range(len(p)):
         d = q[j] - p[j]
         dd, dp, pp = max(d[0] ** 2 + d[1] ** 2 + d[2] ** 2, 1e-12), (d * p[j]).sum(), (p[j] ** 2).sum()
+        mx, my, mz = (p[j] + q[j]) / 2
+        beyond = mx * mx + my * my + mz * mz - (np.sqrt(dd) / 2 + reach[j] + SLACK_M) ** 2
         for i in range(len(a)):
-            if found[i]:
-                continue
-            x, y, z = a[i]
+            x, y, z = a[i, 0], a[i, 1], a[i, 2]
             aa = x * x + y * y + z * z
+            if found[i] or beyond * aa > (x * mx + y * my + z * mz) ** 2:
+                continue
             ad, ap = x * d[0] + y * d[1] + z * d[2], x * p[j, 0] + y * p[j, 1] + z * p[j, 2]
             s = min(max((ap * dd - dp * ad) / max(aa * dd - ad * ad, 1e-12), 0.0), 1.0)
             t = min(max((s * ad - dp) / dd, 0.0), 1.0)

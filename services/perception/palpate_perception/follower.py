@@ -101,6 +101,8 @@ class Watch:
         self._r_W = (cloud.deproject(np.ones(camera.shape), camera.K) @ camera.X_WC[:3, :3].T).reshape(-1, 3)
         self._times: list[float] = []
         self._images: list[Image] = []
+        self._depths: list[float] = []
+        """Mean depth of the region in each image [m]."""
 
     def add(self, t_s: float, image: Image, arm: ArmMask, q: Array | None) -> None:
         """Add an image [m] exposed at `t_s` [s] with the arm at joint positions `q` [rad], None if unknown."""
@@ -110,14 +112,15 @@ class Watch:
             seen[arm.hides(q, self.camera.X_WC[:3, 3], self._r_W, z).reshape(image.shape)] = np.nan
         self._times.append(t_s)
         self._images.append(seen)
+        with np.errstate(invalid="ignore"):
+            self._depths.append(float(np.nanmean(seen[self._middle])))
 
     def over(self) -> bool:
         """True after two breaths, with a still wall, or at the time limit."""
         lasted = self._times[-1] - self._times[0] if self._times else 0.0
         if lasted < WATCH.still_s:
             return False
-        with np.errstate(invalid="ignore"):
-            height = -np.array([np.nanmean(image[self._middle]) for image in self._images])
+        height = -np.array(self._depths)
         if lasted >= WATCH.longest_s or not np.isfinite(height).all():
             return lasted >= WATCH.longest_s
         low, high = np.quantile(height, (0.05, 0.95))
