@@ -403,6 +403,8 @@ class Stepper:
                 sent += self._packed(port, message if isinstance(message, list) else (message,), t)
             elif t % port.period:
                 raise LockstepError(f"{self.role.name} sent {name} at {t} ns: not a multiple of its period ({port.period} ns)")
+            elif self._refuse is None:
+                sent.append(port.pack(message, t))
             else:
                 sent += self._packed(port, (message,), t)
         return sent
