@@ -41,6 +41,8 @@ def test_bytes_are_those_of_rosbags_and_decode_to_the_same_message(name: str, da
     assert type(decoded) is codec.message_type(name)
     assert bytes(codec.store.serialize_cdr(decoded, name)) == expected
     assert codec.encode(decoded, name) == expected
+    passed = codec.passer(name)(message)
+    assert passed is None or codec.encode(passed, name) == expected
     # Others may send big-endian.
     big = bytes(codec.store.serialize_cdr(message, name, little_endian=False))
     assert codec.encode(codec.decode(big, name), name) == expected
@@ -156,6 +158,15 @@ def test_decoded_names_are_not_shared_between_messages() -> None:
     first = codec.decode(payload, name)
     first.name.append("changed")
     assert codec.decode(payload, name).name == ["a", "bc"]
+
+
+def test_readers_in_the_process_do_not_share_arrays_and_lists_with_the_sender() -> None:
+    names, zeros = ["a"], np.zeros(1)
+    passed = codec.passer("sensor_msgs/msg/JointState")(JointState(header(0), names, zeros, zeros, zeros))
+    names[0], zeros[0] = "b", 1.0
+    assert passed.name == ["a"]
+    assert passed.position.tolist() == [0.0]
+    assert not passed.position.flags.writeable
 
 
 def test_unknown_type_is_named() -> None:

@@ -97,18 +97,23 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 def passer(name: str) -> Callable[[Message], Message | None]:
     """Return a function that gives the message which decoding an encoded one would give, or None if it has to be decoded.
 
-    Arrays are copied, since their owner may write to them later, and are read-only, as decoded ones are.
+    Arrays and lists are copied, since their owner may write to them later. Arrays are read-only, as decoded ones are.
     """
-    names = [field for field, _ in store.get_msgdef(name).fields]
+    fields = store.get_msgdef(name).fields
+    names = [field for field, _ in fields]
     arrays = [(names.index(field), dtype) for field, dtype, _ in _array_fields(name)]
     if not _exact(name, but=frozenset(names[k] for k, _ in arrays)):
         return lambda _: None
     if not arrays:
         return lambda message: message
+    numbers = {k for k, _ in arrays}
+    lists = [k for k, (_, (kind, _)) in enumerate(fields) if kind in (Nodetype.ARRAY, Nodetype.SEQUENCE) and k not in numbers]
     make, values_of = message_type(name), attrgetter("__class__", *names)
 
     def passed(message: Message) -> Message | None:
         _, *values = values_of(message)
+        for k in lists:
+            values[k] = list(values[k])
         for k, dtype in arrays:
             array = values[k]
             if array.__class__ is not np.ndarray or array.dtype != dtype:
