@@ -36,8 +36,8 @@ __all__ = [
     "encoder",
     "interface_files",
     "message_type",
-    "passer",
     "palpation_definitions",
+    "passer",
     "store",
     "type_hash",
 ]
