@@ -1,9 +1,10 @@
 """Services of one process, stepped in the contract's order; messages between them are delivered at once.
 
 A message is encoded once, since the run hash covers its bytes. Readers get the message itself, with copies of its arrays, if
-decoding would give an equal one, else the first reader decodes it. `composed` (without transport) and `distributed` (between other
-processes) drive a group in the same order: by tick, then by the same_tick edges of the contract among all roles, also those outside
-the group. So the first of all pending steps in this order has all its inputs, and groups that wait for each other do not deadlock.
+decoding would give an equal one, else the first reader decodes it. `composed` (without transport) and `distributed` (between
+other processes) drive a group in the same order: by tick, then by the same_tick edges of the contract among all roles, also
+those outside the group. So the first of all pending steps in this order has all its inputs, and groups that wait for each
+other do not deadlock.
 """
 
 from __future__ import annotations
