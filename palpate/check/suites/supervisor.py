@@ -187,7 +187,7 @@ def _press(rig: Rig, arm: PlayedArm, force: float) -> list[ReceivedMessage]:
 def _turning(arm: PlayedArm, speed: float) -> Array:
     """Return joint velocities [rad/s] that move the tool at `speed` [m/s] by the first joint alone."""
     lever = float(np.linalg.norm(tool_jacobian(arm.q, arm.robot)[:3, 0]))
-    return np.array((speed / lever, *np.zeros(6)))
+    return np.append(speed / lever, np.zeros(len(arm.home) - 1))
 
 
 def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:

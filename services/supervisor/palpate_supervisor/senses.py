@@ -36,15 +36,15 @@ class SensesTuning(NamedTuple):
     """A tool that is faster does not touch anything: strokes are at 0.03 m/s."""
     free_ft_n: float = 1.0
     """Largest tared force in free air by the F/T sensor."""
-    free_joints_n: float = 1.5
+    free_joints_n: float = 2.0
     """The same by the joints."""
     offset_rad: float = 0.3
     """Travel of the joints, summed, over which their offsets are learned: gravity errors change with the posture."""
-    tare_s: float = 0.5
+    tare_s: float = 1.0
     """Time over which F/T bias and joint offsets are learned at rest."""
     start_s: float = 0.1
     """The same before the arm first moves."""
-    friction_gain: float = 0.05
+    friction_gain: float = 0.03
     """Part of the joints' deviation that a sample adds to their friction."""
     slow_radps: float = 0.003
     """v_0: joint speed at which friction is half of its value."""
