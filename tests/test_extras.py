@@ -58,6 +58,11 @@ NEEDS = {
     "palpate_robot.backends.mujoco": "robot-mujoco group",
     "palpate_robot.backends.lbr": "robot-lbr group",
     "palpate_robot.backends.lbr.emulator": "run",
+    "palpate_robot.backends.ros2_control": "robot-lbr group",
+    "palpate_robot.backends.ros2_control.emulator": "run",
+    "palpate_robot.backends.emulated": "run",
+    "palpate_robot.backends.hardware": "robot-lbr group",
+    "palpate_robot.backends.watchdog": "robot-lbr group",
     "palpate_tissue": "tissue group",
     "palpate_tissue.backends.elastic": "tissue-elastic group",
     "palpate_tissue.backends.fmu": "tissue-fmu group",
@@ -103,6 +108,7 @@ ON_DEMAND = {
     "palpate_fmu.reading.FmuError": "fmu",
     "palpate_fmu.reading.opened_fmu": "fmu",
     "palpate_models.robot.urdf_arm.load_arm": "run",
+    "palpate_robot.backends.ros2_control.emulator.Ros2Emulator": "run",
     "palpate_robot.plant.Plant": "run",
 }
 """Imports of a single function, and the extra that its callers need."""

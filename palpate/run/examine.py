@@ -26,7 +26,7 @@ from palpate.run.places import Absent
 from palpate.run.processes import SecureBus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
-from palpate.run.self_test import RATES, measure
+from palpate.run.self_test import RATES, REAL_PROCESSES, SIMULATED_PROCESSES, measure
 from palpate_bus.implementations import check_libraries
 from palpate_bus.settings import Settings
 from palpate_conductor.outcome import RunResult, Tell, Timing
@@ -142,14 +142,15 @@ def _rate(scenario: Scenario) -> float:
 
     Raises UserError if there is none.
     """
+    real = scenario.services.tissue == NONE or scenario.robot.driver.emulated
     rate = Settings.read().rate
     if rate is None:
-        measured = measure()
+        measured = measure(REAL_PROCESSES if scenario.services.tissue == NONE else SIMULATED_PROCESSES)
         rate = measured.rate
         if rate is None:
             raise UserError(f"this machine cannot keep {RATES[-1]:g} of real time now: {measured.summary}; run in lockstep")
-        if rate < 1.0:
+        if rate < 1.0 or real:
             say(f"this machine keeps {rate:g} of real time now: {measured.summary}")
-    if rate < 1.0 and scenario.services.tissue == NONE:
-        raise UserError("services.tissue = 'none' is for hardware, which cannot be slowed down")
+    if rate < 1.0 and real:
+        raise UserError("services.tissue = 'none' and robot.driver.emulated are in real time: hardware cannot be slowed down")
     return rate

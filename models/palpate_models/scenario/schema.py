@@ -114,6 +114,8 @@ class Exam(Section):
 class RobotDriver(Section):
     """Connection to a real arm through a ROS 2 system over rmw_zenoh; each driver uses the fields that it needs."""
 
+    profile: str | None = None
+    """Of `services.robot: ros2_control`: `franka`, `ur`, or the path of a YAML file like theirs."""
     router: str = "tcp/127.0.0.1:7447"
     """zenoh endpoint of the ROS system: its rmw_zenohd, or the emulator."""
     domain: Annotated[int, Field(ge=0, le=232)] = 0
@@ -124,14 +126,18 @@ class RobotDriver(Section):
     """Name of the controller that takes the commands; default: the driver's."""
     joint_states: str | None = None
     """Topic of the joint states; default: the driver's."""
-    ft_topic: str = "ft_sensor/wrench"
-    """Topic of the F/T sensor's driver, geometry_msgs/WrenchStamped."""
-    ft_sign: Literal[1, -1] = 1
-    """-1 if the driver reports the wrench of the sensor on the tool."""
+    ft_topic: str | None = None
+    """Topic of the F/T sensor's driver, geometry_msgs/WrenchStamped; default: the driver's, else `ft_sensor/wrench`."""
+    ft_sign: Literal[1, -1] | None = None
+    """-1 if the driver reports the wrench of the sensor on the tool; default: the driver's, else 1."""
+    ft_weight: bool | None = None
+    """False if the wrench is without the tool's weight; default: the driver's, else true."""
     ft_yaw_deg: Annotated[float, Field(ge=-360, le=360)] = 0.0
     """Rotation of the sensor's x axis about the flange's z axis."""
     emulated: bool = False
     """True if the arm is the emulator. It then exchanges the `sim/` topics with simulated tissue and camera."""
+    events: tuple[str, ...] = ()
+    """Events of the emulated arm: a time [s], a name and a number, such as `12.5 speed 0.5`."""
 
 
 class RosCamera(Section):

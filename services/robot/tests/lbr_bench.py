@@ -14,14 +14,14 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario.schema import Scenario
+from palpate_robot.backends.hardware import ArmPort, HardwareService, InnerLoop, load_control
 from palpate_robot.backends.lbr.emulator import Emulator, Options
-from palpate_robot.backends.lbr.port import LbrPort
-from palpate_robot.backends.lbr.service import InnerLoop, LbrService, load_control
+from palpate_robot.backends.lbr.service import lbr_service
 
 MS = 1_000_000
 
 
-class DirectPort(LbrPort):
+class DirectPort(ArmPort):
     """Hands messages over; `states` is called once a millisecond and cycles the emulator when its period has passed."""
 
     def __init__(self, emulator: Emulator, period_ms: int) -> None:
@@ -56,9 +56,9 @@ class DirectPort(LbrPort):
         readings, self._readings = self._readings, []
         return readings
 
-    def command(self, q: Any, torque: Any) -> None:
-        self.torques.append(np.array(torque))
-        self.emulator.session.take(np.array(q), np.array(torque))
+    def command(self, q: Any, values: Any) -> None:
+        self.torques.append(np.array(values))
+        self.emulator.session.take(np.array(q), np.array(values))
 
     def rivals(self) -> list[bytes]:
         others, self.commanded_by = self.commanded_by, []
@@ -76,7 +76,7 @@ class DirectPort(LbrPort):
         pass
 
 
-def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any) -> tuple[LbrService, DirectPort]:
+def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any) -> tuple[HardwareService, DirectPort]:
     """Driver and port; options are the emulator's."""
     exam = exam_input(scenario)
     chosen = Options(**options)
@@ -84,7 +84,7 @@ def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any
     inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
     connection = exam.robot.driver.model_copy(update={"emulated": True})
     robot = exam.robot.model_copy(update={"driver": connection, "level": CommandLevel(level)})
-    return LbrService(exam.model_copy(update={"robot": robot}), port, inner), port
+    return lbr_service(exam.model_copy(update={"robot": robot}), port, inner), port
 
 
 SCENARIO = load_scenario("clean")
@@ -95,7 +95,7 @@ class Rig:
     """Driver, emulated arm, and a joint servo that commands it."""
 
     def __init__(self, **options: Any) -> None:
-        self.driver: LbrService
+        self.driver: HardwareService
         self.port: DirectPort
         self.driver, self.port = driver_on_emulator(SCENARIO, **options)
         self.inbox = HandInbox()

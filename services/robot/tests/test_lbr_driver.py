@@ -12,7 +12,8 @@ from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
-from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, GravityModel, MeasuredArm
+from palpate_robot.backends.hardware import GravityModel
+from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, MeasuredLbr
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 
 
@@ -180,15 +181,15 @@ class Stream:
 
 
 @pytest.fixture
-def moving() -> tuple[MeasuredArm, Stream]:
-    arm, stream = MeasuredArm(), Stream()
+def moving() -> tuple[MeasuredLbr, Stream]:
+    arm, stream = MeasuredLbr(), Stream()
     for t in range(0, 100 * MS, 2 * MS):
         assert arm.update(t, stream.at(t, START + t))
     assert arm.v[0] == pytest.approx(0.5, rel=0.01)
     return arm, stream
 
 
-def test_a_controller_whose_clock_was_set_back_is_still_obeyed(moving: tuple[MeasuredArm, Stream]) -> None:
+def test_a_controller_whose_clock_was_set_back_is_still_obeyed(moving: tuple[MeasuredLbr, Stream]) -> None:
     arm, stream = moving
     assert arm.update(100 * MS, stream.at(100 * MS, START - 3_600_000_000_000))
     assert arm.received == 100 * MS
@@ -199,7 +200,7 @@ def test_a_controller_whose_clock_was_set_back_is_still_obeyed(moving: tuple[Mea
 
 
 @pytest.mark.parametrize("back", [0, 4 * MS, CLOCK_SET_NS - 99 * MS])
-def test_a_state_that_was_overtaken_is_passed_over(moving: tuple[MeasuredArm, Stream], back: int) -> None:
+def test_a_state_that_was_overtaken_is_passed_over(moving: tuple[MeasuredLbr, Stream], back: int) -> None:
     arm, stream = moving
     q = arm.q.copy()
     assert not arm.update(100 * MS, stream.at(100 * MS, START + 98 * MS - back))

@@ -11,8 +11,9 @@ from lbr_bench import MS
 
 from palpate_bus.messages import codec
 from palpate_models.robot import lbr
+from palpate_robot.backends.emulated import Metronome
 from palpate_robot.backends.lbr import port
-from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession, Metronome, main
+from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession, main
 from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
 PERIOD = 2 * MS

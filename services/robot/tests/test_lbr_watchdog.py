@@ -23,10 +23,11 @@ from palpate_conductor.collector import Collector
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input, seen
 from palpate_models.scenario.schema import RobotDriver
+from palpate_robot.backends.hardware import TAKE_OVER_NS
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
-from palpate_robot.backends.lbr.service import TAKE_OVER_NS
-from palpate_robot.backends.lbr.watchdog import TIMEOUT_NS, Watchdog
+from palpate_robot.backends.lbr.watchdog import lbr_watchdog
+from palpate_robot.backends.watchdog import TIMEOUT_NS, Watchdog
 
 PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
@@ -36,7 +37,7 @@ def dead_driver(watched: bool) -> Emulator:
     emulator = Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
-    watchdog = Watchdog()
+    watchdog = lbr_watchdog()
     for cycle in range(400):
         t = 2 * MS * cycle
         watchdog.state(t, emulator.state(1 + t))
@@ -59,7 +60,7 @@ def test_without_it_the_arm_goes_on_and_with_it_it_stands() -> None:
 
 
 def started() -> Watchdog:
-    watchdog = Watchdog()
+    watchdog = lbr_watchdog()
     emulator = Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
@@ -84,7 +85,7 @@ def test_the_old_driver_does_not_get_the_arm_back_a_new_one_does() -> None:
 
 
 def test_a_driver_that_died_before_the_watchdog_began_leaves_no_push() -> None:
-    watchdog, emulator = Watchdog(), Emulator(plant_input(load_scenario("clean")), Options())
+    watchdog, emulator = lbr_watchdog(), Emulator(plant_input(load_scenario("clean")), Options())
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     for t in range(0, TIMEOUT_NS + 3 * MS, 2 * MS):
@@ -101,7 +102,7 @@ def test_an_old_speed_is_not_damped() -> None:
 
 
 def test_before_anything_was_commanded_it_keeps_out() -> None:
-    assert Watchdog().decide(10 * TIMEOUT_NS) is None
+    assert lbr_watchdog().decide(10 * TIMEOUT_NS) is None
 
 
 @pytest.fixture

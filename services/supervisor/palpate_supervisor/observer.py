@@ -28,7 +28,7 @@ GAP_S: Final = 0.05
 class MomentumObserver:
     """External torques of any arm that pinocchio models, with n joints.
 
-    An arm without torque sensors gives its motor currents times the torque constants, less its friction model.
+    An arm without torque sensors could give its motor currents times the torque constants, less its friction model.
     """
 
     def __init__(self, model: pin.Model, frame: str) -> None:
@@ -53,4 +53,8 @@ class MomentumObserver:
         self._integral = self._integral + dt_s * ((torque + self._torque) / 2 + qd @ coriolis - gravity + self.residual)
         self._torque = torque
         self.residual = GAIN_PER_S * (momentum - self._integral)
-        self.J_W = pin.computeFrameJacobian(model, data, q, self._frame, _WORLD_AXES)[:3]
+        self.place(q)
+
+    def place(self, q: Array) -> None:
+        """Set the Jacobian alone, for an arm without torque sensors."""
+        self.J_W = pin.computeFrameJacobian(self._model, self._data, q, self._frame, _WORLD_AXES)[:3]

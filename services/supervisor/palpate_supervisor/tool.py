@@ -72,21 +72,26 @@ class ToolSense:
         pin.forwardKinematics(model, data, q)
         pin.updateFramePlacement(model, data, self._indenter)
         pin.updateFramePlacement(model, data, self._sensor)
-        self._observer.update(q, qd, torque, dt_s)
-        velocity_W = self._observer.J_W @ qd
+        force_S = wrench_S[:3] - self._R_SW @ self._weight_W
+        observed = self._observer
+        if len(torque):
+            observed.update(q, qd, torque, dt_s)
+            residual = observed.residual
+        else:  # an arm without joint torques has one sense: the F/T sensor takes the place of the other, and both agree
+            observed.place(q)
+            residual = observed.J_W.T @ self._R_SW.T @ force_S
+        velocity_W = observed.J_W @ qd
         before_W = velocity_W if self._velocity_W is None else self._velocity_W
         self._velocity_W = velocity_W
         speed = _norm(velocity_W)
-        force_S = wrench_S[:3] - self._R_SW @ self._weight_W
         self._moved = self._moved or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
         if not self._moved:
             self._rested += 1
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
         acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
         load_S = self._R_SW @ (self._weight_W - self._mass * acceleration_W)
-        observed = self._observer
         self.comparison = self._senses.compare(
-            measured, observed.residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, starting=not self._moved
+            measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, starting=not self._moved
         )
         ft = _norm(force_S - self._bias_S)
         return Tool(self._p_WI.copy(), speed, max(ft, self.comparison.joint_force), self.comparison.joint_force)

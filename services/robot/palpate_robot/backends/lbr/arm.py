@@ -2,69 +2,35 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
-import pinocchio as pin
 
-from palpate_bus.contract import contract
-from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import urdf
-from palpate_models.scenario.schema import Robot
+from palpate_robot.backends.hardware import STATE_AGE_NS, MeasuredArm
 from palpate_robot.backends.lbr.port import ClientCommandMode, ConnectionQuality, SafetyState, SessionState
 
 VELOCITY_LAG_S: Final = 0.004
 """Time constant of the low-pass on the differentiated position: LBRState carries no velocity. It keeps the encoder's steps
 (about 1e-5 rad) below 3 mrad/s at 500 Hz and costs the damping 4 ms."""
-STATE_AGE_NS: Final = contract().topics["joint_states"].max_age
 CLOCK_SET_NS: Final = 1_000_000_000
 """A stamp older than the newest by this much means that the controller's clock was set back; otherwise the state was
 overtaken."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarriedLoad:
-    """Gravity and sensor orientation at a posture."""
-
-    gravity: Array
-    """Gravity torques [N m], shape (7,)."""
-    up_S: Array
-    """World z axis in F/T sensor axes, shape (3,)."""
-
-
-class GravityModel:
-    """Evaluates gravity torques and the sensor's orientation."""
-
-    def __init__(self, robot: Robot) -> None:
-        self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
-        self._data = self._model.createData()
-        self._sensor = self._model.getFrameId("ft_sensor")
-
-    def at(self, q: Array) -> CarriedLoad:
-        """Return both at joint positions q [rad], shape (7,)."""
-        pin.forwardKinematics(self._model, self._data, q)
-        rotation = pin.updateFramePlacement(self._model, self._data, self._sensor).rotation
-        gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
-        return CarriedLoad(np.array(gravity), rotation[2].copy())
-
-
-class MeasuredArm:
+class MeasuredLbr(MeasuredArm):
     """Joint state from a stream of LBRState."""
 
     def __init__(self) -> None:
-        self.q = np.zeros(lbr.HOME.shape)
-        """Measured positions [rad], shape (7,)."""
-        self.v = np.zeros(lbr.HOME.shape)
-        """Velocities [rad/s], shape (7,), see `VELOCITY_LAG_S`."""
-        self.torque = np.zeros(lbr.HOME.shape)
-        """Measured joint torques, gravity included [N m], shape (7,)."""
+        super().__init__(len(lbr.HOME))
         self.session = SessionState.IDLE
-        self.received: int | None = None
-        """Arrival of the newest state [ns], None before the first."""
         self._stamp: int | None = None
         self._fault: str | None = "no LBRState received yet"
+
+    @property
+    def accepts(self) -> bool:
+        """True while the session commands."""
+        return self.session is SessionState.COMMANDING_ACTIVE
 
     def update(self, t: int, state: Any) -> bool:
         """Take a state received at `t` [ns]; returns True if it is new and usable.

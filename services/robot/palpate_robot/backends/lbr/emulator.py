@@ -22,51 +22,26 @@ and camera it also exchanges exact poses and contact wrenches on topics under `e
 from __future__ import annotations
 
 import argparse
-import gc
 import logging
-import signal
 import sys
 from collections import deque
 from dataclasses import dataclass
-from time import monotonic_ns, sleep, time_ns
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages import (
-    Point,
-    Pose,
-    Quaternion,
-    TFMessage,
-    ToolState,
-    Transform,
-    TransformStamped,
-    Twist,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-)
-from palpate_bus.messages.stamps import header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import link_names
-from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
-from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.backends.emulated import BRAKE_NMS, EmulatedArm, serve
+from palpate_robot.backends.hardware import WRENCH
 from palpate_robot.backends.lbr.port import (
-    CONTACT_TOPIC,
-    LINKS,
-    LINKS_TOPIC,
     STATE,
-    TOOL_STATE,
-    TOOL_TOPIC,
     TORQUE_COMMAND,
-    WRENCH,
     ClientCommandMode,
     ConnectionQuality,
     FriControlMode,
@@ -74,7 +49,6 @@ from palpate_robot.backends.lbr.port import (
     SafetyState,
     SessionState,
 )
-from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 
 PERIODS_MS: Final = range(1, 101)
 MONITORING_S: Final = 0.2
@@ -190,11 +164,6 @@ class FriSession:
 
 log = logging.getLogger("emulator")
 
-BRAKE: Final = np.full(7, 2000.0)
-"""Joint damping without commands [N m s/rad]: the arm's position control and brakes hold it."""
-CONTACT_AGE_NS: Final = 200_000_000
-"""Age above which a contact wrench is dropped: the tissue is lost."""
-
 
 @dataclass(frozen=True)
 class Options:
@@ -208,50 +177,36 @@ class Options:
     ft_topic: str = "ft_sensor/wrench"
 
 
-class Emulator:
+class Emulator(EmulatedArm):
     """Physics and session; call `cycle` once per send period. Time comes from the caller."""
 
     def __init__(self, known: PlantInput, options: Options) -> None:
         """Create the arm of a scenario, with its errors."""
-        drawn = draw_errors(known.errors, known.seed)
+        super().__init__(known, options.period_ms)
         self._options = options
-        self._plant = DartPlant(known.robot, drawn=drawn.arm)
-        streams = np.random.SeedSequence([known.seed, 0x4C4252]).spawn(4)
-        joints, ft, load, torque = (np.random.Generator(np.random.PCG64(stream)) for stream in streams)
-        self._ft = FtSensor(drawn.force, ft, options.period_ms * 1e-3)
-        self._joints = JointSensor(drawn.arm, joints, self._plant.q, self._plant.gravity_torque())
-        self._torque_sensors = TorqueSensors(known.robot, drawn.torque, torque)
-        self._link_torque: Array = self._plant.gravity_torque()
-        """Mean torque on the links in the last send period [N m]."""
-        self.session = FriSession(options.period_ms, self._joints.q.copy(), command_timeout_ms=options.command_timeout_ms)
-        self._radius, self._links = known.robot.indenter_radius_m, link_names(known.robot)
-        self._load_error = load.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
+        self.session = FriSession(options.period_ms, self.measured, command_timeout_ms=options.command_timeout_ms)
+        self._load_error = self._load_rng.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
         """Constant error of the arm's load data [N m]."""
-        self._applied = Drive(self._joints.q.copy(), np.zeros(7))
-        self.force_W, self.moment_W = np.zeros(3), np.zeros(3)
-        self.measured: Array = self._joints.q.copy()
+        self._applied = Drive(self.measured, np.zeros(7))
 
     def cycle(self, *, answered: bool = True) -> None:
         """Advance the arm by one send period under the newest command."""
-        plant, joints, options = self._plant, self._joints, self._options
-        self.measured, _ = joints.read()
+        self.measure()
+        plant, stiffness = self._plant, self._options.stiffness_nm
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
         active = self.session.state is SessionState.COMMANDING_ACTIVE
-        damping = 2 * 0.7 * np.sqrt(np.full(7, options.stiffness_nm)) if active else BRAKE
-        total = np.zeros(7)
-        for _ in range(options.period_ms):
-            spring = options.stiffness_nm * (drive.position - joints.q)
-            error = self._load_error if active else 0.0
-            torque = plant.gravity_torque() + drive.torque + spring + error
-            plant.step(torque, self.force_W, self.moment_W, damping)
-            joints.update(plant.q, plant.v, torque)
-            total += torque - plant.friction
-        self._link_torque = total / options.period_ms
+        damping = 2 * 0.7 * np.sqrt(np.full(7, stiffness)) if active else np.full(7, BRAKE_NMS)
+        error = self._load_error if active else np.zeros(7)
+
+        def torques() -> tuple[Array, Array]:
+            spring = stiffness * (drive.position - self._joints.q)
+            return plant.gravity_torque() + drive.torque + spring + error, damping
+
+        self.advance(torques)
 
     def state(self, now: int) -> Any:
         """Return LBRState at wall time `now` [ns]."""
         session, drive = self.session, self._applied
-        plant, readings = self._plant, self._options.period_ms
         ipo = self.measured if session.state >= SessionState.COMMANDING_WAIT else np.full(7, np.nan)
         return LBRState(
             sample_time=self._options.period_ms * 1e-3,
@@ -267,102 +222,35 @@ class Emulator:
             time_stamp_nano_sec=now % 1_000_000_000,
             measured_joint_position=self.measured,
             commanded_joint_position=drive.position,
-            measured_torque=self._torque_sensors.read(plant.q, plant.v, self._link_torque, readings),
+            measured_torque=self.read_torques(),
             commanded_torque=drive.torque,
             external_torque=np.zeros(7),
             ipo_joint_position=ipo,
             tracking_performance=1.0,
         )
 
-    def wrench(self, now: int) -> Any:
-        """Return the F/T reading."""
-        fx, fy, fz, mx, my, mz = self._ft.read(self._plant.sensor_wrench())
-        return WrenchStamped(header(now, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
 
-    def tool(self, now: int) -> Any:
-        """Return the exact palpation_msgs/ToolState."""
-        motion = self._plant.tool_motion().tolist()
-        pose = Pose(Point(*motion[:3]), Quaternion(*motion[3:7]))
-        return ToolState(header(now, "world"), pose, Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), self._radius)
-
-    def links(self, now: int) -> Any:
-        """Return the exact tf2_msgs/TFMessage of all links in world."""
-        found = []
-        for link, pose in zip(self._links, self._plant.link_poses().tolist(), strict=True):
-            transform = Transform(Vector3(*pose[:3]), Quaternion(*pose[3:]))
-            found.append(TransformStamped(header(now, "world"), link, transform))
-        return TFMessage(found)
-
-
-class Metronome:
-    """Due times and stamps of cycles. Time comes from the caller.
-
-    A real arm does not catch up: a late cycle delays all that follow, and its own clock advances one period per cycle.
-    """
-
-    def __init__(self, period: int, now: int, wall: int) -> None:
-        """Put the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns]."""
-        self._period = period
-        self._due = now + period
-        self._stamp = wall
-
-    def wait(self, now: int) -> int:
-        """Return the time until the next cycle [ns], 0 when it is due."""
-        return max(self._due - now, 0)
-
-    def begin(self, now: int) -> int:
-        """Begin a cycle; return its stamp [ns]."""
-        if now - self._due > self._period:
-            self._due = now
-        self._due += self._period
-        self._stamp += self._period
-        return self._stamp
-
-
-class Graph:
-    """The emulator's publishers and subscriptions."""
-
-    def __init__(self, node: RosNode, options: Options) -> None:
-        name = options.namespace
-        self.state = node.publisher(f"{name}/state", STATE)
-        self.wrench = node.publisher(options.ft_topic, WRENCH)
-        self.command = node.subscription(f"{name}/command/torque", TORQUE_COMMAND)
-        self.contact = node.subscription(CONTACT_TOPIC, WRENCH)
-        self.tool = node.publisher(TOOL_TOPIC, TOOL_STATE)
-        self.links = node.publisher(LINKS_TOPIC, LINKS)
-
-
-def serve(emulator: Emulator, graph: Graph, options: Options, running: list[bool]) -> None:
-    """Run cycles in wall-clock time while `running[0]`; after the session ends the arm stands and no state is published."""
-    metronome = Metronome(options.period_ms * 1_000_000, monotonic_ns(), time_ns())
-    contact_at = 0
-    cycles = 0
+def serve_graph(emulator: Emulator, node: RosNode, options: Options) -> None:
+    """Run in wall-clock time until a signal; after the session ends the arm stands and no state is published."""
+    states = node.publisher(f"{options.namespace}/state", STATE)
+    wrenches = node.publisher(options.ft_topic, WRENCH)
+    commands = node.subscription(f"{options.namespace}/command/torque", TORQUE_COMMAND)
     reported = ""
-    while running[0]:
-        sleep(metronome.wait(monotonic_ns()) / 1e9)
-        now = monotonic_ns()
-        stamp = metronome.begin(now)
-        contact = graph.contact.newest()
-        if contact is not None:
-            f, m = contact.wrench.force, contact.wrench.torque
-            emulator.force_W[:], emulator.moment_W[:] = (f.x, f.y, f.z), (m.x, m.y, m.z)
-            contact_at = now
-        elif now - contact_at > CONTACT_AGE_NS:
-            emulator.force_W[:] = emulator.moment_W[:] = 0.0
-        command = graph.command.newest()
+
+    def cycle(stamp: int) -> None:
+        nonlocal reported
+        command = commands.newest()
         if command is not None:
             emulator.session.take(np.array(command.joint_position), np.array(command.torque))
         emulator.cycle()
         if not emulator.session.ended:
-            graph.state.publish(emulator.state(stamp))
+            states.publish(emulator.state(stamp))
         elif reported != emulator.session.ended:
             reported = emulator.session.ended
             log.error("the session has ended: %s", reported)
-        graph.wrench.publish(emulator.wrench(stamp))
-        graph.tool.publish(emulator.tool(stamp))
-        if cycles % (50 // options.period_ms or 1) == 0:
-            graph.links.publish(emulator.links(stamp))
-        cycles += 1
+        wrenches.publish(emulator.wrench(stamp))
+
+    serve(emulator, node, cycle)
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -386,19 +274,8 @@ def main(arguments: list[str] | None = None) -> int:
     except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2
-    running = [True]
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        running[0] = False
-
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
     log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
-    gc.freeze()  # avoids garbage collections of 0.1 s
-    try:
-        serve(emulator, Graph(node, options), options, running)
-    finally:
-        node.close()
+    serve_graph(emulator, node, options)
     return 0
 
 

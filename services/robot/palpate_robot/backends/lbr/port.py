@@ -6,17 +6,15 @@ types are those of the ROS package, so that type hash and CDR are equal.
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
 from enum import IntEnum
 from typing import Any
 
 from rosbags.typesys import get_types_from_msg
 
 from palpate_bus.messages import codec
-from palpate_bus.wire.ros_node import RosNode
-from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import RobotDriver
+from palpate_robot.backends.hardware import ZenohArmPort
 
 _STATE = """\
 float64 sample_time
@@ -106,84 +104,16 @@ class FriControlMode(IntEnum):
     NO_CONTROL = 3
 
 
-WRENCH = "geometry_msgs/msg/WrenchStamped"
-TOOL_STATE = "palpation_msgs/msg/ToolState"
-LINKS = "tf2_msgs/msg/TFMessage"
-CONTACT_TOPIC, TOOL_TOPIC, LINKS_TOPIC = "emulator/contact_wrench", "emulator/tool_state", "emulator/link_poses"
+class ZenohPort(ZenohArmPort):
+    """Connection to the stack."""
 
-
-class LbrPort(ABC):
-    """The driver's connection to the arm."""
-
-    @abstractmethod
-    def states(self) -> list[Any]:
-        """Return LBRState messages since the last call, oldest first."""
-
-    @abstractmethod
-    def wrenches(self) -> list[Any]:
-        """Return WrenchStamped messages of the F/T sensor since the last call, oldest first."""
-
-    @abstractmethod
-    def command(self, q: Array, torque: Array) -> None:
-        """Send joint positions [rad] and torque overlay [N m], shapes (7,)."""
-
-    @abstractmethod
-    def rivals(self) -> list[bytes]:
-        """Return the GIDs of other senders of commands since the last call, oldest first."""
-
-    @abstractmethod
-    def contact(self, wrench: Any) -> None:
-        """Emulated: sends the tissue's wrench on the indenter."""
-
-    @abstractmethod
-    def physics(self) -> tuple[Any | None, Any | None]:
-        """Emulated: return new ToolState and link poses."""
-
-    @abstractmethod
-    def close(self) -> None:
-        """Disconnect from the ROS side."""
-
-
-class ZenohPort(LbrPort):
-    """Connection over zenoh, with the keys of rmw_zenoh."""
-
-    def __init__(self, connection: RobotDriver) -> None:
+    def __init__(self, given: RobotDriver) -> None:
         """Connect. Raises BusConfigError."""
-        name = (connection.namespace or NAMESPACE).strip("/")
-        self._node = RosNode("palpate_robot.backends.lbr", connection.domain, BusOptions(router=connection.router))
-        self._states = self._node.subscription(f"{name}/state", STATE)
-        self._wrenches = self._node.subscription(connection.ft_topic.strip("/"), WRENCH)
-        self._command = self._node.publisher(f"{name}/command/torque", TORQUE_COMMAND)
-        self._commands = self._node.subscription(f"{name}/command/torque", TORQUE_COMMAND)
-        if connection.emulated:
-            self._contact = self._node.publisher(CONTACT_TOPIC, WRENCH)
-            self._tool = self._node.subscription(TOOL_TOPIC, TOOL_STATE)
-            self._links = self._node.subscription(LINKS_TOPIC, LINKS)
+        name = (given.namespace or NAMESPACE).strip("/")
+        command = f"{name}/command/torque", TORQUE_COMMAND
+        ft_topic = given.ft_topic or "ft_sensor/wrench"
+        super().__init__("palpate_robot.backends.lbr", given, (f"{name}/state", STATE), command, ft_topic)
 
-    def states(self) -> list[Any]:
-        """Return LBRState messages since the last call, oldest first."""
-        return self._states.take()
-
-    def wrenches(self) -> list[Any]:
-        """Return WrenchStamped messages since the last call, oldest first."""
-        return self._wrenches.take()
-
-    def command(self, q: Array, torque: Array) -> None:
-        """Send both; the stack's torque controller also needs a joint position, see docs/real-robot.md on its stiffness."""
-        self._command.publish(LBRTorqueCommand(q, torque))
-
-    def rivals(self) -> list[bytes]:
-        """Return the GIDs of other senders; this process's own commands are left out."""
-        return self._commands.others(self._command.gid)
-
-    def contact(self, wrench: Any) -> None:
-        """Send the tissue's wrench to the emulator."""
-        self._contact.publish(wrench)
-
-    def physics(self) -> tuple[Any | None, Any | None]:
-        """Return new ToolState and link poses of the emulator."""
-        return self._tool.newest(), self._links.newest()
-
-    def close(self) -> None:
-        """Disconnect from the ROS side."""
-        self._node.close()
+    def command(self, q: Array, values: Array) -> None:
+        """Send both; the stack's torque controller also needs a joint position, see docs/real-lbr.md on its stiffness."""
+        self._command.publish(LBRTorqueCommand(q, values))

@@ -1,0 +1,442 @@
+"""A real arm behind a ROS 2 system in the role robot: its states and F/T readings in, commands out, with the rules of
+`palpate_robot.driver`.
+
+With an `InnerLoop` the control service runs in this process and is stepped on every state, so there is neither transport nor
+another timer between a joint state and its torque.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Final
+
+import numpy as np
+import pinocchio as pin
+
+from palpate_bus import implementations
+from palpate_bus.contract import contract
+from palpate_bus.messages import JointState, RobotStatus, String, Vector3, Wrench, WrenchStamped
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.service import Inbox, Outbox, Service
+from palpate_bus.wire.ros_node import RosNode
+from palpate_bus.wire.zenoh_config import BusOptions
+from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.robot.arm import arm_of, urdf
+from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.schema import ExamInput, Robot, RobotDriver, Scenario
+from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
+from palpate_robot.stop_requests import StopRequests
+
+JOINTS: Final = "joint_states"
+SETPOINT: Final = "planning/setpoint"
+STATE_AGE_NS: Final = contract().topics[JOINTS].max_age
+FT_AGE_NS: Final = contract().topics["ft/wrench"].max_age
+STATUS_PERIOD: Final = contract().topics["robot/status"].period
+LINKS_PERIOD: Final = contract().topics["sim/link_poses"].period
+TAKE_OVER_NS: Final = 100_000_000
+"""Time after the first command in which commands of others are tolerated: the watchdog sends until it sees the new driver."""
+WRENCH: Final = "geometry_msgs/msg/WrenchStamped"
+TOOL_STATE: Final = "palpation_msgs/msg/ToolState"
+LINKS: Final = "tf2_msgs/msg/TFMessage"
+CONTACT_TOPIC: Final = "emulator/contact_wrench"
+"""Topic of the tissue's wrench on the indenter of an emulated arm."""
+TOOL_TOPIC: Final = "emulator/tool_state"
+LINKS_TOPIC: Final = "emulator/link_poses"
+
+
+class MeasuredArm(ABC):
+    """Joint state from the arm's own messages."""
+
+    def __init__(self, joints: int) -> None:
+        self.q = np.zeros(joints)
+        """Measured positions [rad], shape (n,)."""
+        self.v = np.zeros(joints)
+        """Velocities [rad/s], shape (n,)."""
+        self.torque = np.zeros(joints)
+        """Measured joint torques, gravity included [N m], shape (n,), or (0,) if the arm has none."""
+        self.received: int | None = None
+        """Arrival of the newest state [ns], None before the first."""
+
+    @abstractmethod
+    def update(self, t: int, state: Any) -> bool:
+        """Take a state received at `t` [ns]; return True if it is new and usable."""
+
+    @property
+    def accepts(self) -> bool:
+        """True if the newest state is of an arm that accepts commands."""
+        return self.received is not None
+
+    @abstractmethod
+    def fault(self, t: int) -> str | None:
+        """Return None if the arm accepts commands at `t` [ns], else a message that says why not."""
+
+
+class ArmPort(ABC):
+    """The driver's connection to the arm."""
+
+    @abstractmethod
+    def states(self) -> list[Any]:
+        """Return the arm's states since the last call, oldest first."""
+
+    @abstractmethod
+    def wrenches(self) -> list[Any]:
+        """Return WrenchStamped messages of the F/T sensor since the last call, oldest first."""
+
+    @abstractmethod
+    def command(self, q: Array, values: Array) -> None:
+        """Send a command, at measured joint positions `q` [rad]; `values`, shape (n,), are torques [N m] or positions [rad]."""
+
+    @abstractmethod
+    def rivals(self) -> list[bytes]:
+        """Return the GIDs of other senders of commands since the last call, oldest first."""
+
+    @abstractmethod
+    def contact(self, wrench: Any) -> None:
+        """Emulated: sends the tissue's wrench on the indenter."""
+
+    @abstractmethod
+    def physics(self) -> tuple[Any | None, Any | None]:
+        """Emulated: return new ToolState and link poses."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Disconnect from the ROS side."""
+
+
+class ZenohArmPort(ArmPort):
+    """Connection over zenoh, with the keys of rmw_zenoh. Subclasses send the commands."""
+
+    def __init__(self, name: str, given: RobotDriver, state: tuple[str, str], command: tuple[str, str], ft_topic: str) -> None:
+        """Connect as node `name`; `state` and `command` are topics with their types. Raises BusConfigError."""
+        self._node = RosNode(name, given.domain, BusOptions(router=given.router))
+        self._states = self._node.subscription(*state)
+        self._wrenches = self._node.subscription(ft_topic.strip("/"), WRENCH)
+        self._command = self._node.publisher(*command)
+        self._commands = self._node.subscription(*command)
+        if given.emulated:
+            self._contact = self._node.publisher(CONTACT_TOPIC, WRENCH)
+            self._tool = self._node.subscription(TOOL_TOPIC, TOOL_STATE)
+            self._links = self._node.subscription(LINKS_TOPIC, LINKS)
+
+    def states(self) -> list[Any]:
+        """See `ArmPort.states`."""
+        return self._states.take()
+
+    def wrenches(self) -> list[Any]:
+        """See `ArmPort.wrenches`."""
+        return self._wrenches.take()
+
+    def rivals(self) -> list[bytes]:
+        """See `ArmPort.rivals`."""
+        return self._commands.others(self._command.gid)
+
+    def contact(self, wrench: Any) -> None:
+        """See `ArmPort.contact`."""
+        self._contact.publish(wrench)
+
+    def physics(self) -> tuple[Any | None, Any | None]:
+        """See `ArmPort.physics`."""
+        return self._tool.newest(), self._links.newest()
+
+    def close(self) -> None:
+        """See `ArmPort.close`."""
+        self._node.close()
+
+
+@dataclass(frozen=True, slots=True)
+class CarriedLoad:
+    """Gravity and sensor orientation at a posture."""
+
+    gravity: Array
+    """Gravity torques [N m], shape (n,)."""
+    up_S: Array
+    """World z axis in F/T sensor axes, shape (3,)."""
+
+
+class GravityModel:
+    """Evaluates gravity torques, the sensor's orientation and the torques of an external wrench."""
+
+    def __init__(self, robot: Robot) -> None:
+        self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
+        self._data = self._model.createData()
+        self._sensor, self._indenter = (self._model.getFrameId(name) for name in ("ft_sensor", "indenter"))
+
+    def at(self, q: Array) -> CarriedLoad:
+        """Return both at joint positions q [rad], shape (n,)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        rotation = pin.updateFramePlacement(self._model, self._data, self._sensor).rotation
+        gravity = pin.computeGeneralizedGravity(self._model, self._data, q)
+        return CarriedLoad(np.array(gravity), rotation[2].copy())
+
+    def external_torque(self, q: Array, wrench_W: Array) -> Array:
+        """Return the joint torques [N m], shape (n,), of a wrench on the indenter at its centre, world axes, shape (6,)."""
+        J_W = pin.computeFrameJacobian(self._model, self._data, q, self._indenter, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
+        return np.asarray(J_W.T @ wrench_W)
+
+    def tool_pose(self, q: Array) -> Array:
+        """Return X_WI of the indenter, shape (4, 4)."""
+        pin.forwardKinematics(self._model, self._data, q)
+        return np.array(pin.updateFramePlacement(self._model, self._data, self._indenter).homogeneous)
+
+
+class _Inbox:
+    """Inbox of control: joint states of `t` [ns] and the set-points since the previous state; all else from the bus."""
+
+    def __init__(self, t: int, joints: Message, setpoints: list[Message], bus: Inbox) -> None:
+        self._t, self._joints, self._bus = t, joints, bus
+        self._new = {JOINTS: [joints], SETPOINT: setpoints}
+
+    def latest(self, topic: str) -> Message | None:
+        return self._joints if topic == JOINTS else self._bus.latest(topic)
+
+    def new(self, topic: str) -> Iterable[Message]:
+        return self._new[topic] if topic in self._new else self._bus.new(topic)
+
+    def stamp(self, topic: str) -> int | None:
+        return self._t if topic == JOINTS else self._bus.stamp(topic)
+
+    def lost(self, role: str) -> bool:
+        return self._bus.lost(role)
+
+
+class InnerLoop:
+    """Steps a service of role control inside the driver."""
+
+    def __init__(self, control: Service) -> None:
+        self._control = control
+        self._setpoints: list[Message] = []
+
+    def collect(self, inbox: Inbox) -> None:
+        """Collect set-points; call it on every tick."""
+        self._setpoints.extend(inbox.new(SETPOINT))
+
+    def command(self, t: int, inbox: Inbox, joints: Message) -> Any | None:
+        """Return the torque command at `t` [ns] for these joint states."""
+        setpoints, self._setpoints = self._setpoints, []
+        return self._control.step(t, _Inbox(t, joints, setpoints, inbox))["control/joint_torque"]
+
+
+def load_control(scenario: Scenario) -> Service:
+    """Return the control service of the scenario. Raises PluginError if it does not exist."""
+    return implementations.create("control", scenario.services.control, scenario)
+
+
+class HardwareService(Service):
+    """A real arm in the role robot. Subclasses give its measurement, its port and its damping."""
+
+    role: ClassVar[str] = "robot"
+    catches_up: ClassVar[bool] = False
+    """A real arm has moved on: missed ticks are skipped."""
+
+    def __init__(
+        self,
+        exam: ExamInput,
+        port: ArmPort,
+        measured: MeasuredArm,
+        damping: Array,
+        *,
+        ft_sign: int,
+        inner: InnerLoop | None = None,
+    ) -> None:
+        """Create the driver of an arm.
+
+        Args:
+            exam: the scenario as the examination knows it.
+            port: connection to the arm.
+            measured: joint state from its messages.
+            damping: largest joint damping in a hold [N m s/rad], shape (n,); it acts some cycles late on a measured speed.
+            ft_sign: -1 if the sensor reports the wrench of the sensor on the tool.
+            inner: follows set-points in this process; without it `control/joint_torque` is applied.
+        """
+        arm, given = arm_of(exam.robot), exam.robot.driver
+        self._robot, self._names, n = exam.robot, list(arm.joint_names), arm.joints
+        self._port = port
+        self._inner = inner
+        self._arm = measured
+        self._damping = damping
+        self._model = GravityModel(exam.robot)
+        self._positions = exam.robot.level is CommandLevel.POSITION
+        self._driver = Driver(arm, exam.limits.force_emergency_n, positions=self._positions)
+        self._stop_requests = StopRequests(self._driver)
+        self._emulated = given.emulated
+        yaw = np.deg2rad(given.ft_yaw_deg)
+        turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
+        self._R_ST = ft_sign * turn
+        self._command: Command | None = None
+        self._command_message: Message | None = None
+        self._commanding_since: int | None = None
+        self._wrench = np.zeros(6)
+        self._wrench_at: int | None = None
+        self._tool: Message | None = None
+        self._links: Message | None = None
+        self._force, self._external_S = 0.0, np.zeros(3)
+        self._applied = np.zeros(n)
+        self._stopped: Array | None = None
+        """Positions at which an arm that takes positions stopped in a hold [rad]."""
+        self._sums, self._summed = np.zeros(6 + 2 * n + len(measured.torque)), 0
+        self._means = self._sums
+        self._states = self._commands = 0
+        self._peak_force = 0.0
+        self._peak_torque = np.zeros(n)
+
+    def start(self) -> Outbox:
+        """Publish the robot description."""
+        return {"robot_description": String(urdf(self._robot))}
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Run one tick: arm state, driver, command to the arm."""
+        outbox: dict[str, Message] = {}
+        fresh = self._receive(t)
+        self._stop_requests.apply(t, inbox)
+        if self._inner is not None:
+            self._inner.collect(inbox)
+        if self._arm.received is not None and t - self._arm.received <= STATE_AGE_NS:
+            joints = JointState(header(self._arm.received), self._names, self._arm.q, self._arm.v, self._applied.copy())
+            outbox[JOINTS] = joints  # on every tick: between two states the newest, with its stamp
+            if self._wrench_at is not None and t - self._wrench_at <= FT_AGE_NS:
+                outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
+            if fresh:
+                self._drive(t, inbox, joints)
+        if self._arm.received is not None:
+            self._check_connection(t)
+            # Damping of an old speed would be a constant push. Zero torque is sent once; then the watchdog takes over.
+            if self._driver.held and t - self._arm.received > STATE_AGE_NS and self._applied.any():
+                self._relax()
+        if not t % STATUS_PERIOD:
+            outbox["robot/status"] = self._status(t)
+        if self._emulated:
+            self._relay(t, inbox, outbox)
+        return outbox
+
+    def finish(self) -> Mapping[str, Any]:
+        """Return safe holds, counts, and the largest force and torques; leaves the arm without torque."""
+        if self._arm.received is not None and not self._positions:
+            self._relax()
+        driver = self._driver
+        self._port.close()
+        return {
+            "mode": driver.mode.name,
+            "holds": [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in driver.holds],
+            "commands_rejected": driver.rejected,
+            "peak_external_force_N": self._peak_force,
+            "peak_torque_nm": [round(float(x), 3) for x in self._peak_torque],
+            "states": self._states,
+            "commands": self._commands,
+            "level": str(self._robot.level),
+        }
+
+    def _relax(self) -> None:
+        self._applied = np.zeros_like(self._applied)
+        self._port.command(self._arm.q, self._applied)
+
+    def _receive(self, t: int) -> bool:
+        """Take messages of the ROS side; return True if the joint state is new."""
+        since = self._commanding_since
+        if self._port.rivals() and since is not None and t - since > TAKE_OVER_NS:
+            self._driver.hold(t, HoldCause.DEVICE, "another process (watchdog?) commands the arm")
+        fresh = False
+        for state in self._port.states():
+            fresh = self._arm.update(t, state) or fresh
+        for reading in self._port.wrenches():
+            force, torque = reading.wrench.force, reading.wrench.torque
+            values = np.array((force.x, force.y, force.z, torque.x, torque.y, torque.z))
+            if not np.isfinite(values).all():
+                self._driver.hold(t, HoldCause.DEVICE, f"F/T reading {values}: must be finite")
+                continue
+            self._wrench = self._corrected(values)
+            self._wrench_at = t
+        if fresh:
+            self._states += 1
+            self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque))
+            self._summed += 1
+        return fresh
+
+    def _corrected(self, reading: Array) -> Array:
+        """Return the wrench of tool and environment on the sensor in its axes, shape (6,)."""
+        return np.concatenate((self._R_ST @ reading[:3], self._R_ST @ reading[3:]))
+
+    def _check_connection(self, t: int) -> bool:
+        """Return True if the arm accepts commands and the F/T sensor is alive; else an active driver holds."""
+        fault = self._arm.fault(t)
+        if fault is None and (self._wrench_at is None or t - self._wrench_at > FT_AGE_NS):
+            fault = "no F/T reading" if self._wrench_at is None else f"no F/T reading for {(t - self._wrench_at) / 1e6:.0f} ms"
+        if fault is not None and self._driver.mode is DriverMode.ACTIVE:
+            self._driver.hold(t, HoldCause.DEVICE, fault)
+        return fault is None
+
+    def _drive(self, t: int, inbox: Inbox, joints: Message) -> None:
+        """Answer a new state with a command."""
+        arm = self._arm
+        load = self._model.at(arm.q)
+        weight = self._robot.tool_mass_kg * GRAVITY
+        self._external_S = self._wrench[:3] + weight * load.up_S
+        self._force = float(np.linalg.norm(self._external_S))
+        self._peak_force = max(self._peak_force, self._force)
+        command = self._newest_command(t, inbox, joints) if self._check_connection(t) else None
+        lost = inbox.lost("control") and self._inner is None
+        values = self._driver.update(t, arm.q, arm.v, load.gravity, self._force, command, lost=lost)
+        active = self._driver.mode is DriverMode.ACTIVE
+        if active:
+            self._stopped = None
+        elif self._positions:
+            if not self._driver.held:
+                return
+            self._stopped = values = arm.q if self._stopped is None else self._stopped  # stops, and stays
+        else:
+            values = -np.minimum(self._driver.damping(arm.v, load.gravity), self._damping) * arm.v
+        if not self._positions:
+            self._applied = np.asarray(values, dtype=float)
+            np.maximum(self._peak_torque, np.abs(self._applied), out=self._peak_torque)
+        self._send(t, values, load, active=active)
+
+    def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
+        """Send torques [N m] or positions [rad] at `t` [ns]; `active` if they are control's."""
+        self._port.command(self._arm.q, values)
+        self._commanding_since = t if self._commanding_since is None else self._commanding_since
+        self._commands += 1
+
+    def _newest_command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
+        message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
+        if message is not None and message is not self._command_message:
+            stamp = nanoseconds(message.header.stamp)
+            expires = stamp + nanoseconds(message.valid_for)
+            values = message.position if self._positions else message.torque
+            self._command = Command(np.array(values), stamp, expires, message.problem, message.culprit)
+            self._command_message = message
+        return self._command
+
+    def _status(self, t: int) -> Message:
+        driver, measured, n = self._driver, t, len(self._names)
+        if self._summed:
+            self._means = self._sums / self._summed
+            self._sums, self._summed = np.zeros_like(self._sums), 0
+        elif self._arm.received is not None:
+            measured = self._arm.received  # no new measurement
+        q, v, wrench, torque = np.split(self._means, (n, 2 * n, 2 * n + 6))
+        cause, reason, fault = driver.cause, driver.reason, self._arm.fault(t)
+        if not driver.held and fault is not None:
+            cause, reason = HoldCause.DEVICE, fault
+        return RobotStatus(
+            header(measured), int(driver.mode), int(cause), reason, q, v, _wrench(wrench),
+            self._applied.copy(), driver.rejected, driver.culprit, torque,
+        )  # fmt: skip
+
+    def _relay(self, t: int, inbox: Inbox, outbox: dict[str, Message]) -> None:
+        """Relay exact poses and contact wrenches between the emulator and the simulated tissue and camera."""
+        for contact in inbox.new("sim/contact_wrench"):
+            self._port.contact(contact)
+        tool, links = self._port.physics()
+        self._tool = self._tool if tool is None else tool
+        if self._tool is not None:
+            outbox["sim/tool_state"] = self._tool
+        self._links = self._links if links is None else links
+        if self._links is not None and not t % LINKS_PERIOD:
+            outbox["sim/link_poses"] = self._links
+
+
+def _wrench(values: Array) -> Message:
+    fx, fy, fz, mx, my, mz = values.tolist()
+    return Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz))

@@ -1,0 +1,131 @@
+"""The driver's connections to a ros2_control system: over zenoh, or to an emulator in this process and in its time."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from palpate_bus.contract import MS
+from palpate_bus.messages import codec
+from palpate_bus.messages.geometry import pose_message
+from palpate_bus.messages.stamps import header
+from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.robot.arm import FT_TO_INDENTER_M, arm_of
+from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.schema import Robot
+from palpate_robot.backends.hardware import ArmPort, ZenohArmPort
+from palpate_robot.backends.ros2_control.profile import Profile
+
+STATE = "sensor_msgs/msg/JointState"
+ARRAY = "std_msgs/msg/Float64MultiArray"
+POSE = "geometry_msgs/msg/PoseStamped"
+FLOAT, BOOL = "std_msgs/msg/Float64", "std_msgs/msg/Bool"
+
+
+class StackStatus(NamedTuple):
+    """Status of a stack besides its joint states; None where nothing new came."""
+
+    speed: float | None = None
+    """Execution speed, 1 for all of it."""
+    running: bool | None = None
+    """False while the arm takes no commands."""
+
+
+def tool_load(mass_kg: float, up_S: Array) -> Array:
+    """Return the wrench of a tool's weight on the F/T sensor, in its axes, shape (6,), with the mass half-way to the indenter."""
+    force = -mass_kg * GRAVITY * up_S
+    return np.concatenate((force, np.cross((0.0, 0.0, FT_TO_INDENTER_M / 2), force)))
+
+
+class Ros2Port(ArmPort):
+    """A port that also gives the status of the stack, and takes poses."""
+
+    def status(self) -> StackStatus:
+        """Return what is new since the last call."""
+        return StackStatus()
+
+    def pose(self, X_BF: Array) -> None:
+        """Send the desired pose of the flange in the arm's base, shape (4, 4), to a Cartesian controller of the stack."""
+        raise NotImplementedError
+
+
+def array_message(values: Array) -> Any:
+    """Return a std_msgs/Float64MultiArray as `ros2 topic pub` makes it."""
+    layout = codec.message_type("std_msgs/msg/MultiArrayLayout")
+    return codec.message_type(ARRAY)(layout(dim=[], data_offset=0), values)
+
+
+class ZenohRos2Port(ZenohArmPort, Ros2Port):
+    """Connection over zenoh, with the keys of rmw_zenoh."""
+
+    def __init__(self, robot: Robot, profile: Profile) -> None:
+        """Connect. Raises BusConfigError, and UserError if the profile has no controller of the arm's level."""
+        self._base = next(iter(arm_of(robot).link_names))
+        command = profile.commands(robot.level), POSE if robot.level is CommandLevel.SETPOINT else ARRAY
+        state = profile.topic(profile.joint_states), STATE
+        super().__init__("palpate_ros2_control", robot.driver, state, command, profile.topic(profile.ft_topic))
+        speed, running = profile.speed_scaling, profile.program_running
+        self._speed = None if speed is None else self._node.subscription(profile.topic(speed), FLOAT)
+        self._running = None if running is None else self._node.subscription(profile.topic(running), BOOL, latched=True)
+
+    def command(self, q: Array, values: Array) -> None:
+        """Send torques or positions, in the order of the arm's joints."""
+        self._command.publish(array_message(values))
+
+    def pose(self, X_BF: Array) -> None:
+        """See `Ros2Port.pose`."""
+        pose = pose_message(X_BF[:3, :3], X_BF[:3, 3])
+        self._command.publish(codec.message_type(POSE)(header(0, self._base), pose))
+
+    def status(self) -> StackStatus:
+        """See `Ros2Port.status`."""
+        speed = None if self._speed is None else self._speed.newest()
+        running = None if self._running is None else self._running.newest()
+        return StackStatus(None if speed is None else speed.data / 100, None if running is None else bool(running.data))
+
+
+class EmulatedPort(Ros2Port):
+    """An emulator in this process; `states` is called once a millisecond and cycles it when its period has passed."""
+
+    def __init__(self, emulator: Any) -> None:
+        """Take a `Ros2Emulator`."""
+        self.emulator = emulator
+        self._t = -MS
+        self._fresh = False
+
+    def states(self) -> list[Any]:
+        """See `ArmPort.states`."""
+        self._t += MS
+        self._fresh = not (self._t // MS) % self.emulator.period_ms
+        if not self._fresh:
+            return []
+        self.emulator.cycle(self._t)
+        return [self.emulator.state(self._t)] if self.emulator.rules.publishes else []
+
+    def wrenches(self) -> list[Any]:
+        """See `ArmPort.wrenches`."""
+        return [self.emulator.wrench(self._t)] if self._fresh else []
+
+    def command(self, q: Array, values: Array) -> None:
+        """See `ArmPort.command`."""
+        self.emulator.command = values
+
+    def rivals(self) -> list[bytes]:
+        """Return none."""
+        return []
+
+    def contact(self, wrench: Any) -> None:
+        """See `ArmPort.contact`."""
+        self.emulator.touch(wrench)
+
+    def physics(self) -> tuple[Any | None, Any | None]:
+        """See `ArmPort.physics`."""
+        return (self.emulator.tool(self._t), self.emulator.links(self._t)) if self._fresh else (None, None)
+
+    def status(self) -> StackStatus:
+        """See `Ros2Port.status`."""
+        return self.emulator.status()
+
+    def close(self) -> None:
+        """Do nothing."""

@@ -1,0 +1,136 @@
+"""The driver of an arm behind ros2_control: joint states in; joint torques, joint positions or a Cartesian pose out.
+
+The profile that `robot.driver.profile` names has topics and conventions of the stack. An arm that accepts commands without
+effect is an error, and so is a force that pulls the tool out at the first contact.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any, Final
+
+import numpy as np
+
+from palpate_bus.messages.geometry import rotation, vector
+from palpate_bus.service import Inbox, Outbox
+from palpate_bus.settings import Settings
+from palpate_bus.wire.zenoh_config import BusConfigError
+from palpate_models.numerics.frames import Array
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose
+from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.load import exam_input, plant_input
+from palpate_models.scenario.schema import ExamInput, Scenario
+from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
+from palpate_robot.backends.ros2_control.checks import TUNING, FirstContactCheck, FollowCheck
+from palpate_robot.backends.ros2_control.joints import MeasuredJoints
+from palpate_robot.backends.ros2_control.port import EmulatedPort, Ros2Port, ZenohRos2Port, tool_load
+from palpate_robot.backends.ros2_control.profile import Profile, profile_of
+from palpate_robot.driver import HoldCause
+
+DAMPING_SHARE: Final = 0.1
+"""Largest joint damping in a hold over that of the simulated driver [A]: it acts one to three cycles late."""
+_TOLERANCE: Final = {
+    CommandLevel.TORQUE: TUNING.torque_nm,
+    CommandLevel.POSITION: TUNING.position_rad,
+    CommandLevel.SETPOINT: TUNING.pose_m,
+}
+
+
+class Ros2ControlService(HardwareService):
+    """A real arm behind ros2_control in the role robot."""
+
+    _port: Ros2Port
+    _arm: MeasuredJoints
+
+    def __init__(self, exam: ExamInput, port: Ros2Port, profile: Profile) -> None:
+        """Drive the arm of `exam` on a port."""
+        arm = arm_of(exam.robot)
+        measured = MeasuredJoints(arm, effort_is_torque=profile.effort_is_torque)
+        super().__init__(exam, port, measured, DAMPING_SHARE * arm.hold_damping_nms, ft_sign=profile.ft_sign)
+        self._profile, self._level = profile, exam.robot.level
+        self._followed, self._first = FollowCheck(_TOLERANCE[self._level]), FirstContactCheck()
+        self._setpoint: Any | None = None
+        turned = base_pose(exam.robot)
+        if arm.R_BL is not None:
+            turned[:3, :3] = turned[:3, :3] @ arm.R_BL.T
+        self._X_BW = np.linalg.inv(turned)
+
+    def step(self, t: int, inbox: Inbox) -> Outbox:
+        """Run one tick, with the status of the stack."""
+        self._arm.report(self._port.status())
+        self._setpoint = inbox.latest(SETPOINT) if self._level is CommandLevel.SETPOINT else None
+        return super().step(t, inbox)
+
+    def finish(self) -> Mapping[str, Any]:
+        """Return what the base returns, and if the first contact was checked."""
+        return {**super().finish(), "first_contact_checked": self._first.passed}
+
+    def _corrected(self, reading: Array) -> Array:
+        wrench = super()._corrected(reading)
+        if self._profile.ft_weight:
+            return wrench
+        return wrench + tool_load(self._robot.tool_mass_kg, self._model.at(self._arm.q).up_S)
+
+    def _send(self, t: int, values: Array, load: CarriedLoad, *, active: bool) -> None:
+        if not active:
+            self._followed.reset()
+        elif fault := self._unexpected(t, values, load):
+            self._driver.hold(t, HoldCause.DEVICE, fault)
+            return  # the next state is answered by the hold
+        if self._level is CommandLevel.SETPOINT:
+            X_WI = self._model.tool_pose(self._arm.q)
+            if active and self._setpoint is not None:
+                X_WI = _pose(self._setpoint)
+            X_IF = np.eye(4)
+            X_IF[2, 3] = -FLANGE_TO_FT_M - FT_TO_INDENTER_M
+            self._port.pose(self._X_BW @ X_WI @ X_IF)
+            self._commands += 1
+        else:
+            super()._send(t, values, load, active=active)
+
+    def _unexpected(self, t: int, values: Array, load: CarriedLoad) -> str:
+        """Return a message if the arm does not follow or the first contact has the wrong sign, else an empty text."""
+        if self._first.wrong(t, self._external_S):
+            pull = f"{self._external_S[2]:+.1f} N along the tool"
+            return f"F/T: the force of the first contact pulls the tool out, {pull}: check robot.driver.ft_sign"
+        arm = self._arm
+        if self._level is CommandLevel.SETPOINT:
+            if self._setpoint is None:
+                return ""
+            command, measured, names = _pose(self._setpoint)[:3, 3], self._model.tool_pose(arm.q)[:3, 3], ["x", "y", "z"]
+            unit = "m"
+        elif self._level is CommandLevel.POSITION:
+            command, measured, names, unit = values, arm.q, self._names, "rad"
+        elif not self._profile.effort_is_torque:
+            return ""
+        else:
+            command, measured, names, unit = values, arm.torque - load.gravity, self._names, "N m"
+        stray = self._followed.stray(t, command, measured)
+        if stray is None:
+            return ""
+        asked, got = f"{command[stray]:.3f} {unit}", f"{measured[stray]:.3f} {unit}"
+        advice = "is the controller active, and does the arm accept commands?"
+        return f"{names[stray]} does not follow: commanded {asked}, measured {got} for {TUNING.window_s:g} s: {advice}"
+
+
+def _pose(setpoint: Any) -> Array:
+    X = np.eye(4)
+    X[:3, :3], X[:3, 3] = rotation(setpoint.pose.orientation), vector(setpoint.pose.position)
+    return X
+
+
+def create(scenario: Scenario) -> Ros2ControlService:
+    """Return the driver of a scenario, connected to the ROS side that `robot.driver` names; in lockstep to an emulator in this
+    process. Raises UserError.
+    """
+    exam = exam_input(scenario)
+    profile = profile_of(exam.robot)
+    if Settings.read().runtime == "wallclock":
+        return Ros2ControlService(exam, ZenohRos2Port(exam.robot, profile), profile)
+    if not exam.robot.driver.emulated:
+        raise BusConfigError(
+            "services.robot = ros2_control drives hardware: use --wallclock, or an emulated arm: robot.driver.emulated=true"
+        )
+    from palpate_robot.backends.ros2_control.emulator import Ros2Emulator  # noqa: PLC0415 - has the physics, which a driver lacks
+
+    return Ros2ControlService(exam, EmulatedPort(Ros2Emulator(plant_input(scenario), profile)), profile)
