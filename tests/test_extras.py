@@ -108,7 +108,7 @@ ON_DEMAND = {
     "palpate_fmu.reading.FmuError": "fmu",
     "palpate_fmu.reading.opened_fmu": "fmu",
     "palpate_models.robot.urdf_arm.load_arm": "run",
-    "palpate_robot.backends.ros2_control.emulator.Ros2Emulator": "run",
+    "palpate_robot.backends.ros2_control.emulator.EmulatedPort": "run",
     "palpate_robot.plant.Plant": "run",
 }
 """Imports of a single function, and the extra that its callers need."""

@@ -16,6 +16,7 @@ from typing import Any
 
 import numpy as np
 
+from palpate_bus.contract import MS
 from palpate_bus.messages import JointState, Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.wire.ros_node import RosNode
@@ -28,7 +29,7 @@ from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.emulated import EmulatedArm, serve
 from palpate_robot.backends.hardware import WRENCH, GravityModel
-from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, StackStatus, tool_load
+from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, Ros2Port, StackStatus, tool_load
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 from palpate_robot.backends.ros2_control.rules import RULES, Sensed
 from palpate_robot.position_loop import PositionLoop
@@ -95,6 +96,52 @@ class Ros2Emulator(EmulatedArm):
     def status(self) -> StackStatus:
         """Return the status that the stack reports."""
         return StackStatus(self.rules.settings.get("speed"), self.rules.program)
+
+
+class EmulatedPort(Ros2Port):
+    """An emulator in this process; `states` is called once a millisecond and cycles it when its period has passed."""
+
+    def __init__(self, known: PlantInput, profile: Profile) -> None:
+        """Create the emulator. Raises UserError."""
+        self.emulator = Ros2Emulator(known, profile)
+        self._t = -MS
+        self._fresh = False
+
+    def states(self) -> list[Any]:
+        """See `ArmPort.states`."""
+        self._t += MS
+        self._fresh = not (self._t // MS) % self.emulator.period_ms
+        if not self._fresh:
+            return []
+        self.emulator.cycle(self._t)
+        return [self.emulator.state(self._t)] if self.emulator.rules.publishes else []
+
+    def wrenches(self) -> list[Any]:
+        """See `ArmPort.wrenches`."""
+        return [self.emulator.wrench(self._t)] if self._fresh else []
+
+    def command(self, q: Array, values: Array) -> None:
+        """See `ArmPort.command`."""
+        self.emulator.command = values
+
+    def rivals(self) -> list[bytes]:
+        """Return none."""
+        return []
+
+    def contact(self, wrench: Any) -> None:
+        """See `ArmPort.contact`."""
+        self.emulator.touch(wrench)
+
+    def physics(self) -> tuple[Any | None, Any | None]:
+        """See `ArmPort.physics`."""
+        return (self.emulator.tool(self._t), self.emulator.links(self._t)) if self._fresh else (None, None)
+
+    def status(self) -> StackStatus:
+        """See `Ros2Port.status`."""
+        return self.emulator.status()
+
+    def close(self) -> None:
+        """Do nothing."""
 
 
 def _timed(text: str) -> tuple[float, str]:

@@ -1,4 +1,4 @@
-"""The driver's connections to a ros2_control system: over zenoh, or to an emulator in this process and in its time."""
+"""The driver's connection to a ros2_control system."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import codec
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header
@@ -83,49 +82,3 @@ class ZenohRos2Port(ZenohArmPort, Ros2Port):
         speed = None if self._speed is None else self._speed.newest()
         running = None if self._running is None else self._running.newest()
         return StackStatus(None if speed is None else speed.data / 100, None if running is None else bool(running.data))
-
-
-class EmulatedPort(Ros2Port):
-    """An emulator in this process; `states` is called once a millisecond and cycles it when its period has passed."""
-
-    def __init__(self, emulator: Any) -> None:
-        """Take a `Ros2Emulator`."""
-        self.emulator = emulator
-        self._t = -MS
-        self._fresh = False
-
-    def states(self) -> list[Any]:
-        """See `ArmPort.states`."""
-        self._t += MS
-        self._fresh = not (self._t // MS) % self.emulator.period_ms
-        if not self._fresh:
-            return []
-        self.emulator.cycle(self._t)
-        return [self.emulator.state(self._t)] if self.emulator.rules.publishes else []
-
-    def wrenches(self) -> list[Any]:
-        """See `ArmPort.wrenches`."""
-        return [self.emulator.wrench(self._t)] if self._fresh else []
-
-    def command(self, q: Array, values: Array) -> None:
-        """See `ArmPort.command`."""
-        self.emulator.command = values
-
-    def rivals(self) -> list[bytes]:
-        """Return none."""
-        return []
-
-    def contact(self, wrench: Any) -> None:
-        """See `ArmPort.contact`."""
-        self.emulator.touch(wrench)
-
-    def physics(self) -> tuple[Any | None, Any | None]:
-        """See `ArmPort.physics`."""
-        return (self.emulator.tool(self._t), self.emulator.links(self._t)) if self._fresh else (None, None)
-
-    def status(self) -> StackStatus:
-        """See `Ros2Port.status`."""
-        return self.emulator.status()
-
-    def close(self) -> None:
-        """Do nothing."""

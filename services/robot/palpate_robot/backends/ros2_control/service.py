@@ -23,7 +23,7 @@ from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_robot.backends.hardware import SETPOINT, CarriedLoad, HardwareService
 from palpate_robot.backends.ros2_control.checks import TUNING, FirstContactCheck, FollowCheck
 from palpate_robot.backends.ros2_control.joints import MeasuredJoints
-from palpate_robot.backends.ros2_control.port import EmulatedPort, Ros2Port, ZenohRos2Port, tool_load
+from palpate_robot.backends.ros2_control.port import Ros2Port, ZenohRos2Port, tool_load
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 from palpate_robot.driver import HoldCause
 
@@ -131,6 +131,6 @@ def create(scenario: Scenario) -> Ros2ControlService:
         raise BusConfigError(
             "services.robot = ros2_control drives hardware: use --wallclock, or an emulated arm: robot.driver.emulated=true"
         )
-    from palpate_robot.backends.ros2_control.emulator import Ros2Emulator  # noqa: PLC0415 - has the physics, which a driver lacks
+    from palpate_robot.backends.ros2_control.emulator import EmulatedPort  # noqa: PLC0415 - has the physics, which a driver lacks
 
-    return Ros2ControlService(exam, EmulatedPort(Ros2Emulator(plant_input(scenario), profile)), profile)
+    return Ros2ControlService(exam, EmulatedPort(plant_input(scenario), profile), profile)
