@@ -36,8 +36,11 @@ def serve(tree: str, answers: IO[str]) -> None:
     from palpate.run.composed import load_services  # noqa: PLC0415
     from palpate.run.roles import WORKERS  # noqa: PLC0415
     from palpate_bus.runtime.composed import Composed  # noqa: PLC0415
-    from palpate_bus.runtime.process import rare_collections  # noqa: PLC0415
 
+    try:
+        from palpate_bus.runtime.process import rare_collections  # noqa: PLC0415
+    except ModuleNotFoundError:  # checkouts that had it elsewhere
+        from palpate_bus.runtime.collection import rare_collections  # type: ignore  # noqa: PLC0415
     try:
         from palpate_models.scenario.load import load_scenario  # noqa: PLC0415
     except ModuleNotFoundError:  # checkouts before the package scenario
