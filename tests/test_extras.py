@@ -108,6 +108,7 @@ ON_DEMAND = {
     "palpate_fmu.reading.FmuError": "fmu",
     "palpate_fmu.reading.opened_fmu": "fmu",
     "palpate_models.robot.urdf_arm.load_arm": "run",
+    "palpate_models.robot.urdf_arm.read_arm": "run",
     "palpate_robot.backends.ros2_control.emulator.EmulatedPort": "run",
     "palpate_robot.plant.Plant": "run",
 }
