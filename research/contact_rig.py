@@ -18,6 +18,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import vector
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
@@ -28,18 +29,21 @@ from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.schema import Background, Phantom, Stiffness
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.arm_file import CommandLevel
-from palpate_models.scenario.errors import ArmErrors, Errors
+from palpate_models.scenario.errors import ArmErrors, DrawnArm, Errors
 from palpate_models.scenario.load import plant_input, true_pose
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint, joint_setpoint
 from palpate_planning.strokes.path import least_twist, pose
 from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.plant import Plant
 from palpate_robot.service import RobotService
 from palpate_tissue.backends.winkler.service import create as create_tissue
 
 Observe = Callable[[int, Mapping[str, Any]], None]
 """Called with the time [ns] and the outbox of each step."""
+Engine = Callable[[Robot, Array, DrawnArm], Plant]
+"""A plant at rest at some joint positions."""
 Script = Callable[[int], Mapping[str, Message]]
 """Messages that a topic without a producer is to bring at a time [ns]."""
 
@@ -188,6 +192,8 @@ class Ringing:
     """Force of the tissue on the indenter, along the vertical [N]."""
     held: bool
     """True if the driver went into its safe hold."""
+    path: Array
+    """Centre of the sphere in world [m], shape (n, 3)."""
 
     def _swing(self, start: float) -> float:
         part = self.force[(self.time >= start) & (self.time < start + WATCH_S)]
@@ -281,30 +287,31 @@ def start_posture(contrast: float = 1.0) -> Array:
 
 
 @cache
-def press(contrast: float, stiffness: float, delays: Delays, arm: str = DEFAULT_ARM) -> Ringing:
+def press(contrast: float, stiffness: float, delays: Delays, arm: str = DEFAULT_ARM, engine: Engine = DartPlant) -> Ringing:
     """Press a wall `contrast` times as stiff as the default, with a controller of `stiffness` [N/m] along the tool.
 
     Runs repeat exactly, so one that has been made is remembered.
     """
     chosen = scenario(contrast, arm)
-    time, force, modes = [], [], []
+    time, force, modes, path = [], [], [], []
 
     def see_wrench(t: int, outbox: Mapping[str, Any]) -> None:
         time.append(t / NS)
         force.append(outbox["sim/contact_wrench"].wrench.force.z)
 
-    def see_status(_: int, outbox: Mapping[str, Any]) -> None:
+    def see_robot(_: int, outbox: Mapping[str, Any]) -> None:
+        path.append(vector(outbox["sim/tool_state"].pose.position))
         if "robot/status" in outbox:
             modes.append(outbox["robot/status"].mode)
 
     script = _Script(contrast, stiffness, arm)
-    robot = RobotService(plant_input(chosen), lambda robot, *, drawn: DartPlant(robot, script.ready, drawn))
+    robot = RobotService(plant_input(chosen), lambda robot, *, drawn: engine(robot, script.ready, drawn))
     run = Composed(
         [
-            Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_status),
+            Delayed(robot, delays.on("control/joint_torque", "sim/contact_wrench"), see_robot),
             Delayed(deepcopy(_tissue(contrast)), delays.on("sim/tool_state"), see_wrench),
             Delayed(create_control(chosen), delays.on("joint_states", "robot/status"), script=script),
         ]
     )
     run.run(lambda: None, round(END_S * NS))
-    return Ringing(np.array(time), np.array(force), 2 in modes)
+    return Ringing(np.array(time), np.array(force), 2 in modes, np.array(path))
