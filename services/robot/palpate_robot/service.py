@@ -138,7 +138,11 @@ class RobotService(Service):
             joints.update(plant.q, plant.v, driven)
             self._driven.append(driven)
             self._friction.append(plant.friction)
-            self._applied = torque if self._loop is None and driver.mode is DriverMode.ACTIVE else torque - damping * joints.v
+            damped = -damping * joints.v
+            if self._loop is not None:
+                self._applied = torque + damped
+            else:
+                self._applied = torque if driver.mode is DriverMode.ACTIVE else damped
 
     def _act(self, values: Array, gravity: Array) -> tuple[Array, Array]:
         """Return torque without gravity [N m] and damping [N m s/rad] of a step, for the values that the driver applies."""
