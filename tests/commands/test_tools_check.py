@@ -126,7 +126,7 @@ FAULTS: dict[str, tuple[str, Callable[[Any], Any], str]] = {
     "control: torque sign": (
         "control/joint_torque",
         lambda m: replace(m, torque=-m.torque),
-        "mode CARTESIAN: the torques of stiffness times offset, J^T F",
+        "mode CARTESIAN: the torques of stiffness times offset, J^T F, or the positions of the pose",
     ),
     "camera: millimetres": ("camera/depth/image_raw", millimetres, "a level plane is where it is"),
     "perception: inward": ("perception/surface", lambda m: replace(m, normals=-m.normals), "with outward normals"),
