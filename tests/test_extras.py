@@ -60,6 +60,7 @@ NEEDS = {
     "palpate_robot.backends.lbr.emulator": "run",
     "palpate_robot.backends.ros2_control": "robot-lbr group",
     "palpate_robot.backends.ros2_control.emulator": "run",
+    "palpate_robot.backends.arm_port": "robot-lbr group",
     "palpate_robot.backends.emulated": "run",
     "palpate_robot.backends.hardware": "robot-lbr group",
     "palpate_robot.backends.watchdog": "robot-lbr group",

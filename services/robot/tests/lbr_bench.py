@@ -14,7 +14,8 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario.schema import Scenario
-from palpate_robot.backends.hardware import ArmPort, HardwareService, InnerLoop, load_control
+from palpate_robot.backends.arm_port import ArmPort
+from palpate_robot.backends.hardware import HardwareService, InnerLoop, load_control
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.service import lbr_service
 

@@ -37,8 +37,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
+from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import BRAKE_NMS, EmulatedArm, serve
-from palpate_robot.backends.hardware import WRENCH
 from palpate_robot.backends.lbr.port import (
     STATE,
     TORQUE_COMMAND,

@@ -14,7 +14,7 @@ from rosbags.typesys import get_types_from_msg
 from palpate_bus.messages import codec
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import RobotDriver
-from palpate_robot.backends.hardware import ZenohArmPort
+from palpate_robot.backends.arm_port import ZenohArmPort
 
 _STATE = """\
 float64 sample_time

@@ -11,7 +11,8 @@ from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_robot.backends.hardware import ArmPort, HardwareService, InnerLoop, load_control
+from palpate_robot.backends.arm_port import ArmPort
+from palpate_robot.backends.hardware import HardwareService, InnerLoop, load_control
 from palpate_robot.backends.lbr.arm import MeasuredLbr
 from palpate_robot.backends.lbr.port import ZenohPort
 

@@ -27,8 +27,9 @@ from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import PlantInput
+from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import EmulatedArm, serve
-from palpate_robot.backends.hardware import WRENCH, GravityModel
+from palpate_robot.backends.hardware import GravityModel
 from palpate_robot.backends.ros2_control.port import ARRAY, BOOL, FLOAT, STATE, Ros2Port, StackStatus, tool_load
 from palpate_robot.backends.ros2_control.profile import Profile, profile_of
 from palpate_robot.backends.ros2_control.rules import RULES, Sensed

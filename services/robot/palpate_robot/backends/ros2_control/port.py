@@ -13,7 +13,7 @@ from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import FT_TO_INDENTER_M, arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.hardware import ArmPort, ZenohArmPort
+from palpate_robot.backends.arm_port import ArmPort, ZenohArmPort
 from palpate_robot.backends.ros2_control.profile import Profile
 
 STATE = "sensor_msgs/msg/JointState"
