@@ -8,8 +8,6 @@ link to a file that the site does not have, such as source code, becomes plain t
 executed and become pages with their output.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

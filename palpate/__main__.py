@@ -4,8 +4,6 @@ If the environment lacks the values of `FIXED`, the interpreter is restarted wit
 during this time is kept until the command can report it.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import sys

@@ -4,8 +4,6 @@ The child is forked, so it has all that was imported and `work` may be any funct
 descriptor 1 too, goes to standard error.
 """
 
-from __future__ import annotations
-
 import ctypes
 import mmap
 import os

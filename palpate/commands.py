@@ -4,8 +4,6 @@ Only the module of the requested command is imported: `palpate stop` does not wa
 imports none of them: it reads their docstrings from the source.
 """
 
-from __future__ import annotations
-
 import ast
 import shutil
 import sys
@@ -35,9 +33,7 @@ GROUPS = {
         "resume": "palpate.live.operator:resume",
         "step": "palpate.live.operator:step",
     },
-    "Assess recordings of other robots": {
-        "assess": "palpate.recording.command:assess",
-    },
+    "Assess recordings of other robots": {"assess": "palpate.recording.command:assess"},
     "Look": {
         "dashboard": "palpate.live.dashboard:dashboard",
         "report": "palpate.report.command:report",

@@ -1,7 +1,5 @@
 """Console output, exit statuses, output options and progress bars of the `palpate` commands."""
 
-from __future__ import annotations
-
 import io
 import json
 import os

@@ -4,8 +4,6 @@ Results must not depend on how many threads a BLAS uses, nor on the kernels that
 seed. All of these are read when the interpreter and the libraries start.
 """
 
-from __future__ import annotations
-
 import os
 import platform
 from collections.abc import Iterator, Mapping

@@ -1,7 +1,5 @@
 """`exam/state` of an examination without planning: a quick one, touches in a program, a conformance check."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, Final
 

@@ -48,9 +48,7 @@ def build(
     only: Annotated[
         list[str] | None,
         typer.Option(
-            "--platform",
-            metavar="NAME",
-            help="Platform of a binary, such as x86_64-linux; may be repeated. By default all.",
+            "--platform", metavar="NAME", help="Platform of a binary, such as x86_64-linux; may be repeated. By default all."
         ),
     ] = None,
     settings: Annotated[

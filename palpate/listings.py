@@ -1,7 +1,5 @@
 """`palpate scenarios` and `palpate topics`: lists of scenarios and topics."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

@@ -1,7 +1,5 @@
 """`palpate keys`: certificates of the secure mode. `palpate router`: the router of a bus that spans containers or machines."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

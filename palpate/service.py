@@ -4,8 +4,6 @@ NAME_OR_FILE is an implementation or a user-defined file, see `palpate_bus.imple
 `services.ROLE` says which. The settings of the run are read from the environment, see `palpate_bus.settings`.
 """
 
-from __future__ import annotations
-
 import sys
 
 from palpate_bus.contract import contract

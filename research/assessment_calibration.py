@@ -11,8 +11,6 @@ new FOLDER. The parameters of contact mechanics (exponent, conversion, lead) are
 presses on the tissue.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path

@@ -5,8 +5,6 @@ posture of an examination, presses 10 mm deep and holds; at `NUDGE_S` the set-po
 long after that rings by itself.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy

@@ -1,7 +1,5 @@
 """DART's own soft bodies, the paper's kind, against our tissue with the same springs: force against depth, and cost."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Run: `python -m research.depth FOLDER... [--picture FILE.png]`, each FOLDER that of a `palpate run --record normal`.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass

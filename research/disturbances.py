@@ -7,8 +7,6 @@ unknown to the assessment. Prints a Markdown table: healthy patients with a find
 share of the area on which the map's 90 % band holds, mean and tenth percentile over patients.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable
 from dataclasses import dataclass, replace

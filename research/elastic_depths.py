@@ -4,8 +4,6 @@
 each depth.
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -3,8 +3,6 @@
 It takes a fraction of a second a person, so that thousands can be had.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -6,8 +6,6 @@ names or message types left every number unchanged. It reads the MCAP file of a 
 `exam.spacing_m=0.02`, `camera.frames=10`; all runs with `--composed`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import hashlib
 import re

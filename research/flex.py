@@ -4,8 +4,6 @@ A flex is a solid: vertices fill the block, elasticity is Saint Venant-Kirchhoff
 modulus E* of the half-space that our wall stands for, with a Poisson ratio at which linear tetrahedra do not lock.
 """
 
-from __future__ import annotations
-
 import time
 from dataclasses import dataclass
 

@@ -3,8 +3,6 @@
 Run: `python -m research.following [SECONDS]`; prints the README's table.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, field
 from time import thread_time

@@ -8,8 +8,6 @@ ones of a logistic regression with three outcomes, lump, muscle, neither, of wei
 each patient is kept in FOLDER: cases that are there are not made again, and a changed assessment needs a new FOLDER.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path

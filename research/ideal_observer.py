@@ -9,8 +9,6 @@ assessment uses the greatest logit of its candidates. Both are compared by the a
 95 % interval (Hanley and McNeil 1982), and by the lumps found where each gives 2 % of the healthy patients a finding (Wilson).
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import replace
 from typing import Final

@@ -8,8 +8,6 @@ many cases the sender's port refuses, the longest time until then, and the other
 reactions of the arm to the lie are not in it.
 """
 
-from __future__ import annotations
-
 import sys
 from collections import defaultdict
 from dataclasses import replace

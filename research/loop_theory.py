@@ -14,8 +14,6 @@ Left out: dry friction, which damps small motion, so a quiet contact can outlive
 limit on the torque's rate; and contact that is lost.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -3,8 +3,6 @@
 Run: `palpate study moved --runs -o FOLDER`, then `python -m research.moved FOLDER/runs/*`.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path

@@ -4,8 +4,6 @@ Their test is simulated on the surface tier for a grid of wall lengths and stiff
 shifts the depth. A place is fitted by interpolation; `palpate validate --only people` simulates each fit.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Callable
 from pathlib import Path
@@ -28,15 +26,7 @@ MOST_OFFSET_M = 0.002
 USUAL_LENGTH_M = 0.015
 LENGTH_WEIGHT = 0.05
 """A force over depth says little of the wall length, so it is drawn to the usual one: by ln 2 costs as much as 3.5 % RMS."""
-COLUMNS = (
-    "region",
-    "id",
-    *WallParameters._fields,
-    "zero_offset_m",
-    "rms_percent",
-    "activated_ratio",
-    "tension",
-)
+COLUMNS = ("region", "id", *WallParameters._fields, "zero_offset_m", "rms_percent", "activated_ratio", "tension")
 """Columns of `fitted.csv`."""
 
 Simulated = Callable[[float, float], Array]

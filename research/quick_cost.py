@@ -4,8 +4,6 @@ Processor time: of quick cases in this process with one thread, after a warm-up,
 composed run by the command line in its own process, start and report included.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import resource
@@ -28,12 +26,7 @@ ONE_THREAD: Final = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1"}
 def quick_cost(name: str, seed: int) -> dict[str, float]:
     """Processor time of the parts of a quick case, and its simulated time [s]."""
     case = run_quick(load_scenario(name, (), seed))
-    return {
-        "simulated": case.report.sim_time_s,
-        "simulate": case.simulate_s,
-        "assess": case.assess_s,
-        "score": case.score_s,
-    }
+    return {"simulated": case.report.sim_time_s, "simulate": case.simulate_s, "assess": case.assess_s, "score": case.score_s}
 
 
 def composed_cost(name: str, seed: int) -> dict[str, float]:

@@ -6,8 +6,6 @@ drawn, as in studies. Figures of studies are compared as the mean over cases of 
 figure when its 90 % interval lies within the margin (two one-sided t tests of 5 %).
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass

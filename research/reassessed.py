@@ -9,8 +9,6 @@ the interval of the mean by bootstrap over patients; and how many of the matched
 band.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Sequence
 from copy import copy

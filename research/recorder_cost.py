@@ -3,8 +3,6 @@
 python -m research.recorder_cost [SIMULATED SECONDS]
 """
 
-from __future__ import annotations
-
 import sys
 import tempfile
 from pathlib import Path

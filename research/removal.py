@@ -6,8 +6,6 @@ rosbags encodes and decodes a message type. Each slot is compared with the mean 
 the thread, so neither the phase of the examination nor other work on the machine counts.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from argparse import ArgumentParser
@@ -40,11 +38,7 @@ MODULES: dict[str, tuple[str, ...]] = {
     "arm's kinematics": ("palpate_robot.kinematics",),
     "tissue's step": ("palpate_tissue.backends.winkler.tissue", "palpate_tissue.contact"),
     "rest point's triangles": ("palpate_tissue.surface",),
-    "path and its splines": (
-        "palpate_planning.strokes.path",
-        "palpate_planning.strokes.path",
-        "palpate_planning.wall.surface",
-    ),
+    "path and its splines": ("palpate_planning.strokes.path", "palpate_planning.strokes.path", "palpate_planning.wall.surface"),
     "perceived surface": ("palpate_planning.wall.surface", "palpate_planning.wall.surface"),
     "nearest vertex": ("palpate_models.numerics.vectors",),
 }

@@ -3,8 +3,6 @@
 `python -m research.scans [SEEDS]` prints the results of the assessment on many phantoms.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -176,16 +174,7 @@ def scan(
     return Scan(scenario, surface, states)
 
 
-def _state(
-    t: float,
-    p: Array,
-    n: Array,
-    depth: float,
-    force: float,
-    steady: bool,
-    X_WA: Array,
-    stroke: int,
-) -> Any:
+def _state(t: float, p: Array, n: Array, depth: float, force: float, steady: bool, X_WA: Array, stroke: int) -> Any:
     p_W = apply(X_WA, p[None])[0]
     n_W = X_WA[:3, :3] @ n
     return ExamState(

@@ -4,8 +4,6 @@ Run: `python -m research.senses FOLDER...`, each FOLDER that of a `palpate run -
 run again over `robot/status`. A lie changes the recorded reading from a moment on: the examination itself does not react to it.
 """
 
-from __future__ import annotations
-
 import argparse
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path

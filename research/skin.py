@@ -3,8 +3,6 @@
 Run: `python -m research.skin FOLDER [--picture FILE.png]`, FOLDER that of a `palpate run --record normal`.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
 from pathlib import Path

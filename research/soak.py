@@ -7,8 +7,6 @@ python -m research.soak draw FOLDER [FOLDER ...] --out soak.png
 second it writes memory and open files of every process to soak.csv; soak.json has the growth of each role's peak memory.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """Delay margins of the contact of robot, tissue and controller: measured, and by linear theory."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from matplotlib.figure import Figure

@@ -5,8 +5,6 @@
 The examinations are equal to the bit, so that processor time compares them; the time they take depends on other load.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import subprocess

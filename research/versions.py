@@ -8,8 +8,6 @@ that load on the machine affects all alike. The cost of a turn is the processor 
 is the mean of the middle half of its turns; the interval holds 95 % of 1000 resamplings of the turns.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

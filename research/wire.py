@@ -4,8 +4,6 @@ Round trips of a joint state (300 B) and one way of a depth image (640 x 480 flo
 settings of a run: raw zenoh, ours (`Publisher`, `Subscription`), and ours over a secure router.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

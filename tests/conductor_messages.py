@@ -1,7 +1,5 @@
 """Synthetic messages of a small examination: a lesion, a finding 4 mm away, a flat abdomen."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

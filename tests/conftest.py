@@ -1,7 +1,5 @@
 """Makes the helpers of these tests importable, and shares examinations between tests."""
 
-from __future__ import annotations
-
 import signal
 import sys
 from pathlib import Path

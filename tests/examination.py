@@ -1,7 +1,5 @@
 """Short examinations through the command that users run, and one whose process is killed."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

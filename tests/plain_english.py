@@ -4,8 +4,6 @@ codespell rejects single words (.codespell-house-words.txt); this script rejects
 cannot express.
 """
 
-from __future__ import annotations
-
 import ast
 import io
 import re

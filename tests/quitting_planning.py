@@ -1,7 +1,5 @@
 """Planning that aborts the examination after a second, for `palpate run --service planning=FILE`."""
 
-from __future__ import annotations
-
 import dataclasses
 from typing import Any
 

@@ -1,7 +1,5 @@
 """A short examination through the command, in real processes, and its results."""
 
-from __future__ import annotations
-
 import csv
 from pathlib import Path
 

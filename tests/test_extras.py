@@ -1,7 +1,5 @@
 """Extras and dependency groups of pyproject.toml name exactly the libraries that their modules import."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess

@@ -1,7 +1,5 @@
 """The tissue as an FMU against the native tissue: the same numbers over a path."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Services and files that exit, crash, hang or print: none takes the command or its output with it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

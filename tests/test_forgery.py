@@ -1,7 +1,5 @@
 """A forged sender is distinguished from a lost service, and has no effect if the run has a key."""
 
-from __future__ import annotations
-
 import socket
 import subprocess
 import sys

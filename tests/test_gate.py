@@ -4,8 +4,6 @@ The world is clean: a patient who lies still, and equipment whose only error is 
 tissue around it, to take minutes. Tests that share no examination are in test_gate_alone.py, for the other worker.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """The rest of the gate (test_gate.py): a healthy patient, and a service killed in contact."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from examination import SHORT, assert_held_and_no_harder, kill_in_contact, palpate_run

@@ -1,7 +1,5 @@
 """The wheel, installed without a checkout: without extras it is bus and contract, with [run] it examines an abdomen."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

@@ -1,7 +1,5 @@
 """`import palpate`: its examples, its patients and assessments, and its examinations."""
 
-from __future__ import annotations
-
 import doctest
 import subprocess
 import sys

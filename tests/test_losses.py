@@ -1,7 +1,5 @@
 """A process of an examination is killed or frozen while the indenter is in contact."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The pages: commands, links, examples, tutorials and generated reference."""
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re

@@ -1,7 +1,5 @@
 """The camera sees the patient breathe and move: by way of the tissue's surface, as it is at that moment."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """An examination that is stopped and released, or interrupted and resumed."""
 
-from __future__ import annotations
-
 import csv
 import signal
 import subprocess

@@ -1,7 +1,5 @@
 """The runtimes against each other and against faults: toy services in real processes over zenoh, placed in any way."""
 
-from __future__ import annotations
-
 import signal
 import tempfile
 import time

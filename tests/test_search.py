@@ -1,7 +1,5 @@
 """Searches on simulated patients, and their Gymnasium environment."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import gymnasium

@@ -4,8 +4,6 @@ Run as a program it prints the table of docs/faults.md, or writes it there:
 `python tests/test_supervisor_reaction.py --docs FILE`.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import sys
 from collections.abc import Callable

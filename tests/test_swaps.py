@@ -1,7 +1,5 @@
 """Short examinations with other services, placements, security and roles that join."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

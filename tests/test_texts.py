@@ -1,7 +1,5 @@
 """Texts in messages are for people: an examination in which every text is another one is the same examination."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter, defaultdict
 from dataclasses import replace

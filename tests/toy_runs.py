@@ -1,7 +1,5 @@
 """Runs of the toy services in real processes over zenoh, placed on processes in any way."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Encoding and decoding of a joint state and a depth image: our codec and that of rosbags."""
 
-from __future__ import annotations
-
 import random
 from typing import Any
 

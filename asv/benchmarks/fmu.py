@@ -1,7 +1,5 @@
 """A step of the abdomen's FMU: through FMPy, and through the prepared ctypes calls that the tissue service uses."""
 
-from __future__ import annotations
-
 import tempfile
 from pathlib import Path
 

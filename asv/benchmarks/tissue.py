@@ -1,7 +1,5 @@
 """A step of the tissue: an indenter of 15 mm radius slides at 30 mm/s and 10 mm depth."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 

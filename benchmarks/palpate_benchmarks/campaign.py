@@ -5,8 +5,6 @@ messages that are sent only before contact are injected during the camera burst.
 its delay, the peak true force, and the outcome of the run. Delays are wall times with a resolution of 20 ms.
 """
 
-from __future__ import annotations
-
 import signal
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace

@@ -1,7 +1,5 @@
 """Cases of the fault campaign and their findings: kinds of faults, outcomes, and the CSV file of the findings."""
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Sequence
 from dataclasses import dataclass, fields

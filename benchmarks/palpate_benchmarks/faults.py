@@ -1,7 +1,5 @@
 """`palpate faults`: runs the fault campaign and shows its findings in the terminal and on docs/faults.md."""
 
-from __future__ import annotations
-
 import tempfile
 from collections import Counter
 from collections.abc import Sequence
@@ -21,16 +19,7 @@ MODES = ("lockstep", "wallclock")
 WIDTH = 200
 """Least width of the table in characters."""
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
-SUMMARY = (
-    "mode",
-    "fault",
-    "cases",
-    "passed",
-    "detected",
-    "after: median, longest [ms]",
-    "largest force [N]",
-    "outcomes",
-)
+SUMMARY = ("mode", "fault", "cases", "passed", "detected", "after: median, longest [ms]", "largest force [N]", "outcomes")
 
 
 def faults(  # noqa: PLR0913 - the options of a command

@@ -17,8 +17,6 @@ messages, 0 for all. `palpate faults` starts its processes in this way.
 | `jump` | the wall clock of this process is an hour ahead; the topic is `clock` |
 """
 
-from __future__ import annotations
-
 import signal
 import sys
 from collections.abc import Callable, Sequence

@@ -6,8 +6,6 @@ itself complete on less than its twin felt, and the liar was named, or did no ha
 (`UNDETECTABLE`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import cycle

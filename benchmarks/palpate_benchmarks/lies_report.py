@@ -1,7 +1,5 @@
 """The campaign of lies on one screen: a matrix of topics and lies, and a table by kind of lie."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Sequence
 from enum import StrEnum

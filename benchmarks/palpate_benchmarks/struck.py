@@ -7,8 +7,6 @@ prints a line when the indenter has slid at depth for SECONDS of simulated time.
 the outcome. Forces and reactions are read from the recording, or, if the fault hit the recorder, from the conductor's messages.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

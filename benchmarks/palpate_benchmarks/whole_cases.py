@@ -3,8 +3,6 @@
 There is a fixed list of cases, and random ones: a seed determines roles, kind and time in contact.
 """
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

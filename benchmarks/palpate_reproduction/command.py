@@ -1,7 +1,5 @@
 """`palpate reproduce`: figures and claims of the seed paper from new runs, compared with the paper."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Annotated

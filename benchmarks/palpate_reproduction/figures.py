@@ -1,7 +1,5 @@
 """Figures of docs/reproduction.md: 3, 5, 6, 7 and 8 of the paper, from our runs. Each function writes one PNG."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The page docs/reproduction.md from finished runs: figures, comparison of the ways to cover, and the paper's limits."""
 
-from __future__ import annotations
-
 import json
 import os
 from collections.abc import Callable, Sequence

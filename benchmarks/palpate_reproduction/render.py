@@ -1,7 +1,5 @@
 """Rendering of a scene without a display: ray casting, smooth normals, one lamp with its shadow."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from ctypes import CDLL, RTLD_GLOBAL
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Scene of a recorded run at a given time: robot, table and deformed abdomen as bodies to draw."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Validation of breathing: rate, shape and irregularity measured on the curve, and the mode over the body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Validation of lumps below the skin: both tiers against axisymmetric finite elements."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

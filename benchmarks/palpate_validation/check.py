@@ -1,7 +1,5 @@
 """Result of a comparison: checks with bounds, a figure in the common style, and the data of both."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path

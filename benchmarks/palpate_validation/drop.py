@@ -8,8 +8,6 @@ figure is stiffer and less damped, as in DART; stiffness is chosen for the 1 mm,
     draw(figure, measure())
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

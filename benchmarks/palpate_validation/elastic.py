@@ -1,7 +1,5 @@
 """Validation of the elastic tier against Hertz and Sneddon: paraboloids and spheres pressed into a flat half-space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Validation of passivity: no closed cycle of pressing, sliding and lifting extracts work from the tissue."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from itertools import pairwise
 

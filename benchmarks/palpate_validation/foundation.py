@@ -5,8 +5,6 @@
 A mesh of the tissue must converge to it for any k_w(r) and G(r), so it is a reference for lumps and for the flat surface.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

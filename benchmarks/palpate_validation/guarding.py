@@ -1,7 +1,5 @@
 """Validation of guarding: its effect on the force of the standard press and of the strokes of an examination."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass, replace
 

@@ -1,7 +1,5 @@
 """Validation of the surface tier against Hertz: the range in which a Winkler-Pasternak wall behaves as a half-space."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Validation of lumps: the tissue against the continuum of its own equations, and the design's force ratios (`DESIGN`)."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

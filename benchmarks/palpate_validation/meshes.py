@@ -1,7 +1,5 @@
 """Validation of the surface tier's numerics: convergence with the mesh, and superposition where the tissue is linear."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Validation with living people: the measurement of Remus et al. simulated on the flat surface tier."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cache

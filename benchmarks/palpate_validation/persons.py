@@ -1,7 +1,5 @@
 """Three sampled persons: maps of the force of a press, and the shape of the body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Check of the sampler of persons: the statistics of their forces against those of the living people of Remus et al."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

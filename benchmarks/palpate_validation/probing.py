@@ -1,7 +1,5 @@
 """Probing of a tissue: a sphere is held below a flat surface until equilibrium."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

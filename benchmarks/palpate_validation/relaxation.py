@@ -1,7 +1,5 @@
 """Validation of relaxation: the Prony series estimated from the force of a held contact."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Results of a validation as a table, as JSON, as figures and as a Markdown page."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path

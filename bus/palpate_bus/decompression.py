@@ -1,7 +1,5 @@
 """Decompresses chunks of recordings within `chunk_mb`, for mcap and rosbags: both believe any size that a file states."""
 
-from __future__ import annotations
-
 from bz2 import BZ2Decompressor
 from typing import Any
 

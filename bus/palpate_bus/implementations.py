@@ -3,8 +3,6 @@
 A choice is the name of an entry point in the group `palpate.<role>`, or the path of a Python file. Functions raise PluginError.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Readers of recordings: a run's folder, a rosbag2 folder with one or more MCAP files, or a single MCAP file."""
 
-from __future__ import annotations
-
 import heapq
 import re
 import shlex

@@ -7,8 +7,6 @@
 The settings of the run are read from the environment, see `palpate_bus.settings`.
 """
 
-from __future__ import annotations
-
 import logging
 import os
 import signal

@@ -11,8 +11,6 @@
 A service uses no socket, thread or wall clock. The contract defines the topics it reads and writes and its period.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, ClassVar, Protocol

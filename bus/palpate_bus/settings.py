@@ -7,8 +7,6 @@
 No other module reads PALPATE_ variables. The scenario, not the settings, says what is examined and how.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 import types
@@ -67,8 +65,7 @@ class Settings(BaseSettings):
         default=(), description="Endpoints to listen on, separated by commas, such as `tcp/127.0.0.1:7501`."
     )
     connect: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(),
-        description="Endpoints of peers, separated by commas. A peer that does not answer yet is tried again.",
+        default=(), description="Endpoints of peers, separated by commas. A peer that does not answer yet is tried again."
     )
     router: str | None = Field(
         default=None,
@@ -79,8 +76,7 @@ class Settings(BaseSettings):
         description="A `client` sends everything through the router: in secure mode, or behind address translation.",
     )
     lowlatency: bool = Field(
-        default=False,
-        description="Offer zenoh's low-latency transport. `palpate run` sets it; no effect in wall-clock mode.",
+        default=False, description="Offer zenoh's low-latency transport. `palpate run` sets it; no effect in wall-clock mode."
     )
     shared_memory: bool = Field(
         default=True, description="Send messages over 3 KiB to processes on the same host by shared memory."
@@ -98,8 +94,7 @@ class Settings(BaseSettings):
         default=None, description="Tags on messages (default: on). Off, an operator's release and end still need one."
     )
     zenoh_config: Path | None = Field(
-        default=None,
-        description="A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect.",
+        default=None, description="A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect."
     )
     domain: int = Field(default=0, ge=0, le=DOMAIN_MAX, validation_alias="ROS_DOMAIN_ID", description="ROS domain.")
     runtime: Literal["lockstep", "wallclock"] = Field(
@@ -142,8 +137,7 @@ class Settings(BaseSettings):
         default=120.0, gt=0, description="Lockstep: time [s] that a foreign service may take to load and to initialise."
     )
     runs: Path | None = Field(
-        default=None,
-        description="Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`.",
+        default=None, description="Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`."
     )
     compose: Annotated[tuple[Path, ...], NoDecode] = Field(
         default=(), description="Compose file of `palpate run` and its overrides, separated by colons."

@@ -3,8 +3,6 @@
 A choice is the name of an entry point in the group `palpate.<kind>`, or the path of a Python file that defines the function.
 """
 
-from __future__ import annotations
-
 import ast
 import re
 import sys

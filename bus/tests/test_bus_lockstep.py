@@ -62,10 +62,7 @@ def test_a_repeated_message_is_an_error() -> None:
         joints.accept(1, b"")
 
 
-@given(
-    counts=st.lists(st.integers(0, 3), min_size=1, max_size=12),
-    order=st.randoms(use_true_random=False),
-)
+@given(counts=st.lists(st.integers(0, 3), min_size=1, max_size=12), order=st.randoms(use_true_random=False))
 def test_event_topics_read_the_same_whatever_order_data_and_advances_arrive_in(counts: list[int], order: random.Random) -> None:
     period = 100 * MS
     sent = [(tick * period, sequence) for tick, count in enumerate(counts) for sequence in range(count)]

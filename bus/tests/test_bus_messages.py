@@ -1,7 +1,5 @@
 """Messages to arrays and back: geometry, depth images, set-points."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

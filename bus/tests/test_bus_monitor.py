@@ -1,7 +1,5 @@
 """Tests of the monitor: each fault is reported with topic, sender, expected and received value within a second of bus time."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any

@@ -1,7 +1,5 @@
 """Tests of the recorder's process and its chunks."""
 
-from __future__ import annotations
-
 import json
 import signal
 from collections import deque

@@ -1,7 +1,5 @@
 """Recordings of other writers: what is read, what is ignored, and what is refused in one line."""
 
-from __future__ import annotations
-
 import sqlite3
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Parts of the runtimes: failures, latencies, priorities."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Subscriptions and authentication tags."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Iterator
 from dataclasses import dataclass

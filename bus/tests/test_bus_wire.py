@@ -1,7 +1,5 @@
 """rmw_zenoh's wire format: keys, attachments, liveliness tokens."""
 
-from __future__ import annotations
-
 import struct
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Tests of the detection of a lost conductor, with a clock that the test sets."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass, field
 from typing import Any

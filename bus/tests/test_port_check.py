@@ -1,7 +1,5 @@
 """The check at the ports: what breaks the contract is refused and named, where it is sent and where it is received."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Callable
 from typing import Any
@@ -60,11 +58,7 @@ LIES: dict[str, tuple[str, Callable[[Any], Any], tuple[str, ...]]] = {
     "one joint is NaN": ("joint_states", lambda m: joints(m, "velocity", NAN), ("velocity = nan", "-4..4 [rad/s]")),
     "one joint is infinite": ("joint_states", lambda m: joints(m, "effort", INF), ("effort = inf", "-200..200 [N m]")),
     "one joint is in degrees": ("joint_states", lambda m: joints(m, "position", 90.0), ("position = 90", "deg")),
-    "another frame": (
-        "ft/wrench",
-        lambda m: dataclasses.replace(m, header=header(0, "moon")),
-        ("'moon'", "ft_sensor"),
-    ),
+    "another frame": ("ft/wrench", lambda m: dataclasses.replace(m, header=header(0, "moon")), ("'moon'", "ft_sensor")),
     "another type": ("ft/wrench", lambda _: Vector3(0.0, 0.0, 0.0), ("geometry_msgs/msg/WrenchStamped",)),
     "a field without a range": ("sim/tool_state", lambda m: _turned(m, NAN), ("pose.orientation.y = nan", "finite")),
     "a quaternion of another length": ("sim/tool_state", lambda m: _turned(m, 0.5), ("with norm 1.118", "a norm of 1")),

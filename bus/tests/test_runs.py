@@ -1,7 +1,5 @@
 """Announced runs: their folder, and joining their bus."""
 
-from __future__ import annotations
-
 import fcntl
 import os
 import subprocess

@@ -3,8 +3,6 @@
 Run as a program it is the process of one role, or of several: `python toy_services.py ROLE[,ROLE ...]`.
 """
 
-from __future__ import annotations
-
 import ctypes
 import os
 import signal

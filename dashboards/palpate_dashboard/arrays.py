@@ -1,7 +1,5 @@
 """Converts messages to arrays for drawing."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

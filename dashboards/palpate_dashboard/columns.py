@@ -1,7 +1,5 @@
 """Batches rows of a recording and sends them as columns: one call for many rows keeps drawing cheap."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Mesh geometry for drawing: vertex normals, shading, and transfer of values between meshes."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Viewer layout: large scene, maps and depth image below it, text and plots to its right."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 

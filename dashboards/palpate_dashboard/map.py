@@ -1,7 +1,5 @@
 """The stiffness map from above, in the abdomen frame A: mean and uncertainty, findings, true outlines, legend."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Colour scales of the maps, and the colour of each drawn item."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

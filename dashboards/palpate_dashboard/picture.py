@@ -4,8 +4,6 @@ palpate dashboard DIR --picture docs/images/dashboard.png --at 105
 palpate dashboard DIR --film docs/images/examination.gif
 """
 
-from __future__ import annotations
-
 import io
 import shutil
 from collections.abc import Callable, Iterator

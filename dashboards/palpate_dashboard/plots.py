@@ -4,8 +4,6 @@ Force over depth is drawn in a 2-D view, because rerun's plots only have time on
 its y is minus force [N] times `STRETCH`: image axes point down.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from itertools import cycle
 from typing import Final

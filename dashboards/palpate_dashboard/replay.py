@@ -5,8 +5,6 @@ python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd fro
 `follow` draws a live run: its past from the recording, then live messages. It is a separate node; no service waits for it.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence

@@ -1,7 +1,5 @@
 """The 3-D scene in world: table, robot, camera, abdomen, perception, plan, contact. Arrays in, rerun entities out."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Mapping
 from typing import Final, NamedTuple
 

@@ -3,8 +3,6 @@
 It sends nothing, so it cannot change a run. Late messages are skipped.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import cache

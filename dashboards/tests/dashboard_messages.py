@@ -1,7 +1,5 @@
 """A short plausible run, as messages: the arm moves, a dome is pressed, a map grows, a finding is made."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Any
 
@@ -88,11 +86,7 @@ def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
         position = position + rotation.apply(lbr.JOINT_ORIGIN[i])
         rotation = rotation * Rotation.from_rotvec(np.array(lbr.JOINT_AXIS[i]) * joints[i])
         poses[f"lbr_link_{i + 1}"] = (position, rotation)
-    for link, step in (
-        ("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M),
-        ("ft_sensor", FLANGE_TO_FT_M),
-        ("indenter", FT_TO_INDENTER_M),
-    ):
+    for link, step in (("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M), ("ft_sensor", FLANGE_TO_FT_M), ("indenter", FT_TO_INDENTER_M)):
         position = position + rotation.apply((0.0, 0.0, step))
         poses[link] = (position, rotation)
     return poses
@@ -181,8 +175,7 @@ def look(t: int) -> Messages:
             "",
         ),
         "planning/path": Path(
-            header(t, "world"),
-            [PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets],
+            header(t, "world"), [PoseStamped(header(t, "world"), pose(p + np.array((0, 0, 0.02)))) for p in targets]
         ),
     }
 

@@ -1,7 +1,5 @@
 """A run that is served live, looked at in a headless browser: the scene is really drawn, for a viewer that joins late."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """`palpate dashboard`: what it shows when it is given what; a recording that is still written; a run that is joined late."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

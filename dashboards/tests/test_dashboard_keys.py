@@ -1,7 +1,5 @@
 """Geometry, texts and keys of the dashboard."""
 
-from __future__ import annotations
-
 import json
 import os
 import pty

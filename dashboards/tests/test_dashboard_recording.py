@@ -1,7 +1,5 @@
 """The recording, read back from its file: what is in it, how much, and when."""
 
-from __future__ import annotations
-
 from collections import defaultdict
 from collections.abc import Iterable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """docs/reference/commands.md, from the commands."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Iterator
 from inspect import cleandoc

@@ -1,7 +1,5 @@
 """docs/errors.md, from the fields in `errors.py` and the table in `error_levels.yaml`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from typing import Final
 

@@ -1,7 +1,5 @@
 """docs/reference/messages.md, from the .msg files of palpation_msgs."""
 
-from __future__ import annotations
-
 from generate.tables import table
 from palpate_bus.messages.typestore import palpation_definitions
 

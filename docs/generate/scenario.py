@@ -1,7 +1,5 @@
 """docs/scenario.md, from the fields of a scenario."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Iterator
 from textwrap import fill

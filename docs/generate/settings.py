@@ -1,7 +1,5 @@
 """docs/settings.md, from the settings of a process."""
 
-from __future__ import annotations
-
 from generate.tables import table
 from palpate_bus.settings import COMPOSE_VARIABLES, Settings, allowed, text, variable
 

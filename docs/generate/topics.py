@@ -1,7 +1,5 @@
 """docs/topics.md, from the contract."""
 
-from __future__ import annotations
-
 from collections.abc import Container, Iterable
 
 from generate.tables import table
@@ -51,10 +49,7 @@ def _milliseconds(topic: Topic) -> str:
 
 def _dataflow(rules: Contract) -> str:
     """Return a mermaid diagram of the data flow between services, without observers."""
-    lines = [
-        "## Dataflow\n",
-        "Thick arrows: same tick. Thin arrows: one period late. Dotted arrows: no service waits for them.",
-    ]
+    lines = ["## Dataflow\n", "Thick arrows: same tick. Thin arrows: one period late. Dotted arrows: no service waits for them."]
     lines += [
         "The recorder and the dashboard read every topic that they may read and are not drawn.\n",
         "```mermaid",

@@ -1,7 +1,5 @@
 """Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
-from __future__ import annotations
-
 from typing import Annotated, Final
 
 from pydantic import BaseModel, ConfigDict, Field

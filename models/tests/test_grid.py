@@ -1,7 +1,5 @@
 """Bodies from grid files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Description of the robot: frames, limits, inertias, collision and visual meshes."""
 
-from __future__ import annotations
-
 from xml.etree import ElementTree
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compiled functions, the nearest vertex and the cache of computed arrays."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Breathing, body motion and guarding of a patient: curves, seeds and settings."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from pydantic import ValidationError
@@ -131,8 +129,7 @@ def test_a_still_patient_does_not_breathe():
 
 
 @pytest.mark.parametrize(
-    "fields",
-    [{"kind": "loud"}, {"peak_to_peak_m": 8}, {"rate_per_min": 0}, {"cough_m": (0.02, 0.01)}, {"amplitude_m": 0.004}],
+    "fields", [{"kind": "loud"}, {"peak_to_peak_m": 8}, {"rate_per_min": 0}, {"cough_m": (0.02, 0.01)}, {"amplitude_m": 0.004}]
 )
 def test_bad_settings_are_refused_by_name(fields):
     with pytest.raises(ValidationError, match=next(iter(fields))):

@@ -1,7 +1,5 @@
 """Persons: drawn from the seed alone, whole, of the bodies and walls that their builds have."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -112,8 +110,7 @@ def test_the_wall_does_not_depend_on_the_mesh() -> None:
 
 def test_over_the_belly_the_wall_varies_as_asked() -> None:
     anatomy = Anatomy(
-        muscles=Muscles(linea_alba=1.1, rectus=1.2),
-        variation=Variation(stiffness=0.2, stiffening_per_m=20.0, correlation=-0.5),
+        muscles=Muscles(linea_alba=1.1, rectus=1.2), variation=Variation(stiffness=0.2, stiffening_per_m=20.0, correlation=-0.5)
     )
     points = belly(SIZE, anatomy)
     deviations, correlations = [], []

@@ -1,7 +1,5 @@
 """Surface and stiffness of the phantom, and buried lumps as felt at the skin."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given

@@ -1,7 +1,5 @@
 """Meshes of users: what is taken, what is refused, and in which words."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import trimesh

@@ -1,7 +1,5 @@
 """Scenarios: files, settings, error levels and scan patterns; wrong input is named."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -37,10 +35,7 @@ def test_what_is_written_out_is_read_back(name: str, tmp_path: Path) -> None:
     ("text", "words"),
     [
         ("exam: {depth_m: deep}", r"mine\.yaml, line 1: exam\.depth_m = 'deep': .*number"),
-        (
-            "seed: 1\nexam:\n  depht_m: 0.01\n",
-            r"mine\.yaml, line 3: exam\.depht_m = 0\.01: there is no .*mean depth_m\?",
-        ),
+        ("seed: 1\nexam:\n  depht_m: 0.01\n", r"mine\.yaml, line 3: exam\.depht_m = 0\.01: there is no .*mean depth_m\?"),
         ("exam: {pattern: zigzag}", r"exam\.pattern = 'zigzag': .*lines, raster, snake"),
         ("phantom: {lesions: [{contrast: 4}]}", r"phantom\.lesions\.0 = .*centre_m"),
         ("seed: 1\nexam: 3\n", r"mine\.yaml, line 2: exam = 3: .*section"),

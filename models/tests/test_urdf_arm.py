@@ -1,7 +1,5 @@
 """Arms from a URDF: the tables agree with pinocchio, and what is broken is named with its link or joint."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The stiffening wall, and the measured curves that it reproduces."""
 
-from __future__ import annotations
-
 from hashlib import sha256
 
 import numpy as np

@@ -4,8 +4,6 @@ The targets cover the examined region of the abdomen and a border around it, in 
 approach and retreat, other patients and registration errors.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -28,11 +26,7 @@ CLEARANCE_M = 0.05
 """Between base and table [A]."""
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
 """Least and largest x, y and height [m] and yaw [rad] of the base."""
-STARTS: tuple[tuple[float, float, float, float], ...] = (
-    (0.0, 0.0, 0.6, 0.0),
-    (0.0, 0.0, 1.1, 0.0),
-    (0.0, 0.1, 1.1, 0.0),
-)
+STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))
 """Placements to start from; the best result counts, as the problem is not convex."""
 MEAN_WEIGHT = 0.3
 """Weight of the mean cost next to the worst target's."""

@@ -1,7 +1,5 @@
 """`palpate check ROLE`: the conformance kit for an implementation of a role."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

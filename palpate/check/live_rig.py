@@ -4,8 +4,6 @@ The protocol is that of a wall-clock run: hello on every edge until the implemen
 start, a control message at least every half second, and the end.
 """
 
-from __future__ import annotations
-
 import gc
 from dataclasses import dataclass
 from time import monotonic, sleep, time_ns

@@ -1,7 +1,5 @@
 """Runs the conformance suite of a role, in this process or on a bus, with a progress bar, and prints the result."""
 
-from __future__ import annotations
-
 import os
 import shlex
 import subprocess

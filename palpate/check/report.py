@@ -1,7 +1,5 @@
 """Results of a conformance check."""
 
-from __future__ import annotations
-
 from dataclasses import asdict, dataclass, field
 from enum import StrEnum
 from typing import Any

@@ -4,8 +4,6 @@
 a bus, in wall-clock mode. The same suites run on both.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableSequence
 from dataclasses import dataclass

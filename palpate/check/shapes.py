@@ -1,7 +1,5 @@
 """Surfaces for the suites: a smooth belly, which is a paraboloid in the abdomen frame, and a level square in world."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`palpate compare`."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

@@ -1,7 +1,5 @@
 """Two palpations of one body, map against map, at the places where the second one was measured."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Final

@@ -1,7 +1,5 @@
 """The figure of a comparison: both maps, and their differences after Bland and Altman."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

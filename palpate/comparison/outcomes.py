@@ -7,8 +7,6 @@ SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S 
 (Angelopoulos, Duchi and Zrnic, PPI++, arXiv 2311.01453).
 """
 
-from __future__ import annotations
-
 import csv
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Readers of the bus and of text: messages, attachments, keys, tokens, chunks, options, scenarios, settings."""
 
-from __future__ import annotations
-
 import random
 import struct
 from collections.abc import Callable, Iterator

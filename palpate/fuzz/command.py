@@ -1,7 +1,5 @@
 """`palpate fuzz`."""
 
-from __future__ import annotations
-
 from typing import Annotated
 
 import typer

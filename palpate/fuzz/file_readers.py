@@ -1,7 +1,5 @@
 """Readers of files: each target writes its input to the working folder, which is a temporary one, and reads it."""
 
-from __future__ import annotations
-
 import io
 import json
 import random

@@ -8,8 +8,6 @@ Each target runs in a child process with bounded memory and a temporary working 
 elsewhere is a find, and so is the end of the process.
 """
 
-from __future__ import annotations
-
 import os
 import random
 import resource

@@ -1,7 +1,5 @@
 """Fuzz targets: a reader, and valid inputs to mutate."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Whole examinations for the library: `palpate run` in its own process, and its results as arrays, tables and pictures."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

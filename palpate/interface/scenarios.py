@@ -1,7 +1,5 @@
 """Scenarios for the library: by name or file, with settings as keywords."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Studies for the library: many randomly drawn patients by any method, and their tables."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path

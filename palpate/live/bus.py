@@ -1,7 +1,5 @@
 """Options that select a live bus, and the connection to it."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager

@@ -1,7 +1,5 @@
 """`palpate doctor`: checks a live bus and names the cause of what is wrong."""
 
-from __future__ import annotations
-
 import os
 import platform
 from dataclasses import asdict, dataclass, field

@@ -1,7 +1,5 @@
 """Topics and nodes of a live bus, from its liveliness tokens; `palpate node list`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from time import monotonic

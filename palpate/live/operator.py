@@ -1,7 +1,5 @@
 """`palpate stop`, `release`, `pause`, `resume`, `step`: control of a run from another terminal."""
 
-from __future__ import annotations
-
 from time import monotonic, sleep
 from typing import Annotated
 
@@ -48,10 +46,7 @@ def resume(run: ChosenRun = None) -> None:
     _request("resume", "palpate resume", run)
 
 
-def step(
-    ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1,
-    run: ChosenRun = None,
-) -> None:
+def step(ms: Annotated[int, typer.Argument(min=1, max=500, help="Simulated milliseconds.")] = 1, run: ChosenRun = None) -> None:
     """Advance a paused run by some milliseconds."""
     _request("step", "palpate step", run, ms=ms)
 

@@ -1,7 +1,5 @@
 """`palpate topic list|info|echo|hz|bw`: topics on a live bus."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager

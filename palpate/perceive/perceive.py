@@ -1,7 +1,5 @@
 """The perceived surface of a depth recording: the perception pipeline on all its images."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """`palpate plan`."""
 
-from __future__ import annotations
-
 import math
 from collections import Counter
 from pathlib import Path

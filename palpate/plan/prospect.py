@@ -1,7 +1,5 @@
 """The plan of an examination on the true surface: strokes, touches, skipped targets, duration."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """One quick case: an examination without an arm as messages, the assessment service, and the scores of whole examinations."""
 
-from __future__ import annotations
-
 import gc
 import hashlib
 from collections.abc import Iterable, Iterator, Sequence

@@ -5,8 +5,6 @@ of arm, camera and force sensor are drawn from those of whole examinations (`pal
 makes exam/state, perception/surface and truth/indentation from the rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass

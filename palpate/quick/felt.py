@@ -4,8 +4,6 @@ The force at a place follows from stiffness and stiffening of the wall there (`f
 of the indenter on a Winkler-Pasternak foundation. It takes half a second per person.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -10,8 +10,6 @@ breathes, guards and moves as in the scenario; earlier presses have lasting effe
 `exam.breathing` says.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -5,8 +5,6 @@ second one with a lump, seeds from 0, with typical errors and quiet breathing. E
 whose setting is not among the runs.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from collections import defaultdict

@@ -1,7 +1,5 @@
 """A recording through the assessment, as messages of a run: one way from evidence to map, findings and report."""
 
-from __future__ import annotations
-
 from itertools import chain
 from pathlib import Path
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """Leaves out rows that cannot be right, and counts them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 

@@ -1,7 +1,5 @@
 """`palpate assess`: a recording of any robot becomes a map, findings and a report."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 

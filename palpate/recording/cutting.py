@@ -1,7 +1,5 @@
 """Cuts readings into contacts: by force and noise over time, by number in a table of probes; finds where each one begins."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise

@@ -1,7 +1,5 @@
 """Faults of a recording: codes, counts and what was done; the text is made here and nowhere else."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import StrEnum
 

@@ -1,7 +1,5 @@
 """Proposes a mapping from the data: what is sure, what is not, and a picture."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
 from pathlib import Path

@@ -4,8 +4,6 @@ Each press has its force F_D and exponent n_i by non-linear least squares, with 
 the body: median and spread of the exponents that presses have of their own, less what noise adds to the spread (empirical Bayes).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

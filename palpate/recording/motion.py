@@ -4,8 +4,6 @@ In contact the force follows the motion along one axis, dF = -k n (n . dp); in f
 the sensor's range or on the stiffness of the body.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Final

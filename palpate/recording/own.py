@@ -1,7 +1,5 @@
 """The results of a run of Palpate as a recording."""
 
-from __future__ import annotations
-
 from operator import attrgetter
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Contacts of a table of probes, which has no time."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

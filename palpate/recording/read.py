@@ -1,7 +1,5 @@
 """Files to a `Recording`: reads, cleans, aligns, tares, cuts, finds the skin, and says what was wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """A recording of palpation, by any robot, as contacts with a body."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property

@@ -1,7 +1,5 @@
 """Contacts of a recording over time: aligned, tared, cut, and measured from the skin where they begin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import Final

@@ -1,7 +1,5 @@
 """Checks contacts against each other and against their own uncertainty."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -1,7 +1,5 @@
 """`palpate replay`. Imports on use, so that its help is fast."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated
 
@@ -25,8 +23,7 @@ def replay(  # noqa: PLR0913 - the options of a command
     tolerance: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="X|TOPIC:FIELD=X",
-            help="Allowed difference: part of each field's range (1e-06), or in a field's unit.",
+            metavar="X|TOPIC:FIELD=X", help="Allowed difference: part of each field's range (1e-06), or in a field's unit."
         ),
     ] = None,
     scenario: Annotated[Path | None, typer.Option(help="Scenario of the service; by default that of the run.")] = None,

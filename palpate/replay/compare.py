@@ -1,7 +1,5 @@
 """Compares the messages of a re-run service with the recorded ones, field by field."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
 from typing import Any

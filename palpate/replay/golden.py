@@ -5,8 +5,6 @@ and, as an attachment, its scenario. Times begin at zero, and floats keep 24 bit
 outputs are those for the rounded inputs, so on one platform a reference differs from a replay by the rounding of outputs only.
 """
 
-from __future__ import annotations
-
 import logging
 import math
 import tempfile

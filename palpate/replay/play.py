@@ -1,7 +1,5 @@
 """Plays a recording on the bus: the same keys, bytes and sequence numbers, in scaled real time."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Re-runs one service in this process on recorded inputs, in the lockstep order of the run, without transport."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 
 from palpate_bus.contract import Contract, Edge

@@ -5,8 +5,6 @@ built from it, with or without a recording of the whole run. A run that was kill
 are read from its recording.
 """
 
-from __future__ import annotations
-
 import io
 from collections.abc import Iterable, Iterator
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """`palpate report`: builds the page of a run again from its folder, also as PDF."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import tempfile

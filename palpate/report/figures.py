@@ -3,8 +3,6 @@
 The view is from the front with the patient's head up: the patient's right is on the viewer's left, as in clinical drawings.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any, NamedTuple
 

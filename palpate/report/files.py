@@ -1,7 +1,5 @@
 """Atomic writes of files that other programs read and of marked parts of pages; results that a kill has left elsewhere."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager

@@ -3,8 +3,6 @@
 The findings come first; the comparison with the truth is a section at the end.
 """
 
-from __future__ import annotations
-
 import base64
 import json
 from importlib.metadata import version

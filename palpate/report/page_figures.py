@@ -1,7 +1,5 @@
 """The figures of report.html: PNG images, and the data of its three-dimensional viewer. Only `truth` draws the truth."""
 
-from __future__ import annotations
-
 import base64
 import io
 from dataclasses import dataclass

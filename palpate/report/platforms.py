@@ -1,26 +1,12 @@
 """Fingerprint of the platform, on which a run hash depends besides scenario, seed and code."""
 
-from __future__ import annotations
-
 import os
 import platform
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = (
-    "numpy",
-    "scipy",
-    "dartpy",
-    "pin",
-    "coal",
-    "casadi",
-    "ompl",
-    "ruckig",
-    "rosbags",
-    "eclipse-zenoh",
-    "scikit-learn",
-)
+PACKAGES = ("numpy", "scipy", "dartpy", "pin", "coal", "casadi", "ompl", "ruckig", "rosbags", "eclipse-zenoh", "scikit-learn")
 """Libraries whose version can change a result."""
 
 

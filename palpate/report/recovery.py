@@ -3,8 +3,6 @@
 A run that continues DIR has its results in DIR/resumed; the continuation of that run has them in DIR/resumed/resumed.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections import deque
 from collections.abc import Iterable, Iterator

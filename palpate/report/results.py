@@ -1,7 +1,5 @@
 """Results in a run's folder: report.json, samples.csv, map.png, evidence.mcap; and the findings on the terminal."""
 
-from __future__ import annotations
-
 import csv
 import logging
 from collections.abc import Sequence
@@ -329,11 +327,7 @@ def _truth(truth: scoring.Truth | None) -> TruthRow:
         x, y = map(float, lump.centroid)
         rows.append(
             LumpRow(
-                centroid_m=(x, y),
-                quadrant=quadrant(x, y),
-                area_m2=lump.area,
-                felt_contrast=lump.contrast,
-                palpable=lump.palpable,
+                centroid_m=(x, y), quadrant=quadrant(x, y), area_m2=lump.area, felt_contrast=lump.contrast, palpable=lump.palpable
             )
         )
     return TruthRow(felt=True, lumps=rows)

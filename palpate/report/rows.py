@@ -1,7 +1,5 @@
 """Models of report.json."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from typing import Any, Final, Protocol
 

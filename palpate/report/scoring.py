@@ -6,8 +6,6 @@ matches by its centroid, and only a lump that no finding matches. Places are tho
 of the abdomen frame A; areas are on the skin.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

@@ -3,8 +3,6 @@
 What they do is imported when they are called, since that takes seconds.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated

@@ -1,7 +1,5 @@
 """The end of an examination: writes the results, prints the findings, sets the exit status."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from contextlib import nullcontext
@@ -37,12 +35,7 @@ HOLD_REASONS: Final = (
 
 
 def conclude(
-    console: Console,
-    folder: Path,
-    scenario: Scenario,
-    result: RunResult,
-    quiet: bool = False,
-    as_json: bool = False,
+    console: Console, folder: Path, scenario: Scenario, result: RunResult, quiet: bool = False, as_json: bool = False
 ) -> None:
     """Write the results and print the findings. Raises typer.Exit(3) if the run failed or its folder is not writable."""
     with nullcontext() if quiet else console.status("writing report and maps: about ten seconds"):

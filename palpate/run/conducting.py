@@ -3,8 +3,6 @@
 The conductor's image imports only this: no role, no resuming.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from palpate.console import SteadyConsole

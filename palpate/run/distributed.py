@@ -1,7 +1,5 @@
 """A run with a process for each service or group of services."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from time import perf_counter

@@ -1,7 +1,5 @@
 """An examination on this machine, from its start to its results."""
 
-from __future__ import annotations
-
 from contextlib import nullcontext
 from dataclasses import replace
 from functools import partial
@@ -121,13 +119,7 @@ def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:
 
 
 def _run(
-    scenario: Scenario,
-    folder: Path,
-    tell: Tell,
-    options: RunOptions,
-    observers: tuple[str, ...],
-    absent: Absent,
-    groups: Groups,
+    scenario: Scenario, folder: Path, tell: Tell, options: RunOptions, observers: tuple[str, ...], absent: Absent, groups: Groups
 ) -> RunResult:
     if options.composed:
         return run_composed(scenario, folder, tell, observers)

@@ -1,7 +1,5 @@
 """The results folder of a run: refused unless empty, locked during the run, with enough disk space."""
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -3,8 +3,6 @@
 Each has its own session, log and signals, as a process started afresh. A single run would save nothing and does not use this.
 """
 
-from __future__ import annotations
-
 import os
 import runpy
 import subprocess

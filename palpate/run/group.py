@@ -4,8 +4,6 @@
 and the environment of that role alone, such as the scenario file of its view and its certificate on a secure bus.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Mapping, Sequence

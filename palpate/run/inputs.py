@@ -1,7 +1,5 @@
 """Checks of a scenario before an examination starts: its phantom, its scan on the true body, its services."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Ctrl-C in an examination: the first ends it and writes the results, the second prints a warning, the third exits at once."""
 
-from __future__ import annotations
-
 import os
 import signal
 from collections.abc import Iterator

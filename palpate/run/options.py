@@ -1,7 +1,5 @@
 """Options that several commands share, and those of `palpate run`. Imports little, so that help is fast."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, fields

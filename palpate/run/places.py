@@ -5,8 +5,6 @@ run writes places.json with the command and the environment of each such role; t
 A debugger, or a program in another language, can do the same.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys
@@ -117,11 +115,7 @@ def place_to_take(role: str, run: Run) -> ServicePlace:
         raise UserError(f"run {run.name} keeps no places: start it with `palpate run --wallclock --handover 60`")
     others = tuple(endpoint for name, endpoint in run.endpoints.items() if name != role)
     bus = BusOptions(connect=others, router=run.router) if run.keys is None else run.options(role)
-    environment = {
-        **kept[role].environment,
-        **bus.to_env(),
-        "ROS_DOMAIN_ID": str(run.domain),
-    }
+    environment = {**kept[role].environment, **bus.to_env(), "ROS_DOMAIN_ID": str(run.domain)}
     return kept[role]._replace(environment=environment)
 
 

@@ -1,7 +1,5 @@
 """Local processes of a run. The list of processes is docker-compose.yml, as for containers."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -278,9 +276,7 @@ class LocalProcesses:
             **process.environment,
             **FIXED,
             **settings.replaced(
-                scenario=self._scenario_files[process.role],
-                out=self._out if process.role in OBSERVERS else None,
-                **self._given,
+                scenario=self._scenario_files[process.role], out=self._out if process.role in OBSERVERS else None, **self._given
             ).to_env(),
             **self.bus[process.role].to_env(),
         }

@@ -1,7 +1,5 @@
 """The console of a run: what the arm does and why, progress and remaining time, and an operator's keys."""
 
-from __future__ import annotations
-
 from types import TracebackType
 from typing import Any, Final, Self
 

@@ -1,7 +1,5 @@
 """Roles of a run, the implementation of each, and the scenario files that they may read."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Sequence
 from pathlib import Path

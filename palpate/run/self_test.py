@@ -6,8 +6,6 @@ For a second each wakes every millisecond, works for 0.8 ms and measures how lat
 milliseconds for a tick; ages and deadlines are stretched alike.
 """
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -12,8 +12,6 @@ An episode is one patient and `presses` presses. The reward of a press is the de
 truth (no lump, or one near its true place), at least WORST.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any, Final, Literal

@@ -4,8 +4,6 @@
 (`palpate.quick.felt`): no physics, a hundredth of the time. Places are in the registered abdomen frame.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final, Protocol
 

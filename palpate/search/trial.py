@@ -1,7 +1,5 @@
 """One search of one patient by one policy, and the population of such patients."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from time import perf_counter
 from typing import Final

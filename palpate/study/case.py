@@ -4,8 +4,6 @@ The process has a fixed environment (one thread of BLAS and OpenMP, fixed hash s
 It ends when the worker that started it ends. Results of whole examinations stay in RUNS/CASE_ID if RUNS is given.
 """
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

@@ -4,8 +4,6 @@ A patient's seed is a hash of study, population, split, number and salt. It does
 comparisons are paired, nor on worker and order, so that every way to run the study examines the same patients.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import shlex

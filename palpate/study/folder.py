@@ -10,8 +10,6 @@ sessions.jsonl             duration of each call of the command
 real_time.md               lateness in wall-clock mode
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Iterable, Iterator, Sequence

@@ -1,7 +1,5 @@
 """Detection of lumps by human examiners, for plots of detection: published figures with sources and limits."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

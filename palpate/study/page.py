@@ -1,7 +1,5 @@
 """study.html: a study's figures and plots on one self-contained page. Plots are SVG with the page's colour variables."""
 
-from __future__ import annotations
-
 import io
 from collections.abc import Mapping, Sequence
 from typing import Any, Final, Literal

@@ -1,7 +1,5 @@
 """real_time.md: delays of messages and ticks in wall-clock mode, and a comparison with the same examinations in lockstep."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Final

@@ -1,7 +1,5 @@
 """Runs the cases of a study on Dask workers: threads of this process, or the workers of a scheduler elsewhere."""
 
-from __future__ import annotations
-
 import logging
 import os
 import re

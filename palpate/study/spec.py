@@ -9,8 +9,6 @@
 Every patient of every population is examined with every entry of `errors` by every method, so that all comparisons are paired.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from importlib import resources
 from itertools import product

@@ -1,7 +1,5 @@
 """Results of a study: its tables as Parquet (one row per case, per finding and per lump), study.json and study.html."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from importlib.metadata import version

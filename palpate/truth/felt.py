@@ -5,8 +5,6 @@ set about its greatest |e| in which e has the sign that it has there and |e| is 
 of A; areas are on the skin.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """True rest surface as functions of xy in the abdomen frame A, and the places on it that the tool touched."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

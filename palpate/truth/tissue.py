@@ -1,7 +1,5 @@
 """True tissue of a scenario, of any implementation, for pressing without the bus."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from palpate_bus.implementations import create

@@ -6,8 +6,6 @@ simulated on the body, and the logarithms of measured over simulated force are t
 surface, in a few rounds. A tenth of the presses is held out.
 """
 
-from __future__ import annotations
-
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace

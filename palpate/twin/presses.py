@@ -4,8 +4,6 @@ A slide counts, once per footprint, as a press that lasts as long as the tool ne
 the tissue under it is loaded.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from math import sqrt

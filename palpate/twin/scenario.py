@@ -1,7 +1,5 @@
 """The twin as a scenario: twin.yaml, the grid file twin.csv, and how well it reproduces the recording."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Final

@@ -5,8 +5,6 @@ force: its
 level, which is the patient's own and which the posterior finds, and what is left of the difference besides that.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Final
 
 import numpy as np

@@ -6,8 +6,6 @@ first said to be elsewhere, or never, counts as the whole budget. Intervals: Wil
 samples of patients for all else.
 """
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Annotated, Final
 

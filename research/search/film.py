@@ -1,7 +1,5 @@
 """A film of a search: `python -m research.search.film` searches a patient and draws the presses and the belief after each."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Final

@@ -5,8 +5,6 @@ Stable-Baselines3's proximal policy optimisation on `Palpate/Search-v0`. Actor a
 of what is known; the actor's last one gives each place and depth a logit: few weights are learned, and none belongs to a place.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Final
@@ -92,10 +90,7 @@ class Network(nn.Module):
         super().__init__()
         layers, nx, ny = space.shape
         self.hidden = nn.Sequential(
-            nn.Conv2d(layers, WIDTH, 5, padding=2),
-            nn.Tanh(),
-            nn.Conv2d(WIDTH, WIDTH, 3, padding=1),
-            nn.Tanh(),
+            nn.Conv2d(layers, WIDTH, 5, padding=2), nn.Tanh(), nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.Tanh()
         )
         self.last = nn.Conv2d(WIDTH, 2, 1)
         nn.init.normal_(self.last.weight, std=0.05)

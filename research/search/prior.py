@@ -4,8 +4,6 @@ The amplitudes of its Gaussian model (`palpate_search.posterior`) by maximum lik
 at random places by the surrogate.
 """
 
-from __future__ import annotations
-
 from typing import Annotated, Final
 
 import numpy as np

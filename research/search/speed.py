@@ -1,7 +1,5 @@
 """Presses a second of processor time of `Palpate/Search-v0`: `python -m research.search.speed`."""
 
-from __future__ import annotations
-
 from time import process_time
 from typing import Annotated, Final, Literal
 

@@ -5,8 +5,6 @@ a lump is said to be near the most probable place when its probability exceeds a
 healthy tuning patients (`curves`).
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Final

@@ -4,8 +4,6 @@ Each patient is examined by `palpate run --composed` with the pattern `search`, 
 the findings of the assessment, scored as those of any scan. An examination that failed has found nothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any, Final

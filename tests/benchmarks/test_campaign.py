@@ -1,7 +1,5 @@
 """The fault campaign: its faults, its cases, and the judgement of a case."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The campaign of lies: what a liar sends, which cases there are, and the judgement of a case."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

@@ -1,7 +1,5 @@
 """`palpate reproduce`: pictures of the scene, the graph of the bus, and the page of the measurements."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

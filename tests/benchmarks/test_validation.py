@@ -1,7 +1,5 @@
 """`palpate validate`: every bound of every section, and the report. Costs are printed, not tested."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import replace

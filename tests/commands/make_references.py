@@ -4,8 +4,6 @@ Needed after a change of a message type or of the inputs. If only the output of 
 `palpate replay REFERENCE --service ROLE --update-refs REFERENCE` is enough.
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tempfile

@@ -1,7 +1,5 @@
 """Commands are loaded alone and fast, and their help and options are uniform."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

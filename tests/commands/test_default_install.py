@@ -1,7 +1,5 @@
 """A default install, without the libraries of other extras: each command shows its help, or refuses in one line at its start."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

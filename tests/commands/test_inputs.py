@@ -1,7 +1,5 @@
 """Bad input ends with a line and status 2 before anything starts; the plan of an examination."""
 
-from __future__ import annotations
-
 import re
 import shlex
 import subprocess

@@ -1,7 +1,5 @@
 """Ctrl-C while an examination starts, runs and ends."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """The console of `palpate run`: narration of `exam/state`, and its keys."""
 
-from __future__ import annotations
-
 import os
 import pty
 import sys

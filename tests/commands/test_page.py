@@ -1,7 +1,5 @@
 """map.png and report.html: made from a run's folder alone, without links to other files."""
 
-from __future__ import annotations
-
 import base64
 import html
 import json

@@ -1,7 +1,5 @@
 """Processes of a run: the compose file, groups, and roles that join or are replaced."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess

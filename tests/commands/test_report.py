@@ -1,7 +1,5 @@
 """The report of a run, from messages as the bus carries them, and the end of an examination."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

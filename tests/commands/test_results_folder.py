@@ -1,7 +1,5 @@
 """The results folder: it belongs to one run, files are written whole, and its disk has room."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

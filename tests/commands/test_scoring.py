@@ -1,7 +1,5 @@
 """Scores against patients whose answer is known by geometry: synthetic forces, the real rules."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from functools import cache
 

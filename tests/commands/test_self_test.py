@@ -1,7 +1,5 @@
 """The rate of real time that a machine keeps in wall-clock mode."""
 
-from __future__ import annotations
-
 import pytest
 from toy_runs import run_toys
 

@@ -1,7 +1,5 @@
 """Implementations of roles: the scenario selects them, unusable ones are refused, a file replaces a service."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

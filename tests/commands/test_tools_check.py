@@ -1,7 +1,5 @@
 """The conformance suites: every implementation passes its own, and a faulty one is named."""
 
-from __future__ import annotations
-
 import shlex
 import sys
 from collections.abc import Callable

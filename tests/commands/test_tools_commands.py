@@ -1,7 +1,5 @@
 """The live commands on the bus of an announced run."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

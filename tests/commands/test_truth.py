@@ -1,7 +1,5 @@
 """The truth by pressing: a copy of the patient, felt with its lumps and without."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Keys and hashes are those of rmw_zenoh, and independent programs read the bus and stop the robot."""
 
-from __future__ import annotations
-
 import ast
 import json
 import shlex

@@ -1,7 +1,5 @@
 """Clock, frames, description, diagnostics and QoS of a recorded examination, as RViz, rqt and `ros2 bag play` need them."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from itertools import pairwise

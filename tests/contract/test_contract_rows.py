@@ -1,7 +1,5 @@
 """Every row of the contract is consistent, its messages survive the wire, and `palpation_msgs` is a ROS 2 package."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from xml.etree import ElementTree

@@ -1,7 +1,5 @@
 """Files, environment and arguments of a role that may not know the patient do not depend on the patient's seed."""
 
-from __future__ import annotations
-
 import ast
 import os
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Dockerfiles and compose files, and an examination by `docker compose` on a Docker engine."""
 
-from __future__ import annotations
-
 import os
 import re
 import subprocess

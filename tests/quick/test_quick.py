@@ -1,7 +1,5 @@
 """The quick tier: the same case gives the same result in any order, in any process; errors reach what is measured."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from pathlib import Path

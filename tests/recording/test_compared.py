@@ -1,7 +1,5 @@
 """Comparison of two palpations of one body, and of outcomes of several."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Bags of other writers: MCAP and SQLite, poses as topic, tf or joints; the same as a table."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

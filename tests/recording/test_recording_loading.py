@@ -1,7 +1,5 @@
 """Forces at a depth from loading curves of one body."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

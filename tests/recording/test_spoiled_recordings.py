@@ -1,7 +1,5 @@
 """Twenty recordings, each spoiled in one way: each fault is named, and none of them makes a finding."""
 
-from __future__ import annotations
-
 import runpy
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A twin fitted to presses of a simulated body."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Message delays around the controller: the wrapper, the contact on either side of its stability margin, the theory."""
 
-from __future__ import annotations
-
 import pytest
 
 from palpate_bus.messages.stamps import NS

@@ -1,7 +1,5 @@
 """DART's soft bodies and MuJoCo's flex against our tissue: every bound. Costs are printed, not tested."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

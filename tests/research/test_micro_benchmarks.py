@@ -1,7 +1,5 @@
 """Each micro-benchmark runs once with small parameters, in contact; and the parts of `palpate bench`."""
 
-from __future__ import annotations
-
 import importlib.util
 from pathlib import Path
 from types import ModuleType

@@ -1,7 +1,5 @@
 """Studies of finished runs, and calibrations that must recover known parameters."""
 
-from __future__ import annotations
-
 from dataclasses import astuple
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Hides all libraries that the extra `run` does not install. Put this folder on PYTHONPATH to emulate a default install."""
 
-from __future__ import annotations
-
 import importlib.metadata
 import re
 import sys

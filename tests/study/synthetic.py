@@ -1,7 +1,5 @@
 """A study of seconds, and tables of studies whose truth is known."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +16,7 @@ TOY: dict[str, Any] = {
     "name": "toy",
     "tier": "quick",
     "populations": {
-        "clean": {"scenario": "clean", "number": {"tune": 2, "test": 3}, "settings": {"exam.region_m": [0.03, 0.03]}},
+        "clean": {"scenario": "clean", "number": {"tune": 2, "test": 3}, "settings": {"exam.region_m": [0.03, 0.03]}}
     },
 }
 

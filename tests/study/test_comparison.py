@@ -1,7 +1,5 @@
 """Paired comparisons of methods whose difference is known."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The psychometric surface of lumps that were found by a known one."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import statsmodels.api as sm

@@ -1,7 +1,5 @@
 """Intervals, ROC and FROC of scores whose statistics are known."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import synthetic

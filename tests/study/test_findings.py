@@ -1,7 +1,5 @@
 """Errors and calibration of findings whose errors are known."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

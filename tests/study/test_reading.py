@@ -1,7 +1,5 @@
 """Tables of studies: failed cases count against a method, and unusable tables are refused."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Study files, the cases made from them, their identifiers and the seeds of their patients."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from pathlib import Path

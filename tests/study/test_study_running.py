@@ -3,8 +3,6 @@
 Cases are examined for real, by the quick tier.
 """
 
-from __future__ import annotations
-
 import dataclasses
 import json
 import subprocess

@@ -1,7 +1,5 @@
 """study.json and study.html of synthetic studies."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 from pathlib import Path
 

@@ -4,8 +4,6 @@
 range but plausible in a related unit (degrees for radians, millimetres for metres) is reported as a unit error.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum

@@ -6,8 +6,6 @@ service sends and where messages of other processes are received. In lockstep a 
 it is dropped and reported, so its readers act as on silence. No service needs a check of its own.
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache

@@ -3,8 +3,6 @@
 Types of the 1 kHz topics have faster codecs (`struct_codecs`) with identical bytes; rosbags handles the others.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cache

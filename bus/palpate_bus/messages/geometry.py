@@ -3,8 +3,6 @@
 Rotations are matrices in arrays and unit quaternions in messages.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from math import sqrt
 from typing import Any, Final, NamedTuple

@@ -1,7 +1,5 @@
 """ROS times, durations and headers from integer nanoseconds, and back."""
 
-from __future__ import annotations
-
 from palpate_bus.messages import Duration, Header, Time
 
 NS = 1_000_000_000

@@ -5,8 +5,6 @@ header, whose `frame_id` has any length; the rest is aligned after it and has a 
 exception for unsuitable fields or bytes; `codec` converts it to CodecError. A decoder returns the message and its end.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import lru_cache
 from struct import Struct

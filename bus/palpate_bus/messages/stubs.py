@@ -4,8 +4,6 @@ python -m palpate_bus.messages.stubs --write     after a change of a .msg file o
 python -m palpate_bus.messages.stubs --check     exits with 1 if the file is out of date; a test runs it
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from pathlib import Path

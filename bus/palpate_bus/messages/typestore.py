@@ -1,7 +1,5 @@
 """Message types of ROS 2 Jazzy and `palpation_msgs`, read by rosbags. Names are ROS names (`sensor_msgs/msg/JointState`)."""
 
-from __future__ import annotations
-
 from functools import cache
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Findings of a monitor: the health of each topic and violations of the contract, also as `diagnostic_msgs/DiagnosticStatus`."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass
 

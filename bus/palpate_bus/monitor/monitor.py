@@ -14,8 +14,6 @@ topic of the contract under any type, to liveliness tokens and to service report
 Samples wait in channels until `poll`, which the owner calls often. Each producer of a 1 kHz topic gets one more subscriber.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from time import monotonic, time_ns

@@ -5,8 +5,6 @@ rates and a busy monitor does not misjudge; in wall-clock mode, by their source 
 if nothing was received while the time of the bus, the median of all periodic topics' stamps, advanced.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field

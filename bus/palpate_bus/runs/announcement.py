@@ -5,8 +5,6 @@ lives; `live` removes the unlocked files of killed runs. A tool joins (`find`) t
 PALPATE_CONNECT, PALPATE_ROUTER or PALPATE_ZENOH_CONFIG; the announced runs.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 import os

@@ -5,8 +5,6 @@ Sent by `palpate stop`, `release`, `pause`, `resume` and `step`, and by keys in 
 (the driver holds the arm safely), r for a release (the examination resumes).
 """
 
-from __future__ import annotations
-
 import json
 import os
 import sys

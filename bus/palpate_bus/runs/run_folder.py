@@ -4,8 +4,6 @@ The kernel releases a lock with the last process that holds it. The next command
 killed runs, and unused shared memory, which zenoh locks in the same way.
 """
 
-from __future__ import annotations
-
 import fcntl
 import os
 import shutil

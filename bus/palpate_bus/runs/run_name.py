@@ -3,8 +3,6 @@
 It identifies the run of a copied file. It is random, since scenario, seed and time could reveal the patient.
 """
 
-from __future__ import annotations
-
 import fcntl
 import json
 from contextlib import suppress

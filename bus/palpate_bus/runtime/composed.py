@@ -1,7 +1,5 @@
 """Composed lockstep: all services in one process, as one group without transport (see `group`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, MutableSequence, Sequence
 from contextlib import nullcontext, suppress
 from typing import Any

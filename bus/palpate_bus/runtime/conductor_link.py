@@ -5,8 +5,6 @@ services then continue for a grace period in which planning lifts the arm; in lo
 without grants.
 """
 
-from __future__ import annotations
-
 import json
 import logging
 from dataclasses import dataclass

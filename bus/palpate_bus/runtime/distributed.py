@@ -6,8 +6,6 @@ has advanced; the event topics of a producer are advanced by the Advance message
 grants simulated time, announces lost roles, and stops the run. A node never hangs: it leaves when the conductor is lost.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from time import monotonic, perf_counter_ns

@@ -7,8 +7,6 @@ those outside the group. So the first of all pending steps in this order has all
 other do not deadlock.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from math import gcd, lcm
 

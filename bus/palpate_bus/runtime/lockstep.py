@@ -296,11 +296,7 @@ class Stepper:
     """Drives one service: buffers in, step, ports out."""
 
     def __init__(
-        self,
-        service: Service,
-        contract: Contract,
-        strict: bool = True,
-        refuse: Callable[[RefusedMessage], None] | None = None,
+        self, service: Service, contract: Contract, strict: bool = True, refuse: Callable[[RefusedMessage], None] | None = None
     ) -> None:
         """`strict` requires a message on every tick of the periodic topics, except from observers.
 

@@ -4,8 +4,6 @@ Its declarations show in the ROS graph (`ros2 node list`, `ros2 topic info`). A 
 connects. ROS 2 does not report that, so `complaints` does.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection
 from time import monotonic
 

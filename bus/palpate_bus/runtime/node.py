@@ -1,7 +1,5 @@
 """Life of the services of a process in any runtime: join, start, step, report, leave."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress

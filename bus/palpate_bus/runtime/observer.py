@@ -3,8 +3,6 @@
 It receives the newest messages of periodic topics and every message of the others. `recording` drives recorders.
 """
 
-from __future__ import annotations
-
 import logging
 from abc import ABC, abstractmethod
 from contextlib import suppress

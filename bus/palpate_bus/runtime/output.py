@@ -4,8 +4,6 @@ A service collects its messages and sends them to the recorder together: at 1 kH
 producer another send per message and the recorder a wake-up each. A chunk every 50 simulated milliseconds has the same bytes.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Garbage collection, priorities, and the state of processes: running, waiting for a core, or frozen."""
 
-from __future__ import annotations
-
 import gc
 import os
 from collections.abc import Iterator

@@ -3,8 +3,6 @@
 The conductor grants at most a second of simulated time beyond that, so nothing is lost, but the run may be slower.
 """
 
-from __future__ import annotations
-
 import logging
 from typing import Any, Protocol, runtime_checkable
 

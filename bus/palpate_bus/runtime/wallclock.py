@@ -9,8 +9,6 @@ the contract is dropped where it is sent or received, so that its readers act as
 On a slow machine the common clock may run slower than the wall clock (PALPATE_RATE); never with hardware.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass

@@ -12,8 +12,6 @@ chunks, which only the conductor and the recorder receive; a role declares livel
 may read. Anything else is denied.
 """
 
-from __future__ import annotations
-
 import json
 import sys
 from collections.abc import Sequence

@@ -7,8 +7,6 @@ Keys are ECDSA on P-256 (RFC 5480), certificates X.509 version 3 (RFC 5280). The
 router identifies its members (`access.py`). Needs the `cryptography` package: `pip install 'palpate[run]'`.
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 from collections.abc import Sequence

@@ -1,7 +1,5 @@
 """Hypothesis strategies for messages: any valid message of any type, from its definition. Needs `hypothesis`."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Any
 

@@ -11,8 +11,6 @@ A role is a ROS node of that name. Sources: ros2/rmw_zenoh, `docs/design.md`, `r
 and `qos.cpp`; the numbers of the policies are those of ros2/rmw, `rmw/types.h`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum

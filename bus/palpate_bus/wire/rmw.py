@@ -24,8 +24,6 @@ rmw_zenoh's fields in the attachment, which ROS 2 ignores. The key is a file tha
 `palpate run` makes one per run. The contract decides which messages carry a tag (`tagged`).
 """
 
-from __future__ import annotations
-
 import os
 import re
 import secrets

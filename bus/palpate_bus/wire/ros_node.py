@@ -3,8 +3,6 @@
 `ros2 node list` and `ros2 topic info` show it.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import zenoh

@@ -3,8 +3,6 @@
 Peers find each other through it and then connect directly; clients send through it. `zenohd` does the same, faster for clients.
 """
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

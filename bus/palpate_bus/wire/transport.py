@@ -3,8 +3,6 @@
 Callbacks only put samples into the subscription's queue, which the service's thread empties.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from itertools import count
 from queue import Empty, SimpleQueue

@@ -221,9 +221,7 @@ def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) 
     endpoints = {role: f"unixsock-stream/{folder.resolve()}/{role}.sock" for role in roles}
     return {
         role: BusOptions(
-            listen=(endpoints[role],),
-            connect=tuple(endpoints[other] for other in roles[:index]),
-            lowlatency=role in lowlatency,
+            listen=(endpoints[role],), connect=tuple(endpoints[other] for other in roles[:index]), lowlatency=role in lowlatency
         )
         for index, role in enumerate(roles)
     }

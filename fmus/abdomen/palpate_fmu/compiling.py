@@ -1,7 +1,5 @@
 """Cross-compiling a folder of C into the shared libraries of an FMU, by zig's C compiler from PyPI."""
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import os

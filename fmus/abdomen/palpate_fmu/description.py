@@ -1,7 +1,5 @@
 """modelDescription.xml for FMI 2.0 and 3.0, from the table of variables."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from itertools import product
 from xml.etree import ElementTree as ET

@@ -1,7 +1,5 @@
 """Writing the abdomen as an FMU: model description, phantom, sources and binaries for every platform."""
 
-from __future__ import annotations
-
 import shutil
 import tempfile
 import uuid

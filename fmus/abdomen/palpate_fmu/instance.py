@@ -11,8 +11,6 @@ FMPy reads the description and loads the library. Variables are grouped into por
 Scalars that are named like array elements (`name[1]`, `name[1,2]`) are one array here too.
 """
 
-from __future__ import annotations
-
 import ctypes
 import logging
 import shutil

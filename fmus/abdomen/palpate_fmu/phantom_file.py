@@ -1,7 +1,5 @@
 """The phantom as the FMU reads it: `resources/phantom.bin`, little-endian, in the layout of src/phantom.c."""
 
-from __future__ import annotations
-
 import struct
 from collections.abc import Mapping
 

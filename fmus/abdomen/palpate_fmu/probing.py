@@ -1,7 +1,5 @@
 """A probing motion: the sphere is pressed into an abdomen FMU along the surface normal, held, and withdrawn."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

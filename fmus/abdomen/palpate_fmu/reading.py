@@ -3,8 +3,6 @@
 A finding does not make an FMU unusable: many tools write descriptions that break a rule and still describe every variable well.
 """
 
-from __future__ import annotations
-
 import re
 import tempfile
 import zipfile

@@ -1,7 +1,5 @@
 """Any FMU run as it is, its scalar outputs plotted over time."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -4,8 +4,6 @@ Without dependencies FMI assumes every input, state and time, which holds for co
 of an array is a scalar, the sparsity of the states' derivatives is written, since integrators use it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator, Sequence
 from itertools import chain
 from xml.etree import ElementTree as ET

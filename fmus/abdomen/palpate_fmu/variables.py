@@ -4,8 +4,6 @@ A value reference stands for a whole array in FMI 3.0. FMI 2.0 has scalars only:
 value reference plus k, and is named `name[1]` or `name[1,2]`.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum

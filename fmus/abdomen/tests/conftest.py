@@ -1,7 +1,5 @@
 """FMUs for the tests of this folder, for this platform only."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """An FMU for model exchange as the tests drive it, and a phantom small enough for dense solvers."""
 
-from __future__ import annotations
-
 import shutil
 from collections.abc import Mapping
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Building the FMU: archive, platforms and the command."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """CasADi's DaeBuilder takes the FMU for model exchange: right-hand side, forces, derivatives and an integration."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Model exchange: the ODE against the co-simulation's step, its directional derivatives, its errors."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import fmpy

@@ -1,7 +1,5 @@
 """The FMU as importers see it: description, values, errors, rollback."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

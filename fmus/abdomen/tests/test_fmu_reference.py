@@ -1,7 +1,5 @@
 """The FMU against its reference and the wall's laws."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -98,9 +96,7 @@ def test_libcosim_steps_it_too(fmu2: Path) -> None:
 
 BREATHING = Breathing(kind="held", coughs_per_min=3)
 PHANTOM = Phantom(
-    edge_m=0.012,
-    stiffness=Stiffness(stiffening_per_m=500, prony_g=(0.3,), prony_tau_s=(2.0,), friction=0.0),
-    breathing=BREATHING,
+    edge_m=0.012, stiffness=Stiffness(stiffening_per_m=500, prony_g=(0.3,), prony_tau_s=(2.0,), friction=0.0), breathing=BREATHING
 )
 """Its modulus stops to rise at a depth of 7.7 mm."""
 RADIUS_M = 0.015

@@ -3,8 +3,6 @@
 A file has the array in numpy's format, followed by the SHA-256 of it.
 """
 
-from __future__ import annotations
-
 import contextlib
 import hashlib
 import mmap

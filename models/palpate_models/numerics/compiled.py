@@ -8,8 +8,6 @@ is cleared if any of its files has changed. A compiled function must not call on
 counts as a source of every package.
 """
 
-from __future__ import annotations
-
 import pickle
 from collections.abc import Callable
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Rigid transforms as 4 x 4 homogeneous matrices, in monogram notation."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

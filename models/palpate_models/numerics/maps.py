@@ -1,7 +1,5 @@
 """Lines of equal value on a mesh."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

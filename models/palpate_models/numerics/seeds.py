@@ -1,7 +1,5 @@
 """Random streams of a patient, one for each purpose, so that they are independent."""
 
-from __future__ import annotations
-
 import zlib
 
 import numpy as np

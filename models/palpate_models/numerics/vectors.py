@@ -1,7 +1,5 @@
 """Compiled functions of 3-vectors as tuples, which stay in registers where small arrays would be allocated."""
 
-from __future__ import annotations
-
 from math import sqrt
 
 import numpy as np

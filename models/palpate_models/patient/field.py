@@ -15,8 +15,6 @@ mm with a sphere of 15 mm: the felt ratio of forces is within 8.5 % for lumps of
 of 40 mm that touches the skin is felt 15 % too little. S was chosen on one ridge (docs/reality.md).
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from statistics import harmonic_mean

@@ -3,8 +3,6 @@
 The file is CSV with a header and one row per node of a complete regular grid, in any order. `columns` names quantities and units.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Guarding: a wide area of contracted abdominal muscle, and its response to pressing."""
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

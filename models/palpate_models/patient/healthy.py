@@ -5,8 +5,6 @@ Gaussian: ridges have crests, patches have borders, hills are log-normal, and wa
 Fields are functions of position, made from random Fourier features (Rahimi and Recht 2007), and do not depend on the mesh.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -184,6 +182,5 @@ def healthy_wall(
     local = np.maximum(stiffening + variation.stiffening_per_m * (shared + np.sqrt(1 - rho**2) * other(points)), 0.0)
     bone = bone_share(x, y, anatomy.skeleton)
     return HealthyWall(
-        np.exp(log_level) * (1 + (anatomy.bone - 1) * bone),
-        (1 - bone) * local + bone * anatomy.bone_stiffening_per_m,
+        np.exp(log_level) * (1 + (anatomy.bone - 1) * bone), (1 - bone) * local + bone * anatomy.bone_stiffening_per_m
     )

@@ -1,7 +1,5 @@
 """Triangle meshes from files: validated, oriented, refined in the examined region."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from pathlib import Path
 

@@ -3,8 +3,6 @@
 Marks of certainty: [A] assumed.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Annotated, Literal
 

@@ -3,8 +3,6 @@
 Marks of certainty: [V] read in the source, [C] computed from measurements, [M] from memory of the literature, [A] assumed.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cache
 from math import dist

@@ -1,7 +1,5 @@
 """The phantom as arrays: rest surface, discrete Laplacian, stiffness with and without lesions."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path

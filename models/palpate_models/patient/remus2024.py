@@ -3,8 +3,6 @@
 R. Remus et al., Frontiers in Bioengineering and Biotechnology 12:1384062, 2024, DOI 10.3389/fbioe.2024.1384062, CC BY 4.0.
 """
 
-from __future__ import annotations
-
 import csv
 from collections.abc import Mapping
 from dataclasses import dataclass

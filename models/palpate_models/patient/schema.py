@@ -3,8 +3,6 @@
 Marks of certainty: [V] read in the source, [C] computed from data, [M] from memory, [A] assumed.
 """
 
-from __future__ import annotations
-
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 

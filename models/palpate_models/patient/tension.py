@@ -4,8 +4,6 @@ The ratio of a scenario is one of forces, as measured on people. The tension act
 so it exceeds the ratio; it is solved for on a flat uniform wall with the scenario's mechanics.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 

@@ -14,8 +14,6 @@ square of the depth reproduces all 48 places within 5 % and both exponents of th
 Each tier steps these equations in its own way: the surface tier in `palpate_tissue.backends.winkler.tissue`, the FMU in C.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

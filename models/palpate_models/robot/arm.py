@@ -4,8 +4,6 @@ Behind the arm's flange follow `ft_sensor` (origin at the measuring face) and `i
 the flange.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -8,8 +8,6 @@ axes of joints:
 so that the tool points along z of the last link. `urdf_arm` makes these tables from a URDF.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 

@@ -1,7 +1,5 @@
 """Forward kinematics and Jacobian of the arm with its tool, straight from its tables: numpy only, not for hot paths."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -3,8 +3,6 @@
 Kinematics, limits, masses and inertias: lbr_fri_ros2_stack, `iiwa7_description` and its joint limits. The capsules are ours.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np
@@ -70,10 +68,7 @@ _ARM_CAPSULES: Final[tuple[tuple[Capsule, ...], ...]] = (
     (Capsule((0.0, 0.0, 0.035), (0.0, 0.035, 0.19), 0.077),),
     (Capsule((0.0, -0.035, 0.0), (0.0, -0.0105, 0.1675), 0.075),),
     (Capsule((0.0, 0.0, 0.03), (0.0, -0.012, 0.085), 0.071), Capsule((0.0, -0.055, 0.12), (0.0, -0.082, 0.1925), 0.06)),
-    (
-        Capsule((0.0, 0.048, 0.0), (0.0, 0.092, 0.0), 0.068),
-        Capsule((0.0, 0.0707, 0.0), (0.0, 0.0707, 0.04), 0.055),
-    ),
+    (Capsule((0.0, 0.048, 0.0), (0.0, 0.092, 0.0), 0.068), Capsule((0.0, 0.0707, 0.0), (0.0, 0.0707, 0.04), 0.055)),
     (Capsule((0.0, 0.0, 0.0), (0.0, 0.0, 0.005), 0.045),),
 )
 

@@ -5,8 +5,6 @@ A field maps points [m], shape (n, 3), to signed distances [m], shape (n,), nega
 (Gibson 1998), then moves every vertex onto the field's zero.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The operating table and the robot's cubic base, as boxes in world."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 
@@ -47,9 +45,7 @@ def boxes(robot: Robot) -> tuple[Box, ...]:
     return (
         _aligned("table_top", (TABLE_X_M[0], TABLE_Y_M[0], under), (TABLE_X_M[1], TABLE_Y_M[1], TABLE_TOP_M)),
         _aligned(
-            "table_column",
-            (x - COLUMN_M[0] / 2, y - COLUMN_M[1] / 2, 0.0),
-            (x + COLUMN_M[0] / 2, y + COLUMN_M[1] / 2, under),
+            "table_column", (x - COLUMN_M[0] / 2, y - COLUMN_M[1] / 2, 0.0), (x + COLUMN_M[0] / 2, y + COLUMN_M[1] / 2, under)
         ),
         Box("robot_base", matrix(base), (BASE_SIDE_M, BASE_SIDE_M, height)),
     )

@@ -3,8 +3,6 @@
 `read_arm` collects everything that is missing or impossible, each with its link or joint; `palpate arm check` prints it.
 """
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass, replace
 from difflib import get_close_matches

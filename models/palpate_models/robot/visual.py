@@ -1,7 +1,5 @@
 """Visual meshes of the robot by link: drawn for the LBR iiwa 7 R800, the collision capsules for other arms."""
 
-from __future__ import annotations
-
 from functools import cache
 from typing import Final, NamedTuple
 
@@ -9,13 +7,7 @@ import numpy as np
 
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import (
-    FLANGE_TO_FT_M,
-    FT_SENSOR_RADIUS_M,
-    FT_TO_INDENTER_M,
-    STANDOFF_RADIUS_M,
-    arm_of,
-)
+from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_RADIUS_M, FT_TO_INDENTER_M, STANDOFF_RADIUS_M, arm_of
 from palpate_models.robot.chain import Arm, Capsule
 from palpate_models.robot.solids import (
     Field,
@@ -191,20 +183,14 @@ def _arm() -> dict[str, list[VisualMesh]]:
             _disc(BULB_M + 0.001, GREY, shoulder[1], shoulder[2]),
             _cap(shoulder[1] - BULB_END_M, shoulder[2], -1.0),
         ],
-        "lbr_link_2": [
-            _housing(_above(upper[2], upper[1]), low, high),
-            _cap(BULB_END_M, 0.0, 1.0),
-        ],
+        "lbr_link_2": [_housing(_above(upper[2], upper[1]), low, high), _cap(BULB_END_M, 0.0, 1.0)],
         "lbr_link_3": [
             _housing(_below(elbow[2], elbow[1]), low, high),
             _ring(ring, GREY),
             _disc(BULB_M + 0.001, GREY, elbow[1], elbow[2]),
             _cap(elbow[1] + BULB_END_M, elbow[2], 1.0),
         ],
-        "lbr_link_4": [
-            _housing(mirrored(_above(lower[2], -lower[1])), low, high),
-            _cap(-BULB_END_M, 0.0, -1.0),
-        ],
+        "lbr_link_4": [_housing(mirrored(_above(lower[2], -lower[1])), low, high), _cap(-BULB_END_M, 0.0, -1.0)],
         "lbr_link_5": [
             _housing(_forearm(), (-0.09, -0.125, -0.01), (0.09, 0.09, 0.26)),
             _ring(ring, GREY),

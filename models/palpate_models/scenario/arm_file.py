@@ -1,7 +1,5 @@
 """The YAML file of an arm: what its URDF lacks, and the defaults of section `robot`."""
 
-from __future__ import annotations
-
 from enum import StrEnum
 from functools import cache
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Checkpoint of an interrupted examination: its measurements, for the run that resumes it."""
 
-from __future__ import annotations
-
 import io
 from dataclasses import dataclass
 from pathlib import Path

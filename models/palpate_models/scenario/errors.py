@@ -8,8 +8,6 @@ the other levels, each value with its mark of certainty and its source.
 and scoring may call it; all other code uses the nominal equipment.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache

@@ -3,8 +3,6 @@
 Errors name file, line, field, value and what is allowed.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from difflib import get_close_matches
@@ -107,11 +105,7 @@ def _line(node: yaml.Node | None, field: Iterable[str]) -> int | None:
 View = Literal["scenario", "plant", "exam"]
 """Views of a scenario; a run's folder has a file of each."""
 _PATIENT: dict[str, Any] = {"name": True, "description": True, "phantom": True, "tissue": True, "services": {"tissue"}}
-HIDDEN: Mapping[View, dict[str, Any]] = {
-    "scenario": {},
-    "plant": _PATIENT,
-    "exam": {**_PATIENT, "seed": True, "errors": True},
-}
+HIDDEN: Mapping[View, dict[str, Any]] = {"scenario": {}, "plant": _PATIENT, "exam": {**_PATIENT, "seed": True, "errors": True}}
 """Fields left out of each view: the patient for the plant; also seed and errors for the examination."""
 _VIEWS: Mapping[str, View] = {
     "tissue": "scenario",

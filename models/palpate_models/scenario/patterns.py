@@ -1,7 +1,5 @@
 """Scan patterns: functions of examination and perceived surface that return lines of targets."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Final

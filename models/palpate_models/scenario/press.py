@@ -4,8 +4,6 @@ The indenter moves along the inward normal from the touched skin, at constant sp
 stiffness is the mean force at the end of the hold.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

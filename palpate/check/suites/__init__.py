@@ -1,7 +1,5 @@
 """Suites: requirements on an implementation of each role, from the contract and the documentation of its messages."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 from palpate.check.report import ConformanceReport

@@ -1,7 +1,5 @@
 """Role assessment: the suite plays an examination of a belly with one stiff area, line by line, to its end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 
@@ -160,15 +158,7 @@ def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
     last = rig.last(MAP)
     if report.expect("a map comes with them", last is not None, "assessment/map", "there" if last is not None else "none"):
         n = len(last.vertices) // 3
-        sizes = {
-            n,
-            len(last.apparent),
-            len(last.lower),
-            len(last.upper),
-            len(last.force),
-            len(last.scanned),
-            len(last.finding),
-        }
+        sizes = {n, len(last.apparent), len(last.lower), len(last.upper), len(last.force), len(last.scanned), len(last.finding)}
         report.expect("one value per vertex", sizes == {n}, n, sorted(sizes))
         ordered = bool(np.all(last.lower <= last.apparent)) and bool(np.all(last.apparent <= last.upper))
         report.expect(

@@ -1,7 +1,5 @@
 """Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Requirements of the contract on every implementation, checked over all messages that it sent during its suite."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

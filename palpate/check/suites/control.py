@@ -1,7 +1,5 @@
 """Role control: impedance or admittance control. The suite plays an arm that stands still at the ready posture."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

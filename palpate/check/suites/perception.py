@@ -1,7 +1,5 @@
 """Conformance of perception: the suite sends depth frames of a belly of known shape, and then none."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -10,14 +8,7 @@ from palpate.check import shapes
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, Rig
 from palpate.check.suites.camera import FRAME
-from palpate_bus.messages import (
-    CameraInfo,
-    CameraTrigger,
-    RegionOfInterest,
-    SurfaceMotion,
-    TFMessage,
-    TransformStamped,
-)
+from palpate_bus.messages import CameraInfo, CameraTrigger, RegionOfInterest, SurfaceMotion, TFMessage, TransformStamped
 from palpate_bus.messages.geometry import depth_message, transform_message
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array, apply, inverse, look_at

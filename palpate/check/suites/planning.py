@@ -1,7 +1,5 @@
 """Role planning: the suite plays an arm that follows, up to the burst of depth frames; then an operator stops it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

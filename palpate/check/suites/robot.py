@@ -1,7 +1,5 @@
 """Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
@@ -9,15 +7,7 @@ import numpy as np
 from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
 from palpate_bus.contract import MS
-from palpate_bus.messages import (
-    JointTorqueCommand,
-    OperatorRequest,
-    RobotStatus,
-    SupervisorState,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-)
+from palpate_bus.messages import JointTorqueCommand, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.geometry import rotation
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_models.numerics.frames import Array

@@ -1,7 +1,5 @@
 """Role search: the suite plays an examination that carries out each request, on a belly with one stiff area."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -1,7 +1,5 @@
 """Role supervisor: the suite plays arm and planning, violates one limit after another, and expects a stop for each."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any
 

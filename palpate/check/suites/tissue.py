@@ -1,7 +1,5 @@
 """Role tissue: the suite moves an indenter above it, into it, along it and out again. The patient holds their breath."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

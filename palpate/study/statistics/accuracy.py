@@ -1,7 +1,5 @@
 """Accuracy of findings: errors of position, size and stiffness (Bland and Altman), calibration of confidences, and effort."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 from zlib import crc32

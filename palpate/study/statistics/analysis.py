@@ -1,7 +1,5 @@
 """All statistics of one method, with the curves that its plots need."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import pandas as pd

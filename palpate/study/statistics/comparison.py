@@ -1,7 +1,5 @@
 """Two methods on the same patients: paired differences, McNemar's test, and equivalence by two one-sided tests."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 import numpy as np

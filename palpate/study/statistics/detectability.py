@@ -4,8 +4,6 @@ A psychometric surface: P(found) = (1 - lapse) / (1 + exp(-(b_0 + sum b_i z_i)))
 Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however clear they are, is kept where AIC wants it.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final

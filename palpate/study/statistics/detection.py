@@ -1,7 +1,5 @@
 """Detection: rates of findings and failures, ROC per patient, FROC over lumps, and rates by felt contrast."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Samples to map and findings: the whole of the assessment, arrays in, arrays out."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from enum import IntEnum

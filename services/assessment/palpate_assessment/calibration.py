@@ -1,7 +1,5 @@
 """Parameters fitted to tuning patients: `calibration.yaml`, made by `python -m research.assessment_calibration`."""
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.resources import files
 

@@ -6,8 +6,6 @@ the time since contact, the strength of f = w(x) exp(-t / relaxation_s) with a p
 f' S^-1 y / (f' S^-1 f + fade_sd^-2).
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial

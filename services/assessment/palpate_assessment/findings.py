@@ -1,7 +1,5 @@
 """From candidates to findings: how probable each is, where it ends, and how it feels against its surroundings."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The map's mesh: a regular grid over the examined region in the xy plane of A, lifted to the perceived surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

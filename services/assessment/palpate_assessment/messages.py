@@ -1,7 +1,5 @@
 """Conversion of messages from other roles."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -7,8 +7,6 @@ bone where ribs and iliac crests may lie, and of the lumps that were detected. T
 as the mode of their posterior under log-normal priors (Rasmussen and Williams 2006, ch. 5): K = K0 + sum_j exp(2 a_j) K_j.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property

@@ -1,7 +1,5 @@
 """States of the examination at 100 Hz to samples: one every few millimetres of travel, by averaging."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from math import sqrt

@@ -8,8 +8,6 @@ forecast w' of perception, because images arrive a tenth of a second late. The a
 is the depth d' corrected accordingly.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Sequence
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Assessment as a service: states of the examination in; samples, a growing map, the final map and findings out."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass

@@ -6,8 +6,6 @@ images of the wall. With z(x) the height of that skin, and z' the height from wh
     d = d' + n_z (z(x) - z').
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

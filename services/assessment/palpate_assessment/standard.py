@@ -4,8 +4,6 @@ A press feels over the radius of its footprint, sqrt(2 R d - d^2) for a sphere o
 it. Forces scale with the force of the press.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields
 from functools import cached_property

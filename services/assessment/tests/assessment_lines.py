@@ -1,7 +1,5 @@
 """Samples along lines over a belly whose log-force is a known function of place, with errors of your own choice."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Map and findings of known bellies, and signs of a muscle around a lump."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import partial
 

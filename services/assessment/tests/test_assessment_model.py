@@ -1,7 +1,5 @@
 """The regression: amplitudes that data of known amplitudes have, and the check of its predictions."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

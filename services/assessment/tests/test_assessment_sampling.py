@@ -1,7 +1,5 @@
 """Samples from states: averages, the map's grid, depth from the final skin and from measured breathing."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The service, driven by states of a sphere that slides over the real tissue, and whole scans on a few seeds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

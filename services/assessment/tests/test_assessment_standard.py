@@ -1,7 +1,5 @@
 """Another body, indenter and depth than the abdomen's: presses of 2 mm with a ball of 6 mm on a small phantom."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Checks of camera messages of other makers: images, intrinsics and static transforms, from ROS or from a recording."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterable
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Errors of the camera: noise, bias, lost pixels."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Images, intrinsics and transforms of other cameras: the recording and the ROS bridge accept and refuse the same ones."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A ROS camera's images, intrinsics and transforms through the bridge, and over zenoh."""
 
-from __future__ import annotations
-
 from itertools import count
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """The camera service and its ray casting."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The conductor's service: collects what the report needs; publishes clock, diagnostics and frames. The same in every runtime."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any

@@ -153,9 +153,7 @@ class Conductor:
     # -- the run
 
     def run(
-        self,
-        exited: Callable[[], Mapping[str, str]] = dict,
-        tell: Callable[[Conductor], None] = lambda _: None,
+        self, exited: Callable[[], Mapping[str, str]] = dict, tell: Callable[[Conductor], None] = lambda _: None
     ) -> RunOutcome:
         """Run to the end. `exited` gives the roles whose process ended, with a text of the reason; `tell` is called often.
 

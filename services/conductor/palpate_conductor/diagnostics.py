@@ -5,8 +5,6 @@ tick, so fast topics are received one at a time, for `sample_s` every `round_s`;
 from their liveliness tokens. `palpate doctor` receives everything at once.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import cycle

@@ -5,8 +5,6 @@ never overrun; up to a second beyond what the recorder has written; in real time
 paused. In wall-clock mode only the common start and the end are granted.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from time import monotonic, time_ns
 

@@ -4,8 +4,6 @@ Only for roles whose absence is safe and whose work another process can continue
 measure or supervise, and a perception that did not process the first scan has no surface to continue with.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from time import monotonic
 from typing import Final

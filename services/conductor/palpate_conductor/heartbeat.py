@@ -4,8 +4,6 @@ A thread sends it, so that drawing a figure or decoding a message does not delay
 since a conductor that hangs does not pass on an operator's stop.
 """
 
-from __future__ import annotations
-
 import os
 from threading import Event, Thread
 from time import monotonic

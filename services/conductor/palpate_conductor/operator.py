@@ -3,8 +3,6 @@
 It answers once the supervisor confirms or refuses the request.
 """
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable
 from dataclasses import dataclass

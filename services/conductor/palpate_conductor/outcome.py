@@ -1,7 +1,5 @@
 """Settings and results of a run: how time passes, how long the conductor waits, how the run ended."""
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field

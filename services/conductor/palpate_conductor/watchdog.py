@@ -3,8 +3,6 @@
 Frozen processes are found only where the conductor can inspect them: on the same machine, in the same namespace of process ids.
 """
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The parts of the conductor, without services."""
 
-from __future__ import annotations
-
 import json
 import subprocess
 import sys

@@ -15,8 +15,6 @@ makes it unstable (small gain).
 The joints follow by inverse kinematics on commanded positions, with damped least squares and the posture in the null space.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import exp
 

@@ -20,8 +20,6 @@ M_ii joint by joint, two nearly coaxial joints that turn against each other are 
 few milliseconds then makes the arm oscillate.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Arm model of the controller, on pinocchio: kinematics, inertia and Coriolis torques at one state."""
 
-from __future__ import annotations
-
 import pinocchio as pin
 
 from palpate_models.numerics.frames import Array

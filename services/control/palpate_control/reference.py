@@ -1,7 +1,5 @@
 """Reference motion between set-points: each is extrapolated by its velocity and blended with the previous one."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import exp
 from typing import NamedTuple

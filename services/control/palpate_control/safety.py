@@ -1,7 +1,5 @@
 """Limits on the torque of any control law: repulsion from joint limits, saturation, and a rate limit."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from palpate_models.numerics.compiled import compiled

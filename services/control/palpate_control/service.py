@@ -1,7 +1,5 @@
 """The control service: joint states and set-points in, joint torques or positions out, at 1 kHz."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Mapping
 from math import isfinite

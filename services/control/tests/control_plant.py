@@ -1,7 +1,5 @@
 """A plant for the controller's tests: the arm on pinocchio, with joint friction, stepped at 1 kHz, and a contact."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Admittance control: the static law, the tare, and the limits of what it commands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from control_plant import WORKING, reference, setpoint

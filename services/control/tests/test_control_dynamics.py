@@ -1,7 +1,5 @@
 """The control law in motion, on a simulated arm with joint friction and one millisecond from measuring to acting."""
 
-from __future__ import annotations
-
 from collections import deque
 from collections.abc import Callable
 

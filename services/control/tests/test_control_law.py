@@ -1,7 +1,5 @@
 """The control law at rest: kinematics, springs, clips, limits."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

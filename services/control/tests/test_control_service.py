@@ -1,7 +1,5 @@
 """The control service: what it sends before, with, and after set-points."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

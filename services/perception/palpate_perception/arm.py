@@ -1,7 +1,5 @@
 """Mask of pixels that may show the arm: nominal kinematics with a margin for their error."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -10,8 +10,6 @@ The displacement is a level and two stochastic oscillators, one at the breathing
 each with a constant variance. Variances and rate are re-estimated from the last half minute, since amplitude and period change.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

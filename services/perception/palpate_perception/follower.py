@@ -9,8 +9,6 @@ pixels show the drift alone,
 and its part slower than `DRIFT.tau_s` is subtracted from all depths.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Final
 

@@ -5,8 +5,6 @@ converges to the true depth, which the median does not. The mean is taken over t
 excludes frames in which the pixel shows something behind an edge.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Camera messages as arrays; the wall's motion and the surface's correction as messages."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -8,8 +8,6 @@ passes a wave of length L with gain 1 / (1 + lambda (2 pi / L)^6 / rho) (Eilers 
 set by the length at which the gain is one half, which does not depend on noise or range.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Final
 

@@ -29,8 +29,6 @@ over all images in which the arm does not hide it. These displacements are fitte
 the surface.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final

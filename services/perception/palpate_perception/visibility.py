@@ -1,7 +1,5 @@
 """Coverage of the region of interest by the camera, and the reasons for gaps."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final

@@ -9,8 +9,6 @@ of A, frame by frame; the singular value decomposition of their coefficients, wh
 Errors that are fixed to the image cancel, since only changes of a pixel count.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -3,8 +3,6 @@
 Run: `python services/perception/tests/bench_perception_surface.py [PNG]`
 """
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

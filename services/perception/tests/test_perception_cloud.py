@@ -1,7 +1,5 @@
 """Points from depth images, and the pattern of targets."""
 
-from __future__ import annotations
-
 import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -46,10 +44,7 @@ def test_the_window_holds_the_box_and_not_much_more() -> None:
 def test_the_window_is_empty_when_the_camera_looks_aside_and_whole_when_the_box_surrounds_it() -> None:
     aside = look_at(np.array([0.95, -0.45, 1.85]), np.array([3.0, -2.0, 1.5]))
     rows, columns = cloud.window(BOX, inverse(aside) @ X_WA, K, (480, 640))
-    assert (rows.stop - rows.start) * (columns.stop - columns.start) == 0 or (rows, columns) == (
-        slice(0, 480),
-        slice(0, 640),
-    )
+    assert (rows.stop - rows.start) * (columns.stop - columns.start) == 0 or (rows, columns) == (slice(0, 480), slice(0, 640))
     inside = look_at(np.array([0.56, 0.0, 0.95]), np.array([0.56, 0.3, 0.9]))
     assert cloud.window(BOX, inverse(inside) @ X_WA, K, (480, 640)) == (slice(0, 480), slice(0, 640))
 

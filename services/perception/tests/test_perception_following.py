@@ -1,7 +1,5 @@
 """Tests of wall following: breath filter, arm mask, and reports of breaths, coughs, shifts and a hidden wall."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

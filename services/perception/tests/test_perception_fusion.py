@@ -1,7 +1,5 @@
 """Fusion of depth images and visibility of the wall."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

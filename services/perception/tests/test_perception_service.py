@@ -1,7 +1,5 @@
 """Perception with the real camera on the real phantom: accuracy, occlusion, calibration error, order, determinism."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from functools import cache
 from typing import Any

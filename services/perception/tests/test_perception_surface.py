@@ -1,7 +1,5 @@
 """The smoothing spline: what it passes, what it smooths, normals, its own error bars, stray points."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -12,8 +12,6 @@ with F the normal force, L the magnitude of the whole force (a hard edge pushes 
 magnitude expected when the command takes effect.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 

@@ -1,7 +1,5 @@
 """The sequence of the examination: home, look, plan, approach, indent, scan, retract, return, assess, done."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ its result is used a fixed simulated time later. In lockstep the step that uses 
 depend on the speed of the machine. In wall-clock mode the result is used when it is available, but not before its time.
 """
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor

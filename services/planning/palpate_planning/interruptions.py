@@ -1,7 +1,5 @@
 """Interruptions of the strokes: a wall that cannot be tracked, too much force, a pause; and how the strokes continue."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final

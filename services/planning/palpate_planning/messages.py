@@ -1,7 +1,5 @@
 """Messages of the examination from arrays, and arrays from the messages of perception."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from palpate_bus.messages import ExamState, Path, PoseStamped, SkinTouch, SurfaceCorrection, SurfaceMotion

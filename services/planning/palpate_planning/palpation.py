@@ -1,7 +1,5 @@
 """The strokes of a plan, one after the other, and their interruptions."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import NamedTuple
 

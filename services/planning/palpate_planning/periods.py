@@ -1,7 +1,5 @@
 """Periods of planning, which `service` reads from the contract."""
 
-from __future__ import annotations
-
 from typing import Final, NamedTuple
 
 MS: Final = 1_000_000

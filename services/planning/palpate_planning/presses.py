@@ -1,7 +1,5 @@
 """Presses that a search requests, appended to the strokes one at a time."""
 
-from __future__ import annotations
-
 from palpate_models.numerics.frames import Array
 from palpate_planning.free_motion import BackgroundTask
 from palpate_planning.palpation import Palpation

@@ -1,7 +1,5 @@
 """Causes for which an examination deviates from its plan: a code for programs and a text for people."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterable
 from enum import IntEnum, StrEnum

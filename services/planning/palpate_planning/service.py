@@ -1,7 +1,5 @@
 """Planning as a service: messages to arrays and back. The examination itself is in `examination`."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Mapping
 from functools import cache

@@ -1,7 +1,5 @@
 """The two kinds of set-point of planning, with the stiffness of each."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Final
 
@@ -52,13 +50,7 @@ def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array, stiffness: Array) -
 
 
 def cartesian_setpoint(
-    t: int,
-    R_WD: Array,
-    p_WD: Array,
-    q: Array,
-    V_WD: Array = _NO_TWIST,
-    F_W: Array = _NO_WRENCH,
-    qd: Array | None = None,
+    t: int, R_WD: Array, p_WD: Array, q: Array, V_WD: Array = _NO_TWIST, F_W: Array = _NO_WRENCH, qd: Array | None = None
 ) -> Setpoint:
     """Return the set-point of contact at `t` [ns]: pose, twist, feed-forward wrench, posture q [rad] in the null space.
 

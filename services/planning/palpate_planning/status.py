@@ -1,7 +1,5 @@
 """Inputs and outputs of a step of the examination, and its phases."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple

@@ -1,7 +1,5 @@
 """Stop, hold and resume: how an examination that is stopped continues or ends."""
 
-from __future__ import annotations
-
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_planning.contact import ContactMeasurement

@@ -1,7 +1,5 @@
 """Motion of the commanded indenter in a stroke: position along the path, depth below the surface, feed-forward force."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

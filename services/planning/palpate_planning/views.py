@@ -1,7 +1,5 @@
 """Views of the abdomen, and the part of the examination that is planned again after an interruption."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Waits of the examination: for what, from when on they are reported, and when they end."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final, NamedTuple
 
@@ -68,10 +66,7 @@ FOR_ROBOT: Final = _wait(
     "robot/status",
 )
 FOR_PLAN: Final = _wait(
-    Reason.WAITS_FOR_PLAN,
-    "waiting for the motion planner",
-    Reason.NO_PATH,
-    "the motion planner did not finish",
+    Reason.WAITS_FOR_PLAN, "waiting for the motion planner", Reason.NO_PATH, "the motion planner did not finish"
 )
 FOR_PERCEPTION: Final = Cause(Reason.WAITS_FOR_PERCEPTION, "waiting for the surface and the targets", "perception")
 FOR_FINDINGS: Final = Cause(Reason.WAITS_FOR_FINDINGS, "waiting for the findings", "assessment")

@@ -1,7 +1,5 @@
 """Closed loop for the tests of planning: an ideal robot that follows set-points, a spring tissue, a perfect camera."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

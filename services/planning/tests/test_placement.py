@@ -1,7 +1,5 @@
 """Kinematics in CasADi, postures along a scan, and where the base stands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

@@ -1,7 +1,5 @@
 """Tests of breathing forecasts and of the reaction to deviations from them."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import numpy as np

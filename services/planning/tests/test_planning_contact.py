@@ -1,7 +1,5 @@
 """Tests of contact force and depth regulation."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import numpy as np

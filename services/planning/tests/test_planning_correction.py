@@ -1,7 +1,5 @@
 """Tests of the correction of the perceived surface from touches."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Tests of the whole examination in closed loop with a spring tissue and an ideal robot."""
 
-from __future__ import annotations
-
 from collections import Counter
 from itertools import pairwise
 

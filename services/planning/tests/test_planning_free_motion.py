@@ -1,7 +1,5 @@
 """Tests of free motions: background worker, trajectory following, and missed steps."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from threading import Event
 

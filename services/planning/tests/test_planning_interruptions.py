@@ -1,7 +1,5 @@
 """Tests of stops, pushes and unexpected motion of the wall: the examination waits, resumes or ends."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

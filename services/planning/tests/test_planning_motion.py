@@ -1,7 +1,5 @@
 """Tests of kinematics, collision scene, free motion and timing."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 from typing import Any
 

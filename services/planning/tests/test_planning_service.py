@@ -1,7 +1,5 @@
 """Tests of the service with messages encoded and decoded as on the bus."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Strokes of a scan: coverage, poses of the indenter, set-points along a path."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -29,13 +27,7 @@ def grid(columns: int, rows: int, snake: bool) -> tuple[np.ndarray, np.ndarray]:
     return np.array(xy), np.array(lines)
 
 
-@given(
-    st.integers(2, 6),
-    st.integers(1, 5),
-    st.booleans(),
-    st.sampled_from(list(Mode)),
-    st.integers(0, 2**30 - 1),
-)
+@given(st.integers(2, 6), st.integers(1, 5), st.booleans(), st.sampled_from(list(Mode)), st.integers(0, 2**30 - 1))
 @settings(deadline=None)
 def test_every_usable_target_is_visited_once_in_order(columns: int, rows: int, joined: bool, mode: Mode, mask: int) -> None:
     xy, lines = grid(columns, rows, joined)

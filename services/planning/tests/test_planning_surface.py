@@ -1,7 +1,5 @@
 """The perceived surface as a smooth height field, and its compiled splines against scipy."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

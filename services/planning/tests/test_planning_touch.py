@@ -1,7 +1,5 @@
 """Tests of the skin's depth from depth and force of a slow descent."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from hypothesis import given, settings

@@ -1,7 +1,5 @@
 """Tests of the waits: each says for what within some seconds, and ends within a bound that counts all of it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 

@@ -4,8 +4,6 @@ Layout: rosbag2's `metadata.yaml` (version 9, ROS 2 Jazzy) next to `<folder>_0.m
 message encoding `cdr`, schema encoding `ros2msg`; see MCAP's well-known profiles and rosbag2_storage's metadata.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path

@@ -6,8 +6,6 @@ writes `DIR/recording_mcap_recovered`, with all complete chunks of the broken fi
 parts are listed, with status 1. It accepts recordings of other programs too, as a folder or a single file (its ROS 2 topics).
 """
 
-from __future__ import annotations
-
 import sys
 from collections import Counter, deque
 from collections.abc import Collection, Iterator

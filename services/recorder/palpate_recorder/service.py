@@ -4,8 +4,6 @@ It is an observer whose data does not come through the inbox: the runtime passes
 no message is decoded or skipped.
 """
 
-from __future__ import annotations
-
 import logging
 import shutil
 from collections.abc import Mapping

@@ -1,7 +1,5 @@
 """The recording as others read it: rosbags' Reader, the mcap library with its ROS 2 decoder, and after a crash."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 import sys

@@ -6,8 +6,6 @@ without
 stiffness: pressed tissue pushes the arm away, so the force falls. An arm that takes positions stops and stays where it is.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final

@@ -10,8 +10,6 @@ DART computes the same, but through its Python binding a call takes five times a
 `palpate_models.robot.kinematics` is the same in numpy; tests compare them.
 """
 
-from __future__ import annotations
-
 from math import cos, sin, sqrt
 from typing import Final
 

@@ -1,7 +1,5 @@
 """Interface of a simulated arm: physics engines behind the same driver and sensors."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Final, Protocol
 

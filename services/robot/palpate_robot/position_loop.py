@@ -8,8 +8,6 @@ discretised as stable proportional-derivative control (Tan, Liu and Turk, IEEE C
 reference at the end of the step h, and the terms in v are implicit, so any gains are stable.
 """
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 

@@ -15,8 +15,6 @@ with the true wrench w, after a lag of first order if the sensor has one, a sens
 power-on, the warm-up a, and x(t), which a tare does not remove: an Ornstein-Uhlenbeck process plus a random walk.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import cos, exp, sin
 from typing import Final

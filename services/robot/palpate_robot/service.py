@@ -1,7 +1,5 @@
 """Robot service: driver, plant and sensors in one step of a millisecond."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping
 from typing import Any, ClassVar
 from zlib import crc32

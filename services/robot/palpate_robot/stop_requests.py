@@ -1,7 +1,5 @@
 """Stop and release requests of operator and supervisor, applied to a driver."""
 
-from __future__ import annotations
-
 from typing import Final
 
 from palpate_bus.messages import OperatorRequest, SupervisorState

@@ -1,7 +1,5 @@
 """The driver on an emulated arm without transport and without a wall clock: time is the caller's."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any
 

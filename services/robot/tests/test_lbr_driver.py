@@ -1,7 +1,5 @@
 """The driver on the emulated arm, in simulated time."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

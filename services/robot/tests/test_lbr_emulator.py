@@ -1,7 +1,5 @@
 """The emulator's pace: that of an arm, whatever its machine does."""
 
-from __future__ import annotations
-
 import socket
 from itertools import pairwise
 
@@ -118,10 +116,7 @@ def test_nan_means_no_torque() -> None:
 
 @pytest.mark.parametrize(
     ("break_it", "words"),
-    [
-        (lambda s: s.take(HOME + 60.0, ZERO), "command guard"),
-        (lambda s: s.take(HOME, np.full(7, 300.0)), "controller"),
-    ],
+    [(lambda s: s.take(HOME + 60.0, ZERO), "command guard"), (lambda s: s.take(HOME, np.full(7, 300.0)), "controller")],
 )
 def test_what_breaks_a_rule_ends_the_session_for_good(break_it: object, words: str) -> None:
     session = active()

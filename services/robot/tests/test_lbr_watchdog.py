@@ -1,7 +1,5 @@
 """The driver's watchdog, in one process and in several."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

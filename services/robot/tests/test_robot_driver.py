@@ -7,13 +7,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.codec import message_type
 from palpate_models.robot import lbr
 from palpate_models.robot.lbr import ARM
-from palpate_robot.driver import (
-    TUNING,
-    Command,
-    Driver,
-    DriverMode,
-    HoldCause,
-)
+from palpate_robot.driver import TUNING, Command, Driver, DriverMode, HoldCause
 
 MS = 1_000_000
 STILL = np.zeros(7)

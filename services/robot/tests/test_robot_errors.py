@@ -1,7 +1,5 @@
 """Errors of sensors and arm: each error shows in readings or in motion, by the size that was drawn."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The plant against pinocchio, which shares none of its code, and against what physics demands."""
 
-from __future__ import annotations
-
 import numpy as np
 import pinocchio as pin
 import pytest

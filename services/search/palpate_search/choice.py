@@ -1,7 +1,5 @@
 """Policies of the search: installed ones by name, or a Python file that has `next_press(posterior, budget)`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Final
 

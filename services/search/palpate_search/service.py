@@ -1,7 +1,5 @@
 """Search service: samples in, next press out, until the budget is spent or a missed lump is improbable."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, Final

@@ -1,7 +1,5 @@
 """Policies, the posterior they use, and the service that asks for presses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace

@@ -1,7 +1,5 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from palpate_supervisor.senses import ForceComparison

@@ -1,7 +1,5 @@
 """Latched stop: which breach latches it, when a soft stop escalates to an emergency stop, when a release is granted."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

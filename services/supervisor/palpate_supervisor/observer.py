@@ -7,8 +7,6 @@ with the measured joint torques tau, the Coriolis matrix C and the gravity torqu
 of the joints with the time constant 1 / K_O. A force F at a point with the Jacobian J causes r = J^T F.
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

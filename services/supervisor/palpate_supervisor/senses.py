@@ -17,8 +17,6 @@ In a direction that no joint feels (a singular posture) the prior F_max decides:
 the regression of the reading on the known weight and inertia while the tool moves freely.
 """
 
-from __future__ import annotations
-
 from math import exp
 from typing import Final, NamedTuple
 

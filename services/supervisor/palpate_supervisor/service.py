@@ -1,7 +1,5 @@
 """Supervisor service: converts messages to numbers and publishes the latched stop."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar

@@ -1,7 +1,5 @@
 """Position, speed and external force of the tool, from joint state and F/T reading only; the perceived rest surface."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple

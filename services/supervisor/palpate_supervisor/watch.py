@@ -1,7 +1,5 @@
 """Compares measurements with the scenario's limits. Numbers in, breaches out."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum

@@ -1,7 +1,5 @@
 """The judge of F/T sensor and joints, on an arm that moves freely and then presses: nominal dynamics, noise, friction, bias."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from functools import cache
 

@@ -1,7 +1,5 @@
 """Limits that the supervisor watches, its latch, and the service."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -8,8 +8,6 @@ s with a constant stiffness k, and slips at the Coulomb limit,
 P removes the component along the normal. It is passive: k is constant, and slipping, turning and unloading only shorten s.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -4,8 +4,6 @@ The tissue simulates a body at rest in a frame V that moves with the body: X_WV 
 are transformed from W to V, outputs from V to W.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar

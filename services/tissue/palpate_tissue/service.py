@@ -3,8 +3,6 @@
 The physics is behind `TissueBackend`. This module converts messages to arrays in the patient's true frame.
 """
 
-from __future__ import annotations
-
 import logging
 from collections.abc import Iterator, Mapping, Sequence
 from math import hypot, sqrt

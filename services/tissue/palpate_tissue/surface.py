@@ -1,7 +1,5 @@
 """Surface geometry: the rest point under the indenter, and the normals of the deformed mesh."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

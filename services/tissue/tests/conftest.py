@@ -1,7 +1,5 @@
 """Makes the foreign FMU importable and gives the tests one cache of compliances."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """An FMU that is not ours, built from a few lines of C: three first-order lags in millimetres, FMI 2.0 or 3.0."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """A small FMU that behaves oddly on request, FMI 2.0 or 3.0: a wall of springs with input z and output f."""
 
-from __future__ import annotations
-
 import zipfile
 from collections.abc import Mapping
 from enum import IntEnum

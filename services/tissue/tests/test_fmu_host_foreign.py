@@ -1,7 +1,5 @@
 """The FMU host: the project's own FMU and foreign ones."""
 
-from __future__ import annotations
-
 from dataclasses import fields, is_dataclass
 from importlib import resources
 from pathlib import Path

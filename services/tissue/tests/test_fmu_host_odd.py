@@ -1,7 +1,5 @@
 """FMUs of strangers: what is legal is hosted, and every answer and every value that ends a run names FMU, variable and time."""
 
-from __future__ import annotations
-
 import zipfile
 from pathlib import Path
 

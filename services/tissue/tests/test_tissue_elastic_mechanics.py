@@ -1,7 +1,5 @@
 """The elastic tissue's laws: the layer, the finite elements, lesions, relaxation, energy, contact."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from itertools import pairwise, product

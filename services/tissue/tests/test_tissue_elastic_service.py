@@ -1,7 +1,5 @@
 """The elastic tissue in its role: by the command's choice, its truth, its cache."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

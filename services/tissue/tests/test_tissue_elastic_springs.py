@@ -1,7 +1,5 @@
 """Stiffening and guarding in the elastic tissue: against an independent solution, what they do to the force, energy."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from functools import cache

@@ -1,7 +1,5 @@
 """The tissue's laws: contact against Hertz, relaxation, energy, friction, breathing, stability."""
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from itertools import pairwise
@@ -51,10 +49,7 @@ def test_force_scales_with_stiffness():
     np.testing.assert_allclose(guarded, 4 * soft, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize(
-    ("radius", "contrast", "reference"),
-    [(0.020, 2, 1.68), (0.020, 10, 6.27), (0.030, 4, 3.70)],
-)
+@pytest.mark.parametrize(("radius", "contrast", "reference"), [(0.020, 2, 1.68), (0.020, 10, 6.27), (0.030, 4, 3.70)])
 def test_lump_force_ratio(radius, contrast, reference):
     """Design figures at 10 mm for an ideal local field; a field whose shear stiffness follows too reads a little more."""
     lump = Lesion(centre_m=(0.0, 0.0), radii_m=(radius, radius), contrast=contrast)

@@ -1,7 +1,5 @@
 """Standard presses: each tier's fast way against its own steps of 1 ms."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """The tissue service against its rows of the contract, also for a patient who moves."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -1,7 +1,5 @@
 """The stiffening wall and the contracted muscle on the surface tier: law, contact, energy, stability."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import replace
 from itertools import pairwise

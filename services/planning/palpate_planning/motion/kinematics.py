@@ -1,7 +1,5 @@
 """Forward and inverse kinematics of robot and tool, on pinocchio."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -86,13 +84,7 @@ class ArmKinematics:
         return J
 
     def solve(
-        self,
-        X_WI: Array,
-        q_seed: Array,
-        q_rest: Array | None = None,
-        *,
-        spin_free: bool = False,
-        iterations: int = 60,
+        self, X_WI: Array, q_seed: Array, q_rest: Array | None = None, *, spin_free: bool = False, iterations: int = 60
     ) -> IkSolution:
         """Return joint positions that put the indenter at X_WI; with `spin_free` the rotation about the tool axis is free.
 

@@ -4,8 +4,6 @@ Deterministic: OMPL's seed is set for each query before planner and sampler are 
 queries; planning ends on an iteration count, never on time; shortcuts are greedy, not random.
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from itertools import pairwise
 

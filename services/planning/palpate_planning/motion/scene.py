@@ -1,7 +1,5 @@
 """The collision scene: the arm's capsules, table, base and the perceived abdomen, checked with coal through pinocchio."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from itertools import pairwise

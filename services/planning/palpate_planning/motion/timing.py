@@ -1,7 +1,5 @@
 """Time parametrisation: jerk-limited speed along a path by ruckig on one degree of freedom, within joint and tool limits."""
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise

@@ -279,12 +279,7 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     cost = ca.sum2(functions.cost.map(count)(Q, bases, force)[0])
     cost += POSTURES.smoothness * ca.dot(weights, ca.sum1(travel**2).T)
     residual = functions.task.map(count)(Q, bases, P, frames)[0]
-    problem = {
-        "x": ca.vec(Q),
-        "p": ca.vertcat(base, ca.vec(P), ca.vec(frames), weights),
-        "f": cost,
-        "g": ca.vec(residual),
-    }
+    problem = {"x": ca.vec(Q), "p": ca.vertcat(base, ca.vec(P), ca.vec(frames), weights), "f": cost, "g": ca.vec(residual)}
     options = {
         "ipopt": {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
         "print_time": False,
@@ -302,12 +297,7 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
     spacing = np.diff(s[knots])
     weights = spacing.mean() / spacing
     parameters = np.concatenate(
-        (
-            batch.base,
-            batch.positions[knots].ravel(),
-            np.hstack(list(batch.frames[knots])).ravel(order="F"),
-            weights,
-        )
+        (batch.base, batch.positions[knots].ravel(), np.hstack(list(batch.frames[knots])).ravel(order="F"), weights)
     )
     lower, upper = (np.tile(limit, len(knots)) for limit in batch.limits)
     result = solver(x0=q[knots].ravel(), p=parameters, lbx=lower, ubx=upper, lbg=0, ubg=0)

@@ -4,8 +4,6 @@ A task is a position of the indenter's origin and the direction of its z axis: f
 elbow swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
 """
 
-from __future__ import annotations
-
 from functools import lru_cache
 from importlib import import_module
 from typing import Any, NamedTuple

@@ -5,8 +5,6 @@ stroke. A skipped target ends a stroke: the arm must not slide over what it cann
 reachable targets may be out of reach.
 """
 
-from __future__ import annotations
-
 from collections.abc import Set
 from dataclasses import dataclass
 from itertools import pairwise
@@ -93,13 +91,7 @@ def _direction(a: Array, b: Array) -> Array:
 
 
 def strokes(
-    xy: Array,
-    lines: Ints,
-    usable: Bools,
-    joined: bool,
-    mode: Mode,
-    spacing: float,
-    breaks: Set[int] = frozenset(),
+    xy: Array, lines: Ints, usable: Bools, joined: bool, mode: Mode, spacing: float, breaks: Set[int] = frozenset()
 ) -> list[Stroke]:
     """Return strokes that visit all usable targets in their order.
 

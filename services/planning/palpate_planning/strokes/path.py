@@ -4,8 +4,6 @@ The indenter's z axis is opposite to the outward normal. The sphere's centre is 
 point lies `depth` below the surface point p along the inward normal. Spin about z is free: the sphere is round.
 """
 
-from __future__ import annotations
-
 from bisect import bisect_right
 from dataclasses import dataclass
 from typing import NamedTuple

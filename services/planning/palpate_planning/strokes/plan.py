@@ -1,7 +1,5 @@
 """From perceived targets to a planned examination: reachable targets, strokes, their postures, the approach."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Strokes as segments of arm motion: postures along them, reach and collisions, paths between them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass, field
 

@@ -1,7 +1,5 @@
 """Breathing motion from perception's forecasts (`perception/motion`), interpolated to any time."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from math import exp, hypot, sqrt

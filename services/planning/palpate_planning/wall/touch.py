@@ -10,8 +10,6 @@ to 1.5, and 1.8 over a guarded muscle. There the error of d0 is -0.02 +- 0.15 mm
 skin between mesh points [C].
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from typing import NamedTuple

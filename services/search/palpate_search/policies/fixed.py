@@ -1,7 +1,5 @@
 """Baselines that ignore measurements: raster, random, Latin hypercube."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.stats import qmc
 

@@ -4,8 +4,6 @@ They have no lump model: the process is one smooth field of log-force with a squ
 papers. The amplitude comes from the measurements; length and noise are set for this task, not for the papers' phantoms.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 

@@ -8,8 +8,6 @@ in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The
 (Lindley 1956; MacKay 1992, "Information-based objective functions for active data selection").
 """
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

@@ -4,8 +4,6 @@
 is three convolutions in numpy, for a region of any size.
 """
 
-from __future__ import annotations
-
 from functools import cache
 from importlib.resources import as_file, files
 from typing import Final

@@ -15,8 +15,6 @@ Depth is then rounded to eighths of a pixel of disparity f b / z (Khoshelham, El
 Kinect depth data", Sensors 2012).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

@@ -1,7 +1,5 @@
 """The camera as a service: a small image every tick, and a full-size one while a burst of frames is requested."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, ClassVar, Final
 from zlib import crc32

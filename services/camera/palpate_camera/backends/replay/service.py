@@ -6,8 +6,6 @@ The recording is an endless loop: a burst continues where the last one stopped, 
 is stamped with the tick at which it is sent. The camera pose is that of the recording (`tf_static`).
 """
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from operator import attrgetter

@@ -1,7 +1,5 @@
 """The camera as a service that passes on the images of a ROS 2 depth camera."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from time import monotonic, sleep, time_ns

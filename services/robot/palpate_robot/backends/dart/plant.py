@@ -13,8 +13,6 @@ Collision detection takes more than half of DART's step. While nothing is within
 is identical to the bit.
 """
 
-from __future__ import annotations
-
 import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Robot service with DART physics."""
 
-from __future__ import annotations
-
 from palpate_models.scenario.load import plant_input
 from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.dart.plant import DartPlant

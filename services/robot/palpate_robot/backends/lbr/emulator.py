@@ -19,8 +19,6 @@ and camera it also exchanges exact poses and contact wrenches on topics under `e
   quality falls from EXCELLENT to POOR, at which commanding ends.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys

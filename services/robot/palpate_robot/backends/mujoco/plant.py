@@ -13,8 +13,6 @@ The model is built from the tables of the arm, as the URDF is. MuJoCo's URDF rea
 to one another, and with them the F/T sensor's measuring face into the last link.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any, Final
 

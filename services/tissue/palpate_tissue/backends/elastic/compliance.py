@@ -10,8 +10,6 @@ below the skin, comes from finite elements: F and F' are their compliances befor
 cancel in the difference; P M interpolates them to the vertices.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

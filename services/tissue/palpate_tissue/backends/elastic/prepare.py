@@ -3,8 +3,6 @@
 For machines on which that takes longer than the start-up time-out of a run.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -5,8 +5,6 @@ pressed = slab.press(radius_m=0.02, depth_m=0.005)
 pressed.force_n / hertz_force(slab.young_pa, slab.poisson, 0.02, 0.005)
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ Trilinear bricks on a graded grid. The volumetric strain is averaged over the el
 bricks of nearly incompressible tissue lock otherwise. Base and sides are fixed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import product

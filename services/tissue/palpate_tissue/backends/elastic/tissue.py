@@ -12,8 +12,6 @@ The coefficients are equal at all vertices, so a step is one small matrix M and 
 steps, and by S times the accumulated effect of the forces since then, which the same M propagates.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """FMU service: messages in, a step of any FMU, messages out."""
 
-from __future__ import annotations
-
 import logging
 import tempfile
 from collections.abc import Mapping

@@ -9,8 +9,6 @@ Only the vertices near the sphere are stepped; the others follow every `far_s`, 
 its forces with those of the explicit steps.
 """
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from math import sqrt
@@ -270,11 +268,7 @@ class ImplicitTissue(TissueBackend):
     """A soft surface pressed by a sphere, in unconditionally stable steps."""
 
     def __init__(
-        self,
-        model: PhantomModel,
-        stiffness: Stiffness | None = None,
-        breathing: BreathingCurve = STILL,
-        dt: float = 0.01,
+        self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 0.01
     ) -> None:
         stiffness = stiffness or Stiffness()
         super().__init__(model, breathing, dt)

@@ -1,7 +1,5 @@
 """Matrices of the tissue, and the stability bound of its explicit step."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 

@@ -9,8 +9,6 @@ and only the dashpot, which is at rest long before the reading, is integrated by
 muscle depends only on its depth and speed, so it is the same for all presses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from math import exp, sqrt
 from typing import Final, NamedTuple

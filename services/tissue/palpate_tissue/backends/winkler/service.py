@@ -1,7 +1,5 @@
 """Tissue service with the Winkler-Pasternak tissue, the default."""
 
-from __future__ import annotations
-
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Service

@@ -15,8 +15,6 @@ step is
 The README has the derivation. The FMU's C source has the same equations.
 """
 
-from __future__ import annotations
-
 from math import isfinite, sqrt
 from typing import NamedTuple
 
@@ -87,14 +85,7 @@ _BETA2, _BENT, _TENSION = 0, 1, 2
 
 @compiled
 def step(
-    wall: Membrane,
-    patch: Patch,
-    bristle: Bristle,
-    motion: Array,
-    radius: float,
-    excursion: float,
-    disturbed: bool,
-    wrench: Array,
+    wall: Membrane, patch: Patch, bristle: Bristle, motion: Array, radius: float, excursion: float, disturbed: bool, wrench: Array
 ) -> bool:
     """Advance the wall by one step at a breathing `excursion` [m]; return True if the sphere touches.
 
@@ -203,11 +194,7 @@ class WinklerTissue(TissueBackend):
     """A soft surface pressed by a sphere. Raises UserError if the mesh is too fine for the period."""
 
     def __init__(
-        self,
-        model: PhantomModel,
-        stiffness: Stiffness | None = None,
-        breathing: BreathingCurve = STILL,
-        dt: float = 1e-3,
+        self, model: PhantomModel, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3
     ) -> None:
         stiffness = stiffness or Stiffness()
         super().__init__(model, breathing, dt)
