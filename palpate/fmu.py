@@ -147,9 +147,8 @@ def simulate(
     """Press into an abdomen, hold, withdraw, and plot force against depth; run any other FMU and plot its outputs."""
     from palpate_fmu.compiling import native
     from palpate_fmu.instance import FmuInstance
-    from palpate_fmu.probing import Probing, plot_probing, probe, write_csv
+    from palpate_fmu.probing import Probing, plot_probing, probe, run_and_plot, write_csv
     from palpate_fmu.reading import FmuError
-    from palpate_fmu.running import run_and_plot
 
     console = SteadyConsole(stderr=True)
 

@@ -63,7 +63,7 @@ def router(
     """Run a zenoh router for services in containers or on several machines, until it is stopped."""
     from palpate_bus.contract import contract
     from palpate_bus.security.access import access_control
-    from palpate_bus.wire.router import DEFAULT_ENDPOINT, serve
+    from palpate_bus.wire.zenoh_config import DEFAULT_ENDPOINT, serve
 
     console = SteadyConsole(stderr=True)
     if keys is not None:

@@ -12,10 +12,9 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import COLOURS, Check, PageSection
+from palpate_validation.check import COLOURS, Check, PageSection, show
 from palpate_validation.drop import DartScene, Ellipsoid, Flesh, SoftBox
 from palpate_validation.probing import STILL
-from palpate_validation.report import show
 
 IntArray = NDArray[np.int32]
 

@@ -14,10 +14,9 @@ from matplotlib.figure import Figure
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
-from palpate_validation.check import COLOURS, QUIET, Check, PageSection
+from palpate_validation.check import COLOURS, QUIET, Check, PageSection, show
 from palpate_validation.hertz import HERTZ, hertz_force
 from palpate_validation.probing import ELASTIC, STILL, hold, static_curve
-from palpate_validation.report import show
 
 RADIUS_M = 0.030
 """Large, so that the contact covers several of the block's vertices."""

@@ -4,8 +4,7 @@ from dataclasses import dataclass
 
 from matplotlib.figure import Figure
 
-from palpate_validation.check import COLOURS, QUIET, Check, PageSection
-from palpate_validation.report import show
+from palpate_validation.check import COLOURS, QUIET, Check, PageSection, show
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, Ringing, press
 from research.loop_theory import linearise
 

@@ -14,7 +14,7 @@ from toy_runs import ROLES, composed_hash, run_toys, toy_services
 from palpate.check.perform import check_here
 from palpate.check.rig import RigSettings
 from palpate.run import composed
-from palpate.run.outlook import scan_safely
+from palpate.run.inputs import scan_safely
 from palpate.run.roles import checked
 from palpate_bus.runtime.failure import FailureCode
 from palpate_conductor.outcome import Patience, RunProgress, RunResult

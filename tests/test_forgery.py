@@ -89,7 +89,7 @@ def test_a_killed_router_is_a_loss_of_the_transport() -> None:
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         where = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
-    words = [sys.executable, "-m", "palpate_bus.wire.router", where]
+    words = [sys.executable, "-m", "palpate_bus.wire.zenoh_config", where]
     router = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
     router.stdout.readline()
     try:

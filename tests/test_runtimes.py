@@ -272,7 +272,7 @@ def test_a_wall_clock_run_ends_at_the_announced_time() -> None:
 
 def test_a_wall_clock_run_without_exam_states_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("palpate_conductor.grants.EXAM_SILENT_S", 1.0)
-    monkeypatch.setattr("palpate_conductor.heartbeat.RECENT_S", 0.0)  # a loaded machine may delay the conductor, too
+    monkeypatch.setattr("palpate_conductor.watchdog.RECENT_S", 0.0)  # a loaded machine may delay the conductor, too
     outcome = run_toys(environment={"TOY_END_S": "30"}, wallclock=True, faults={"planning": ("exam/state", "drop", "0.5")})
     assert_failed(outcome, FailureCode.EXAM_SILENT, "planning")
 

@@ -13,7 +13,7 @@ import palpate
 from palpate.search.environment import ID, SearchEnv
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import Trial, search
-from palpate_search.choice import policy
+from palpate_search.posterior import policy
 from research.search.whole import summary
 
 CENTRE = (0.04, -0.03)

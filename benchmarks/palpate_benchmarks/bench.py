@@ -41,7 +41,7 @@ def bench(
     for group in only or ():
         if group not in GROUPS:
             raise typer.BadParameter(f"--only {group}: must be one of {', '.join(GROUPS)}")
-    from palpate.report.platforms import fingerprint
+    from palpate.report.files import fingerprint
     from palpate.run.inputs import usable
 
     screen, console = Console(stderr=True), Console(width=max(WIDTH, Console().width))

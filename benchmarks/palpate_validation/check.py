@@ -1,12 +1,16 @@
 """Result of a comparison: checks with bounds, a figure in the common style, and the data of both."""
 
-from collections.abc import Callable, Mapping
+import json
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.figure import Figure
+from rich.console import Console
+from rich.table import Table
 
 Draw = Callable[[Figure], None]
 
@@ -85,3 +89,95 @@ def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.
         figure = Figure(figsize=size_in, layout="constrained")
         draw(figure)
         figure.savefig(path, dpi=dpi, metadata={"Software": None})
+
+
+MARKS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
+
+
+def number(value: float) -> str:
+    """Return a number with about three significant digits."""
+    if value == 0:
+        return "0"
+    if abs(value) < 1e-3 or abs(value) >= 1e5:
+        return f"{value:.1e}"
+    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
+
+
+def table(sections: Sequence[PageSection]) -> Table:
+    """Return a table of all checks."""
+    out = Table("check", "measured", "bound", "against", "", box=None, pad_edge=False)
+    out.columns[1].justify = "right"
+    for section in sections:
+        out.add_row(f"[bold]{section.title}[/]")
+        for check in section.checks:
+            value = f"{number(check.measured)} {check.unit}".strip()
+            out.add_row(f"  {check.name}", value, check.bound, check.against, MARKS[check.passed])
+    return out
+
+
+def failures(sections: Sequence[PageSection]) -> list[Check]:
+    """Return the checks outside their bounds."""
+    return [check for section in sections for check in section.checks if check.passed is False]
+
+
+def write(sections: Sequence[PageSection], out: Path) -> None:
+    """Write validate.json, and the PNG of the last section if it has a figure, to the folder `out`, made if needed."""
+    out.mkdir(parents=True, exist_ok=True)
+    facts = {
+        section.name: {
+            "title": section.title,
+            "text": section.text,
+            "checks": [
+                {"name": c.name, "measured": c.measured, "unit": c.unit, "low": c.low, "high": c.high, "against": c.against,
+                 "passed": c.passed}
+                for c in section.checks
+            ],
+            "data": section.data,
+        }
+        for section in sections
+    }  # fmt: skip
+    (out / "validate.json").write_text(json.dumps(_plain(facts), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    last = sections[-1]
+    if last.draw is not None:
+        write_figure(last.draw, out / f"{last.name}.png", last.size_in)
+
+
+def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> None:
+    """Write the Markdown page, and its small PNGs to the folder `images`, which is created if needed."""
+    images.mkdir(parents=True, exist_ok=True)
+    where = images.relative_to(page.parent).as_posix()
+    lines = [
+        "# Validation",
+        "",
+        "The physics against independent references, measured by `palpate validate --docs docs/validation.md`.",
+        "Every bound is a test in `tests/benchmarks`. Costs were measured on a busy two-core machine: compare ratios.",
+    ]
+    for section in sections:
+        lines += ["", f"## {section.title}", "", section.text, "", "| | measured | bound | against |", "|---|---|---|---|"]
+        for c in section.checks:
+            verdict = {True: "", False: " **missed**", None: ""}[c.passed]
+            lines.append(f"| {c.name} | {number(c.measured)} {c.unit}{verdict} | {c.bound} | {c.against} |".replace("  ", " "))
+        if section.draw is not None:
+            write_figure(section.draw, images / f"{section.name}.png", section.size_in, dpi=90)
+            lines += ["", f"![{section.title}]({where}/{section.name}.png)"]
+    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def show(section: PageSection, out: Path = Path("out/research")) -> None:
+    """Print the checks of one section and write its files, for a study in `research`."""
+    write([section], out)
+    console = Console()
+    Console(width=max(150, console.width)).print(table([section]))
+    console.print(section.text)
+
+
+def _plain(value: Any) -> Any:
+    """Return the value for JSON: floats with seven digits, null if not finite."""
+    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
+    if isinstance(plain, Mapping):
+        return {str(key): _plain(item) for key, item in plain.items()}
+    if isinstance(plain, (list, tuple)):
+        return [_plain(item) for item in plain]
+    if isinstance(plain, float):
+        return float(f"{plain:.7g}") if np.isfinite(plain) else None
+    return plain

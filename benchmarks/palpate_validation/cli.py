@@ -50,7 +50,7 @@ def validate(
     docs: Annotated[Path | None, output_file("Also write this Markdown page, with PNGs next to it.")] = None,
 ) -> None:
     """Measure the physics against Hertz, measured people, DART and theory. The exit status is 3 if a bound is missed."""
-    from palpate_validation.report import failures, table, write, write_page
+    from palpate_validation.check import failures, table, write, write_page
 
     console = Console(stderr=True)
     unknown = [name for name in only or () if name not in SECTIONS]

@@ -132,7 +132,9 @@ def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
 
 def test_router_command_routes_until_a_signal(tmp_path: Path) -> None:
     endpoint = f"unixsock-stream/{tmp_path}/router.sock"
-    router = subprocess.Popen([sys.executable, "-m", "palpate_bus.wire.router", endpoint], stdout=subprocess.PIPE, text=True)
+    router = subprocess.Popen(
+        [sys.executable, "-m", "palpate_bus.wire.zenoh_config", endpoint], stdout=subprocess.PIPE, text=True
+    )
     try:
         assert router.stdout is not None
         assert endpoint in router.stdout.readline()
@@ -147,7 +149,7 @@ def test_router_command_routes_until_a_signal(tmp_path: Path) -> None:
 
 def test_router_command_refuses_what_it_cannot_listen_on() -> None:
     done = subprocess.run(
-        [sys.executable, "-m", "palpate_bus.wire.router", "7447"], capture_output=True, text=True, timeout=60, check=False
+        [sys.executable, "-m", "palpate_bus.wire.zenoh_config", "7447"], capture_output=True, text=True, timeout=60, check=False
     )
     assert done.returncode == 2
     assert "7447" in done.stderr

@@ -113,7 +113,7 @@ final.findings
 # %%
 from palpate.search.hand import PatientHand  # noqa: E402
 from palpate.search.trial import search  # noqa: E402
-from palpate_search.choice import policy  # noqa: E402
+from palpate_search.posterior import policy  # noqa: E402
 
 trial = search(PatientHand(palpate.scenario("lump", seed=7)), policy("informed"), presses=20)
 plt.plot(trial.seconds, trial.lump, label="there is a lump")

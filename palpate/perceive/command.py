@@ -34,7 +34,7 @@ def perceive(
     from palpate.console import print_json
     from palpate.perceive.perceive import perceived, write
     from palpate_bus.recordings import open_recording
-    from palpate_camera.backends.replay.service import ReplayedCamera
+    from palpate_camera.backends.replay import ReplayedCamera
     from palpate_models.scenario.load import load_scenario
 
     own = bag / "exam.yaml"

@@ -7,7 +7,7 @@ import numpy as np
 import trimesh
 from matplotlib.figure import Figure
 
-from palpate_camera.backends.replay.service import ReplayedCamera
+from palpate_camera.backends.replay import ReplayedCamera
 from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import exam_input

@@ -8,8 +8,7 @@ from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
 
 from palpate.quick.patient import seen_lattice
-from palpate.run.inputs import scan_over, surface_of
-from palpate.run.outlook import Outlook
+from palpate.run.inputs import Outlook, scan_over, surface_of
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_models.numerics.frames import Array, apply, inverse

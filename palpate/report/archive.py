@@ -19,8 +19,7 @@ import numpy as np
 from mcap.reader import make_reader
 from numpy.typing import NDArray
 
-from palpate.replay.golden import write_recording
-from palpate.replay.rerun import rerun
+from palpate.replay.golden import rerun, write_recording
 from palpate.report.evidence import columns_of, xyz
 from palpate.truth.pressed import Pressed
 from palpate.truth.surface import Touched

@@ -1,9 +1,13 @@
-"""Atomic writes of files that other programs read and of marked parts of pages; results that a kill has left elsewhere."""
+"""Atomic writes of files that other programs read and of marked parts of pages; results that a kill has left elsewhere; the
+fingerprint of the platform.
+"""
 
 import os
+import platform
 from collections.abc import Iterator
 from contextlib import contextmanager
 from glob import escape
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +15,37 @@ import psutil
 import typer
 
 from palpate.console import say
+
+PACKAGES = ("numpy", "scipy", "dartpy", "pin", "coal", "casadi", "ompl", "ruckig", "rosbags", "eclipse-zenoh", "scikit-learn")
+"""Libraries whose version can change a result."""
+
+
+def _cpu() -> str:
+    path = Path("/proc/cpuinfo")
+    if path.is_file():
+        for line in path.read_text(encoding="utf-8").splitlines():
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or "unknown"
+
+
+def _version(package: str) -> str | None:
+    try:
+        return version(package)
+    except PackageNotFoundError:
+        return None
+
+
+def fingerprint() -> dict[str, Any]:
+    """Return the versions of operating system, processor, Python and libraries."""
+    return {
+        "system": platform.platform(),
+        "libc": " ".join(platform.libc_ver()),
+        "cpu": _cpu(),
+        "cores": os.cpu_count(),
+        "python": platform.python_version(),
+        "packages": {package: found for package in PACKAGES if (found := _version(package))},
+    }
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from typing import Any, Final
 import numpy as np
 
 from palpate.environment import given
-from palpate.replay.rerun import rerun
+from palpate.replay.golden import rerun
 from palpate.report.archive import (
     EvidenceError,
     InterruptedRun,

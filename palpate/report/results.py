@@ -27,8 +27,7 @@ from palpate.report.evidence import (
     steady_contact,
     unassessed_of,
 )
-from palpate.report.files import write_text
-from palpate.report.platforms import fingerprint
+from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, RecordedRow, Report, TruthRow
 from palpate.truth.pressed import Pressed, press_patient
 from palpate.truth.surface import TrueBody

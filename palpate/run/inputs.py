@@ -1,20 +1,102 @@
-"""Checks of a scenario before an examination starts: its phantom, its scan on the true body, its services."""
+"""Checks and estimates of an examination before it starts: phantom, scan on the true body, services, duration, presses."""
+
+from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from palpate.run.outlook import scan_safely
+from palpate.apart import guarded
 from palpate.run.roles import NONE, checked, settings_of
 from palpate.truth.surface import TrueBody, TrueSurface
+from palpate_bus.settings import Settings
 from palpate_errors import UserError
+from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.patterns import Scan
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.patterns import Scan, Surface, scan_of, touch_centres
+from palpate_models.scenario.schema import PATTERN, Exam, Mode, Scenario
 from palpate_plugins import PluginError, is_file
+
+
+def scan_safely(exam: Exam, surface: Surface) -> Scan:
+    """Return the scan of the examination's pattern; a user's pattern runs in a child process. Raises PluginError."""
+    if not PATTERN.foreign(exam.pattern):
+        return scan_of(exam, surface)
+    part = f"exam.pattern = {exam.pattern!r}"
+    return guarded(part, lambda: scan_of(exam, surface), Settings.read().start_limit_s, PluginError)
+
+
+@dataclass(frozen=True)
+class ExamTiming:
+    """Durations in simulated time."""
+
+    approach_and_return_s: float = 12.0
+    """Before the first descent and after the last."""
+    touch_s: float = 2.7
+    line_change_s: float = 3.0
+    """Lift, transfer, touch and press between two lines."""
+    point_s: float = 2.8
+    """One point of a point-wise scan."""
+    searched_press_s: float = 4.0
+    """One press of a search, which moves further."""
+    transfer_mps: float = 0.17
+    """Speed above the skin between two lines."""
+
+
+TIMING = ExamTiming()
+
+
+@dataclass(frozen=True)
+class Outlook:
+    """Expected duration, touches, lines and presses."""
+
+    duration_s: float
+    """Simulated time; of a search, an upper limit."""
+    touches: int
+    """Touches of the skin before the scan."""
+    lines: int
+    presses: int
+    """Pressed targets; of a search, an upper limit."""
+
+    @staticmethod
+    def of(exam: Exam) -> Outlook:
+        """Return the estimates for an examination; the duration is a fit to examinations of several sizes."""
+        scan = scan_safely(exam, _flat)
+        touches = len(touch_centres(scan.targets))
+        presses = exam.budget.presses if exam.searched else len(scan.targets)
+        duration = TIMING.approach_and_return_s + TIMING.touch_s * touches + _pressing_s(exam, scan)
+        return Outlook(duration, touches, len(scan.lines), presses)
+
+
+def _pressing_s(exam: Exam, scan: Scan) -> float:
+    if exam.searched:
+        return min(TIMING.searched_press_s * exam.budget.presses, exam.budget.seconds)
+    if exam.mode is Mode.POINT:
+        return TIMING.point_s * len(scan.targets)
+    slide = sum(_length(line) for line in scan.lines)
+    between = sum(_length(np.vstack((a[-1], b[0]))) for a, b in pairwise(scan.lines))
+    if scan.joined:
+        return (slide + between) / exam.speed_mps + TIMING.line_change_s
+    return slide / exam.speed_mps + between / TIMING.transfer_mps + TIMING.line_change_s * len(scan.lines)
+
+
+def _length(points: Array) -> float:
+    return float(np.linalg.norm(np.diff(points, axis=0), axis=1).sum())
+
+
+def _flat(xy: Array) -> tuple[Array, Array]:
+    """Return a flat surface: the length of a scan hardly depends on heights."""
+    return np.column_stack((xy, np.zeros(len(xy)))), np.tile((0.0, 0.0, 1.0), (len(xy), 1))
+
+
+def duration_text(seconds: float) -> str:
+    """Return a duration as text: `40 s`, `3 min`."""
+    return f"{seconds / 60:.0f} min" if seconds > 120 else f"{seconds:.0f} s"
 
 
 def surface_of(phantom: PhantomModel) -> TrueSurface:

@@ -7,7 +7,7 @@ from rich.console import Console
 from rich.progress import BarColumn, Progress, SpinnerColumn, TaskProgressColumn, TextColumn, TimeElapsedColumn
 from rich.text import Text
 
-from palpate.run.outlook import Outlook, duration_text
+from palpate.run.inputs import Outlook, duration_text
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.operator import HINT, WORDS, OperatorKeys

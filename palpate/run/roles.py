@@ -13,7 +13,7 @@ from palpate_bus.settings import Settings
 from palpate_models.scenario.load import HIDDEN, did_you_mean, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services
 from palpate_plugins import PluginError, is_file
-from palpate_search.choice import POLICY, policy
+from palpate_search.posterior import POLICY, policy
 from palpate_search.service import try_policy
 
 _ROLES = {name: role for name, role in contract().roles.items() if name != "conductor"}

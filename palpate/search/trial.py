@@ -12,8 +12,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
-from palpate_search.choice import Policy
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import Policy, Posterior
 
 CONTRAST: Final = 2.0
 """Felt contrast of each lump, by the surrogate, at its centre."""

@@ -13,8 +13,7 @@ from palpate.interface.scenarios import scenario
 from palpate.search.hand import PatientHand
 from palpate.search.trial import search
 from palpate_models.numerics.frames import Array
-from palpate_search.choice import policy
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import Posterior, policy
 from palpate_search.presses import Budget
 
 FRAMES_PER_S: Final = 3

@@ -23,8 +23,7 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor
 from torch import nn
 
 from palpate.search.environment import SearchEnv
-from palpate_search.choice import policy
-from palpate_search.posterior import LAYERS
+from palpate_search.posterior import LAYERS, policy
 
 WIDTH: Final = 16
 """Channels of the hidden layers."""

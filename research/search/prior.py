@@ -19,8 +19,7 @@ from palpate_assessment.model import natural
 from palpate_assessment.standard import LENGTHS, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
-from palpate_search.choice import policy
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import Posterior, policy
 
 NAMES: Final = (
     *(f"natural variation over {1e3 * length:.0f} mm" for length in LENGTHS.fields_m),

@@ -16,7 +16,7 @@ from rich.progress import track
 
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import case, search
-from palpate_search.choice import policies, policy
+from palpate_search.posterior import policies, policy
 
 HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}
 

@@ -28,11 +28,10 @@ from palpate_validation import (
     population,
     relaxation,
 )
-from palpate_validation.check import Check, PageSection
+from palpate_validation.check import Check, PageSection, failures, number, write, write_page
 from palpate_validation.drop import DartScene
 from palpate_validation.foundation import lump, static_force, uniform
 from palpate_validation.population import PopulationSample
-from palpate_validation.report import failures, number, write, write_page
 
 
 def assert_bounds(section: PageSection) -> None:

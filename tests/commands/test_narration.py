@@ -11,7 +11,7 @@ from typing import Any
 from rich.console import Console
 
 from palpate.exam_state import exam_state
-from palpate.run.outlook import Outlook
+from palpate.run.inputs import Outlook
 from palpate.run.progress import PHASES, Narration, RunDisplay
 from palpate_bus.messages import ExamState, OperatorRequest
 from palpate_bus.messages.stamps import NS

@@ -17,8 +17,7 @@ from palpate_fmu.compiling import WARNINGS, native, platforms
 from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.phantom_file import ExportError, sizes_of, start_values
-from palpate_fmu.probing import probe
-from palpate_fmu.running import run_and_plot
+from palpate_fmu.probing import probe, run_and_plot
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 

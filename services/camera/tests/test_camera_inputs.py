@@ -25,8 +25,8 @@ from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import open_recording
 from palpate_bus.service import Service
 from palpate_bus.testing.hand_inbox import HandInbox
-from palpate_camera.backends.replay.service import POSE, ReplayedCamera
-from palpate_camera.backends.ros.service import CameraPort, RosCameraService
+from palpate_camera.backends.replay import POSE, ReplayedCamera
+from palpate_camera.backends.ros import CameraPort, RosCameraService
 from palpate_camera.messages import FRAME, IMAGE, INFO
 from palpate_errors import UserError
 from palpate_recorder.service import RecorderService

@@ -19,7 +19,7 @@ from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import header, nanoseconds, time_message
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
-from palpate_camera.backends.replay.service import POSE, ReplayedCamera, create
+from palpate_camera.backends.replay import POSE, ReplayedCamera, create
 from palpate_camera.messages import IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
 from palpate_models.scenario.load import load_scenario
 from palpate_recorder.service import RecorderService

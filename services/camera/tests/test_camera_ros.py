@@ -24,7 +24,7 @@ from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing.hand_inbox import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera.backends.ros.service import CameraPort, RosCameraService, ZenohCamera
+from palpate_camera.backends.ros import CameraPort, RosCameraService, ZenohCamera
 from palpate_camera.inputs import CameraError
 from palpate_models.scenario.schema import RosCamera
 

@@ -22,13 +22,12 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import pid_space
 from palpate_bus.wire.rmw import Tagger
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
-from palpate_conductor import grants, heartbeat
+from palpate_conductor import grants
 from palpate_conductor.collector import Collector, KeptMessages
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.heartbeat import Heartbeat
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, Timing, failure_of
-from palpate_conductor.watchdog import FreezeWatch, RunWatchdog
+from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_errors import UserError
 
 TOPIC = "truth/indentation"
@@ -118,7 +117,7 @@ def test_a_standstill_is_longer_than_the_services_wait_and_stops_the_heartbeat(
 ) -> None:
     session = open_session(BusOptions())
     now = 100.0
-    monkeypatch.setattr(heartbeat, "monotonic", lambda: now)
+    monkeypatch.setattr("palpate_conductor.watchdog.monotonic", lambda: now)
     try:
         beat = Heartbeat(Member(session, "conductor", contract(), 0), contract(), wallclock)
         beat.loop_turned()

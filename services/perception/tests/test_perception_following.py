@@ -10,9 +10,8 @@ from palpate_models.robot.kinematics import tool_pose
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot
-from palpate_perception.arm import ArmMask, passes
 from palpate_perception.breath_filter import BreathFilter, strongest_rate
-from palpate_perception.follower import rises
+from palpate_perception.follower import ArmMask, passes, rises
 from palpate_perception.tracker import jackknife
 from palpate_perception.wall import steady, without_gaps
 from research.following import READY, Patient, Run, run

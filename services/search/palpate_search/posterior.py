@@ -12,7 +12,7 @@ adds one row to each Cholesky factor, so an update takes about a millisecond.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from itertools import product
 from typing import Final
 
@@ -27,6 +27,7 @@ from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
+from palpate_plugins import PluginKind
 from palpate_search.presses import LEAST_MEASURED_M, PRESS_S, Budget, Press, Task, press_duration
 
 RADII_M: Final = (0.014, 0.022, 0.030)
@@ -298,3 +299,18 @@ def maps(posterior: Posterior) -> Array:
     layers[3] = press_duration(posterior.here, posterior.task.places) - PRESS_S
     layers[4], layers[5] = posterior.lump, left
     return layers.reshape(LAYERS, *shape(posterior))
+
+
+Policy = Callable[[Posterior, Budget], tuple[Array, float]]
+"""`next_press(posterior, budget) -> place, depth`: xy in the abdomen frame [m], shape (2,), and depth [m]."""
+POLICY: Final = PluginKind("policy", "search.policy", "next_press", "posterior, budget")
+
+
+def policies() -> tuple[str, ...]:
+    """Return the names of the installed policies."""
+    return POLICY.names()
+
+
+def policy(choice: str) -> Policy:
+    """Return the policy of a name or file. Raises PluginError."""
+    return POLICY.load(choice)

@@ -16,8 +16,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
-from palpate_search.choice import Policy, policy
-from palpate_search.posterior import Posterior
+from palpate_search.posterior import Policy, Posterior, policy
 from palpate_search.presses import Budget, Press, Task
 
 FRAME: Final = contract().topics["assessment/map"].frame or ""

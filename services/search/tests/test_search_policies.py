@@ -21,7 +21,6 @@ from palpate_bus.messages import ExamState, Point, SearchRequest
 from palpate_models.scenario.press import DEPTH_M
 from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
 from palpate_plugins import PluginError
-from palpate_search.choice import policies, policy
 from palpate_search.policies.fixed import latin_hypercube, raster
 from palpate_search.policies.informed import information
 from palpate_search.policies.learned import convolved, ppo
@@ -39,6 +38,8 @@ from palpate_search.posterior import (
     USUAL_N,
     VARIATION_SCALES,
     Posterior,
+    policies,
+    policy,
 )
 from palpate_search.presses import Budget, Press, Task, press_duration
 from palpate_search.service import TUNING, checked, create, next_press
