@@ -8,24 +8,31 @@ from typing import Any
 import pytest
 
 sys.path.insert(0, str(Path(__file__).parent))
-from examination import GATE, Finished, palpate_run
+from examination import GATE, TINY, Finished, palpate_run
 
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
+FUSED = (*TINY, "camera.frames=10")
 LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
 
 @pytest.fixture(scope="session")
 def distributed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """Return a short examination by the command, in real processes."""
-    return palpate_run("clean", tmp_path_factory.mktemp("distributed"), settings=GATE)
+    """Return a tiny examination by the command, in real processes."""
+    return palpate_run("clean", tmp_path_factory.mktemp("distributed"), settings=FUSED)
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Finished:
+    """Return the same examination in one process."""
+    return palpate_run("clean", tmp_path_factory.mktemp("tiny"), "--composed", "--record", "none", settings=FUSED)
 
 
 @pytest.fixture(scope="session")
 def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
-    """Return the same examination in one process."""
+    """Return an examination of the whole lesion in one process."""
     return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--record", "none", settings=GATE)
 
 

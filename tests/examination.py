@@ -87,7 +87,9 @@ class Killed:
 
 
 def kill_in_contact(role: str, folder: Path, *options: str) -> Killed:
-    words = command("clean", folder, *options, settings=(*SHORT, "camera.frames=4"))
+    words = command(
+        "clean", folder, *options, settings=(*SHORT, "exam.region_m=[0.06, 0.03]", "camera.frames=4", "phantom.edge_m=0.01")
+    )
     run = subprocess.Popen(words, stderr=subprocess.PIPE, stdout=subprocess.DEVNULL, text=True)
     lines: list[str] = []
     killed_at: float | None = None

@@ -32,8 +32,15 @@ def assert_within_bounds(finished: Finished) -> None:
     assert report["depth_rms_error_m"] <= DEPTH_RMS_M
 
 
-def test_the_lesion_is_found(distributed: Finished) -> None:
-    assert_within_bounds(distributed)
+def test_the_lesion_is_found(composed: Finished) -> None:
+    assert_within_bounds(composed)
+
+
+@pytest.mark.slow
+def test_processes_find_the_lesion(composed: Finished, tmp_path: Path) -> None:
+    finished = palpate_run("clean", tmp_path, settings=GATE)
+    assert_within_bounds(finished)
+    assert finished.report["run_hash"] == composed.report["run_hash"]
 
 
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
@@ -49,7 +56,7 @@ def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) 
     assert found["ratio"] == pytest.approx(expected["ratio"], rel=1e-2)
 
 
-def test_distributed_and_composed_have_the_same_run_hash(distributed: Finished, composed: Finished) -> None:
-    assert composed.status == 0, composed.output
-    assert distributed.report["run_hash"] == composed.report["run_hash"]
-    assert distributed.report["findings"] == composed.report["findings"]
+def test_distributed_and_composed_have_the_same_run_hash(distributed: Finished, tiny: Finished) -> None:
+    assert tiny.status == 0, tiny.output
+    assert distributed.report["run_hash"] == tiny.report["run_hash"]
+    assert distributed.report["findings"] == tiny.report["findings"]

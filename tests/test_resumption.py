@@ -26,7 +26,7 @@ from palpate_conductor.collector import Collected, Collector
 from palpate_models.scenario.load import load_scenario
 from palpate_recorder.recover import recover
 
-SMALL = (*SHORT, "camera.frames=4", "phantom.edge_m=0.01")
+SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
 Blow = Callable[[psutil.Process], None]
 
 

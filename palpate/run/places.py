@@ -21,7 +21,7 @@ from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run, named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_conductor.grants import ROLES
+from palpate_conductor.grants import REPLACEABLE
 from palpate_errors import UserError
 from palpate_inputs import read_json
 from palpate_plugins import is_file
@@ -106,8 +106,8 @@ def place_to_join(role: str, run: Run) -> ServicePlace:
 
 def place_to_take(role: str, run: Run) -> ServicePlace:
     """Return the place of a service of `run` that can be replaced. Raises UserError if it cannot."""
-    if role not in ROLES:
-        raise UserError(f"{role}: only {', '.join(sorted(ROLES))} can change hands in a run; without the others it ends")
+    if role not in REPLACEABLE:
+        raise UserError(f"{role}: only {', '.join(sorted(REPLACEABLE))} can change hands in a run; without the others it ends")
     if run.runtime != "wallclock":
         raise UserError(f"run {run.name} is in {run.runtime}: services change hands in wall-clock runs only")
     kept = {name: place for name, place in read_places(run).items() if not place.awaited}
@@ -157,7 +157,7 @@ def join(
 
 
 def takeover(
-    role: Annotated[str, typer.Argument(help=f"One of {', '.join(sorted(ROLES))}.")],
+    role: Annotated[str, typer.Argument(help=f"One of {', '.join(sorted(REPLACEABLE))}.")],
     service: NameOrFile = None,
     run: RunName = None,
 ) -> NoReturn:
