@@ -37,8 +37,9 @@ class ConformanceReport:
         """Begin a group of checks."""
         self.group = name
 
-    def expect(self, name: str, ok: bool, expected: object, got: object) -> bool:
-        """Record a check; returns True if it passed."""
+    def expect(self, name: str, ok: bool, expected: object, got: object = None) -> bool:
+        """Record a check; returns True if it passed. `got`: the value received, by default that it is as expected or not."""
+        got = ("as expected" if ok else "not as expected") if got is None else got
         verdict = Verdict.PASSED if ok else Verdict.FAILED
         self.results.append(Result(self.group, name, verdict, str(expected), str(got)))
         return ok

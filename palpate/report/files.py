@@ -16,7 +16,9 @@ import typer
 
 from palpate.console import say
 
-PACKAGES = ("numpy", "scipy", "dartpy", "pin", "coal", "casadi", "ompl", "ruckig", "rosbags", "eclipse-zenoh", "scikit-learn")
+PACKAGES = (
+    "numpy", "scipy", "dartpy", "pin", "coal", "casadi", "numba", "ompl", "ruckig", "rosbags", "eclipse-zenoh", "scikit-learn",
+)  # fmt: skip
 """Libraries whose version can change a result."""
 
 

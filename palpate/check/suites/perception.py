@@ -122,12 +122,7 @@ def _surface(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:
     tilt = float(np.quantile(angle[near], 0.95)) if near.any() else np.inf
     report.expect("with outward normals", tilt < 10, "95 % within 10 degrees", f"{tilt:.1f} degrees")
     inside = int(np.max(message.triangles, initial=0)) < len(p_A)
-    report.expect(
-        "triangles index its vertices",
-        inside,
-        "indices below the number of vertices",
-        "as expected" if inside else "not as expected",
-    )
+    report.expect("triangles index its vertices", inside, "indices below the number of vertices")
 
 
 def _targets(rig: Rig, X_WA: Array, report: ConformanceReport) -> None:

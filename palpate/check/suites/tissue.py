@@ -200,12 +200,7 @@ def _surface(rig: Rig, report: ConformanceReport) -> None:
     sizes = {(len(m.vertices), len(m.triangles)) for m in meshes}
     report.expect("sim/surface: one mesh throughout", len(sizes) == 1, "constant topology", sorted(sizes))
     inside = all(int(np.max(m.triangles, initial=0)) < len(m.vertices) // 3 for m in meshes)
-    report.expect(
-        "sim/surface: triangles index its vertices",
-        inside,
-        "indices below the number of vertices",
-        "as expected" if inside else "not as expected",
-    )
+    report.expect("sim/surface: triangles index its vertices", inside, "indices below the number of vertices")
     first = np.asarray(meshes[0].vertices).reshape(-1, 3)
     dent = max(float(np.max(np.linalg.norm(np.asarray(m.vertices).reshape(-1, 3) - first, axis=1))) for m in meshes)
     report.expect(

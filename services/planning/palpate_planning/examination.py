@@ -117,8 +117,8 @@ class ExaminationSequence:
         if course.phase is Phase.DONE or self._known.exam.searched:
             return self.skipped
         everything = frozenset(range(self.status.target_count)) if wanted is None else wanted
-        left = everything if course.palpation is None else course.palpation.remaining
-        return dict.fromkeys(left, self.status.cause) | self._skipped
+        remaining = everything if course.palpation is None else course.palpation.remaining
+        return dict.fromkeys(remaining, self.status.cause) | self._skipped
 
     def step(self, now: Observation) -> ExamStep:
         """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
@@ -325,13 +325,13 @@ class ExaminationSequence:
         status.steady, status.force_limited, status.depth_setpoint = step.steady, step.limited, step.depth_setpoint
         status.target_index = self._requested.done if self._known.exam.searched else step.target
         status.targets_skipped = len(self._skipped)
-        cause = palpation.failed or palpation.left or palpation.waits
+        cause = palpation.failed or palpation.early_end or palpation.waits
         self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause)
 
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
         """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
         assert now.reading is not None
-        course, rest, cause = self._course, self._rest, palpation.left
+        course, rest, cause = self._course, self._rest, palpation.early_end
         course.arm.hold(now.reading.q)
         self._requested.drop_plan()
         more = not palpation.failed and (palpation.open_ended or bool(palpation.ahead))

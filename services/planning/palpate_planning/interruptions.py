@@ -152,13 +152,13 @@ class Recovery:
         """Cause by target."""
         self.failed = NO_CAUSE
         """Cause of abandoned strokes."""
-        self.left = NO_CAUSE
+        self.early_end = NO_CAUSE
         """Cause of an early end without failure."""
 
     @property
     def ending(self) -> bool:
         """True if the arm lifts and the strokes end."""
-        return bool(self.failed or self.left)
+        return bool(self.failed or self.early_end)
 
     def give_up(self, cause: Cause) -> None:
         """Abandon the strokes."""
@@ -200,7 +200,7 @@ class Recovery:
 
     def leave(self, cause: Cause, targets: Iterable[int]) -> None:
         """End the strokes early and skip the targets that are left."""
-        self.left = cause
+        self.early_end = cause
         self.skipped |= dict.fromkeys(targets, cause)
 
     def reached(self, position: float, *, slid: bool) -> float:

@@ -1,4 +1,15 @@
-"""The strokes of a plan, one after the other, and their interruptions."""
+"""The strokes of a plan, one after the other, and their interruptions.
+
+| what happens | arm | targets ahead |
+|---|---|---|
+| the last segment ends, or `close` | stays above the skin | none |
+| no request in time (`early_end`) | stays above the skin | none |
+| `leave`: patient moved, wall hidden, elbow too straight, first place without tissue, long wait | lifts and ends | `ahead` |
+| `abandon`, last allowed soft stop or place without tissue (`failed`) | lifts and ends; at once in free motion | `remaining` |
+| `pause` | lifts and waits for `resume` | examined from there |
+| force at the soft-stop limit | lifts | near ones skipped, then examined |
+| wall against its forecast | lifts | examined from shortly before; skipped after several repeats |
+"""
 
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -136,9 +147,9 @@ class Palpation:
         return self._recovery.failed
 
     @property
-    def left(self) -> Cause:
+    def early_end(self) -> Cause:
         """Cause of an early end without failure."""
-        return self._recovery.left
+        return self._recovery.early_end
 
     @property
     def waits(self) -> Cause:
@@ -202,7 +213,7 @@ class Palpation:
 
     def leave(self, cause: Cause) -> None:
         """Lift off and end without failure: the rest of the plan counts as skipped."""
-        if self.left or self.stage is StrokeStage.DONE:
+        if self.early_end or self.stage is StrokeStage.DONE:
             return
         self._skip_rest(cause)
         if self.stage is not StrokeStage.LIFT:
@@ -405,7 +416,7 @@ class Palpation:
         if not end:
             return
         if end.reason is Reason.NO_REQUEST:
-            self._recovery.left = end
+            self._recovery.early_end = end
         elif end.reason is Reason.ARM_DISPLACED or not (self._waits.pressed or self._strokes_before):
             self.abandon(end)
         else:
@@ -437,9 +448,9 @@ class Palpation:
 
         A stroke in which the arm hides the wall is not `ahead`: the wall would be hidden there again.
         """
-        left = self.remaining
-        self._recovery.leave(cause, left)
-        self.ahead = self._later if cause.reason is Reason.WALL_HIDDEN else left
+        remaining = self.remaining
+        self._recovery.leave(cause, remaining)
+        self.ahead = self._later if cause.reason is Reason.WALL_HIDDEN else remaining
 
 
 def presses(segment: Segment) -> bool:
