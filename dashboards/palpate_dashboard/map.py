@@ -40,7 +40,7 @@ class MapView:
         lines = rr.LineStrips3D(strips, colors=[(150, 150, 150, 255)], radii=[rr.Radius.ui_points(0.7)])
         quadrants = {"RUQ": (-1, 1), "LUQ": (1, 1), "RLQ": (-1, -1), "LLQ": (1, -1)}
         here = {name: (a, b) for name, (a, b) in quadrants.items() if max(a * left, a * right) > 0 < max(b * low, b * high)}
-        places = [(x + 0.42 * a * w, y + 0.56 * b * h, 0.003) for a, b in here.values()]
+        places = [(x + 0.42 * a * w, y + 0.42 * b * h, 0.003) for a, b in here.values()]
         names = rr.Points3D(places, labels=list(here), radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
         for layer in LAYERS:
             self._recording.log(f"map/{layer}/frame", lines, static=True)
@@ -51,7 +51,7 @@ class MapView:
         places = self._corner + np.outer((np.arange(len(labels)) + 0.5) * step, (0.0, 1.0, 0.0))
         swatches = rr.Boxes3D(centers=places, half_sizes=[(0.006, step / 2, 0.0005)], colors=colors, fill_mode="solid")
         self._recording.log(f"map/{layer}/legend", swatches, static=True)
-        label_places = places + np.array((0.03, 0.0, 0.0))
+        label_places = places + np.array((0.034, 0.0, 0.0))
         names = rr.Points3D(label_places, labels=labels, radii=[0.0001], colors=[palette.TARGETS], show_labels=True)
         self._recording.log(f"map/{layer}/legend/labels", names, static=True)
 

@@ -37,7 +37,7 @@ class ForceDepthPlane:
     def bounds(self) -> tuple[tuple[float, float], tuple[float, float]]:
         """Return the visible x and y ranges of the plane."""
         x, y = self.size
-        return (-0.16 * x, 1.06 * x), (-1.08 * y, 0.16 * y)
+        return (-0.16 * x, 1.08 * x), (-1.08 * y, 0.26 * y)
 
 
 class ForceDepth:
@@ -57,8 +57,8 @@ class ForceDepth:
         lines += [[(0, -STRETCH * f), (-0.015 * x, -STRETCH * f)] for f in forces]
         shape = rr.LineStrips2D(lines, colors=[_AXIS], radii=[rr.Radius.ui_points(0.7)])
         self._recording.log("force_depth/axes", shape, static=True)
-        places = [(STRETCH * d, 0.06 * y) for d in depths] + [(-0.06 * x, -STRETCH * f) for f in forces]
-        words = [f"{d:.0f} mm" for d in depths] + [f"{f:.0f} N" for f in forces]
+        places = [(STRETCH * d, 0.06 * y) for d in depths] + [(-0.06 * x, -STRETCH * f) for f in forces[1:]]
+        words = [f"{d:.0f} mm" for d in depths] + [f"{f:.0f} N" for f in forces[1:]]
         marks = rr.Points2D(places, labels=words, colors=[_AXIS], radii=[0.01], show_labels=True)
         self._recording.log("force_depth/axes/ticks", marks, static=True)
         wanted = [[(STRETCH * plane.wanted_mm, 0), (STRETCH * plane.wanted_mm, -y)]]
