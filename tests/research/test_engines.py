@@ -1,8 +1,13 @@
-"""DART's soft bodies and MuJoCo's flex against our tissue: every bound. Costs are printed, not tested."""
+"""DART's soft bodies and MuJoCo's flex against our tissue: every bound; costs are printed, not tested. Micro-benchmarks run."""
+
+import importlib.util
+from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 import pytest
 
+from palpate_benchmarks.bench import codec_cost, tables, tissue_cost
 from palpate_validation.check import PageSection
 from palpate_validation.drop import Ellipsoid, Flesh, SoftBox
 from research import dart_bodies, flex
@@ -65,3 +70,51 @@ def test_a_small_flex_pushes_back(tmp_path, monkeypatch) -> None:
 @pytest.mark.slow
 def test_mujoco_flex() -> None:
     assert_bounds(flex.section())
+
+
+FOLDER = Path(__file__).parents[2] / "asv" / "benchmarks"
+
+
+def benchmarks(name: str) -> ModuleType:
+    spec = importlib.util.spec_from_file_location(f"asv_{name}", FOLDER / f"{name}.py")
+    assert spec
+    assert spec.loader
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+@pytest.mark.parametrize("by", ["palpate", "rosbags"])
+def test_codec(by: str) -> None:
+    codec = benchmarks("codec").Codec()
+    codec.setup("joint_state", by)
+    codec.time_encode()
+    codec.time_decode()
+
+
+@pytest.mark.parametrize("wall", ["linear", "guarding"])
+def test_a_step_on_the_abdomen(wall: str) -> None:
+    abdomen = benchmarks("tissue").Abdomen()
+    abdomen.setup("surface", wall)
+    abdomen.time_step()
+    assert abdomen.track_contacts() > 5
+
+
+@pytest.mark.parametrize("tier", ["surface", "elastic"])
+def test_a_step_on_a_flat_patch(tier: str) -> None:
+    patch = benchmarks("tissue").FlatPatch()
+    patch.setup(tier, 700)
+    patch.time_step()
+    assert len(patch.body.contacts) > 3
+
+
+def test_a_size_that_the_tier_refuses_is_skipped(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("palpate_tissue.backends.elastic.compliance.MOST_VERTICES", 500)
+    with pytest.raises(NotImplementedError):
+        benchmarks("tissue").FlatPatch().setup("elastic", 700)
+
+
+def test_the_parts_of_bench() -> None:
+    figures = {"runs": {}, "parts": {"codec": codec_cost(20), "tissue": tissue_cost("surface", 50)}}
+    assert all(value > 0 for part in figures["parts"].values() for value in part.values())
+    assert [table.title for table in tables(figures)] == ["Parts"]

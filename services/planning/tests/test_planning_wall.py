@@ -1,0 +1,263 @@
+"""The wall as planning knows it: the perceived surface, the touches, and the correction that they give."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from planning_fakes import grid_mesh
+from scipy.interpolate import CubicSpline
+
+from palpate_models.numerics.frames import apply, matrix
+from palpate_models.section import Pose
+from palpate_planning.wall.surface import BicubicField, CubicPieces, PerceivedSurface, bicubic_at, cubic_at
+from palpate_planning.wall.touch import FELT_N, TUNING, Onset, find_touch
+from palpate_planning.wall.wall import PRIOR, HeightMeasurement, TouchCorrection
+
+X_WA = matrix(Pose(xyz_m=(0.56, 0.05, 0.93), rpy_rad=(0.05, -0.08, 0.3)))
+VERTICES, TRIANGLES = grid_mesh((0.14, 0.14))
+SURFACE = PerceivedSurface.from_mesh(apply(X_WA, VERTICES), None, X_WA)
+inner = st.floats(-0.1, 0.1)
+
+
+def dome(x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+    """Exact point and outward normal in world."""
+    n = np.array((x / 0.25, y / 0.6, 1.0))
+    p = np.array((x, y, -x * x / 0.5 - y * y / 1.2))
+    return apply(X_WA, p[None])[0], X_WA[:3, :3] @ n / np.linalg.norm(n)
+
+
+@given(inner, inner)
+@settings(deadline=None)
+def test_points_and_normals_are_those_of_the_dome(x: float, y: float) -> None:
+    p, n = SURFACE.at(np.array([[x, y]]))
+    exact_p, exact_n = dome(x, y)
+    assert p[0] == pytest.approx(exact_p, abs=1e-4)
+    assert n[0] == pytest.approx(exact_n, abs=5e-3)
+
+
+@given(inner, inner, st.floats(-0.01, 0.03))
+@settings(deadline=None)
+def test_nearest_finds_the_foot_of_the_perpendicular(x: float, y: float, height: float) -> None:
+    p, n = (a[0] for a in SURFACE.at(np.array([[x, y]])))
+    foot, normal, distance, _ = SURFACE.nearest(p + height * n)
+    assert foot == pytest.approx(p, abs=2e-5)
+    assert normal == pytest.approx(n, abs=2e-4)
+    assert distance == pytest.approx(height, abs=1e-6)
+
+
+def test_given_normals_are_used() -> None:
+    exact = np.array([dome(x, y)[1] for x, y in VERTICES[:, :2]])
+    surface = PerceivedSurface.from_mesh(apply(X_WA, VERTICES), exact, X_WA)
+    _, n = surface.at(np.array([[0.071, -0.043]]))
+    assert n[0] == pytest.approx(dome(0.071, -0.043)[1], abs=1e-5)
+
+
+def test_outside_the_mesh_the_edge_holds() -> None:
+    p, n = SURFACE.at(np.array([[0.5, 0.0]]))
+    assert np.isfinite(p).all()
+    assert np.linalg.norm(n) == pytest.approx(1.0)
+
+
+def test_before_perception_depth_is_counted_from_the_plane_of_a() -> None:
+    _, normal, distance, _ = PerceivedSurface.plane(X_WA).nearest(apply(X_WA, np.array([[0.02, 0.03, 0.04]]))[0])
+    assert distance == pytest.approx(0.04)
+    assert normal == pytest.approx(X_WA[:3, 2])
+
+
+def test_a_mesh_without_extent_is_refused() -> None:
+    with pytest.raises(ValueError, match="3 vertices"):
+        PerceivedSurface.from_mesh(np.zeros((3, 3)), None, X_WA)
+    with pytest.raises(ValueError, match="spans"):
+        PerceivedSurface.from_mesh(np.zeros((30, 3)), None, X_WA)
+
+
+def test_a_surface_of_no_numbers_is_refused() -> None:
+    nowhere = np.full_like(VERTICES, np.nan)
+    for vertices, normals in ((VERTICES, nowhere), (nowhere, None)):
+        with pytest.raises(ValueError, match="not finite"):
+            PerceivedSurface.from_mesh(vertices, normals, X_WA)
+
+
+RNG = np.random.default_rng(5)
+KNOTS = np.cumsum(RNG.uniform(0.1, 1.0, 12))
+X, Y = np.linspace(-1.0, 2.0, 13), np.linspace(0.0, 1.0, 9)
+
+
+@pytest.mark.parametrize("s", [KNOTS[0], KNOTS[5], KNOTS[-1], *RNG.uniform(KNOTS[0], KNOTS[-1], 5)])
+def test_a_curve_and_its_derivative_are_those_of_scipy(s: float) -> None:
+    curve = CubicSpline(KNOTS, RNG.normal(size=(12, 16)), bc_type="natural")
+    value, derivative = cubic_at(CubicPieces(curve.x, curve.c), float(s))
+    assert value == pytest.approx(curve(s), abs=1e-12)
+    assert derivative == pytest.approx(curve(s, 1), abs=1e-11)
+
+
+@pytest.mark.parametrize(
+    "xy", [(-1.0, 0.0), (2.0, 1.0), (0.25, 0.5), (-3.0, 0.4), (5.0, 7.0), *RNG.uniform((-1, 0), (2, 1), (5, 2))]
+)
+def test_a_field_at_one_point_is_that_of_scipy_at_many(xy: tuple[float, float]) -> None:
+    field = BicubicField(X, Y, RNG.normal(size=(13, 9, 3)))
+    x, y = map(float, xy)
+    assert bicubic_at(field.spline, x, y) == pytest.approx(field(np.array((x, y))), abs=1e-12)
+
+
+def test_a_field_goes_through_the_values_it_is_made_of() -> None:
+    values = RNG.normal(size=(13, 9, 3))
+    field = BicubicField(X, Y, values)
+    assert bicubic_at(field.spline, float(X[4]), float(Y[7])) == pytest.approx(values[4, 7], abs=1e-12)
+
+
+PLACES = np.array([(x, y) for x in (-0.07, 0.0, 0.07) for y in (-0.07, 0.0, 0.07)])
+BETWEEN = np.array([(x, y) for x in (-0.05, 0.03) for y in (-0.04, 0.06)])
+
+
+def tilted(xy: np.ndarray) -> np.ndarray:
+    """[m] outward."""
+    return np.asarray(0.015 + xy @ np.array((0.012, -0.008)))
+
+
+def test_without_touches_the_correction_is_zero_and_uncertain() -> None:
+    correction = TouchCorrection()
+    assert correction.height(np.zeros(2)) == 0.0
+    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(PRIOR.offset_m, PRIOR.field_m))
+
+
+def test_offset_and_tilt_are_found_in_between() -> None:
+    correction = TouchCorrection()
+    for place in PLACES:
+        correction.touch(HeightMeasurement(place, float(tilted(place)), 2e-4))
+    for place in BETWEEN:
+        assert correction.height(place) == pytest.approx(float(tilted(place)), abs=3e-4)
+        assert correction.sigma(place) < 0.0015
+    assert correction.sigma(np.array((0.2, 0.2))) > correction.sigma(BETWEEN[0])
+
+
+def test_touches_at_one_place_are_averaged() -> None:
+    correction = TouchCorrection()
+    for height in (0.0042, 0.0038):
+        correction.touch(HeightMeasurement(np.zeros(2), height, 5e-4))
+    assert correction.height(np.zeros(2)) == pytest.approx(0.004, abs=2e-5)
+    assert correction.sigma(np.zeros(2)) == pytest.approx(5e-4 / np.sqrt(2), rel=0.01)
+
+
+def test_errors_agree_with_the_reported_sd() -> None:
+    rng = np.random.default_rng(3)
+    everywhere = np.vstack((PLACES, BETWEEN))
+    apart = np.sum((everywhere[:, None] - everywhere) ** 2, axis=-1)
+    covariance = PRIOR.offset_m**2 + PRIOR.tilt_rad**2 * everywhere @ everywhere.T
+    covariance += PRIOR.field_m**2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
+    scores = []
+    for _ in range(50):
+        truth = rng.multivariate_normal(np.zeros(len(everywhere)), covariance)
+        correction = TouchCorrection()
+        for place, height in zip(PLACES, truth, strict=False):
+            correction.touch(HeightMeasurement(place, float(height + 4e-4 * rng.standard_normal()), 4e-4))
+        scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
+    assert np.std(scores) == pytest.approx(1.0, abs=0.2)
+
+
+@pytest.mark.parametrize(("rough_m", "most_m", "roughness"), [(0.0, 0.3e-3, (0.0, 0.3)), (1.2e-3, 1.5e-3, (0.5, 2.0))])
+def test_touches_determine_the_roughness_of_the_error(rough_m: float, most_m: float, roughness: tuple[float, float]) -> None:
+    """After 25 touches a smooth error is known to within the error of a touch, a rough one is not."""
+    rng = np.random.default_rng(5)
+    places = np.array([(x, y) for x in np.linspace(-0.09, 0.09, 5) for y in np.linspace(-0.09, 0.09, 5)])
+    correction = TouchCorrection()
+    for place in places:
+        height = tilted(place) + rough_m * rng.standard_normal() + 2e-4 * rng.standard_normal()
+        correction.touch(HeightMeasurement(place, float(height), 2.5e-4))
+    assert roughness[0] <= correction.roughness <= roughness[1]
+    assert correction.sigma(np.array((0.02, 0.02))) < most_m
+
+
+def test_the_latest_touch_can_be_revised() -> None:
+    revised, right = TouchCorrection(), TouchCorrection()
+    for correction in (revised, right):
+        correction.touch(HeightMeasurement(PLACES[0], 0.004, 4e-4))
+    revised.touch(HeightMeasurement(PLACES[1], 0.006, 9e-4))
+    revised.revise(HeightMeasurement(PLACES[1], 0.005, 4e-4))
+    right.touch(HeightMeasurement(PLACES[1], 0.005, 4e-4))
+    assert revised.height(PLACES[2]) == pytest.approx(right.height(PLACES[2]))
+    assert revised.sigma(PLACES[2]) == pytest.approx(right.sigma(PLACES[2]))
+
+
+def test_a_new_scan_keeps_offset_and_tilt_learned_from_touches() -> None:
+    correction = TouchCorrection()
+    for place in PLACES:
+        correction.touch(HeightMeasurement(place, float(tilted(place)), 3e-4))
+    before = correction.sigma(PLACES[0])
+    correction.blur()
+    assert correction.sigma(PLACES[0]) > before
+    for place in BETWEEN:
+        assert correction.height(place) == pytest.approx(float(tilted(place)), abs=5e-4)
+
+
+def test_a_better_surface_needs_a_smaller_correction() -> None:
+    rng = np.random.default_rng(5)
+    apart = np.sum((PLACES[:, None] - PLACES) ** 2, axis=-1)
+    bent = rng.multivariate_normal(
+        np.zeros(len(PLACES)), (2 * PRIOR.field_m) ** 2 * np.exp(-apart / (2 * PRIOR.field_length_m**2))
+    )
+    correction = TouchCorrection()
+    for place, field in zip(PLACES, bent, strict=True):
+        correction.touch(HeightMeasurement(place, float(tilted(place) + field), 2e-4))
+    better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
+    assert better.roughness < correction.roughness
+    heights, sigmas = better.over(BETWEEN)
+    assert heights == pytest.approx(tilted(BETWEEN), abs=2e-4)
+    assert (sigmas < [correction.sigma(place) for place in BETWEEN]).all()
+
+
+def test_successive_touches_share_the_error_of_the_breath() -> None:
+    """Nine touches within three seconds leave the error of the breath in the offset; within three minutes they average it."""
+    hasty, slow = TouchCorrection(), TouchCorrection()
+    for number, place in enumerate(PLACES):
+        hasty.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number / 3.0))
+        slow.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number * 20.0))
+    middle = PLACES[4]
+    assert hasty.sigma(middle) == pytest.approx(5e-4, rel=0.2)
+    assert slow.sigma(middle) < 0.7 * hasty.sigma(middle)
+
+
+def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:
+    """Rows of depth [m] and force [N] every 0.14 mm, until contact is detected; `stiffness` [N] at 4 mm."""
+    depth = np.arange(onset - 0.008, onset + 0.016, 0.00014)
+    force = stiffness * (np.maximum(depth - onset, 0.0) / 0.004) ** exponent
+    force = force + bias + noise * np.random.default_rng(seed).standard_normal(len(depth))
+    return np.column_stack((depth, force))[: int(np.argmax(force >= FELT_N)) + 1]
+
+
+@given(st.floats(-0.02, 0.02), st.floats(0.6, 4.0), st.floats(1.2, 1.45), st.floats(-0.1, 0.1), st.integers(0, 1000))
+@settings(deadline=None)
+def test_the_skin_is_found_within_its_uncertainty(
+    onset: float, stiffness: float, exponent: float, bias: float, seed: int
+) -> None:
+    touch = find_touch(descent(onset, stiffness, exponent, bias, 0.03, seed))
+    assert abs(touch.depth - onset) < 4 * touch.sigma
+    assert touch.sigma < 0.0012
+
+
+@given(st.floats(0.2, 0.6), st.floats(1.2, 1.45), st.integers(0, 1000))
+@settings(deadline=None)
+def test_on_a_soft_wall_the_air_above_the_skin_is_kept(stiffness: float, exponent: float, seed: int) -> None:
+    touch = find_touch(descent(0.0, stiffness, exponent, 0.05, 0.03, seed))
+    assert abs(touch.depth) < 0.0015
+    assert abs(touch.depth) < 4 * touch.sigma
+
+
+def test_the_law_itself_is_found_exactly() -> None:
+    touch = find_touch(descent(0.003, 1.5, 1.3, 0.05, 0.0))
+    assert touch.depth == pytest.approx(0.003, abs=1e-5)
+
+
+def test_on_bone_the_skin_is_where_force_begins() -> None:
+    rows = np.array([(-0.0003, 0.0), (-0.0002, 0.01), (-0.0001, 0.0), (0.0, 0.0), (0.0001, 1.2)])
+    touch = find_touch(rows)
+    assert touch.depth == pytest.approx(0.0, abs=1e-9)
+    assert touch.sigma == TUNING.unfitted_sd_m
+
+
+def test_a_wrong_forecast_shifts_the_touch() -> None:
+    onset = Onset()
+    for k, (depth, force) in enumerate(descent(0.003, 1.5, 1.3, 0.0, 0.0)):
+        onset.add(float(depth), float(force), k, 0.001)
+    assert onset.touch().depth == pytest.approx(0.003, abs=1e-5)
+    assert onset.touch_again(np.full(len(onset.times), 0.0005)).depth == pytest.approx(0.0025, abs=1e-5)
