@@ -9,8 +9,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from palpate.fuzz.bus_readers import Broken, FuzzTarget
 from palpate.fuzz.fuzz import Find, FuzzPlan, all_targets, attempt, campaign, choose, mutate
-from palpate.fuzz.target import Broken, FuzzTarget
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_models.scenario.load import ScenarioError, load_scenario

@@ -2,7 +2,8 @@
 
 import random
 import struct
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from functools import partial
 from importlib import resources
 from pathlib import Path
@@ -11,16 +12,30 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate.fuzz.target import Broken, FuzzTarget
 from palpate_bus.contract import contract
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.messages.typestore import array_dtype
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_bus.settings import Settings
 from palpate_bus.wire.liveliness import parse_token
-from palpate_bus.wire.rmw import ATTACHMENT_SIZE, AttachmentWriter, WireError, parse_key, topic_key, unpack
+from palpate_bus.wire.rmw import AttachmentWriter, WireError, parse_key, topic_key, unpack
 from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
 from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
+
+
+@dataclass(frozen=True)
+class FuzzTarget:
+    """A function under test and its valid inputs."""
+
+    name: str
+    check: Callable[[bytes], bool]
+    """Reads one input; returns True if it was accepted, False if it was refused with the documented error."""
+    seeds: Callable[[random.Random], Sequence[bytes]]
+
+
+class Broken(AssertionError):
+    """A property does not hold for an accepted input."""
+
 
 # -- messages
 
@@ -96,49 +111,64 @@ def _scalar(base: str, rng: random.Random) -> Any:
 # -- attachment, keys, tokens, chunks, options
 
 
-def _attachment(data: bytes) -> bool:
-    try:
-        sequence, sent, gid = unpack(data)
-    except WireError:
-        return False
-    if AttachmentWriter(gid).pack(sequence, sent) != data[:ATTACHMENT_SIZE]:
-        raise Broken("attachment: packing the unpacked values changes it")
-    return True
+def _round_trip(
+    name: str, read: Callable[[bytes], Any], write: Callable[[Any], bytes], refused: type[Exception], seeds: Sequence[bytes]
+) -> FuzzTarget:
+    """Return a target that checks that data is refused with `refused`, or that its value is equal after writing and reading."""
+
+    def check(data: bytes) -> bool:
+        try:
+            value = read(data)
+        except refused:
+            return False
+        if read(write(value)) != value:
+            raise Broken(f"{name}: reading what was written changes it")
+        return True
+
+    return FuzzTarget(name, check, lambda _: seeds)
 
 
-ATTACHMENT = FuzzTarget(
-    "attachment", _attachment, lambda rng: [AttachmentWriter(rng.randbytes(16)).pack(rng.randrange(2**62), rng.randrange(2**62))]
-)
+def _text(data: bytes) -> str:
+    return data.decode("utf-8", "surrogateescape")
 
 
-def _key(data: bytes) -> bool:
-    text = data.decode("utf-8", "surrogateescape")
-    try:
-        key = parse_key(text)
-    except WireError:
-        return False
-    if parse_key(str(key)) != key:
-        raise Broken("key: parsing the written text changes it")
-    return True
+def _bytes(text: str) -> bytes:
+    return text.encode("utf-8", "surrogateescape")
 
 
-KEY = FuzzTarget("key", _key, lambda _: [topic_key(topic, 3).encode() for topic in contract().topics.values()])
+def _pack(value: tuple[int, int, bytes]) -> bytes:
+    sequence, sent, gid = value
+    return AttachmentWriter(gid).pack(sequence, sent)
 
 
-def _token(data: bytes) -> bool:
-    try:
-        entity = parse_token(data.decode("utf-8", "surrogateescape"))
-    except WireError:
-        return False
-    if parse_token(entity.token) != entity:
-        raise Broken("token: parsing the written text changes it")
-    return True
+_VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
 
 
-_ENDPOINT = (
-    "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
-)
-TOKEN = FuzzTarget("token", _token, lambda _: [b"@ros2_lv/0/a1b2/0/0/NN/%/%/robot", _ENDPOINT.encode()])
+def _options(data: bytes) -> BusOptions:
+    return BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, _text(data).split("\n"), strict=False))))
+
+
+def _round_trips() -> Iterator[FuzzTarget]:
+    yield _round_trip(
+        "attachment", unpack, _pack, WireError, [_pack((2**40 + number, 2**61, bytes(range(16)))) for number in range(3)]
+    )
+    keys = [topic_key(topic, 3).encode() for topic in contract().topics.values()]
+    yield _round_trip("key", lambda data: parse_key(_text(data)), lambda key: _bytes(str(key)), WireError, keys)
+    node = "@ros2_lv/0/a1b2/0/0/NN/%/%/robot"
+    endpoint = (
+        "@ros2_lv/0/a1b2/0/3/MP/%/%/robot/%joint_states/sensor_msgs::msg::dds_::JointState_/RIHS01_" + 64 * "a" + "/::,1:,:,:,,"
+    )
+    tokens = [node.encode(), endpoint.encode()]
+    yield _round_trip("token", lambda data: parse_token(_text(data)), lambda found: _bytes(found.token), WireError, tokens)
+    options = [
+        b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k",
+    ]  # fmt: skip
+    yield _round_trip("options", _options, _written, BusConfigError, options)
+
+
+def _written(options: BusOptions) -> bytes:
+    environment = options.to_env()
+    return _bytes("\n".join(environment.get(name, "") for name in _VARIABLES))
 
 
 def _chunk(data: bytes) -> bool:
@@ -158,27 +188,6 @@ def _small_chunk() -> bytes:
 
 
 CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [_small_chunk(), *(random_payload(CHUNK_TYPE, rng) for _ in range(3))])
-
-
-_VARIABLES = ("PALPATE_LISTEN", "PALPATE_CONNECT", "PALPATE_ROUTER", "PALPATE_MODE", "PALPATE_LOWLATENCY", "PALPATE_TLS")
-
-
-def _options(data: bytes) -> bool:
-    words = data.decode("utf-8", "surrogateescape").split("\n")
-    try:
-        options = BusOptions.from_settings(Settings.read(dict(zip(_VARIABLES, words, strict=False))))
-    except BusConfigError:
-        return False
-    if BusOptions.from_settings(Settings.read(options.to_env())) != options:
-        raise Broken("options: their environment yields other options")
-    return True
-
-
-OPTIONS = FuzzTarget(
-    "options",
-    _options,
-    lambda _: [b"tcp/127.0.0.1:7501,unixsock-stream//run/a.sock\ntcp/a:1\ntcp/host:7447\npeer\n1", b"\n\ntls/h:1\nclient\n0\n/k"],
-)
 
 
 def _texts(_: random.Random) -> list[bytes]:
@@ -221,4 +230,4 @@ SETTING = FuzzTarget("setting", _setting, lambda _: _SETTINGS)
 
 def bus_targets() -> list[FuzzTarget]:
     """Return a target for each reader of bytes from the bus, of options and of scenarios."""
-    return [*_codecs(), ATTACHMENT, KEY, TOKEN, CHUNK, OPTIONS, SCENARIO, SETTING]
+    return [*_codecs(), *_round_trips(), CHUNK, SCENARIO, SETTING]

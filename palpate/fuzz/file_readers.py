@@ -12,9 +12,12 @@ from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
+from trimesh import Trimesh
+from trimesh.exchange.obj import export_obj
+from trimesh.exchange.ply import export_ply
+from trimesh.exchange.stl import export_stl, export_stl_ascii
 
-from palpate.fuzz.bus_readers import random_payload
-from palpate.fuzz.target import FuzzTarget
+from palpate.fuzz.bus_readers import FuzzTarget, random_payload
 from palpate.recording.read import read_recording
 from palpate.report.archive import FILE, read_evidence, write_evidence
 from palpate.report.page import read_report
@@ -58,39 +61,14 @@ def _target(
 
 # -- meshes
 
-_CORNERS = ((-0.2, -0.3, 0.0), (0.2, -0.3, 0.0), (0.2, 0.3, 0.0), (-0.2, 0.3, 0.0))
-_FACES = ((0, 1, 2), (0, 2, 3))
-
-
-def _obj() -> bytes:
-    lines = [f"v {x} {y} {z}" for x, y, z in _CORNERS] + [f"f {a + 1} {b + 1} {c + 1}" for a, b, c in _FACES]
-    return "\n".join(["# plate", "o plate", *lines]).encode()
-
-
-def _stl(text: bool) -> bytes:
-    corners = np.array(_CORNERS)[np.array(_FACES)]
-    if text:
-        facets = [
-            "facet normal 0 0 1\nouter loop\n" + "".join(f"vertex {x} {y} {z}\n" for x, y, z in face) + "endloop\nendfacet\n"
-            for face in corners
-        ]
-        return f"solid plate\n{''.join(facets)}endsolid plate\n".encode()
-    rows = b"".join(np.concatenate(([0, 0, 1], face.ravel())).astype("<f4").tobytes() + b"\0\0" for face in corners)
-    return bytes(80) + len(corners).to_bytes(4, "little") + rows
-
-
-def _ply(text: bool) -> bytes:
-    kind = "ascii" if text else "binary_little_endian"
-    header = (
-        f"ply\nformat {kind} 1.0\ncomment plate\nelement vertex 4\nproperty float x\nproperty float y\nproperty float z\n"
-        "element face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    )
-    if text:
-        rows = [*(" ".join(map(str, corner)) for corner in _CORNERS), *("3 " + " ".join(map(str, face)) for face in _FACES)]
-        return (header + "\n".join(rows) + "\n").encode()
-    faces = b"".join(b"\3" + np.array(face, "<i4").tobytes() for face in _FACES)
-    return header.encode() + np.array(_CORNERS, "<f4").tobytes() + faces
-
+_PLATE = Trimesh([(-0.2, -0.3, 0.0), (0.2, -0.3, 0.0), (0.2, 0.3, 0.0), (-0.2, 0.3, 0.0)], [(0, 1, 2), (0, 2, 3)], process=False)
+_MESHES = {
+    "obj-text": export_obj(_PLATE).encode(),
+    "stl-binary": export_stl(_PLATE),
+    "stl-text": export_stl_ascii(_PLATE).encode(),
+    "ply-binary": export_ply(_PLATE),
+    "ply-text": export_ply(_PLATE, encoding="ascii"),
+}
 
 # -- FMUs
 
@@ -257,13 +235,7 @@ def _bag() -> bytes:
 def _foreign(path: Path, *, table: bool) -> None:
     """Read a table or a bag, or either with this mapping or arm."""
     files = {"input.csv" if table else "input.mcap": _table() if table else _bag(), "arm.urdf": _ARM}
-    files["mapping.yaml"] = (
-        _TABLE_MAPPING
-        if table
-        else b"""topics: {wrench: wrench, pose: {topic: joints, urdf: arm.urdf, frame: tip}}
-tool: {radius_m: 0.01}
-"""
-    )
+    files["mapping.yaml"] = _TABLE_MAPPING if table else _BAG_MAPPING
     for name, content in files.items():
         if name != path.name:
             Path(name).write_bytes(content)
@@ -313,9 +285,8 @@ _REPORT = json.dumps({
 
 def file_targets() -> Iterator[FuzzTarget]:
     """Yield a target for each reader of files."""
-    for name, seed in (("obj", _obj()), ("stl", _stl(False)), ("stl", _stl(True)), ("ply", _ply(False)), ("ply", _ply(True))):
-        kind = "text" if seed.isascii() and b"\0" not in seed else "binary"
-        yield _target(f"mesh:{name}-{kind}", f"input.{name}", lambda path: load_mesh(path, 0.1), (seed,))
+    for name, seed in _MESHES.items():
+        yield _target(f"mesh:{name}", f"input.{name.partition('-')[0]}", lambda path: load_mesh(path, 0.1), (seed,))
     described = (_ARRAY.encode(), _SCALARS.encode())
     yield _target("fmu:archive", "input.fmu", _read_fmu, tuple(map(_fmu, described)))
     yield _target("fmu:description", "input.xml", _read_described, described)

@@ -21,9 +21,8 @@ from time import perf_counter, process_time, thread_time
 from typing import Any, Final
 
 from palpate.apart import ChildLost, TimeLimit, run_apart, shared_numbers
-from palpate.fuzz.bus_readers import bus_targets
+from palpate.fuzz.bus_readers import FuzzTarget, bus_targets
 from palpate.fuzz.file_readers import file_targets
-from palpate.fuzz.target import FuzzTarget
 
 SLOW_S = 1.0
 """Processor time above which an input is a find, since it would delay a service."""
