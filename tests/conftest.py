@@ -7,6 +7,7 @@ from typing import Any
 
 import pytest
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "bus" / "tests"))
 sys.path.insert(0, str(Path(__file__).parent))
 from examination import GATE, TINY, Finished, palpate_run
 

@@ -44,7 +44,6 @@ NEEDS = {
     "palpate_bus.decompression": "recordings group",
     "palpate_bus.recordings": "recordings group",
     "palpate_bus.security.keys": "conductor group",
-    "palpate_bus.testing.strategies": "bench",
     "palpate_errors": BARE,
     "palpate_inputs": BARE,
     "palpate_plugins": BARE,

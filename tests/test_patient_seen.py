@@ -9,7 +9,7 @@ from scipy.interpolate import LinearNDInterpolator
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.stamps import header
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService
 from palpate_models.numerics.frames import look_at
 from palpate_models.patient.breathing import Breathing, BreathingCurve

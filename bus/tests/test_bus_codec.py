@@ -4,13 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from message_strategies import messages
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec, stubs
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
 from palpate_bus.messages.typestore import PACKAGES, TYPE_NAMES
-from palpate_bus.testing.strategies import messages
 
 TYPES = sorted(
     {row.type for row in contract().topics.values()}

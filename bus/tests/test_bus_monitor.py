@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from message_strategies import messages
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.conformance import Checker, leaves, numbers
@@ -16,7 +17,6 @@ from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueComman
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.monitor.health import RECENT_S, Violation, diagnostics
 from palpate_bus.monitor.monitor import Monitor
-from palpate_bus.testing.strategies import messages
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token
 
 RULES = contract()

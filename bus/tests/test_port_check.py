@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from message_strategies import messages
 from toy_services import TOYS, Robot
 
 from palpate_bus.contract import MS, contract
@@ -19,7 +20,6 @@ from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.service import Inbox, Outbox, Service
-from palpate_bus.testing.strategies import messages
 
 RULES = contract()
 NAN, INF = float("nan"), float("inf")

@@ -9,7 +9,7 @@ from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus.implementations import check, check_libraries, create, create_for, names
 from palpate_bus.runtime.failure import Failure
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario, Services
 from palpate_plugins import PluginError

@@ -8,13 +8,13 @@ import pytest
 import yaml
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from message_strategies import messages
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Edge, Role, Topic, Visibility, contract, parse
 from palpate_bus.contract.conformance import leaves, numbers, violations
 from palpate_bus.messages import Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import header
-from palpate_bus.testing.strategies import messages
 
 RULES = contract()
 TOPICS = pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)

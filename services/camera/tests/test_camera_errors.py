@@ -8,7 +8,7 @@ import pytest
 from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh
 from palpate_bus.messages.stamps import header
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.errors import (
     BASELINE_M,
     DISPARITY_STEP_PX,

@@ -24,7 +24,7 @@ from palpate_bus.messages.geometry import transform_matrix
 from palpate_bus.messages.stamps import header
 from palpate_bus.recordings import open_recording
 from palpate_bus.service import Service
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_camera.backends.replay import POSE, ReplayedCamera
 from palpate_camera.backends.ros import CameraPort, RosCameraService
 from palpate_camera.messages import FRAME, IMAGE, INFO

@@ -21,7 +21,7 @@ from palpate_bus.messages import (
     Vector3,
 )
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_camera.backends.ros import CameraPort, RosCameraService, ZenohCamera

@@ -9,7 +9,7 @@ import trimesh
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage, codec
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.scene import Caster, Mesh, Scene
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
 from palpate_camera.messages import Pinhole

@@ -8,7 +8,7 @@ import pytest
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create
 from palpate_models.robot.lbr import HOME, JOINT_NAMES

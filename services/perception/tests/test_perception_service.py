@@ -11,7 +11,7 @@ from scipy.interpolate import LinearNDInterpolator
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, SurfaceMotion, TFMessage, codec
 from palpate_bus.messages.stamps import header, nanoseconds
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.numerics.frames import apply, inverse, matrix
 from palpate_models.patient.phantom import PhantomModel, build_phantom

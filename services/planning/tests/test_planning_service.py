@@ -22,7 +22,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.setpoint import ControlMode, Setpoint
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Exam, Scenario
 from palpate_planning.reasons import Reason

@@ -7,7 +7,7 @@ import numpy as np
 
 from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input

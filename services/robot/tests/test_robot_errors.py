@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from lbr_bench import Rig
 
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf

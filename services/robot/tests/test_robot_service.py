@@ -9,7 +9,7 @@ import pytest
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import decode, encode, message_type
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import link_names, urdf

@@ -10,7 +10,7 @@ import pytest
 from palpate_bus.contract import MS
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState, SurfaceMesh, Vector3, Wrench
 from palpate_bus.messages.stamps import header
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf

@@ -14,7 +14,7 @@ from palpate_bus.implementations import create_for
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.patient import wall
 from palpate_models.patient.guarding import FADING_S
 from palpate_models.patient.phantom import PhantomModel, flat_phantom

@@ -12,7 +12,7 @@ from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.service import Service
-from palpate_bus.testing.hand_inbox import HandInbox
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import apply, matrix
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.motion import BodyMotion, Motion
