@@ -269,6 +269,29 @@ def test_the_example_patient_and_mesh_are_examined(tmp_path: Path) -> None:
     assert ran.report["scores"]["matched"] == 1
 
 
+FOUND = re.compile(r"^    (?:palpate (run .*--composed.*)|([RL][UL]Q +\(.*))$", re.MULTILINE)
+
+
+@pytest.mark.slow
+@pytest.mark.timeout(1800)
+@pytest.mark.parametrize("page", ["examine", "patient"])
+def test_a_tutorial_shows_what_its_command_prints(page: str, tmp_path: Path) -> None:
+    """The findings after the first `palpate run` that has some are those of this version, digit by digit."""
+    command, rows = "", []
+    for line, row in FOUND.findall((ROOT / "docs" / "tutorials" / f"{page}.md").read_text(encoding="utf-8")):
+        if line and rows:
+            break
+        command, rows = line or command, [*rows, row] if row else rows
+    words = [*shlex.split(command)[1:], "--record", "none"]
+    words[words.index("-o") + 1] = str(tmp_path / "out")
+    called = subprocess.run(
+        [str(Path(sys.executable).with_name("palpate")), "run", *words], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    printed = {" ".join(line.split()) for line in called.stdout.splitlines()}
+    assert rows
+    assert {" ".join(row.split()) for row in rows} <= printed, called.stdout
+
+
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
     sys.path.insert(0, str(ROOT / "docs"))
