@@ -4,8 +4,6 @@ Each patient is a drawn person with one thing changed, by family. The variants o
 drawn from the seed. docs/studies.md lists the ranges with their sources, with these marks: [V] read in the source, [A] assumed.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from enum import StrEnum
 from typing import Any, Final

@@ -1,7 +1,5 @@
 """The split `shift`: its patients and equipment are valid, reproducible, and not those of the population."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np
