@@ -12,21 +12,9 @@ from matplotlib.colors import LogNorm, Normalize, to_hex
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 
+from palpate.report import figures
 from palpate.report.archive import Evidence
 from palpate.report.evidence import map_of
-from palpate.report.figures import (
-    FORCE_COLOURS,
-    INK,
-    QUIET,
-    STIFFNESS_COLOURS,
-    UNCERTAINTY_COLOURS,
-    WHERE_FELT,
-    Drawing,
-    MapQuantity,
-    colour_bar,
-    drawable,
-    panel_title,
-)
 from palpate.report.scoring import Truth
 from palpate_bus.messages import ExamState
 from palpate_models.numerics.frames import Array
@@ -67,9 +55,9 @@ def _png(figure: Figure) -> bytes:
 
 def plain(axes: Axes, ylabel: str, xlabel: str = "") -> None:
     """Draw labels and a light grid."""
-    axes.set_ylabel(ylabel, color=INK, fontsize=9)
-    axes.set_xlabel(xlabel, color=INK, fontsize=9)
-    axes.tick_params(labelsize=8.5, colors=INK)
+    axes.set_ylabel(ylabel, color=figures.INK, fontsize=9)
+    axes.set_xlabel(xlabel, color=figures.INK, fontsize=9)
+    axes.tick_params(labelsize=8.5, colors=figures.INK)
     axes.grid(color=GRID, lw=0.7)
     axes.set_axisbelow(True)
     for side in ("top", "right"):
@@ -82,9 +70,9 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool
     None if there is no map.
     """
     message = evidence.stiffness_map
-    if message is None or not drawable(message):
+    if message is None or not figures.drawable(message):
         return None
-    drawing = Drawing(message, evidence.findings, None, abdomen)
+    drawing = figures.Drawing(message, evidence.findings, None, abdomen)
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
     left.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
@@ -98,11 +86,11 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool
     return _png(figure)
 
 
-def _ratio_layer(drawing: Drawing) -> MapQuantity:
+def _ratio_layer(drawing: figures.Drawing) -> figures.MapQuantity:
     """Return the layer of apparent stiffness relative to the background."""
     ratio = drawing.map.apparent / drawing.background
     low, high = np.quantile(ratio[drawing.map.scanned], (0.002, 0.998))
-    return MapQuantity(ratio, STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
+    return figures.MapQuantity(ratio, figures.STIFFNESS_COLOURS, LogNorm(float(low), max(2.0, float(high))), "times background")
 
 
 def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
@@ -127,7 +115,7 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
     plain(force, "normal force [N]")
     measured = np.where(evidence.depth * 1e3 > _FREE_MM, evidence.depth * 1e3, np.nan)
     wanted = np.where(evidence.setpoint * 1e3 > _FREE_MM, evidence.setpoint * 1e3, np.nan)
-    depth.plot(evidence.time, wanted, color=QUIET, lw=1.4, label="set-point")
+    depth.plot(evidence.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
     depth.plot(evidence.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
     depth.set_ylim(_SHOWN_MM, None)
@@ -148,24 +136,24 @@ def force_depth(evidence: Evidence) -> bytes | None:
         evidence.depth[held] * 1e3, evidence.force[held], c=evidence.time[held], s=2, cmap="viridis", rasterized=True
     )
     plain(axes, "measured normal force [N]", "measured depth [mm]")
-    colour_bar(image, axes, "simulated time [s]")
+    figures.colour_bar(image, axes, "simulated time [s]")
     return _png(figure)
 
 
 def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
     """Return true apparent stiffness with outlines of findings, and the depth error; None if either is unknown."""
     message = evidence.stiffness_map
-    if known is None or message is None or not drawable(message):
+    if known is None or message is None or not figures.drawable(message):
         return None
-    drawing = Drawing(message, evidence.findings, known)
+    drawing = figures.Drawing(message, evidence.findings, known)
     if drawing.true is None:
         return None
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
-    drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", WHERE_FELT, truth=True)
+    drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", figures.WHERE_FELT, truth=True)
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
-    layer = MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")
+    layer = figures.MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")
     small = "estimated over true apparent stiffness, minus one"
     drawing.panel(middle, layer, "e", "Error of the estimate", small, truth=True)
     _depth_errors(right, evidence)
@@ -183,7 +171,7 @@ def _depth_errors(axes: Axes, evidence: Evidence) -> None:
         axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
     plain(axes, "readings in steady contact", "depth error [mm]")
     axes.legend(fontsize=8.5, frameon=False)
-    panel_title(axes, "f", "Error of the depth", "in steady contact")
+    figures.panel_title(axes, "f", "Error of the depth", "in steady contact")
 
 
 MAX_VERTICES = 65_535
@@ -233,11 +221,11 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[Layer], dict[str, 
         ticks = tuple(form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5))
         layers.append((Layer(name, stops, ticks), positions, colors, outlined))
 
-    add("stiffness on the skin", shape, ratio, LogNorm(low, high, clip=True), STIFFNESS_COLOURS, "{:.1f} ×", True)
+    add("stiffness on the skin", shape, ratio, LogNorm(low, high, clip=True), figures.STIFFNESS_COLOURS, "{:.1f} ×", True)
     force_norm = Normalize(0.0, float(force[known].max()), clip=True)
-    add("force as height", relief, force, force_norm, FORCE_COLOURS, "{:.1f} N", False)
+    add("force as height", relief, force, force_norm, figures.FORCE_COLOURS, "{:.1f} N", False)
     top = Normalize(0.0, float(np.quantile(half[known], 0.995)), clip=True)
-    add("uncertainty on the skin", shape, half, top, UNCERTAINTY_COLOURS, "± {:.0f} %", True)
+    add("uncertainty on the skin", shape, half, top, figures.UNCERTAINTY_COLOURS, "± {:.0f} %", True)
     outline = level_lines(shape, triangles, (mapped.finding >= 0).astype(np.float64), 0.5)
     data = {
         "radius": radius,

@@ -16,15 +16,7 @@ import numpy as np
 
 from palpate.environment import given
 from palpate.replay.golden import rerun
-from palpate.report.archive import (
-    EvidenceError,
-    InterruptedRun,
-    NothingRecordedError,
-    completed,
-    inputs,
-    interrupted_run,
-    tick_after,
-)
+from palpate.report import archive
 from palpate.report.evidence import points
 from palpate_assessment.sampling import columns
 from palpate_assessment.service import AssessmentService
@@ -55,9 +47,9 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
 
     Raises EvidenceError if the run is still active, is complete, or has no recording.
     """
-    if completed(folder) is not None:
-        raise EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
-    run = interrupted_run(folder)
+    if archive.completed(folder) is not None:
+        raise archive.EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
+    run = archive.interrupted_run(folder)
     note = ""
     checkpoint, earlier = _continued(folder.resolve())
     collected, recording = run.collected, run.recording
@@ -66,7 +58,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
             with checkpoint_given(checkpoint):
                 _assess(run)
         except RecordingError as error:
-            raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
+            raise archive.EvidenceError(f"{folder}: nothing can be recovered: {error}") from error
         except Exception as error:  # a user-defined assessment, which may have ended the run
             note = f"; the assessment could not finish: {type(error).__name__}: {error}"
     why = gave_up(collected) or ("" if collected.exam is None else str(collected.exam.message))
@@ -89,18 +81,18 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
     )
 
 
-def _assess(run: InterruptedRun) -> None:
+def _assess(run: archive.InterruptedRun) -> None:
     """Run the assessment on the recorded examination, as if it had been aborted where the recording ends."""
     scenario, recording, collected = run.scenario, run.recording, run.collected
     exam = collected.exam
     if exam is None:
         return
     rules, row = contract(), contract().topics["exam/state"]
-    end = tick_after(recording.last, "assessment")
+    end = archive.tick_after(recording.last, "assessment")
     aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
     over = RecordedMessage(end, row.name, aborted, len(collected.exam_states) + 1)
     service = create("assessment", scenario.services.assessment, seen(scenario, view_of("assessment")))
-    received = chain(inputs(recording, "assessment"), [over])
+    received = chain(archive.inputs(recording, "assessment"), [over])
     for sent in rerun(service, rules, received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
         if sent.topic == "assessment/map":
             collected.stiffness_map = codec.decode(sent.payload, rules.topics[sent.topic].type)
@@ -137,14 +129,16 @@ def resumption(folder: Path) -> Resumption:
     """
     while _holds_run(folder / FOLDER):
         folder /= FOLDER
-    if completed(folder) is not None:
-        raise EvidenceError(f"--resume {folder}: its run was completed")
+    if archive.completed(folder) is not None:
+        raise archive.EvidenceError(f"--resume {folder}: its run was completed")
     runs = _runs(folder)
     reached = _reached(runs)
     if not len(reached.felt.time):
-        raise EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
+        raise archive.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
-        raise EvidenceError(f"--resume {folder}: all targets were reached; palpate report {folder} --recover has its findings")
+        raise archive.EvidenceError(
+            f"--resume {folder}: all targets were reached; palpate report {folder} --recover has its findings"
+        )
     lost = tuple(text for run in runs for text in run.recording.damage)
     return Resumption(folder / FOLDER, runs[-1].scenario, reached, tuple(run.collected for run in runs), lost)
 
@@ -154,8 +148,8 @@ def _holds_run(folder: Path) -> bool:
     if not (folder / "scenario.yaml").is_file():
         return False
     try:
-        return completed(folder) is not None or interrupted_run(folder) is not None
-    except NothingRecordedError:
+        return archive.completed(folder) is not None or archive.interrupted_run(folder) is not None
+    except archive.NothingRecordedError:
         return False
 
 
@@ -180,15 +174,15 @@ def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
             yield
 
 
-def _runs(folder: Path) -> list[InterruptedRun]:
+def _runs(folder: Path) -> list[archive.InterruptedRun]:
     """Return the run in a folder, preceded by those that it continued."""
     folders = [folder.resolve()]
     while folders[0].name == FOLDER and (folders[0].parent / "scenario.yaml").is_file():
         folders.insert(0, folders[0].parent)
-    return [interrupted_run(one) for one in folders]
+    return [archive.interrupted_run(one) for one in folders]
 
 
-def _reached(runs: list[InterruptedRun]) -> Checkpoint:
+def _reached(runs: list[archive.InterruptedRun]) -> Checkpoint:
     """Return the checkpoint at the end of a sequence of runs, each of which continued its predecessor."""
     reached: Checkpoint | None = None
     for run in runs:
@@ -197,7 +191,7 @@ def _reached(runs: list[InterruptedRun]) -> Checkpoint:
     return reached
 
 
-def _extended(run: InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+def _extended(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
     """Return the checkpoint at the end of a run that continued from `earlier`: its samples, remaining targets and surface."""
     known, c = exam_input(run.scenario), run.collected
     assessment = AssessmentService(known, earlier)

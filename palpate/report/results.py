@@ -13,20 +13,7 @@ from rich.console import Console
 from rich.table import Table
 
 from palpate.apart import guarded
-from palpate.report import archive, rows, scoring
-from palpate.report.evidence import (
-    ContactRecord,
-    Samples,
-    body_of,
-    felt_truth,
-    found_of,
-    map_of,
-    peak_force,
-    points,
-    samples_of,
-    steady_contact,
-    unassessed_of,
-)
+from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, RecordedRow, Report, TruthRow
 from palpate.truth.pressed import Pressed, press_patient
@@ -51,7 +38,7 @@ class Known:
     """Known parts of the truth of a run; None if unknown."""
 
     body: TrueBody | None
-    contact: ContactRecord | None
+    contact: evidence.ContactRecord | None
     felt: scoring.Truth | None
 
 
@@ -59,17 +46,17 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     """Return the truth of a run and of the `earlier` runs that it continued. The first press of a patient takes seconds."""
     if c.phantom is None:
         return Known(None, None, None)
-    body = body_of(c.phantom)
+    body = evidence.body_of(c.phantom)
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     registered = np.array(exam_input(scenario).X_WA)
-    runs = [steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
-    contact = reduce(ContactRecord.then, runs)
+    runs = [evidence.steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
+    contact = reduce(evidence.ContactRecord.then, runs)
     try:
         pressed = _pressed(scenario)
     except Exception:  # a user-defined tissue that was changed during the run, or that can be created only once
         log.exception("palpable truth unknown: the patient cannot be pressed")
         pressed = None
-    return Known(body, contact, None if pressed is None else felt_truth(scenario, body, pressed, contact.touched))
+    return Known(body, contact, None if pressed is None else evidence.felt_truth(scenario, body, pressed, contact.touched))
 
 
 def _pressed(scenario: Scenario) -> Pressed | None:
@@ -89,15 +76,15 @@ def clean_world(scenario: Scenario) -> bool:
 def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     """Return the report of a run, complete or not."""
     c = result.collected
-    found = None if c.stiffness_map is None else map_of(c.stiffness_map)
+    found = None if c.stiffness_map is None else evidence.map_of(c.stiffness_map)
     final = c.findings if c.findings is not None and c.findings.final else None
     depth = _depth(known)
     scores = None
     if known.felt is not None and final is not None:
-        scores = scoring.score(found_of(final.findings), found, known.felt, found_of(final.candidates))
+        scores = scoring.score(evidence.found_of(final.findings), found, known.felt, evidence.found_of(final.candidates))
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
     runs = (*result.earlier, c)
-    forces = [peak_force(m) for run in runs for m in run.indentation]
+    forces = [evidence.peak_force(m) for run in runs for m in run.indentation]
     forces = forces or [s.normal_force for run in runs for s in run.exam_states if s.in_contact]
     return Report(
         scenario=scenario.name,
@@ -125,7 +112,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
-        unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else unassessed_of(c.stiffness_map)),
+        unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else evidence.unassessed_of(c.stiffness_map)),
         background_N=None if c.stiffness_map is None else float(c.stiffness_map.background),
         truth=None if known.body is None else _truth(known.felt),
         scores=scores,
@@ -160,7 +147,7 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded:
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
     report = assemble(scenario, result, known).model_copy(update={"run": run, "recorded": recorded})
-    samples = samples_of(c.samples)
+    samples = evidence.samples_of(c.samples)
     write_samples(folder / "samples.csv", samples, run)
     touched, felt = None if known.contact is None else known.contact.touched, known.felt
     archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
@@ -173,7 +160,7 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded:
     return report
 
 
-def sample_columns(samples: Samples) -> dict[str, Array]:
+def sample_columns(samples: evidence.Samples) -> dict[str, Array]:
     """Return the columns of samples.csv by name, in the abdomen frame, each of shape (m,)."""
     x, y, z = samples.position.T
     nx, ny, nz = samples.normal.T
@@ -194,7 +181,7 @@ def sample_columns(samples: Samples) -> dict[str, Array]:
     }
 
 
-def write_samples(path: Path, samples: Samples, run: str = "") -> None:
+def write_samples(path: Path, samples: evidence.Samples, run: str = "") -> None:
     """Write samples.csv: one row per sample of the run named `run`, in the abdomen frame."""
     columns = sample_columns(samples)
     with path.open("w", newline="", encoding="utf-8") as file:
@@ -356,5 +343,5 @@ def _surface(scenario: Scenario, surface: Any | None, body: TrueBody | None) -> 
     if surface is None or body is None:
         return None
     centre, half = np.array(scenario.exam.centre_m), 0.5 * np.array(scenario.exam.region_m)
-    perceived = apply(inverse(body.X_WA), points(surface))
+    perceived = apply(inverse(body.X_WA), evidence.points(surface))
     return scoring.surface_error(perceived, body, centre - half, centre + half)

@@ -13,32 +13,20 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
+from palpate_models.patient import schema
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.remus2024 import fitted
-from palpate_models.patient.schema import (
-    Anatomy,
-    Background,
-    Build,
-    Draw,
-    Lesion,
-    Muscles,
-    Phantom,
-    Range,
-    Skeleton,
-    Stiffness,
-    Variation,
-)
 
 GAP_M = (0.002, 0.020)
 """Range of the gap between the outlines of a pair of lumps, uniform."""
 _TRIES = 50
 
 
-def drawn_lumps(draw: Draw, rng: np.random.Generator) -> tuple[Lesion, ...]:
+def drawn_lumps(draw: schema.Draw, rng: np.random.Generator) -> tuple[schema.Lesion, ...]:
     """Return the lumps of one person, without overlap as far as the region has room."""
     count = int(rng.integers(draw.lumps[0], draw.lumps[1] + 1))
-    lumps: list[Lesion] = []
+    lumps: list[schema.Lesion] = []
     while len(lumps) < count:
         first = _separate_lump(draw, rng, lumps)
         lumps.append(first)
@@ -47,7 +35,7 @@ def drawn_lumps(draw: Draw, rng: np.random.Generator) -> tuple[Lesion, ...]:
     return tuple(lumps)
 
 
-def _place(draw: Draw, rng: np.random.Generator) -> tuple[float, float]:
+def _place(draw: schema.Draw, rng: np.random.Generator) -> tuple[float, float]:
     """Return a centre [m] in the region or on its border."""
     at = rng.uniform(-1, 1, 2)
     if draw.place == "edge":
@@ -56,10 +44,10 @@ def _place(draw: Draw, rng: np.random.Generator) -> tuple[float, float]:
     return x, y
 
 
-def _lump(draw: Draw, rng: np.random.Generator, centre_m: tuple[float, float]) -> Lesion:
+def _lump(draw: schema.Draw, rng: np.random.Generator, centre_m: tuple[float, float]) -> schema.Lesion:
     small = _log_uniform(draw.radius_m, rng)
     radii = (small, small * float(rng.uniform(*draw.elongation)))
-    return Lesion(
+    return schema.Lesion(
         centre_m=centre_m,
         radii_m=radii if rng.random() < 0.5 else radii[::-1],
         contrast=_log_uniform(draw.contrast, rng),
@@ -67,12 +55,12 @@ def _lump(draw: Draw, rng: np.random.Generator, centre_m: tuple[float, float]) -
     )
 
 
-def _log_uniform(limits: Range, rng: np.random.Generator) -> float:
+def _log_uniform(limits: schema.Range, rng: np.random.Generator) -> float:
     """Return a number from the log-uniform distribution between `limits`."""
     return float(np.clip(np.exp(rng.uniform(*np.log(limits))), *limits))
 
 
-def _separate_lump(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -> Lesion:
+def _separate_lump(draw: schema.Draw, rng: np.random.Generator, others: list[schema.Lesion]) -> schema.Lesion:
     """Return a lump that overlaps no other; if no try succeeds, the one farthest from the others."""
     best, most = _lump(draw, rng, _place(draw, rng)), -np.inf
     for _ in range(_TRIES):
@@ -86,7 +74,7 @@ def _separate_lump(draw: Draw, rng: np.random.Generator, others: list[Lesion]) -
     return best
 
 
-def _moved_beside(first: Lesion, second: Lesion, rng: np.random.Generator) -> Lesion:
+def _moved_beside(first: schema.Lesion, second: schema.Lesion, rng: np.random.Generator) -> schema.Lesion:
     """Return the second lump of a pair, moved in a random direction from the first to a random gap between the outlines."""
     angle = rng.uniform(0, 2 * np.pi)
     away = np.array((np.cos(angle), np.sin(angle)))
@@ -142,7 +130,7 @@ MEASURED_FAT_M = 0.015
 """Fat thickness included in the measurements: young men with a body mass index of 19.5 to 24.6 [A]."""
 FAT_YOUNG_PA = 3000.0
 """Young's modulus of fat [M: 1.6 to 3.3 kPa excised]."""
-BUILDS = (Build.SLIM, Build.MEDIAN, Build.OBESE)
+BUILDS = (schema.Build.SLIM, schema.Build.MEDIAN, schema.Build.OBESE)
 SHARES = (0.2, 0.5, 0.3)
 """Share of each build [A]."""
 BREATHS_PER_MIN = (12.0, 14.0, 20.0)
@@ -163,13 +151,13 @@ class Figure(NamedTuple):
 
 
 FIGURES = {
-    Build.SLIM: Figure((0.28, 0.32), (0.42, 0.46), (0.16, 0.19), (-0.012, 0.004), (2.4, 2.8), (0.004, 0.009)),
-    Build.MEDIAN: Figure((0.33, 0.38), (0.44, 0.48), (0.18, 0.22), (0.008, 0.018), (2.3, 2.6), (0.009, 0.015)),
-    Build.OBESE: Figure((0.42, 0.48), (0.46, 0.52), (0.25, 0.31), (0.025, 0.045), (2.0, 2.3), (0.030, 0.060)),
+    schema.Build.SLIM: Figure((0.28, 0.32), (0.42, 0.46), (0.16, 0.19), (-0.012, 0.004), (2.4, 2.8), (0.004, 0.009)),
+    schema.Build.MEDIAN: Figure((0.33, 0.38), (0.44, 0.48), (0.18, 0.22), (0.008, 0.018), (2.3, 2.6), (0.009, 0.015)),
+    schema.Build.OBESE: Figure((0.42, 0.48), (0.46, 0.52), (0.25, 0.31), (0.025, 0.045), (2.0, 2.3), (0.030, 0.060)),
 }
 
 
-def drawn(phantom: Phantom, seed: int) -> Phantom:
+def drawn(phantom: schema.Phantom, seed: int) -> schema.Phantom:
     """Return the phantom with all random parts of `kind: person` drawn; other phantoms and drawn persons are unchanged.
 
     Equal settings and seeds give equal persons. `draw` and `build` affect only their own parts.
@@ -179,12 +167,12 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
     rng = generator(seed, "person")
     build = phantom.build
     chosen = BUILDS[int(rng.choice(len(BUILDS), p=SHARES))]
-    figure = FIGURES[chosen if build is Build.DRAWN else build]
+    figure = FIGURES[chosen if build is schema.Build.DRAWN else build]
     width, length, height, dome, exponent, fat = rng.uniform(*np.transpose(figure)).tolist()
     statistics = wall_statistics()
     people = rng.multivariate_normal(statistics.mean, statistics.between)
     wall = under_fat(_stiffness(people, rng), fat)
-    anatomy = Anatomy(
+    anatomy = schema.Anatomy(
         fat_m=fat,
         dome_m=dome,
         exponent=exponent,
@@ -197,7 +185,7 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
         update={
             "size_m": (width, length, height),
             "stiffness": wall,
-            "background": Background(cv=0, margins=1),
+            "background": schema.Background(cv=0, margins=1),
             "anatomy": anatomy,
             "breathing": _breathing(phantom.breathing, generator(seed, "breath")),
             "lesions": phantom.lesions + lumps,
@@ -206,14 +194,14 @@ def drawn(phantom: Phantom, seed: int) -> Phantom:
     )
 
 
-def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
+def _stiffness(people: Array, rng: np.random.Generator) -> schema.Stiffness:
     """Return a person's wall from ln k_w, ln length and stiffening; relaxation and friction are drawn [A]."""
-    usual = Stiffness()
+    usual = schema.Stiffness()
     k_w, length = np.exp(people[:2]).tolist()
     relaxing = np.array(usual.prony_g) * np.exp(0.2 * rng.standard_normal(len(usual.prony_g)))
     relaxing *= min(1.0, 0.8 / relaxing.sum())
     times = np.array(usual.prony_tau_s) * np.exp(0.3 * rng.standard_normal(len(usual.prony_tau_s)))
-    return Stiffness(
+    return schema.Stiffness(
         k_w_n_per_m3=k_w,
         length_m=length,
         stiffening_per_m=max(float(people[2]), 0.0),
@@ -224,7 +212,7 @@ def _stiffness(people: Array, rng: np.random.Generator) -> Stiffness:
     )
 
 
-def under_fat(wall: Stiffness, fat_m: float) -> Stiffness:
+def under_fat(wall: schema.Stiffness, fat_m: float) -> schema.Stiffness:
     """Return the wall under more fat than in the measurements: k_w and the fat's k_f = E / t in series [C, assumed model].
 
     Both carry the pressure p, so with the shares phi = k_s / k of the displacement and p = k (u + beta^2 u^3 / 3) of each,
@@ -252,19 +240,19 @@ def _breathing(breathing: Breathing, rng: np.random.Generator) -> Breathing:
     return breathing.model_copy(update={name: value for name, value in own.items() if name not in breathing.model_fields_set})
 
 
-def _skeleton(rng: np.random.Generator, length: float) -> Skeleton:
+def _skeleton(rng: np.random.Generator, length: float) -> schema.Skeleton:
     """Draw ribs and iliac crests of a body of this length [m]: the lowest ribs are just above the umbilicus [M, ranges A]."""
     scale = length / 0.46
-    return Skeleton(
+    return schema.Skeleton(
         costal_arch_m=scale * rng.uniform(0.16, 0.20),
         costal_slope=rng.uniform(0.5, 0.9),
         iliac_crest_m=(scale * rng.uniform(0.125, 0.145), -scale * rng.uniform(0.10, 0.14)),
     )
 
 
-def _muscles(rng: np.random.Generator) -> Muscles:
+def _muscles(rng: np.random.Generator) -> schema.Muscles:
     """Draw rectus and linea alba: at rest 0.9 to 1.4 times as stiff as the sides [A, within the measured variation]."""
-    return Muscles(
+    return schema.Muscles(
         linea_alba_m=rng.uniform(0.012, 0.022),
         rectus_m=rng.uniform(0.055, 0.075),
         linea_alba=rng.uniform(0.9, 1.4),
@@ -272,7 +260,7 @@ def _muscles(rng: np.random.Generator) -> Muscles:
     )
 
 
-def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
+def _guarding(draw: schema.Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
     """Draw a contracted area. Its force ratio is that of a measured place [C]; position and size [A]."""
     if draw.guarding == "none":
         return ()
@@ -283,7 +271,7 @@ def _guarding(draw: Draw, rng: np.random.Generator) -> tuple[Guarding, ...]:
     return (Guarding(centre_m=(x, y), radii_m=(a, b), ratio=ratio, kind=draw.guarding),)
 
 
-def _variation(statistics: WallStatistics) -> Variation:
+def _variation(statistics: WallStatistics) -> schema.Variation:
     stiffness, stiffening = np.sqrt(np.diag(statistics.places)).tolist()
     correlation = statistics.places[0, 1] / (stiffness * stiffening)
-    return Variation(stiffness=stiffness, stiffening_per_m=stiffening, correlation=float(np.clip(correlation, -1, 1)))
+    return schema.Variation(stiffness=stiffness, stiffening_per_m=stiffening, correlation=float(np.clip(correlation, -1, 1)))

@@ -6,25 +6,9 @@ from typing import Final, NamedTuple
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_models.robot import lbr
+from palpate_models.robot import lbr, solids
 from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_RADIUS_M, FT_TO_INDENTER_M, STANDOFF_RADIUS_M, arm_of
 from palpate_models.robot.chain import Arm, Capsule
-from palpate_models.robot.solids import (
-    Field,
-    Triangles,
-    Y,
-    Z,
-    blend,
-    box,
-    cone,
-    cut,
-    cylinder,
-    half_space,
-    inverse,
-    mesh,
-    mirrored,
-    revolve,
-)
 from palpate_models.scenario.schema import Robot
 
 Rgba = tuple[float, float, float, float]
@@ -55,95 +39,100 @@ class VisualMesh(NamedTuple):
     """A mesh in its link's frame: vertices [m], shape (n, 3); outward triangles, shape (m, 3); colour, each in 0..1."""
 
     vertices: Array
-    triangles: Triangles
+    triangles: solids.Triangles
     rgba: Rgba
 
 
-def _half_bulb(centre_z: float, middle_y: float) -> Field:
+def _half_bulb(centre_z: float, middle_y: float) -> solids.Field:
     """Return the half of a joint's bulb on the +y side of its middle plane, closed by a dome."""
     over = 0.03  # the inner dome lies beyond the middle plane and is cut off
-    return cylinder(Y, (0.0, middle_y - over, centre_z), BULB_END_M + over, BULB_M, 0.036)
+    return solids.cylinder(solids.Y, (0.0, middle_y - over, centre_z), BULB_END_M + over, BULB_M, 0.036)
 
 
-def _other_half(centre_z: float, middle_y: float) -> Field:
+def _other_half(centre_z: float, middle_y: float) -> solids.Field:
     """Return the room of the bulb's other half, which belongs to the next housing."""
-    return cylinder(Y, (0.0, middle_y + SEAM_M - 0.3, centre_z), 0.3, BULB_M + 0.012, 0.004)
+    return solids.cylinder(solids.Y, (0.0, middle_y + SEAM_M - 0.3, centre_z), 0.3, BULB_M + 0.012, 0.004)
 
 
-def _below(height: float, middle_y: float) -> Field:
+def _below(height: float, middle_y: float) -> solids.Field:
     """Return a housing from a rotary joint at z = 0 up to half of a bulb at `height`, on the +y side (links 1 and 3)."""
-    tube = cylinder(Z, (0.0, 0.0, -0.02), 0.10, TUBE_M, 0.004)
+    tube = solids.cylinder(solids.Z, (0.0, 0.0, -0.02), 0.10, TUBE_M, 0.004)
     bulb = _half_bulb(height, middle_y)
-    neck = cone((0.0, 0.006, 0.07), (0.0, middle_y + 0.04, height), TUBE_M - 0.004, BULB_M - 0.020)
-    return cut(
+    neck = solids.cone((0.0, 0.006, 0.07), (0.0, middle_y + 0.04, height), TUBE_M - 0.004, BULB_M - 0.020)
+    return solids.cut(
         CREASE_M,
-        blend(0.035, tube, neck, bulb),
-        half_space((0.0, 0.0, -1.0), -SEAM_M),
-        half_space(Y, middle_y + BULB_END_M),
-        inverse(_other_half(height, middle_y)),
+        solids.blend(0.035, tube, neck, bulb),
+        solids.half_space((0.0, 0.0, -1.0), -SEAM_M),
+        solids.half_space(solids.Y, middle_y + BULB_END_M),
+        solids.inverse(_other_half(height, middle_y)),
     )
 
 
-def _above(height: float, shift: float) -> Field:
+def _above(height: float, shift: float) -> solids.Field:
     """Return a housing from half of a bulb at z = 0, on the +y side, up to a rotary joint at `height` (links 2 and 4)."""
-    tube = cylinder(Z, (0.0, shift, height - 0.09), 0.11, TUBE_M, 0.004)
+    tube = solids.cylinder(solids.Z, (0.0, shift, height - 0.09), 0.11, TUBE_M, 0.004)
     bulb = _half_bulb(0.0, 0.0)
-    neck = cone((0.0, 0.04, 0.0), (0.0, shift + 0.006, height - 0.08), BULB_M - 0.020, TUBE_M - 0.004)
-    return cut(
+    neck = solids.cone((0.0, 0.04, 0.0), (0.0, shift + 0.006, height - 0.08), BULB_M - 0.020, TUBE_M - 0.004)
+    return solids.cut(
         CREASE_M,
-        blend(0.035, tube, neck, bulb),
-        half_space(Z, height - SEAM_M),
-        half_space(Y, BULB_END_M),
-        inverse(_other_half(0.0, 0.0)),
+        solids.blend(0.035, tube, neck, bulb),
+        solids.half_space(solids.Z, height - SEAM_M),
+        solids.half_space(solids.Y, BULB_END_M),
+        solids.inverse(_other_half(0.0, 0.0)),
     )
 
 
-def _base() -> Field:
+def _base() -> solids.Field:
     """Return the foot with its connector panel at the back."""
-    foot = cylinder(Z, (0.0, 0.0, 0.0), 0.05, 0.096, 0.008)
-    column = cone((0.0, 0.0, 0.03), (0.0, 0.0, 0.20), 0.088, TUBE_M - 0.008)
-    panel = box((-0.085, 0.0, 0.045), (0.06, 0.11, 0.075), 0.01)
+    foot = solids.cylinder(solids.Z, (0.0, 0.0, 0.0), 0.05, 0.096, 0.008)
+    column = solids.cone((0.0, 0.0, 0.03), (0.0, 0.0, 0.20), 0.088, TUBE_M - 0.008)
+    panel = solids.box((-0.085, 0.0, 0.045), (0.06, 0.11, 0.075), 0.01)
     top = lbr.JOINT_ORIGIN[0][2] - SEAM_M
-    return cut(CREASE_M, blend(0.03, foot, column, panel), half_space((0.0, 0.0, -1.0), 0.0), half_space(Z, top))
-
-
-def _forearm() -> Field:
-    """Link 5: narrows and runs past the wrist on its -y side."""
-    tube = cylinder(Z, (0.0, 0.0, -0.02), 0.07, TUBE_M, 0.004)
-    narrow = cone((0.0, 0.0, 0.04), (0.0, -0.03, 0.105), TUBE_M - 0.003, 0.047)
-    side = cone((0.0, -0.03, 0.105), (0.0, -0.081, 0.175), 0.045, 0.032)
-    disc = cylinder(Y, (0.0, -0.112, 0.1925), 0.05, 0.055, 0.02)
-    wrist = cylinder(Y, (0.0, -0.0640, 0.1925), 0.2, 0.067, 0.01)
-    return cut(
+    return solids.cut(
         CREASE_M,
-        blend(0.035, tube, narrow, side, disc),
-        half_space((0.0, 0.0, -1.0), -SEAM_M),
-        half_space((0.0, -1.0, 0.0), 0.112),
-        inverse(wrist),
+        solids.blend(0.03, foot, column, panel),
+        solids.half_space((0.0, 0.0, -1.0), 0.0),
+        solids.half_space(solids.Z, top),
     )
 
 
-def _wrist() -> Field:
+def _forearm() -> solids.Field:
+    """Link 5: narrows and runs past the wrist on its -y side."""
+    tube = solids.cylinder(solids.Z, (0.0, 0.0, -0.02), 0.07, TUBE_M, 0.004)
+    narrow = solids.cone((0.0, 0.0, 0.04), (0.0, -0.03, 0.105), TUBE_M - 0.003, 0.047)
+    side = solids.cone((0.0, -0.03, 0.105), (0.0, -0.081, 0.175), 0.045, 0.032)
+    disc = solids.cylinder(solids.Y, (0.0, -0.112, 0.1925), 0.05, 0.055, 0.02)
+    wrist = solids.cylinder(solids.Y, (0.0, -0.0640, 0.1925), 0.2, 0.067, 0.01)
+    return solids.cut(
+        CREASE_M,
+        solids.blend(0.035, tube, narrow, side, disc),
+        solids.half_space((0.0, 0.0, -1.0), -SEAM_M),
+        solids.half_space((0.0, -1.0, 0.0), 0.112),
+        solids.inverse(wrist),
+    )
+
+
+def _wrist() -> solids.Field:
     """Link 6: the bulb of A6 and the short tube of A7. Its frame is 70.7 mm from the arm's axis."""
-    bulb = cylinder(Y, (0.0, 0.0707 - 0.061, 0.0), 0.128, 0.061, 0.038)
-    tube = cone((0.0, 0.0707, 0.02), (0.0, 0.0707, 0.10), 0.052, 0.044)
-    sides = half_space((0.0, -1.0, 0.0), -(0.0707 - 0.060)), half_space(Y, 0.0707 + 0.064)
-    return cut(CREASE_M, blend(0.03, bulb, tube), half_space(Z, 0.078), *sides)
+    bulb = solids.cylinder(solids.Y, (0.0, 0.0707 - 0.061, 0.0), 0.128, 0.061, 0.038)
+    tube = solids.cone((0.0, 0.0707, 0.02), (0.0, 0.0707, 0.10), 0.052, 0.044)
+    sides = solids.half_space((0.0, -1.0, 0.0), -(0.0707 - 0.060)), solids.half_space(solids.Y, 0.0707 + 0.064)
+    return solids.cut(CREASE_M, solids.blend(0.03, bulb, tube), solids.half_space(solids.Z, 0.078), *sides)
 
 
-def _housing(field: Field, low: tuple[float, float, float], high: tuple[float, float, float]) -> VisualMesh:
-    return VisualMesh(*mesh(field, low, high, EDGE_M), WHITE)
+def _housing(field: solids.Field, low: tuple[float, float, float], high: tuple[float, float, float]) -> VisualMesh:
+    return VisualMesh(*solids.mesh(field, low, high, EDGE_M), WHITE)
 
 
 def _turned(
     profile: list[tuple[float, float]],
     rgba: Rgba,
     origin: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    axis: tuple[float, float, float] = Z,
+    axis: tuple[float, float, float] = solids.Z,
 ) -> VisualMesh:
     """Return a revolved profile of (radius, height), closed at both ends."""
     closed = [(0.0, profile[0][1]), *profile, (0.0, profile[-1][1])]
-    return VisualMesh(*revolve(np.array(closed), axis, origin), rgba)
+    return VisualMesh(*solids.revolve(np.array(closed), axis, origin), rgba)
 
 
 def _ring(radius: float, rgba: Rgba, z: float = 0.0, y: float = 0.0, half: float = 0.005) -> VisualMesh:
@@ -156,7 +145,7 @@ def _ring(radius: float, rgba: Rgba, z: float = 0.0, y: float = 0.0, half: float
 def _disc(radius: float, rgba: Rgba, y: float, z: float, half: float = 0.004) -> VisualMesh:
     """Return the disc in the middle plane of a bulb."""
     profile = [(radius - 0.003, -half), (radius, -half + 0.0015), (radius, half - 0.0015), (radius - 0.003, half)]
-    return _turned(profile, rgba, (0.0, y, z), Y)
+    return _turned(profile, rgba, (0.0, y, z), solids.Y)
 
 
 def _cap(y: float, z: float, side: float, radius: float = 0.033) -> VisualMesh:
@@ -178,7 +167,7 @@ def _arm() -> dict[str, list[VisualMesh]]:
             _turned([(0.098, -0.0), (0.098, 0.006)], GREY),
         ],
         "lbr_link_1": [
-            _housing(mirrored(_below(shoulder[2], -shoulder[1])), low, high),
+            _housing(solids.mirrored(_below(shoulder[2], -shoulder[1])), low, high),
             _ring(ring, GREY),
             _disc(BULB_M + 0.001, GREY, shoulder[1], shoulder[2]),
             _cap(shoulder[1] - BULB_END_M, shoulder[2], -1.0),
@@ -190,7 +179,7 @@ def _arm() -> dict[str, list[VisualMesh]]:
             _disc(BULB_M + 0.001, GREY, elbow[1], elbow[2]),
             _cap(elbow[1] + BULB_END_M, elbow[2], 1.0),
         ],
-        "lbr_link_4": [_housing(mirrored(_above(lower[2], -lower[1])), low, high), _cap(-BULB_END_M, 0.0, -1.0)],
+        "lbr_link_4": [_housing(solids.mirrored(_above(lower[2], -lower[1])), low, high), _cap(-BULB_END_M, 0.0, -1.0)],
         "lbr_link_5": [
             _housing(_forearm(), (-0.09, -0.125, -0.01), (0.09, 0.09, 0.26)),
             _ring(ring, GREY),
@@ -224,7 +213,7 @@ def _tool(robot: Robot) -> dict[str, list[VisualMesh]]:
             _turned([(0.028, 0.0), (0.028, 0.006), (0.018, 0.012), (rod, 0.02), (rod, length - 0.02)], STEEL),
             _turned([(rod, length - 0.02), (0.008, length - 0.008), (0.008, length)], STEEL),
         ],
-        "indenter": [VisualMesh(*revolve(sphere), BLUE)],
+        "indenter": [VisualMesh(*solids.revolve(sphere), BLUE)],
     }
 
 
@@ -241,7 +230,7 @@ def _capsules(arm: Arm) -> dict[str, list[VisualMesh]]:
     return {link: [VisualMesh(*_capsule(capsule), WHITE) for capsule in capsules] for link, capsules in shapes}
 
 
-def _capsule(capsule: Capsule) -> tuple[Array, Triangles]:
+def _capsule(capsule: Capsule) -> tuple[Array, solids.Triangles]:
     start, end = np.array(capsule.start), np.array(capsule.end)
     length = float(np.linalg.norm(end - start))
     x, y, z = (end - start) / length if length else (0.0, 0.0, 1.0)
@@ -249,4 +238,4 @@ def _capsule(capsule: Capsule) -> tuple[Array, Triangles]:
     low = capsule.radius * np.stack((np.sin(angle), -np.cos(angle)), axis=1)
     profile = np.concatenate((low, low[::-1] * (1, -1) + (0, length)))
     profile[[0, -1], 0] = 0.0
-    return revolve(profile, (float(x), float(y), float(z)), capsule.start)
+    return solids.revolve(profile, (float(x), float(y), float(z)), capsule.start)
