@@ -27,7 +27,7 @@ from palpate.report.results import truth_of_run
 from palpate.report.rows import Report
 from palpate.report.scoring import Map
 from palpate.truth.felt import Felt
-from palpate.truth.surface import Touched
+from palpate.truth.pressed import Touched
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario

@@ -15,8 +15,7 @@ from scipy.ndimage import gaussian_filter1d
 
 from palpate.report.evidence import felt_truth, found_of, map_of
 from palpate.report.scoring import Scores, Truth, score
-from palpate.truth.pressed import press_patient
-from palpate.truth.surface import Touched, TrueBody
+from palpate.truth.pressed import Touched, TrueBody, press_patient
 from palpate_assessment.service import AssessmentService
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3
 from palpate_bus.messages.stamps import header

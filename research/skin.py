@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.codec import Message

@@ -7,9 +7,9 @@ import numpy as np
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
+from palpate_models.patient.wall import Guarding
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue

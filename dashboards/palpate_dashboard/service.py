@@ -18,7 +18,7 @@ from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import depth_in_metres, pose_matrix, transform_matrix
 from palpate_bus.messages.stamps import nanoseconds
-from palpate_bus.runs.run_name import run_of
+from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, plots, text

@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from typing import Final
 
-from generate.tables import one_line, table
+from generate import one_line, table
 from palpate_models.scenario.errors import LEVEL, Errors
 from palpate_models.scenario.errors import table as levels
 

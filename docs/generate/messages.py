@@ -1,6 +1,6 @@
 """docs/reference/messages.md, from the .msg files of palpation_msgs."""
 
-from generate.tables import table
+from generate import table
 from palpate_bus.messages.typestore import palpation_definitions
 
 _HEAD = """# Messages

@@ -5,7 +5,7 @@ from collections.abc import Iterator
 from textwrap import fill
 from typing import Any, Final, get_args, get_origin
 
-from generate.tables import one_line, table
+from generate import one_line, table
 from palpate_models.scenario.schema import Scenario
 from palpate_models.section import UNITS, Section
 

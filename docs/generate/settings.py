@@ -1,6 +1,6 @@
 """docs/settings.md, from the settings of a process."""
 
-from generate.tables import table
+from generate import table
 from palpate_bus.settings import COMPOSE_VARIABLES, Settings, allowed, text, variable
 
 _HEAD = """# Settings

@@ -2,7 +2,7 @@
 
 from collections.abc import Container, Iterable
 
-from generate.tables import table
+from generate import table
 from palpate_bus.contract import Contract, Edge, Qos, Role, Topic, Visibility, contract
 
 _HEAD = """\

@@ -7,12 +7,12 @@ from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import apply
 from palpate_models.patient.breathing import MOST_M, STILL, TABLE_S, Breathing, BreathingCurve
-from palpate_models.patient.guarding import Activation, Guarding
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Background, Phantom, Stiffness
 from palpate_models.patient.tension import pressed_force, tension_of_ratio
+from palpate_models.patient.wall import Activation, Guarding
 
 QUIET = Breathing(kind="quiet")
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from palpate.quick.errors import Loop
 from palpate.quick.patient import PERIOD_S, Patient, seen_lattice
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.patterns import scan_of

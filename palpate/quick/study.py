@@ -26,7 +26,7 @@ from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting
 from palpate.quick.patient import PERIOD_S
 from palpate.report import archive
 from palpate.report.archive import read_evidence
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_models.numerics.frames import Array, apply, matrix

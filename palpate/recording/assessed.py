@@ -19,7 +19,7 @@ from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
 from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import NS, header
-from palpate_bus.runs.run_name import name_run
+from palpate_bus.runs.run_folder import name_run
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
 from palpate_models.scenario.load import dump_scenario

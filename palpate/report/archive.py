@@ -21,8 +21,7 @@ from numpy.typing import NDArray
 
 from palpate.replay.golden import rerun, write_recording
 from palpate.report.evidence import columns_of, xyz
-from palpate.truth.pressed import Pressed
-from palpate.truth.surface import Touched
+from palpate.truth.pressed import Pressed, Touched
 from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.contract import contract
@@ -30,7 +29,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import BROKEN, RecordedMessage, Recording, RecordingError, open_recording
 from palpate_bus.runs.announcement import live
-from palpate_bus.runs.run_name import in_use
+from palpate_bus.runs.run_folder import in_use
 from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
 from palpate_errors import UserError

@@ -13,8 +13,7 @@ from numpy.typing import NDArray
 
 from palpate.report.scoring import Found, Map, Truth
 from palpate.truth.felt import Felt
-from palpate.truth.pressed import Pressed
-from palpate.truth.surface import Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import NS, nanoseconds

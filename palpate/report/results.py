@@ -16,10 +16,9 @@ from palpate.apart import guarded
 from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, FindingRow, LumpRow, RecordedRow, Report, TruthRow
-from palpate.truth.pressed import Pressed, press_patient
-from palpate.truth.surface import TrueBody
+from palpate.truth.pressed import Pressed, TrueBody, press_patient
 from palpate_bus import implementations
-from palpate_bus.runs.run_name import run_of
+from palpate_bus.runs.run_folder import run_of
 from palpate_bus.settings import Settings
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult

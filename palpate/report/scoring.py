@@ -17,7 +17,7 @@ from scipy.optimize import linear_sum_assignment
 from scipy.spatial import Delaunay
 
 from palpate.truth.felt import Felt, Lump
-from palpate.truth.surface import Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, apply
 
 Mask = NDArray[np.bool_]

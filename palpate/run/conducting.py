@@ -11,7 +11,7 @@ from palpate.run.folder import locked
 from palpate.run.interrupts import all_is_measured, results_first
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, workers
-from palpate_bus.runs.run_name import LOCK, in_use
+from palpate_bus.runs.run_folder import LOCK, in_use
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct

@@ -15,7 +15,7 @@ from typing import Final
 from palpate.report.files import bring_back
 from palpate.run.inputs import Outlook, duration_text
 from palpate.run.options import Record
-from palpate_bus.runs.run_name import FILE, LOCK, in_use, run_of
+from palpate_bus.runs.run_folder import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunProgress, Tell
 from palpate_errors import UserError

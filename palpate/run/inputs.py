@@ -11,7 +11,7 @@ import numpy as np
 
 from palpate.apart import guarded
 from palpate.run.roles import NONE, checked, settings_of
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.settings import Settings
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array

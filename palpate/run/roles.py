@@ -8,7 +8,7 @@ from palpate.apart import guarded
 from palpate.run.options import Record
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.runs.run_name import name_run
+from palpate_bus.runs.run_folder import name_run
 from palpate_bus.settings import Settings
 from palpate_models.scenario.load import HIDDEN, did_you_mean, dump_scenario, view_of
 from palpate_models.scenario.schema import Scenario, Services

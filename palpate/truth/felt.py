@@ -14,8 +14,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.ndimage import label, maximum
 from scipy.spatial import Delaunay
 
-from palpate.truth.pressed import Pressed
-from palpate.truth.surface import TrueSurface
+from palpate.truth.pressed import Pressed, TrueSurface
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam
 

@@ -21,7 +21,7 @@ from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
 from palpate.recording.recording import PalpationRecording
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate.twin.presses import FittedPress, amplitude, presses_of, simulated
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.grid import BodyGrid

@@ -10,7 +10,7 @@ import pytest
 from PIL import Image
 
 from palpate.report.archive import Evidence, completed, write_evidence
-from palpate.truth.surface import Touched
+from palpate.truth.pressed import Touched
 from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
 from palpate_reproduction.page import chosen_moments

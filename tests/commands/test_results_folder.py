@@ -23,7 +23,7 @@ from palpate.run.conducting import conduct_others
 from palpate.run.folder import WatchedRoom, another_folder, check_room, locked, results_folder, unless_begun, what_it_takes
 from palpate.run.inputs import Outlook
 from palpate.run.roles import write_scenario_files
-from palpate_bus.runs.run_name import LOCK, name_run, run_of
+from palpate_bus.runs.run_folder import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError

@@ -9,8 +9,7 @@ import pytest
 from palpate.report import scoring
 from palpate.report.scoring import Found, Map, Scores, Truth
 from palpate.truth.felt import Felt
-from palpate.truth.pressed import Pressed
-from palpate.truth.surface import Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam
 

@@ -8,8 +8,7 @@ import pytest
 
 from palpate.truth import pressed
 from palpate.truth.felt import Felt
-from palpate.truth.pressed import Copies, Pressed, press_patient
-from palpate.truth.surface import Touched, TrueBody, TrueSurface
+from palpate.truth.pressed import Copies, Pressed, Touched, TrueBody, TrueSurface, press_patient
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Lesion
 from palpate_models.scenario.load import load_scenario

@@ -1,20 +1,59 @@
-"""Folder of a run's sockets and scenario copies, locked while a process of the run lives.
+"""The results folder of a run, which has its name, and the folder of its sockets and scenario copies, locked while it lives.
 
-The kernel releases a lock with the last process that holds it. The next command that searches for runs removes the folders of
-killed runs, and unused shared memory, which zenoh locks in the same way.
+The name identifies the run of a copied file. It is random, since scenario, seed and time could reveal the patient. The kernel
+releases a lock with the last process that holds it. The next command that searches for runs removes the folders of killed runs,
+and unused shared memory, which zenoh locks in the same way.
 """
 
 import fcntl
+import json
 import os
 import shutil
 import tempfile
 from contextlib import suppress
+from datetime import UTC, datetime
+from importlib.metadata import version
 from pathlib import Path
 from time import time
 from typing import Final
+from uuid import uuid4
+
+from palpate_inputs import read_json
+
+FILE: Final = "run.json"
+LOCK: Final = "run.lock"
+"""File in a results folder that the run locks; it contains the process id. The kernel releases the lock at the end."""
+_LENGTH: Final = 12
+
+
+def name_run(folder: Path) -> str:
+    """Name a new run and write `run.json` to its results folder; return the name, hexadecimal. Raises OSError."""
+    name = uuid4().hex[:_LENGTH]
+    began = datetime.now(UTC).isoformat(timespec="seconds")
+    facts = {"run": name, "began": began, "palpate": version("palpate")}
+    (folder / FILE).write_text(json.dumps(facts, indent=2) + "\n", encoding="utf-8")
+    return name
+
+
+def in_use(folder: Path) -> bool:
+    """Return True if a run still writes to a results folder. Raises OSError if the folder cannot be read."""
+    with suppress(FileNotFoundError), (folder / LOCK).open("rb") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+    return False
+
+
+def run_of(folder: Path) -> str:
+    """Return the name of the run of a results folder; empty if it has none."""
+    with suppress(OSError, ValueError, KeyError, TypeError):
+        return str(read_json(folder / FILE)["run"])
+    return ""
+
 
 PREFIX: Final = "palpate-run-"
-LOCK: Final = "lock"
+_LOCK: Final = "lock"
 SHARED_MEMORY: Final = Path("/dev/shm")
 YOUNG_S: Final = 60.0
 """Younger segments may not be locked yet."""
@@ -26,7 +65,7 @@ class RunFolder:
     def __init__(self) -> None:
         """Create the folder. Raises OSError."""
         self.path = Path(tempfile.mkdtemp(prefix=PREFIX))
-        self.lock = os.open(self.path / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        self.lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self.lock, fcntl.LOCK_EX)
 
     def remove(self) -> None:
@@ -44,7 +83,7 @@ def remove_leftovers() -> list[Path]:
         with suppress(OSError):  # another user's, just removed, or not locked yet
             if path.stat().st_uid != os.getuid():
                 continue
-            with (path / LOCK).open("rb") as file:
+            with (path / _LOCK).open("rb") as file:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
                 shutil.rmtree(path)
                 removed.append(path)

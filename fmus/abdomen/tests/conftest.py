@@ -7,8 +7,8 @@ import pytest
 from palpate_fmu.compiling import native
 from palpate_fmu.export import build_fmu
 from palpate_models.patient.breathing import Breathing
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
+from palpate_models.patient.wall import Guarding
 
 PHANTOM = Phantom(
     stiffness=Stiffness(k_w_n_per_m3=1.7e5, length_m=0.015, stiffening_per_m=80),

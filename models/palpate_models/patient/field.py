@@ -24,8 +24,8 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.schema import Background, Lesion, Structure
+from palpate_models.patient.wall import Guarding
 
 _SHARE = 0.857
 _FADE_M = 0.0146

@@ -15,8 +15,8 @@ from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient import schema
 from palpate_models.patient.breathing import Breathing
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.remus2024 import fitted
+from palpate_models.patient.wall import Guarding
 
 GAP_M = (0.002, 0.020)
 """Range of the gap between the outlines of a pair of lumps, uniform."""

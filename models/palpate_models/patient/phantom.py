@@ -58,7 +58,7 @@ class PhantomModel:
     young: Array | None = None
     """Instantaneous Young's modulus without lesions [Pa], shape (n,); None if it is proportional to `background`."""
     voluntary: bool = False
-    """The tension fades under gentle pressure: see `palpate_models.patient.guarding.Activation`."""
+    """The tension fades under gentle pressure: see `palpate_models.patient.wall.Activation`."""
 
 
 def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:

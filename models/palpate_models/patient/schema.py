@@ -9,9 +9,8 @@ from typing import Annotated, Literal, Self
 from pydantic import Field, model_validator
 
 from palpate_models.patient.breathing import Breathing
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.motion import Motion
-from palpate_models.patient.wall import MEDIAN
+from palpate_models.patient.wall import MEDIAN, Guarding
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
 Factor = Annotated[float, Field(ge=0.2, le=5)]

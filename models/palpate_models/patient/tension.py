@@ -15,9 +15,9 @@ from scipy.optimize import brentq
 from palpate_models.numerics.frames import Array
 from palpate_models.patient import wall
 from palpate_models.patient.field import edge_distance, smoothstep
-from palpate_models.patient.guarding import Guarding
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.schema import Stiffness
+from palpate_models.patient.wall import Guarding
 
 RADIUS_M, DEPTH_M, SPEED_MPS = 0.010, 0.010, 0.005
 """The press in which the ratio is defined: that of the measured people (Remus 2024)."""

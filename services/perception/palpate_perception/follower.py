@@ -22,8 +22,7 @@ from palpate_models.robot.kinematics import link_transforms
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall
-from palpate_perception.cloud import Intrinsics, RegionBox
-from palpate_perception.fusion import Image
+from palpate_perception.cloud import Image, Intrinsics, RegionBox
 from palpate_perception.tracker import NOTHING, Followed, Tracker, WallAverage, shift_between
 from palpate_perception.wall import WALL_FIT, WallNotVisibleError, WallPixels, steady
 

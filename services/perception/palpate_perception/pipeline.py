@@ -13,8 +13,7 @@ from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface, visibility
-from palpate_perception.cloud import CROP, Cloud, Intrinsics, RegionBox
-from palpate_perception.fusion import DepthFusion, FusedDepth
+from palpate_perception.cloud import CROP, Cloud, DepthFusion, FusedDepth, Intrinsics, RegionBox
 from palpate_perception.surface import FittedSurface
 from palpate_perception.visibility import Gaps, ViewReason
 from palpate_perception.wall import BreathingMode

@@ -18,9 +18,8 @@ from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_perception import messages
-from palpate_perception.cloud import Cloud, Intrinsics
+from palpate_perception.cloud import Cloud, DepthFusion, Intrinsics
 from palpate_perception.follower import WATCH, Follower
-from palpate_perception.fusion import DepthFusion
 from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
 from palpate_perception.visibility import ViewReason

@@ -21,8 +21,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.table import TABLE_TOP_M
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
-from palpate_perception.cloud import CROP, Intrinsics, RegionBox
-from palpate_perception.fusion import Image
+from palpate_perception.cloud import CROP, Image, Intrinsics, RegionBox
 
 
 @dataclass(frozen=True)

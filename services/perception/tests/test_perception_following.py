@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.messages import SurfaceMotion
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.robot.kinematics import tool_pose

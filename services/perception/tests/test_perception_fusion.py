@@ -7,7 +7,7 @@ from palpate_bus.messages import PalpationTargets
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
-from palpate_perception.fusion import DepthFusion, frame_sigma
+from palpate_perception.cloud import DepthFusion, frame_sigma
 from palpate_perception.visibility import Gaps, ViewReason
 
 SHAPE = (40, 50)

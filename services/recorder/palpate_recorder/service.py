@@ -13,7 +13,7 @@ from typing import Any
 
 from palpate_bus.contract import Contract, Topic, contract
 from palpate_bus.messages import codec
-from palpate_bus.runs.run_name import run_of
+from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import RECORDING, Settings
 from palpate_models.scenario.schema import Scenario

@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import BreathingCurve
-from palpate_models.patient.guarding import Activation
 from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
 
 

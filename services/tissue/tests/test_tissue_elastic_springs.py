@@ -16,11 +16,10 @@ from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
 from palpate_bus.testing import HandInbox
 from palpate_models.patient import wall
-from palpate_models.patient.guarding import FADING_S
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
-from palpate_models.patient.wall import MEDIAN
+from palpate_models.patient.wall import FADING_S, MEDIAN
 from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance, compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE

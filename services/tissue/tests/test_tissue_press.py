@@ -7,14 +7,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.truth.surface import TrueBody, TrueSurface
+from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate.truth.tissue import true_tissue
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing, BreathingCurve
-from palpate_models.patient.guarding import FADING_S
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
+from palpate_models.patient.wall import FADING_S
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.press import LIMIT_N, apparent_stiffness, depths, times
 from palpate_tissue.backend import TissueBackend

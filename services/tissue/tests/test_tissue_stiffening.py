@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 from palpate_models.patient import wall
-from palpate_models.patient.guarding import FADING_S, Guarding
 from palpate_models.patient.phantom import build_phantom, flat_phantom
 from palpate_models.patient.schema import Background, Lesion, Phantom, Stiffness
 from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS, tension_of_ratio
-from palpate_models.patient.wall import MEDIAN
+from palpate_models.patient.wall import FADING_S, MEDIAN, Guarding
 from palpate_tissue.backends.winkler.mechanics import STEP_LIMIT, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue, stiffen
 

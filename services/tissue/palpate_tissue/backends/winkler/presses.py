@@ -20,9 +20,9 @@ from scipy.spatial import cKDTree
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.vectors import add, dot, row, scale, subtract
-from palpate_models.patient.guarding import Activation
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
+from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
 from palpate_tissue.backends.winkler.implicit import TUNING, ImplicitWall, Stride, implicit_wall, sweep, unbalanced
 from palpate_tissue.contact import RIM
@@ -102,7 +102,7 @@ def press_forces(
 def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
     """Return the contraction of guarding muscle at the `ends` [s] of steps with `depths` [m], shapes (n,).
 
-    At rest it is fully contracted; the press sustains it or lets it fade (`palpate_models.patient.guarding`).
+    At rest it is fully contracted; the press sustains it or lets it fade (`palpate_models.patient.wall`).
     """
     levels = [1.0]
     for lasted, depth, deeper in zip(np.diff(ends, prepend=0.0), depths, np.diff(depths, prepend=0.0), strict=True):
