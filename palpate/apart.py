@@ -47,7 +47,7 @@ def ended(code: int) -> str:
     """Return how a process ended, from its exit status or minus its signal."""
     if code >= 0:
         return f"left with status {code}"
-    name = {one.value: f" ({one.name})" for one in signal.Signals}.get(-code, "")
+    name = {known.value: f" ({known.name})" for known in signal.Signals}.get(-code, "")
     return f"killed by signal {-code}{name}"
 
 

@@ -152,9 +152,9 @@ def coverage(path: Path, names: Sequence[str], evidence: Sequence[Evidence]) -> 
     """Draw the covered part of the region over simulated time since first contact, for each way to cover."""
     figure = _figure(7.5, 3.4)
     axes = figure.subplots()
-    for name, one in zip(names, evidence, strict=True):
-        begin = one.time[np.argmax(one.in_contact)]
-        axes.plot(one.time - begin, 100 * one.visited / max(one.target_count, 1), lw=1.6, label=name)
+    for name, record in zip(names, evidence, strict=True):
+        begin = record.time[np.argmax(record.in_contact)]
+        axes.plot(record.time - begin, 100 * record.visited / max(record.target_count, 1), lw=1.6, label=name)
     axes.set_xlabel("simulated time since first contact [s]", fontsize=9, color=INK)
     axes.set_ylabel("targets reached [%]", fontsize=9, color=INK)
     axes.set_xlim(0, None)

@@ -193,9 +193,9 @@ def write_page(
     show("figures 7 and 8: maps")
     figures.force_map(images / "figure-7-force.png", evidence[0], sample_places(folder))
     correlation = figures.correlation(images / "figure-8-correlation.png", evidence[0], known_truth(scenario, evidence[0]))
-    figures.coverage(images / "coverage.png", [one.name for one in ways], evidence)
+    figures.coverage(images / "coverage.png", [way.name for way in ways], evidence)
     inside, outside, ratio = _forces(evidence[0])
-    factor = next(one.covering_s for one in ways if one.name == "raster, point") / ways[0].covering_s
+    factor = next(way.covering_s for way in ways if way.name == "raster, point") / ways[0].covering_s
     environment = Environment(
         loader=PackageLoader("palpate_reproduction"), undefined=StrictUndefined, keep_trailing_newline=True, trim_blocks=True
     )
@@ -221,7 +221,7 @@ def write_page(
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")
-    return {**facts, "ways": [vars(one) for one in ways], "run_hash": report.run_hash, "page": str(page)}
+    return {**facts, "ways": [vars(way) for way in ways], "run_hash": report.run_hash, "page": str(page)}
 
 
 def _forces(evidence: Evidence) -> tuple[float, float, float]:

@@ -124,17 +124,17 @@ def measure(patients: int = SETUP.patients) -> Measured:
 
 
 def _pooled(breaths: tuple[Breaths, ...], field: str) -> Array:
-    return np.concatenate([getattr(one, field) for one in breaths])
+    return np.concatenate([getattr(breath, field) for breath in breaths])
 
 
 def _cv(breaths: tuple[Breaths, ...], field: str) -> float:
     """Return the mean over patients of the coefficient of variation [%]."""
-    return 100 * float(np.mean([getattr(one, field).std() / getattr(one, field).mean() for one in breaths]))
+    return 100 * float(np.mean([getattr(breath, field).std() / getattr(breath, field).mean() for breath in breaths]))
 
 
 def _memory(breaths: tuple[Breaths, ...], field: str) -> float:
     """Return the mean over patients of the correlation between successive breaths."""
-    return float(np.mean([np.corrcoef(getattr(one, field)[:-1], getattr(one, field)[1:])[0, 1] for one in breaths]))
+    return float(np.mean([np.corrcoef(getattr(breath, field)[:-1], getattr(breath, field)[1:])[0, 1] for breath in breaths]))
 
 
 def section(found: Measured | None = None) -> PageSection:

@@ -45,7 +45,7 @@ class PopulationSample:
 
     def of_people(self, depth: int) -> list[Array]:
         """Return the logarithms of the forces of each person at a depth."""
-        return [np.log(self.force[self.person == one, depth]) for one in np.unique(self.person)]
+        return [np.log(self.force[self.person == person, depth]) for person in np.unique(self.person)]
 
     def figures(self) -> dict[str, float]:
         """Return the compared statistics."""

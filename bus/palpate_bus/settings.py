@@ -217,7 +217,7 @@ class Settings(BaseSettings):
         try:
             return make()
         except ValidationError as error:
-            raise BusConfigError("; ".join(_complaint(cls, one) for one in error.errors())) from None
+            raise BusConfigError("; ".join(_complaint(cls, problem) for problem in error.errors())) from None
 
 
 def variable(name: str) -> str:

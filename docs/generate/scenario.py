@@ -82,7 +82,7 @@ def _allowed(schema: dict[str, Any], parts: dict[str, Any]) -> str:
     if "$ref" in schema:
         return _allowed(parts[schema["$ref"].rpartition("/")[2]], parts)
     if "anyOf" in schema:
-        return " or ".join(_allowed(one, parts) for one in schema["anyOf"])
+        return " or ".join(_allowed(choice, parts) for choice in schema["anyOf"])
     if "enum" in schema or "const" in schema:
         return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
     if schema.get("type") == "array":

@@ -130,8 +130,8 @@ def hz(
     with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
         spacing = Spacing()
         for received in _each_period(reader, seconds):
-            for one in received:
-                spacing.add(one.sent_ns, _stamp_ns(one, topic))
+            for message in received:
+                spacing.add(message.sent_ns, _stamp_ns(message, topic))
             _print_rate(spacing, topic, as_json)
         if spacing.messages > 1:
             _print_rate(spacing, topic, as_json, whole=True)
@@ -150,7 +150,7 @@ def bw(
     with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
         window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
         for received in _each_period(reader, seconds):
-            window.append([len(one.payload) for one in received])
+            window.append([len(message.payload) for message in received])
             _print_bandwidth(window, topic, as_json)
 
 

@@ -331,28 +331,32 @@ def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
 
 def digest(outcomes: Iterable[Outcome]) -> str:
     """Return the SHA-256 over the sorted pairs of case and run hash; a case without a hash counts by its reason."""
-    pairs = sorted((one.case.case_id, (one.report and one.report.run_hash) or f"without: {one.why}") for one in outcomes)
+    pairs = sorted(
+        (outcome.case.case_id, (outcome.report and outcome.report.run_hash) or f"without: {outcome.why}") for outcome in outcomes
+    )
     return hashlib.sha256(json.dumps(pairs).encode()).hexdigest()
 
 
 def record(study: str, outcomes: Sequence[Outcome], sessions: Sequence[Session]) -> RunRecord:
     """Return the record of a finished study."""
-    wallclock = any(one.case.runtime == "wallclock" for one in outcomes)
-    platforms = {json.dumps(one.report.platform, sort_keys=True): one.report.platform for one in outcomes if one.report}
+    wallclock = any(outcome.case.runtime == "wallclock" for outcome in outcomes)
+    platforms = {
+        json.dumps(outcome.report.platform, sort_keys=True): outcome.report.platform for outcome in outcomes if outcome.report
+    }
     return RunRecord(
         study=study,
         split=outcomes[0].case.split,
         cases=len(outcomes),
-        done=sum(one.status == "done" for one in outcomes),
-        failed=sum(one.status == "failed" for one in outcomes),
-        not_completed=sum(not one.completed for one in outcomes),
+        done=sum(outcome.status == "done" for outcome in outcomes),
+        failed=sum(outcome.status == "failed" for outcome in outcomes),
+        not_completed=sum(not outcome.completed for outcome in outcomes),
         digest=None if wallclock else digest(outcomes),
         no_digest=NO_DIGEST if wallclock else None,
-        code=sorted({one.code for one in outcomes if one.code}),
+        code=sorted({outcome.code for outcome in outcomes if outcome.code}),
         platforms=[platforms[key] for key in sorted(platforms)],
-        peak_memory_bytes=max(one.peak_memory_bytes for one in outcomes),
-        wall_time_s=sum(one.wall_time_s for one in outcomes),
-        core_s=sum(one.core_s for one in outcomes),
+        peak_memory_bytes=max(outcome.peak_memory_bytes for outcome in outcomes),
+        wall_time_s=sum(outcome.wall_time_s for outcome in outcomes),
+        core_s=sum(outcome.core_s for outcome in outcomes),
         sessions=list(sessions),
     )
 

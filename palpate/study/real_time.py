@@ -20,7 +20,7 @@ Named = Sequence[tuple[str, Report]]
 
 def write_real_time(folder: Path, outcomes: Sequence[Outcome]) -> None:
     """Write real_time.md into the folder of a study if it has examinations in wall-clock mode."""
-    named = [(one.case.label, one.report) for one in outcomes if one.report is not None]
+    named = [(outcome.case.label, outcome.report) for outcome in outcomes if outcome.report is not None]
     clocked = [(name, report) for name, report in named if report.runtime == "wallclock" and report.failure is None]
     if clocked:
         machine = clocked[0][1].platform

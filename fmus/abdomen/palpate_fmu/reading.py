@@ -116,7 +116,7 @@ def _simplify(root: ET.Element) -> None:
     variables = root.find("ModelVariables")
     variables = ET.SubElement(root, "ModelVariables") if variables is None else variables
     older = root.get("fmiVersion") == "2.0"
-    known = set(map(str, range(1, len(variables) + 1))) if older else {one.get("valueReference") for one in variables}
+    known = set(map(str, range(1, len(variables) + 1))) if older else {element.get("valueReference") for element in variables}
     for parent in [root.find("ModelStructure"), *root.iterfind("ModelStructure/*")]:
         for unknown in list(parent if parent is not None else ()):
             unknown.attrib.pop("dependencies", None)
@@ -124,14 +124,14 @@ def _simplify(root: ET.Element) -> None:
             reference = unknown.get("index" if older else "valueReference")
             if parent is not None and reference not in known and not len(unknown):
                 parent.remove(unknown)
-    types = {one.get("name") for one in root.iterfind("TypeDefinitions/*")}
+    types = {element.get("name") for element in root.iterfind("TypeDefinitions/*")}
     for variable in variables:
         variable.attrib.setdefault("initial", "")  # else FMPy derives it, for legal combinations of the other attributes only
-        for one in (variable, *variable):
-            one.attrib.pop("derivative", None)
-            one.attrib.pop("clocks", None)
-            if one.get("declaredType") not in types:
-                one.attrib.pop("declaredType", None)
+        for element in (variable, *variable):
+            element.attrib.pop("derivative", None)
+            element.attrib.pop("clocks", None)
+            if element.get("declaredType") not in types:
+                element.attrib.pop("declaredType", None)
 
 
 def binary_folders(path: Path) -> tuple[str, ...]:

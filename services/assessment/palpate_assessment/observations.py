@@ -97,8 +97,8 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
     if standard.anatomy is None:  # each press is a stroke
         usual = np.median(force[cKDTree(xy).query(xy, USABLE.neighbours)[1]], axis=1)
     else:
-        medians = {int(one): float(np.median(force[stroke == one])) for one in np.unique(stroke)}
-        usual = np.array([medians[int(one)] for one in stroke])
+        medians = {int(number): float(np.median(force[stroke == number])) for number in np.unique(stroke)}
+        usual = np.array([medians[int(number)] for number in stroke])
     return Observations(
         standard=standard,
         xy=xy,
