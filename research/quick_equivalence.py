@@ -20,7 +20,6 @@ from scipy import stats
 
 from palpate.quick.case import run_quick
 from palpate.quick.errors import loop_errors
-from palpate.quick.study import drawn_of, runs_in, trace_of
 from palpate.report.archive import read_evidence
 from palpate.report.evidence import map_of
 from palpate.report.results import truth_of_run
@@ -32,6 +31,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_validation.check import COLOURS, QUIET, write_figure
+from research.loop_errors import drawn_of, runs_in, trace_of
 
 LEVEL: Final = 0.90
 MARGINS: Final[dict[str, tuple[float, str]]] = {

@@ -11,10 +11,10 @@ from palpate.quick.case import QuickCase, collected, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import QuickExamination
 from palpate.quick.patient import NoTissueError, Patient, Touch
-from palpate.quick.study import renewed
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
+from research.loop_errors import renewed
 
 SMALL = ("exam.region_m=[0.06, 0.05]", "exam.centre_m=[-0.05, -0.05]")
 ALONE = """

@@ -1,6 +1,6 @@
-"""Fits the errors of whole examinations: `python -m palpate.quick.study RUN...` writes loop.yaml from run folders.
+"""Fits the errors of whole examinations: `python -m research.loop_errors RUN...` writes loop.yaml from run folders.
 
-`python -m palpate.quick.study --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` first runs examinations: persons, every
+`python -m research.loop_errors --examine 12 --set 'exam.region_m=[0.1, 0.1]' -o DIR` first runs examinations: persons, every
 second one with a lump, seeds from 0, with typical errors and quiet breathing. Existing runs are kept, as are rows of loop.yaml
 whose setting is not among the runs.
 """
@@ -45,7 +45,7 @@ _HALF_VALUE: Final = 1.678
 """(1 + x) exp(-x) is one half here."""
 _HEADER: Final = """\
 # Errors of whole examinations, by setting of the errors and kind of breathing; fields: palpate/quick/errors.py.
-# Written by `python -m palpate.quick.study`; do not edit.
+# Written by `python -m research.loop_errors`; do not edit.
 """
 
 
