@@ -7,8 +7,6 @@ slab that is bonded below, and a rigid sphere that meets it without friction. Co
 skin that pulls is released, one that enters the sphere is held.
 """
 
-from __future__ import annotations
-
 import argparse
 from dataclasses import dataclass
 from itertools import product

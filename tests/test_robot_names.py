@@ -1,7 +1,5 @@
 """No code outside an arm's data and its driver knows a robot by name; quotations in docstrings and comments may."""
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

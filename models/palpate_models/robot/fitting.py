@@ -1,7 +1,5 @@
 """Fits of values that an arm's URDF and file leave open: a ready posture, and a capsule about each link."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Final
 

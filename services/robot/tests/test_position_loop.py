@@ -1,7 +1,5 @@
 """Position commands in simulation: the loop on either engine, and what the driver refuses."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
