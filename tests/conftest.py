@@ -14,7 +14,8 @@ from examination import GATE, TINY, Finished, palpate_run
 # A shell's background job ignores Ctrl-C, and so would the processes that tests start.
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
-FUSED = (*TINY, "camera.frames=10")
+FUSED = (*TINY, "phantom.edge_m=0.005", "camera.frames=10")
+"""A tiny examination on a fine mesh, whose surface is perceived to a millimetre."""
 LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
