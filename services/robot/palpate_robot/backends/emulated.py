@@ -4,8 +4,6 @@ A subclass of `EmulatedArm` decides what the drives do in a cycle. Exact poses a
 `emulator/`.
 """
 
-from __future__ import annotations
-
 import gc
 import signal
 from collections.abc import Callable

@@ -5,8 +5,6 @@ With an `InnerLoop` the control service runs in this process and is stepped on e
 another timer between a joint state and its torque.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass

@@ -5,8 +5,6 @@ stop while the arm accepts them, it sends damping without torque until another d
 these commands and holds. Driver and watchdog share message parsing, but no decision logic.
 """
 
-from __future__ import annotations
-
 import logging
 import signal
 import sys

@@ -1,7 +1,5 @@
 """Joint state from a stream of LBRState, and whether the arm accepts commands. Arrays in, arrays out."""
 
-from __future__ import annotations
-
 from typing import Any, Final
 
 import numpy as np

@@ -4,8 +4,6 @@ The messages are those of `lbr_fri_idl` (branch fri-1, FRI 1.11 to 1.16) with th
 types are those of the ROS package, so that type hash and CDR are equal.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import Any
 

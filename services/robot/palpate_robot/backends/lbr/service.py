@@ -1,7 +1,5 @@
 """The driver of a KUKA LBR behind lbr_fri_ros2_stack: LBRState and F/T readings in, torque overlay out."""
 
-from __future__ import annotations
-
 from typing import Final
 
 import numpy as np

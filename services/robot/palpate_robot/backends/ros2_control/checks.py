@@ -1,7 +1,5 @@
 """Two checks of an arm that takes commands: it follows them, and its force pushes the tool away at the first contact."""
 
-from __future__ import annotations
-
 from collections import deque
 from dataclasses import dataclass
 from typing import Final

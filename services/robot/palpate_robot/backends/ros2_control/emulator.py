@@ -6,8 +6,6 @@
 (`robot.driver.profile`), whose topics and conventions it has; what else `robot.driver` sets is the driver's view alone.
 """
 
-from __future__ import annotations
-
 import argparse
 import logging
 import sys

@@ -1,7 +1,5 @@
 """Joint state from sensor_msgs/JointState, and whether the arm accepts commands. Arrays in, arrays out."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The driver's connection to a ros2_control system."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Profiles: what the driver has to know of a ROS 2 stack, as YAML files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Final, Literal
 

@@ -3,8 +3,6 @@
 Arrays in, arrays out; no physics, no messages.
 """
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from enum import StrEnum

@@ -4,8 +4,6 @@ The profile that `robot.driver.profile` names has topics and conventions of the 
 effect is an error, and so is a force that pulls the tool out at the first contact.
 """
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import Any, Final
 

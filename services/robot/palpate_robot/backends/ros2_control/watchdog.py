@@ -3,8 +3,6 @@
 python -m palpate_robot.backends.ros2_control.watchdog my_arm.yaml     # on the robot's computer, before the driver
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 from typing import Any
