@@ -4,10 +4,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from palpate_bus.testing.hand_inbox import HandInbox
 
 from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.testing import HandInbox
 from palpate_models.scenario.load import load_scenario
 from palpate_robot.backends.ros2_control.checks import FirstContactCheck
 from palpate_robot.backends.ros2_control.service import create
