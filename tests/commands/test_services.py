@@ -26,7 +26,7 @@ def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
     scenario = chosen()
     for role in Services.model_fields:
         assert choice(scenario, role) in names(role)
-    assert names("robot") == ("dart", "lbr", "mujoco")
+    assert names("robot") == ("dart", "lbr", "mujoco", "ros2_control")
     assert names("tissue") == ("elastic", "fmu", "winkler")
     assert names("camera") == ("kinect", "replay", "ros")
 
@@ -38,7 +38,9 @@ def test_an_unknown_role_is_named(option: str) -> None:
 
 
 def test_an_unknown_implementation_is_refused_with_the_allowed_ones() -> None:
-    with pytest.raises(PluginError, match=r"healthy: services\.robot = 'bullet': want one of dart, lbr, mujoco, or the path"):
+    with pytest.raises(
+        PluginError, match=r"services\.robot = 'bullet': want one of dart, lbr, mujoco, ros2_control, or the path"
+    ):
         chosen("robot=bullet")
     with pytest.raises(PluginError, match=r"services\.robot = 'none'"):
         chosen("robot=none")
