@@ -1,7 +1,5 @@
 """DART against MuJoCo for each arm: contact force and path of a press 10 mm deep: `python -m research.engines ARM...`."""
 
-from __future__ import annotations
-
 import sys
 from typing import NamedTuple
 
