@@ -35,6 +35,8 @@ class MotionTuning:
     end_tolerance_m: float = 1e-4
     braking_fraction: float = 0.75
     """Fraction of the acceleration with which the motion along a path brakes."""
+    behind_rad: float = 0.1
+    """A free motion has arrived when no joint is this far behind: a real arm may be slowed down by its own controller."""
     stopped_speed_fraction: float = 0.1
     """Below this fraction of its speed the descent counts as stopped by force."""
 
@@ -96,6 +98,8 @@ class StrokeMotion:
         self._sample = 0.0
         self._following = True
         """False while a free motion pauses."""
+        self._behind_rad = 0.0
+        """Largest distance of a joint from a free motion."""
         self._q_offset: Array | None = None
         """Measured less planned joint positions at the start of a free motion [rad], shape (n,); None until then."""
         self._deepest = self._exam.depth_m if segment.depth_m is None else segment.depth_m
@@ -191,12 +195,12 @@ class StrokeMotion:
             self.along.step(self.along.position + self.stopping_distance, max(self.along.velocity, MOTION.creep_mps))
 
     def follow_free_motion(self, rate: float) -> bool:
-        """Advance the segment's free motion by `rate` samples; return True at its end."""
+        """Advance the segment's free motion by `rate` samples; return True once the arm is at its end."""
         assert self.segment.free is not None
         last = len(self.segment.free) - 1.0
         self._following = True
         self._sample = min(self._sample + rate, last)
-        return self._sample >= last
+        return self._sample >= last and self._behind_rad < MOTION.behind_rad
 
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
         """Regulate the measured depth towards the target depth.
@@ -239,4 +243,5 @@ class StrokeMotion:
         x = self._sample / last if last else 1.0
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
         q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
+        self._behind_rad = float(np.abs(q_now - contact.q).max())
         return joint_setpoint(t, contact.X_WI, q_now, qd_now, self._arm.stiffness_nmprad)
