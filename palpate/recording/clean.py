@@ -15,6 +15,10 @@ _RUN: Final = 10
 """A value that repeats this much longer than usual is frozen."""
 _FEWEST: Final = 5
 """Least number of readings of a clipped or frozen stretch."""
+_LIMIT: Final = 0.2
+"""Least end of a sensor's range, as a share of the greatest force."""
+_LIMIT_COUNT: Final = 3.0
+"""A force at the end of the range is at least this many times as frequent as the next one."""
 
 
 def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
@@ -48,7 +52,7 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
         away = np.linalg.norm(readings.position - median_filter(readings.position, (5, 1), mode="nearest"), axis=1)
         usual = np.linalg.norm(np.diff(readings.position, axis=0), axis=1)
         drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * float(np.median(usual))), float(away.max(initial=0.0)))
-    clipped, limit = _clipped(readings.force)
+    clipped, limit = _clipped(readings.force, readings.position)
     if clipped.any():
         faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
     return replace(readings, clipped=clipped), faults
@@ -74,13 +78,21 @@ def _frozen(values: Array, others: Array) -> Mask:
     return frozen
 
 
-def _clipped(force: Array) -> tuple[Mask, float]:
-    """Return True where a component stays at its extreme, shape (n,), and that force [N]."""
+def _clipped(force: Array, position: Array) -> tuple[Mask, float]:
+    """Return True where a component stays at an extreme while the tool moves, shape (n,), and that force [N].
+
+    An extreme near zero is none, and neither is one that is about as frequent as the next value: that is the sensor's resolution.
+    """
     clipped, limit = np.zeros(len(force), bool), 0.0
+    still = np.append(False, (np.diff(position, axis=0) == 0).all(axis=1))
     for column in force.T:
-        for end in (column.max(), column.min()):
-            runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == end)))
-            if sum(one.stop - one.start >= _FEWEST for one in runs):
-                clipped[column == end] = True
-                limit = abs(float(end))
+        values, counts = np.unique(column, return_counts=True)
+        for end, beside in ((-1, -2), (0, 1)) if len(values) > 1 else ():
+            value = float(values[end])
+            if abs(value) < _LIMIT * np.abs(force).max() or counts[end] < _LIMIT_COUNT * counts[beside]:
+                continue
+            runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == value)))
+            if any(one.stop - one.start >= _FEWEST and still[one].mean() < 0.5 for one in runs):
+                clipped[column == value] = True
+                limit = abs(value)
     return clipped, limit

@@ -18,6 +18,10 @@ POWERS: Final = (1.0, 1.2, 1.4, 1.6, 1.8, 2.0)
 HERTZ: Final = 1.5
 _FEW: Final = 10
 """Number of loadings from which on the power is fitted."""
+_CYCLES: Final = 5
+"""Least number of cycles of a slide that pushes in and out."""
+FOOTPRINT_SHARE: Final = 0.4
+"""Share of the footprint's radius over which readings of a slide count as one place."""
 _SHORTEST_S: Final = 0.05
 _LOADED: Final = 0.95
 """Share of the greatest depth up to which a press loads."""
@@ -25,50 +29,64 @@ _LOADED: Final = 0.95
 
 @dataclass(frozen=True)
 class ContactOnset:
-    """Begin of a contact by its loading: F = stiffness (s - at)^power."""
+    """Begin of a contact by its loading: F = stiffness (s - at - slope along)^power."""
 
     at: float
     """Inward coordinate s at which the force begins [m]."""
     sd: float
     """Its standard error [m]."""
-    stiffness: float
-    """[N/m^power]"""
+    slope: float
+    """Rise of the skin along the path of the tool [1]."""
     misfit: float
     """RMS of the force that is not explained, over its RMS."""
 
 
-def onset(inward: Array, force: Array, power: float, sigma: float) -> ContactOnset | None:
+Loaded = tuple[Array, Array] | tuple[Array, Array, Array]
+"""Inward coordinate s [m] and force [N] of a loading, and where the tool slides its coordinate along the path [m]; shape (k,)."""
+
+
+def onset(load: Loaded, power: float, sigma: float) -> ContactOnset | None:
     """Return the onset of a loading by weighted regression of F^(1/power) on s; None with too few readings.
 
-    `inward` [m], `force` [N], shape (k,); `sigma`: SD of the force [N].
+    `sigma`: SD of the force [N].
     """
-    rising = force > 2 * sigma
-    if rising.sum() < 3 or np.ptp(inward[rising]) <= 0:
+    rising = load[1] > 2 * sigma
+    s, F, *along = (values[rising] for values in load)
+    terms = np.column_stack((np.ones(len(s)), s, *along))
+    if len(s) < terms.shape[1] + 1 or np.ptp(s) <= 0:
         return None
-    s, F = inward[rising], force[rising]
+    middle = terms.mean(axis=0) * np.arange(terms.shape[1]).clip(max=1)
+    terms = terms - middle
     g = F ** (1 / power)
-    w = (power * F ** (1 - 1 / power)) ** 2
-    middle, mean = np.average(s, weights=w), np.average(g, weights=w)
-    spread = float(w @ (s - middle) ** 2)
-    slope = float(w @ ((s - middle) * (g - mean))) / spread
-    if slope <= 0:
+    w = power * F ** (1 - 1 / power)
+    found, _, rank, _ = np.linalg.lstsq(terms * w[:, None], g * w, rcond=None)
+    steepness = float(found[1])
+    if rank < len(found) or steepness <= 0:
         return None
-    at = middle - mean / slope
-    rest = F - (slope * np.maximum(s - at, 0)) ** power
-    variance = max(float(rest @ rest) / max(len(s) - 2, 1), sigma**2)
-    sd = np.sqrt(variance * (1 / w.sum() + (middle - at) ** 2 / spread)) / slope
-    return ContactOnset(float(at), float(sd), slope**power, float(np.sqrt(rest @ rest / (F @ F))))
+    rest = F - np.maximum(terms @ found, 0) ** power
+    covariance = np.linalg.inv((terms * w[:, None]).T @ (terms * w[:, None]))
+    covariance *= max(float(rest @ rest) / max(len(s) - len(found), 1), sigma**2)
+    slope = -float(found[2]) / steepness if along else 0.0
+    back = -float(found[0]) / steepness  # from the mean s to the skin
+    pull = np.zeros(len(found))
+    pull[:2] = 1.0, back
+    return ContactOnset(
+        at=float(middle[1]) + back - (slope * float(middle[2]) if along else 0.0),
+        sd=float(np.sqrt(pull @ covariance @ pull)) / steepness,
+        slope=slope,
+        misfit=float(np.sqrt(rest @ rest / (F @ F))),
+    )
 
 
-def power_of(loadings: Sequence[tuple[Array, Array]], sigma: float) -> float:
-    """Return the power of depth that fits most loadings best; each is inward coordinate [m] and force [N].
+def power_of(loads: Sequence[Loaded], sigma: float) -> float:
+    """Return the power of depth that fits most loadings best.
 
     Of few it is that of a sphere on an elastic half-space (Hertz).
     """
-    if len(loadings) < _FEW:
+    if len(loads) < _FEW:
         return HERTZ
-    chosen = loadings[:: max(1, len(loadings) // 100)]
-    misfits = [np.median([o.misfit if (o := onset(s, F, p, sigma)) else 1.0 for s, F in chosen] or [1.0]) for p in POWERS]
+    chosen = loads[:: max(1, len(loads) // 100)]
+    misfits = [np.median([found.misfit if (found := onset(load, p, sigma)) else 1.0 for load in chosen]) for p in POWERS]
     return POWERS[int(np.argmin(misfits))]
 
 
@@ -120,20 +138,44 @@ def before_lift(inward: Array) -> slice:
     return slice(0, len(deep) - int(np.argmax(deep[::-1])))
 
 
-def modulated(force: Array) -> bool:
-    """Return True if the force rises and falls by more than its least value, which shows where the skin is; shape (k,)."""
-    across = np.count_nonzero(np.diff(force > 0.5 * (force.max() + force.min())))
-    return bool(across >= 2 and force.max() > 2 * force.min() > 0)
+def cycles(position: Array, inward: Array, force: Array, radius: float) -> list[slice]:
+    """Return the stretches of a slide that pushes in and out: whole cycles, from one least force to a next one.
+
+    A stretch is about as long as `FOOTPRINT_SHARE` of the footprint of a cycle. There is none if the force does not rise and fall
+    by more than its least value within a footprint of the path. Position [m], shape (k, 3); `inward` [m], `force` [N], (k,).
+    """
+    low, high = np.quantile(force, (0.05, 0.95))
+    troughs = find_peaks(-force, prominence=0.5 * (high - low))[0]
+    way = path_length(position)
+    cycle = [slice(int(a), int(b) + 1) for a, b in pairwise(troughs) if b - a >= _FEW]
+    if len(cycle) < _CYCLES or high < 2 * low:
+        return []
+    footprint = np.sqrt(radius * min(float(np.median([np.ptp(inward[one]) for one in cycle])), radius))
+    if np.median(np.diff(way[troughs])) > footprint:
+        return []
+    together = max(
+        1, round(FOOTPRINT_SHARE * footprint / float(np.median([way[one.stop - 1] - way[one.start] for one in cycle])))
+    )
+    parts = [cycle[k : k + together] for k in range(0, len(cycle), together)]
+    return [slice(part[0].start, part[-1].stop) for part in parts]
+
+
+def path_length(position: Array) -> Array:
+    """Return the length of the path up to each reading [m], shape (k,)."""
+    return np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(position, axis=0), axis=1))))
 
 
 def windows(lateral: Array, travel: float) -> list[NDArray[np.intp]]:
     """Return the readings of each stretch of `travel` [m] of a path, shape (k, 3)."""
-    way = np.concatenate(([0.0], np.cumsum(np.linalg.norm(np.diff(lateral, axis=0), axis=1))))
-    number = np.floor(way / travel).astype(int)
-    return [part for part in np.split(np.arange(len(way)), np.flatnonzero(np.diff(number)) + 1) if len(part) >= 3]
+    number = np.floor(path_length(lateral) / travel).astype(int)
+    return [part for part in np.split(np.arange(len(number)), np.flatnonzero(np.diff(number)) + 1) if len(part) >= 3]
+
+
+def across(position: Array, outward: Array) -> Array:
+    """Return positions without their part along the outward axis [m], shape (k, 3)."""
+    return position - np.outer(position @ outward, outward)
 
 
 def lateral_travel(position: Array, outward: Array) -> float:
     """Return the extent of a contact across the outward axis [m]."""
-    across = position - np.outer(position @ outward, outward)
-    return float(np.linalg.norm(across - across[0], axis=1).max())
+    return float(np.linalg.norm(across(position - position[0], outward), axis=1).max())

@@ -48,7 +48,7 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     inward = [-(p[one] @ n[one][0]) for one in kept]
     loads = [(s[d], force[one][d]) for s, one in zip(inward, kept, strict=True) if (d := cutting.loading(s))]
     power = cutting.power_of(loads, sigma)
-    onsets = [cutting.onset(s, F, power, sigma) for s, F in loads]
+    onsets = [cutting.onset(load, power, sigma) for load in loads]
     given = readings.touch is not None
     zero = [-(start[one][0] @ n[one][0]) for one in kept]
     off = np.array([begin.at - at if begin else np.nan for begin, at in zip(onsets, zero, strict=True)])

@@ -8,7 +8,7 @@ from typing import Final, Self
 
 import numpy as np
 
-from palpate.recording.cutting import windows
+from palpate.recording.cutting import FOOTPRINT_SHARE, windows
 from palpate.recording.faults import Fault
 from palpate.recording.loading import Loading, loading
 from palpate_assessment.sampling import ForceSample
@@ -114,7 +114,7 @@ class PalpationRecording:
         ]
         for number, touch in enumerate(self.touches, start=1):
             if touch.kind is ContactKind.SLIDE:
-                samples += _slid(touch, number, 0.4 * sqrt(self.indenter_radius_m * nominal))
+                samples += _slid(touch, number, FOOTPRINT_SHARE * sqrt(self.indenter_radius_m * nominal))
         return sorted(samples, key=lambda sample: sample.stroke)
 
     @property

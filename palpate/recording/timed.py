@@ -1,14 +1,14 @@
 """Contacts of a recording over time: aligned, tared, cut, and measured from the skin where they begin."""
 
-from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from enum import Enum, auto
 from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 
 from palpate.recording import cutting
-from palpate.recording.cutting import ContactOnset
+from palpate.recording.cutting import ContactOnset, across
 from palpate.recording.faults import Fault, FaultCode, Remedy
 from palpate.recording.mapping import SCALES, Mapping
 from palpate.recording.motion import TUNING, Axis, delay, free_air, noise, shifted, tared
@@ -84,9 +84,16 @@ def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fau
     return replace(readings, force=level), sigma
 
 
+class _Motion(Enum):
+    PRESS = auto()
+    SLIDE = auto()
+    CYCLE = auto()
+    """Part of a slide that pushes in and out, which is a press of its own."""
+
+
 @dataclass(frozen=True)
 class _Loading:
-    """The first part of a contact, or a stretch of a slide, along one normal."""
+    """The first part of a contact, whole cycles of a slide, or another stretch of one, along one normal."""
 
     normal: Array
     inward: Array
@@ -97,6 +104,13 @@ class _Loading:
     """A position in it [m], shape (3,): its end, or its mean."""
     at_inward: float
     """Inward coordinate there [m]."""
+    along: Array | None = None
+    """Coordinate along the path of cycles [m], 0 at `at`, shape (k,)."""
+
+    @property
+    def loaded(self) -> cutting.Loaded:
+        """Its values, as the onset is sought in them."""
+        return (self.inward, self.force) if self.along is None else (self.inward, self.force, self.along)
 
 
 class _Measured:
@@ -105,12 +119,20 @@ class _Measured:
     def __init__(
         self, readings: Readings, outward: Array, radius: float, sigma: float, touching: list[slice], span: float
     ) -> None:
-        self.readings, self.outward, self.radius, self.sigma, self.touching = readings, outward, radius, sigma, touching
+        self.readings, self.outward, self.radius, self.sigma = readings, outward, radius, sigma
         p = readings.position
         self.reach = float(np.sqrt(radius * min(span, radius)))
         """Radius of the footprint [m]."""
         self.stations = grid_over(np.concatenate([p[one, :2] for one in touching]), self.reach)
-        self.slides = [cutting.lateral_travel(p[one], outward) > self.reach for one in touching]
+        self.touching: list[tuple[slice, _Motion]] = []
+        for one in touching:
+            if cutting.lateral_travel(p[one], outward) <= self.reach:
+                self.touching.append((one, _Motion.PRESS))
+                continue
+            force = normal_force(readings.force[one], outward)
+            parts = cutting.cycles(across(p[one], outward), -(p[one] @ outward), force, radius)
+            cycles = [slice(one.start + part.start, one.start + part.stop) for part in parts]
+            self.touching += [(part, _Motion.CYCLE) for part in cycles] or [(one, _Motion.SLIDE)]
         self.skin: RecordedSkin | None = None
         self.power = 1.0
 
@@ -118,9 +140,9 @@ class _Measured:
         """Return the contacts and the skin."""
         given = self.skin is not None
         for _ in range(2):  # the second time with the normals of the first
-            loads = [self._loading(one, slide) for one, slide in zip(self.touching, self.slides, strict=True)]
-            self.power = cutting.power_of([(load.inward, load.force) for load in loads], self.sigma)
-            onsets = [cutting.onset(load.inward, load.force, self.power, self.sigma) for load in loads]
+            loads = [self._loading(*one) for one in self.touching]
+            self.power = cutting.power_of([load.loaded for load in loads], self.sigma)
+            onsets = [cutting.onset(load.loaded, self.power, self.sigma) for load in loads]
             points, sd = self._skin_points(loads, onsets)
             if not given:
                 self.skin = fitted(points, sd, self.stations, 2 * self.reach)
@@ -128,32 +150,35 @@ class _Measured:
         if given:
             self.skin = self.skin.through(points, sd)
         contacts: list[Contact] = []
-        for one, slide, load, begin in zip(self.touching, self.slides, loads, onsets, strict=True):
-            if slide:
+        for (one, motion), load, begin in zip(self.touching, loads, onsets, strict=True):
+            if motion is _Motion.SLIDE:
                 contacts += self._slid(one)
             elif begin is not None and self.readings.whole[one].any():
                 contacts.append(self._pressed(one, load, begin))
         centres, normals = self.skin.points()
         return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
 
-    def _loading(self, one: slice, slide: bool) -> _Loading:
+    def _loading(self, one: slice, motion: _Motion) -> _Loading:
         p = self.readings.position[one]
         normal = self.outward if self.skin is None else self.skin.at(p[:1, :2])[1][0]
-        inward = -(p @ normal)
-        if slide:
-            across = p - np.outer(p @ normal, normal)
-            still = np.linalg.norm(across - across[0], axis=1) < 0.5 * self.reach
+        inward, whole = -(p @ normal), self.readings.whole[one]
+        if motion is _Motion.CYCLE:
+            middle, along = p.mean(axis=0), cutting.path_length(across(p, normal))
+            force = normal_force(self.readings.force[one], normal)
+            return _Loading(normal, inward[whole], force[whole], middle, float(inward.mean()), (along - along.mean())[whole])
+        if motion is _Motion.SLIDE:
+            still = np.linalg.norm(across(p - p[0], normal), axis=1) < 0.5 * self.reach
             p, inward = p[: max(3, int(np.argmin(still)))], inward[: max(3, int(np.argmin(still)))]
         down = cutting.loading(inward)
-        whole = self.readings.whole[one][: len(p)][down]
+        whole = whole[: len(p)][down]
         force = normal_force(self.readings.force[one][: len(p)][down], normal)
         return _Loading(normal, inward[down][whole], force[whole], p[down][-1], float(inward[down][-1]))
 
     def _skin_points(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> tuple[Array, Array]:
         """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
 
-        They are of onsets; of stretches of slides in which the depth changes; and, with less weight, of the other stretches, in
-        which the tool is taken to keep the depth that it had when it began to slide.
+        They are of onsets; and, with less weight, of the stretches of slides that do not push in and out, in which the tool is
+        taken to keep the depth that it had when it began to slide.
         """
         points, sd = [], []
         for load, begin in zip(loads, onsets, strict=True):
@@ -161,38 +186,25 @@ class _Measured:
                 points.append(load.at + (load.at_inward - begin.at) * load.normal)
                 sd.append(begin.sd)
         begun = [load.at_inward - begin.at if begin else np.nan for load, begin in zip(loads, onsets, strict=True)]
-        sliding = [depth for depth, slide in zip(begun, self.slides, strict=True) if slide and depth > 0]
+        slides = [(one, depth) for (one, motion), depth in zip(self.touching, begun, strict=True) if motion is _Motion.SLIDE]
+        sliding = [depth for _, depth in slides if depth > 0]
         usual = float(np.median(sliding)) if sliding else np.nan
-        for one, depth in zip(self.touching, begun, strict=True):
-            for stretch in self._stretches(one):
-                if cutting.modulated(stretch.force):
-                    begin = cutting.onset(stretch.inward, stretch.force, self.power, self.sigma)
-                    if begin is not None:
-                        points.append(stretch.at + (stretch.at_inward - begin.at) * stretch.normal)
-                        sd.append(begin.sd)
-                elif np.isfinite(usual):
-                    kept = depth if 0.5 * usual < depth < 2 * usual else usual
-                    points.append(stretch.at + kept * stretch.normal)
-                    sd.append(_FOLLOWS * kept)
+        for one, depth in slides:
+            p = self.readings.position[one][self.readings.whole[one]]
+            normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
+            for part in cutting.windows(across(p, self.outward), self.reach)[1:-1] if np.isfinite(usual) else []:
+                kept = depth if 0.5 * usual < depth < 2 * usual else usual
+                points.append(p[part].mean(axis=0) + kept * normals[part].mean(axis=0))
+                sd.append(_FOLLOWS * kept)
         return np.array(points).reshape(-1, 3), np.array(sd)
-
-    def _stretches(self, one: slice) -> Iterator[_Loading]:
-        """Yield each stretch of a footprint of a slide, with its mean position; none of a press."""
-        if not self.slides[self.touching.index(one)]:
-            return
-        whole = self.readings.whole[one]
-        p, F = self.readings.position[one][whole], self.readings.force[one][whole]
-        normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
-        for part in cutting.windows(p - np.outer(p @ self.outward, self.outward), self.reach)[1:-1] or []:
-            normal, middle = normals[part].mean(axis=0), p[part].mean(axis=0)
-            yield _Loading(normal, -(p[part] @ normal), normal_force(F[part], normals[part]), middle, -float(middle @ normal))
 
     def _pressed(self, one: slice, load: _Loading, begin: ContactOnset) -> Contact:
         p = self.readings.position[one]
-        kept = cutting.before_lift(-(p @ load.normal))
+        cycle = load.along is not None
+        kept = slice(None) if cycle else cutting.before_lift(-(p @ load.normal))
         whole = self.readings.whole[one][kept]
         p, F, time = p[kept][whole], self.readings.force[one][kept][whole], self._time(one)[kept][whole]
-        depth = -(p @ load.normal) - begin.at
+        depth = -(p @ load.normal) - begin.at - (0.0 if load.along is None else begin.slope * load.along)
         return Contact(
             kind=ContactKind.PRESS,
             position=p + np.outer(depth - self.radius, load.normal),

@@ -9,6 +9,7 @@ import pytest
 from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
+from palpate.recording.cutting import cycles, onset
 from palpate.recording.loading import loading
 from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
@@ -105,3 +106,24 @@ def test_force_and_exponent_are_those_of_the_body(exponent: float, spread: float
 def test_a_press_of_one_reading_keeps_it() -> None:
     found = loading([np.array((0.002,))], [np.array((0.7,))], [0.002], [0.01])
     assert found.force == pytest.approx((0.7,))
+
+
+@pytest.mark.parametrize("per_cycle", [12, 40])
+def test_a_slide_that_pushes_in_and_out_shows_stiffness_and_skin(per_cycle: int) -> None:
+    """The skin slopes, so that neither height nor force alone shows where it is; the force is controlled."""
+    rng = np.random.default_rng(0)
+    k = np.arange(60 * per_cycle)
+    x = 0.0015 * k / per_cycle
+    force = 1.2 - np.cos(2 * np.pi * k / per_cycle)
+    stiffness = np.where(x < 0.045, 3e3, 4.5e3)
+    inward = 0.2 * x + (force / stiffness) ** (1 / 1.2) + 1e-6 * rng.standard_normal(len(k))
+    position = np.column_stack((x, np.zeros(len(k)), -inward))
+    parts = cycles(position * (1, 1, 0), inward, force, 0.006)
+    onsets = [onset((inward[one], force[one], x[one]), 1.2, 0.01) for one in parts]
+    assert 50 <= len(parts) <= 60
+    for one, begin in zip(parts, onsets, strict=True):
+        assert begin is not None
+        if not one.start <= 30 * per_cycle < one.stop:
+            assert begin.slope == pytest.approx(0.2, abs=0.02)
+            assert begin.at == pytest.approx(0.0, abs=0.001)
+    assert not cycles(position * (1, 1, 0), inward, np.full(len(k), 1.2), 0.006)

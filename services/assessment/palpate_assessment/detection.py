@@ -43,6 +43,8 @@ class ShapeSearch:
 
     tries: int = 120
     """Evaluations for place, radius and edge of the strongest bump that was tried."""
+    starts: int = 3
+    """Bumps apart from each other that are refined where no anatomy is assumed: a small lump may be between those tried first."""
     widest: float = 1.3
     """Largest radius over the largest one of the bumps that are tried first."""
     most: int = 4
@@ -67,6 +69,10 @@ class ShapeSearch:
     """Index of the usual radius, which is the length of a piece."""
     least_gain: float = 0.0
     """Log Bayes factor, over all places, below which no more lumps are sought where no anatomy is assumed."""
+    surrounded: float = 0.55
+    """Least share of a structure's outline that is within the samples where no anatomy is assumed: the border may be stiff."""
+    narrow: float = 0.35
+    """Largest radius, over the lesser width of the samples, where no anatomy is assumed: a wider lump has no surroundings."""
     crossed: float = 0.5
     """A stroke crosses a lump whose shape is at least this part of the highest value of any sample: its centre may be outside."""
 
@@ -262,27 +268,30 @@ def _best(regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bu
         return None, 0.0
     xy, lengths = regression.observations.xy, regression.observations.standard.lengths
     t = _strengths(regression, bumps)
-    first = bumps[int(np.argmax(t))]
 
     def loss(p: Array) -> float:
         bump = shape(p)
         return -float(_strengths(regression, [bump])[0]) if _possible(regression, bump) else 0.0
 
     anatomy = regression.observations.standard.anatomy is not None
-    points = np.array(first.path or ((first.x, first.y),)).ravel()
-    start = np.array((*points, np.log(first.radius), np.log(first.edge)))
-    simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
     narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy else SEARCH.narrowest), lengths.edge_m))
     widest = np.log((lengths.radii_m[-1] * SEARCH.widest, lengths.wide_edge_m))
     low, high = xy.min(axis=0) - lengths.pitch_m, xy.max(axis=0) + lengths.pitch_m
-    limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
-    best = minimize(
-        loss,
-        start,
-        method="Nelder-Mead",
-        bounds=limits,
-        options={"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2},
-    )
+    firsts: list[Bump] = []
+    for k in np.argsort(-t, kind="stable"):
+        if all(bumps[k].apart(one) >= SEARCH.too_near for one in firsts):
+            firsts.append(bumps[k])
+        if len(firsts) >= (1 if anatomy else SEARCH.starts):
+            break
+    found = []
+    for first in firsts:
+        points = np.array(first.path or ((first.x, first.y),)).ravel()
+        start = np.array((*points, np.log(first.radius), np.log(first.edge)))
+        simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
+        limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
+        options = {"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2}
+        found.append(minimize(loss, start, method="Nelder-Mead", bounds=limits, options=options))
+    best = min(found, key=lambda one: float(one.fun))
     return shape(best.x), -float(best.fun)
 
 
@@ -313,6 +322,10 @@ def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
 def _possible(regression: Regression, bump: Bump) -> bool:
     """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
     o = regression.observations
-    if o.standard.anatomy is None and not o.encloses(np.array(bump.path or ((bump.x, bump.y),))):
+    if o.standard.anatomy is None and not (
+        o.encloses(np.array(bump.path or ((bump.x, bump.y),))).all()
+        and bump.radius <= SEARCH.narrow * o.width
+        and o.encloses(bump.outline()).mean() >= SEARCH.surrounded
+    ):
         return False
     return all(bump.apart(one) >= SEARCH.too_near for one in regression.lumps)

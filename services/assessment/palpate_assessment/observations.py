@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, cKDTree
+from scipy.spatial import ConvexHull, Delaunay, cKDTree
 
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import PressStandard
@@ -28,6 +28,9 @@ class Usable:
     adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
     fewest: int = 10
     """Least number of samples."""
+    gap: float = 3.0
+    """Largest circumradius of a triangle of samples without a gap, over the usual distance of neighbours: 1.5 % of the triangles
+    of samples at random places are larger."""
     neighbours: int = 9
     """Presses, itself among them, whose median is the usual force at a place."""
 
@@ -73,10 +76,27 @@ class Observations:
         """Convex hull of the samples; its volume is the area [m^2]."""
         return ConvexHull(self.xy)
 
-    def encloses(self, places: Array) -> bool:
-        """Return True if places [m], shape (k, 2), are all within the samples' convex hull."""
+    @cached_property
+    def width(self) -> float:
+        """Least width of the convex hull [m]."""
         sides = self.hull.equations
-        return bool((places @ sides[:, :2].T + sides[:, 2] <= 0).all())
+        return float(-(self.xy[self.hull.vertices] @ sides[:, :2].T + sides[:, 2]).min(axis=0).max())
+
+    @cached_property
+    def mesh(self) -> tuple[Delaunay, NDArray[np.bool_]]:
+        """Triangles between samples, and which of them are filled: without a gap of many samples, as in a notch of the region."""
+        mesh = Delaunay(self.xy)
+        sides = [self.xy[mesh.simplices[:, k]] - self.xy[mesh.simplices[:, k - 1]] for k in range(3)]
+        doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
+        circumradius = np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30)
+        spacing = float(np.median(np.asarray(cKDTree(self.xy).query(self.xy, 2)[0])[:, 1]))
+        return mesh, circumradius <= USABLE.gap * spacing
+
+    def encloses(self, places: Array) -> NDArray[np.bool_]:
+        """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
+        mesh, filled = self.mesh
+        inside = mesh.find_simplex(places)
+        return (inside >= 0) & filled[inside]
 
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Return some of the samples."""

@@ -12,6 +12,9 @@ from scipy.special import erfc
 from palpate_assessment.standard import LENGTHS
 from palpate_models.numerics.frames import Array
 
+_AROUND = np.linspace(0.0, 2 * np.pi, 16, endpoint=False)
+"""Directions of the points of a disc's outline [rad]."""
+
 
 def smooth(a: Array, b: Array, length: float | Array) -> Array:
     """Return the squared-exponential covariance between places a (k, 2) and b (l, 2), shape (k, l)."""
@@ -55,6 +58,18 @@ class Bump:
     def __call__(self, xy: Array, beyond: float = 0.0) -> Array:
         """Return the shape at places [m], shape (k, 2) -> (k,), its radius greater by `beyond`."""
         return np.asarray(0.5 * erfc((self.distance(xy) - self.radius - beyond) / (np.sqrt(2) * self.edge)))
+
+    def outline(self) -> Array:
+        """Return points of its boundary [m], shape (k, 2): of a disc a circle, of a ridge both sides and the ends."""
+        around = self.radius * np.column_stack((np.cos(_AROUND), np.sin(_AROUND)))
+        if not self.path:
+            return around + np.array((self.x, self.y))
+        corners = np.array(self.path)
+        along = np.diff(corners, axis=0) / np.linalg.norm(np.diff(corners, axis=0), axis=1)[:, None]
+        aside = self.radius * np.column_stack((-along[:, 1], along[:, 0]))
+        middles = 0.5 * (corners[1:] + corners[:-1])
+        ends = corners[[0, -1]] + self.radius * along[[0, -1]] * ((-1,), (1,))
+        return np.concatenate((middles + aside, middles - aside, corners[1:] + aside, corners[1:] - aside, ends))
 
     def apart(self, other: Bump) -> float:
         """Return the distance between two bumps over the sum of their radii."""
