@@ -92,7 +92,7 @@ def _clipped(force: Array, position: Array) -> tuple[Mask, float]:
             if abs(value) < _LIMIT * np.abs(force).max() or counts[end] < _LIMIT_COUNT * counts[beside]:
                 continue
             runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == value)))
-            if any(one.stop - one.start >= _FEWEST and still[one].mean() < 0.5 for one in runs):
+            if any((~still[one]).sum() >= _FEWEST for one in runs):
                 clipped[column == value] = True
                 limit = abs(value)
     return clipped, limit

@@ -9,6 +9,8 @@ class FaultCode(StrEnum):
 
     SIGN = "sign"
     UNIT = "unit"
+    FORCE_UNIT = "force_unit"
+    TIME_UNIT = "time_unit"
     FRAME = "frame"
     NO_FREE_AIR = "no_free_air"
     DRIFT = "drift"
@@ -27,6 +29,8 @@ class FaultCode(StrEnum):
 _TEXTS = {
     FaultCode.SIGN: "the force pulls where the tool presses: its sign is wrong, see force.on of the mapping",
     FaultCode.UNIT: "a contact travels {value:.3g} m, which does not suit the tool's radius: see units.length of the mapping",
+    FaultCode.FORCE_UNIT: "the force of presses is {value:.3g} N, which no palpation has: see units.force of the mapping",
+    FaultCode.TIME_UNIT: "there is a row every {value:.3g} s: see units.time of the mapping",
     FaultCode.FRAME: "the force is {value:.0f} deg off the direction of pressing: wrong frame, see force.axes of the mapping",
     FaultCode.NO_FREE_AIR: "no part of the recording is free of contact, so that the force cannot be tared",
     FaultCode.DRIFT: "the force drifts by {value:.2g} N between the first and the last free motion",

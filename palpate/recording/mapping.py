@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from math import pi
 from pathlib import Path
 from typing import Annotated, Final, Literal
 
@@ -13,7 +14,9 @@ from palpate_models.scenario.load import explain
 from palpate_models.section import Pose, Section, Vec3
 
 Triple = tuple[str, str, str]
-SCALES: Final = {"m": 1.0, "mm": 1e-3, "N": 1.0, "mN": 1e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+Turn = Annotated[float, Field(ge=-2 * pi, le=2 * pi)]
+"""[rad]; larger numbers are degrees."""
+SCALES: Final = {"m": 1.0, "mm": 1e-3, "N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 """Metres, newtons and seconds in a unit."""
 
 
@@ -81,7 +84,7 @@ class Units(Section):
     """Units of the table. Messages are in SI units."""
 
     length: Literal["m", "mm"] = "m"
-    force: Literal["N", "mN"] = "N"
+    force: Literal["N", "mN", "gf"] = "N"
     time: Literal["s", "ms", "us", "ns"] = "s"
 
 
@@ -92,7 +95,7 @@ class ForceSource(Section):
     """Whose force it is: what the tool feels points outward when it presses; what the body feels points inward."""
     axes: Literal["recording", "tool"] = "recording"
     """Axes of the force: those of the positions, or those of the tool's pose."""
-    rpy_rad: Vec3 = (0.0, 0.0, 0.0)
+    rpy_rad: tuple[Turn, Turn, Turn] = (0.0, 0.0, 0.0)
     """Orientation of the force's axes in those of the tool."""
     tare: bool = True
     """True to take the zero of the force from motion in free air; needs time."""

@@ -21,6 +21,10 @@ from palpate_models.numerics.frames import Array, inverse, matrix
 _UPRIGHT: Final = 0.7
 """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
 _WRONG_FRAME_DEG: Final = 40.0
+_FORCE_N: Final = (0.01, 200.0)
+"""Plausible change of the force in a recording."""
+_STEP_S: Final = (2e-5, 2.0)
+"""Plausible time between rows."""
 
 
 def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None) -> PalpationRecording:
@@ -58,6 +62,8 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     readings = moved(readings, mapping)
     if len(readings.position) < 10:
         raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least 10")
+    if wrong := _implausible(readings):
+        return _refused(name, mapping, faults + wrong)
     parts = probes(readings) if readings.time is None else blocks(readings.time)
     known = None if readings.normal is None else readings.normal.mean(axis=0)
     axis = pressing_axis(readings.position, readings.force, parts, known)
@@ -66,8 +72,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
             f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
         )
     if axis.angle_deg > _WRONG_FRAME_DEG:
-        faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg))
-        return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
+        return _refused(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
     if axis.flipped:
         faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
         readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
@@ -100,6 +105,23 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         abdomen=mapping.body.anatomy == "abdomen",
         exponent=palpated.exponent,
     )
+
+
+def _refused(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecording:
+    return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
+
+
+def _implausible(readings: Readings) -> list[Fault]:
+    """Return faults of the units of force and time."""
+    faults, (low, high) = [], _FORCE_N
+    force = float(np.quantile(np.linalg.norm(readings.force - np.median(readings.force, axis=0), axis=1), 0.99))
+    if not low < force < high:
+        faults.append(Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force))
+    if readings.time is not None:
+        step = float(np.median(np.diff(readings.time)))
+        if not _STEP_S[0] < step < _STEP_S[1]:
+            faults.append(Fault(FaultCode.TIME_UNIT, 1, 1, Remedy.REFUSED, step))
+    return faults
 
 
 def _body_frame(mapping: Mapping, axis: Axis, position: Array) -> Array:

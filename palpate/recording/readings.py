@@ -32,6 +32,8 @@ KINDS: Final = {
     "tf": "tf2_msgs/msg/TFMessage",
     "joints": "sensor_msgs/msg/JointState",
 }
+_SNIFFED: Final = 100_000
+"""Bytes of a table with semicolons in which decimal commas are sought."""
 _SHORTEST_S: Final = 0.005
 """Forces of a bag are averaged over this time."""
 
@@ -78,7 +80,12 @@ def read_table(path: Path) -> pd.DataFrame:
         if path.suffix == ".parquet":
             _check_parquet(file, path)
             return pd.read_parquet(file)
-        return pd.read_csv(file, sep="\t" if path.suffix == ".tsv" else ",", skipinitialspace=True, low_memory=False)
+        first = file.readline()
+        file.seek(0)
+        separator = max(",;\t", key=lambda one: first.count(one.encode()))
+        decimal = "," if separator == ";" and b"," in file.read(_SNIFFED) else "."
+        file.seek(0)
+        return pd.read_csv(file, sep=separator, decimal=decimal, skipinitialspace=True, low_memory=False)
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
     except UserError:
@@ -234,13 +241,14 @@ def _kinematics(states: list[tuple[float, Any]], source: Joints) -> tuple[Array,
         model = pinocchio.buildModelFromXML(checked_xml(text, source.urdf))
     except ValueError as error:
         raise ReadingError(f"{source.urdf}: is not a URDF: {error}") from None
-    data, frame, first = model.createData(), model.getFrameId(source.frame), states[0][1].name
-    if frame >= model.nframes or (unknown := [name for name in first if not model.existJointName(name)]):
+    data, frame = model.createData(), model.getFrameId(source.frame)
+    names = {name for _, state in states for name in state.name}
+    if frame >= model.nframes or (unknown := sorted(name for name in names if not model.existJointName(name))):
         raise ReadingError(f"{source.urdf}: no {source.frame if frame >= model.nframes else 'joint ' + unknown[0]}")
-    at = [model.joints[model.getJointId(name)].idx_q for name in first]
+    at = {name: model.joints[model.getJointId(name)].idx_q for name in names}
     q, poses = pinocchio.neutral(model), []
     for _, state in states:
-        q[at] = state.position
+        q[[at[name] for name in state.name]] = state.position  # the order may change from message to message
         pinocchio.forwardKinematics(model, data, q)
         poses.append(pinocchio.updateFramePlacement(model, data, frame).homogeneous.copy())
     X = np.array(poses)

@@ -67,7 +67,9 @@ def write(folder: Path, table: pd.DataFrame, plugin: StoragePlugin) -> None:
                 p = (row.x, row.y, row.z)
                 send("/tool_pose", PoseStamped(header(t, "world"), Pose(Point(*p), q)), t)
                 send("/tf", TFMessage([TransformStamped(header(t, "world"), "tool", TransformMessage(Vector3(*p), q))]), t)
-                send("/joints", JointState(header(t), list("xyz"), np.array(p), np.empty(0), np.empty(0)), t)
+                names = list("xyz" if k % 4 else "zxy")  # the order changes
+                q_now = np.array([getattr(row, name) for name in names])
+                send("/joints", JointState(header(t), names, q_now, np.empty(0), np.empty(0)), t)
 
 
 @pytest.mark.parametrize("plugin", list(StoragePlugin))

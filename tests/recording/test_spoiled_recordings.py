@@ -134,6 +134,16 @@ def resampled(t, rate):
     return pd.DataFrame({name: np.interp(at, t.t, t[name]) for name in ("t", *P, *F)})
 
 
+def header_again(t):
+    t = t.astype(object)
+    t.iloc[1000] = t.columns
+    return t
+
+
+def in_newtons_as_mN(t):
+    return t.assign(**{name: 1e-3 * t[name] for name in F})
+
+
 def mapped(mapping, **changes):
     return mapping.model_copy(update=changes)
 
@@ -178,6 +188,9 @@ SPOILED = {
     "unlike": (unlike, OVER_TIME, C.DISAGREE),
     "grazing": (grazing, OVER_TIME, C.SHALLOW),
     "holes": (holes, OVER_TIME, C.INVALID),
+    "millinewtons": (in_newtons_as_mN, mapped(OVER_TIME, units=Units(force="mN")), C.FORCE_UNIT),
+    "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
+    "header-again": (header_again, OVER_TIME, C.INVALID),
     "probes-flipped": (flipped, PROBES, C.SIGN),
     "probes-turned": (turned, PROBES, C.FRAME),
     "probes-no-normal": (no_normal, PROBES, C.INVALID),
