@@ -87,9 +87,9 @@ def _clipped(force: Array, position: Array) -> tuple[Mask, float]:
     still = np.append(False, (np.diff(position, axis=0) == 0).all(axis=1))
     for column in force.T:
         values, counts = np.unique(column, return_counts=True)
-        for end, beside in ((-1, -2), (0, 1)) if len(values) > 1 else ():
+        for end, following in ((-1, -2), (0, 1)) if len(values) > 1 else ():
             value = float(values[end])
-            if abs(value) < _LIMIT * np.abs(force).max() or counts[end] < _LIMIT_COUNT * counts[beside]:
+            if abs(value) < _LIMIT * np.abs(force).max() or counts[end] < _LIMIT_COUNT * counts[following]:
                 continue
             runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == value)))
             if any((~still[one]).sum() >= _FEWEST for one in runs):
