@@ -173,7 +173,7 @@ def windows(lateral: Array, travel: float) -> list[NDArray[np.intp]]:
 
 def across(position: Array, outward: Array) -> Array:
     """Return positions without their part along the outward axis [m], shape (k, 3)."""
-    return position - np.outer(position @ outward, outward)
+    return np.asarray(position - np.outer(position @ outward, outward))
 
 
 def lateral_travel(position: Array, outward: Array) -> float:

@@ -113,7 +113,8 @@ def _refused(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecor
 
 def _implausible(readings: Readings) -> list[Fault]:
     """Return faults of the units of force and time."""
-    faults, (low, high) = [], _FORCE_N
+    faults: list[Fault] = []
+    low, high = _FORCE_N
     force = float(np.quantile(np.linalg.norm(readings.force - np.median(readings.force, axis=0), axis=1), 0.99))
     if not low < force < high:
         faults.append(Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force))

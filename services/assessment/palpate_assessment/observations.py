@@ -96,7 +96,7 @@ class Observations:
         """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
         mesh, filled = self.mesh
         inside = mesh.find_simplex(places)
-        return (inside >= 0) & filled[inside]
+        return np.asarray((inside >= 0) & filled[inside])
 
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Return some of the samples."""

@@ -63,7 +63,7 @@ class Bump:
         """Return points of its boundary [m], shape (k, 2): of a disc a circle, of a ridge both sides and the ends."""
         around = self.radius * np.column_stack((np.cos(_AROUND), np.sin(_AROUND)))
         if not self.path:
-            return around + np.array((self.x, self.y))
+            return np.asarray(around + np.array((self.x, self.y)))
         corners = np.array(self.path)
         along = np.diff(corners, axis=0) / np.linalg.norm(np.diff(corners, axis=0), axis=1)[:, None]
         aside = self.radius * np.column_stack((-along[:, 1], along[:, 0]))
