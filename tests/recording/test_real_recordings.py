@@ -3,8 +3,6 @@
 The folder of the tables is named by the environment variable PALPATE_RECORDINGS.
 """
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 
