@@ -72,6 +72,11 @@ class FaultCase:
     """Simulated time at depth before the fault."""
 
     @property
+    def identity(self) -> tuple[str, str, str, float]:
+        """That of its finding."""
+        return self.kind, self.where, self.mode, self.at_s
+
+    @property
     def mode(self) -> str:
         """Runtime mode as in the findings."""
         return "wall clock" if self.wallclock else "lockstep"
@@ -114,6 +119,8 @@ class FaultFinding:
     """True if the results up to the fault were saved."""
     left_behind: str = ""
     """Files left on the machine that the next command does not remove."""
+    code: str = ""
+    """Digest of the code that ran; empty for cases that are older than this field."""
 
     @property
     def identity(self) -> tuple[str, str, str, float]:

@@ -26,7 +26,9 @@ def faults(  # noqa: PLR0913 - the options of a command
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
-    out: Annotated[Path, output_file("File for the findings; cases in it are skipped.", "--out", "-o")] = Path("faults.csv"),
+    out: Annotated[
+        Path, output_file("File for the findings; cases in it by the present code are skipped.", "--out", "-o")
+    ] = Path("faults.csv"),
     docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Repeat cases that are in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
@@ -37,6 +39,7 @@ def faults(  # noqa: PLR0913 - the options of a command
 
     `--kind lie`: services that send wrong values.
     """
+    from palpate.study.folder import code_digest
     from palpate_benchmarks import lies, lies_report
     from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
@@ -55,10 +58,11 @@ def faults(  # noqa: PLR0913 - the options of a command
         todo += drawn(random, seed, modes)
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
+    code = code_digest()[:8]
+    done = {finding.identity: finding.code for finding in found}
     if not again:
-        done = {finding.identity for finding in found}
-        todo = [case for case in todo if (case.kind, case.where, case.mode, case.at_s) not in done]
-    todo = todo[:limit]
+        todo = [case for case in todo if done.get(case.identity) != code]
+    todo = sorted(todo, key=lambda case: case.identity in done)[:limit]
     started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
@@ -68,6 +72,7 @@ def faults(  # noqa: PLR0913 - the options of a command
         )
         lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
         for number, finding in enumerate(chain(findings, lying), 1):
+            finding.code = code
             found = [f for f in found if f.identity != finding.identity] + [finding]
             write_text(out, csv_text(found))
             display.show(number, len(todo), f"{'ok' if finding.good else 'bad'} {finding.where}: {finding.sign or finding.ended}")
@@ -112,10 +117,16 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
     """Return the summary for the documentation; `csv_text` has every case."""
     good = sum(f.good for f in findings)
     largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
-    lines = [f"{good} of {len(findings)} cases passed; the largest force was {largest:.1f} N.", ""]
+    lines = [f"{good} of {len(findings)} cases passed; the largest force was {largest:.1f} N. {by_code(findings)}", ""]
     lines += _markdown_table(SUMMARY, _summary(findings))
     bad = [f"**!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in in_order(findings) if not f.good]
     return "\n".join([*lines, *([""] if bad else []), *bad]) + "\n"
+
+
+def by_code(findings: Sequence[FaultFinding]) -> str:
+    """Return how many cases were run by which code."""
+    counts = Counter(f.code or "earlier code" for f in findings)
+    return f"Cases by code: {', '.join(f'{code} {count}' for code, count in counts.most_common())}."
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

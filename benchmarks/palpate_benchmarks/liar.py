@@ -9,6 +9,7 @@
 | `frozen`, `zero`, `nan`, `infinite` | the value at the moment; 0; NaN; infinity |
 | `gain`, `sign` | times the amount; minus the value |
 | `bias`, `drift`, `spike` | plus the amount; plus the amount per second; plus the amount in one message per second |
+| `noise`, `dead`, `stuck` | plus white noise with the amount as its deviation; this noise alone; it around the present value |
 | `permuted` | the values of neighbouring joints |
 | `swapped`, `unnormalised` | a quaternion as w x y z; times the amount |
 | `late`, `delayed` | the message of the amount [ms] earlier, with its stamp; its field in a message with a new stamp |
@@ -39,6 +40,7 @@ WHOLE: Final = "message"
 TWINS: Final = {"ft/wrench": "robot/status", "joint_states": "robot/status"}
 """Topics whose fields another one repeats: a lie of the sensor is in both."""
 Array = np.ndarray[Any, Any]
+_RANDOM: Final = np.random.default_rng(48)
 CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
     "frozen": lambda x, first, amount, s: first if first.shape == x.shape else x,
     "zero": lambda x, first, amount, s: 0 * x,
@@ -49,11 +51,15 @@ CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
     "bias": lambda x, first, amount, s: x + amount,
     "drift": lambda x, first, amount, s: x + amount * s,
     "spike": lambda x, first, amount, s: x + amount if s % 1.0 < 1e-9 else x,
+    "noise": lambda x, first, amount, s: x + amount * _RANDOM.standard_normal(x.shape),
+    "dead": lambda x, first, amount, s: amount * _RANDOM.standard_normal(x.shape),
+    "stuck": lambda x, first, amount, s: first + amount * _RANDOM.standard_normal(x.shape),
     "permuted": lambda x, first, amount, s: np.roll(x.reshape(-1, 7), 1, axis=1).ravel(),
     "swapped": lambda x, first, amount, s: np.roll(x.reshape(-1, 4), 1, axis=1).ravel(),
     "unnormalised": lambda x, first, amount, s: amount * x,
 }
 """Changed values from: the true ones, those at the moment, the amount, and the time since the moment [s]."""
+NOISES: Final = ("noise", "dead", "stuck")
 ORDER_KINDS: Final = ("late", "repeated", "disordered", "stale")
 KINDS: Final = (*CHANGES, "delayed", *ORDER_KINDS)
 
@@ -166,6 +172,13 @@ def _with(value: Any, path: list[str], values: Iterator[float]) -> Any:
     return value if isinstance(value, str) else type(value)(next(values))
 
 
+def _in(lie: Lie, topic: str) -> Lie:
+    """Return the lie in a topic of the sensor; noise is averaged over the longer period of a twin."""
+    periods = contract().topics[lie.topic].period_ms, contract().topics[topic].period_ms
+    averaged = (periods[0] / periods[1]) ** 0.5 if lie.kind in NOISES else 1.0
+    return replace(lie, topic=topic, amount=averaged * lie.amount)
+
+
 class Liar(Service):
     """Wraps a service; see the module's description."""
 
@@ -173,7 +186,7 @@ class Liar(Service):
         self._service = service
         self.role = service.role  # type: ignore[misc]  # that of the wrapped service
         self.catches_up = service.catches_up  # type: ignore[misc]
-        self._lying = {topic: LyingTopic(replace(lie, topic=topic)) for topic in lie.topics}
+        self._lying = {topic: LyingTopic(_in(lie, topic)) for topic in lie.topics}
 
     def start(self) -> Outbox:
         """Return the latched messages; a lie in them begins at once."""

@@ -57,6 +57,8 @@ JOINTS: Final = frozenset({"position", "velocity", "effort", "applied_torque", "
 """Fields with a number per joint."""
 AMOUNTS: Final = {"N": 5.0, "N m": 0.5, "rad": 0.05, "rad/s": 0.2, "m": 0.03, "m/s": 0.1, "1": 0.3, "px": 20.0, "N/m": 500.0}
 """Bias by unit, a tenth of it per second for a drift, four times for a spike."""
+NOISE: Final = {"N": 0.05, "N m": 0.002, "rad": 1e-6, "rad/s": 1e-4, "m": 0.002}
+"""Noise of a live sensor by unit, standard deviation; `noise` adds twenty times as much."""
 FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0.5}
 DELAYS_MS: Final = (20, 50, 200)
 LIVE_KINDS: Final = ("zero", "stale")
@@ -163,6 +165,9 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
     ):
         if not (topic.latched and kind in dict(varied)):
             yield kind, amount
+    if path in topic.varies:
+        live = NOISE[topic.units[path]]
+        yield from (("noise", 20 * live), ("dead", live), ("stuck", live))
     if path in JOINTS:
         yield "permuted", 0.0
 

@@ -94,7 +94,8 @@ def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> I
             yield MessageViolation(ViolationKind.CHANGE, path, f"a change of {rate:g} {topic.units[path]} per second", text)
     for count, (path, most) in zip(past.repeats, topic.varies.items(), strict=True):
         if count >= most and repeats(message, past.message, path):
-            text = f"{numbers(message, path).tolist()} in {count + 2} messages in a row"
+            values = numbers(message, path)
+            text = f"{values.tolist() if values.size <= _FEW else 'the same values'} in {count + 2} messages in a row"
             yield MessageViolation(ViolationKind.FROZEN, path, f"at most {most + 1} equal ones: a live sensor has noise", text)
 
 

@@ -85,6 +85,7 @@ def conforms(row: str, sends: bool) -> Callable[[Message, PastMessages, int], bo
         "array": np.asarray,
         "frame": topic.frame,
         "repeats": repeats,
+        "equal": np.array_equal,
     }
     exec(compile(text, f"<check of {topic.name}>", "exec"), names)
     check: Callable[[Message, PastMessages, int], bool] = names["conforms"]
@@ -143,7 +144,8 @@ class _Source:
         for k, (path, most) in enumerate(self._topic.varies.items()):
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
-            yield f"if m.{first} != before.{first} or not repeats(m, before, {path!r}): past.repeats[{k}] = 0"
+            same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
+            yield f"if m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
             yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
             yield "else: return False"
 

@@ -26,6 +26,8 @@ class JudgeTuning:
     excitation_n2: float = 5.0
     """Least information on the gain for the self-test."""
     noise_n: float = 1.5
+    rest_noise_n: float = 0.4
+    """Twice that of the noisiest published sensor of this class."""
     tested_above_m: float = 0.015
     """The self-test must be complete before the tool is this low above the perceived surface."""
     never_ns: int = 2**62
@@ -56,8 +58,9 @@ class SensorJudge:
     def _judge_ft(self, c: ForceComparison, depth: float | None) -> list[Breach]:
         if self._disagreed >= TUNING.disagreements:
             return _ft(f"{c.disagreement:.1f} N from the force by the joints, limit {TUNING.disagreement_n:g} N")
-        if c.noise > TUNING.noise_n:
-            return _ft(f"noise of {c.noise:.1f} N, limit {TUNING.noise_n:g} N")
+        for noise, limit, where in ((c.noise, TUNING.noise_n, ""), (c.rest_noise, TUNING.rest_noise_n, " at rest")):
+            if noise > limit:
+                return _ft(f"noise of {noise:.1f} N{where}, limit {limit:g} N")
         if c.drift > TUNING.drift_n:
             return _ft(f"bias changed by {c.drift:.1f} N in free air, limit {TUNING.drift_n:g} N")
         return self._test(c, depth)

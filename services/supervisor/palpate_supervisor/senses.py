@@ -58,6 +58,8 @@ class SensesTuning(NamedTuple):
     """Low-pass of reading and load in the regression of the gain."""
     noise_s: float = 0.2
     """Averaging time of the noise."""
+    still_mps: float = 0.005
+    """Tool speed below which the tool is at rest."""
 
 
 TUNING: Final = SensesTuning()
@@ -96,6 +98,8 @@ class ForceComparison(NamedTuple):
     """Information in the gain: sum of the squared changes of the load [N^2]."""
     noise: float
     """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise."""
+    rest_noise: float
+    """The same at the latest rest in free air, where the arm's vibrations do not add to it."""
 
 
 class ForceSenses:
@@ -106,7 +110,7 @@ class ForceSenses:
         """Rows: offset, friction, the late sign of the speed, and its mean."""
         self._tool = np.zeros((11, 3))
         """Rows of `_compare`."""
-        self._sums = np.zeros(3)
+        self._sums = np.zeros(4)
         self._started = False
 
     def compare(
@@ -149,11 +153,12 @@ def _norm(x: Array) -> float:
 @compiled
 def _compare(
     state: Arrays, motion: Arrays, ft: Arrays, speed: float, dt_s: float, starting: bool, tuning: SensesTuning
-) -> tuple[float, float, float, float, float, float, float, float]:
-    """Return the first fields of `Comparison`, and update `state`: the rows of `joints` and `tool`, and `sums`.
+) -> tuple[float, float, float, float, float, float, float, float, float]:
+    """Return the fields of `ForceComparison`, and update `state`: the rows of `joints` and `tool`, and `sums`.
 
     `tool`: F/T bias, first bias and late F/T force (S), difference and force by the joints (W), smooth reading, smooth load and
-    their means in free air, last reading (S). `sums`: reading times load, load squared, squared change of the reading [N^2].
+    their means in free air, last reading (S). `sums`: reading times load, load squared, squared change of the reading, and the
+    same at rest [N^2].
     """
     (joints, tool, sums), (qd, residual, J_W), (reading_S, load_S, R_WS) = state, motion, ft
     offset, friction, sign, mean_sign = joints[0], joints[1], joints[2], joints[3]
@@ -186,7 +191,10 @@ def _compare(
         sums[0] += (load * (tool[5] - tool[7])).sum()
         sums[1] += (load * load).sum()
     change_S = reading_S - tool[9]  # of white noise, the next change is half the other way; a step of the force has none
-    sums[2] += _share(dt_s, tuning.noise_s) * (-2 * (change_S * tool[10]).sum() - sums[2])
+    white = -2 * (change_S * tool[10]).sum()
+    sums[2] += _share(dt_s, tuning.noise_s) * (white - sums[2])
+    if at_rest and speed < tuning.still_mps:
+        sums[3] += _share(dt_s, tuning.noise_s) * (white - sums[3])
     tool[9], tool[10] = reading_S, change_S
     if starting:
         first_S[:] = bias_S
@@ -194,4 +202,5 @@ def _compare(
     joints_W += smooth * (force_W - joints_W)
     gain = sums[0] / sums[1] if sums[1] > 0.0 else 1.0
     drift = _norm(bias_S - first_S)
-    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], np.sqrt(max(sums[2], 0.0))
+    noise, rest_noise = np.sqrt(max(sums[2], 0.0)), np.sqrt(max(sums[3], 0.0))
+    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], noise, rest_noise

@@ -21,6 +21,8 @@ class BiasTuning:
 
     still_mps: float = 0.005
     """Tool speed below which the tool is at rest."""
+    longest_s: float = 1.0
+    """Longest time of rest whose mean is the bias: a sensor that drifts while the arm waits must not be taken for true."""
     largest_n: float = 6.0
     """A larger force before the first motion is contact, not bias: poor sensors have up to 5.2 N of bias."""
 
@@ -44,7 +46,7 @@ class Tool(NamedTuple):
 
 
 class ToolSense:
-    """Evaluates tool state from joint state and F/T reading. The sensor bias is the mean reading before the arm first moves."""
+    """Evaluates tool state from joint state and F/T reading. The sensor bias is the mean of the first second of rest."""
 
     def __init__(self, robot: Robot) -> None:
         self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
@@ -61,7 +63,7 @@ class ToolSense:
         self._R_SW: Array = self._data.oMf[self._sensor].rotation.T
         """Views of pinocchio's latest result."""
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
-        self._bias_S, self._rested, self._moved = np.zeros(3), 0, False
+        self._bias_S, self._rested, self._rested_s, self._moved = np.zeros(3), 0, 0.0, False
 
     def sense(self, measured: Measurement, dt_s: float) -> Tool:
         """Return the tool state of a measurement that comes `dt_s` [s] after the one before."""
@@ -82,9 +84,10 @@ class ToolSense:
         before_W = velocity_W if self._velocity_W is None else self._velocity_W
         self._velocity_W = velocity_W
         speed = _norm(velocity_W)
-        self._moved = self._moved or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
+        over = self._rested_s > TUNING.longest_s
+        self._moved = self._moved or over or speed > TUNING.still_mps or _norm(force_S) > TUNING.largest_n
         if not self._moved:
-            self._rested += 1
+            self._rested, self._rested_s = self._rested + 1, self._rested_s + dt_s
             self._bias_S = self._bias_S + (force_S - self._bias_S) / self._rested
         acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
         load_S = self._R_SW @ (self._weight_W - self._mass * acceleration_W)

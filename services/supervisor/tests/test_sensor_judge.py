@@ -81,6 +81,7 @@ RNG = np.random.default_rng(3)
         (wrong_ft(lambda t, w: 0.1 * w, 0.0), PRESS_S - LIE_S),
         (wrong_ft(lambda t, w: -w, 0.0), PRESS_S - LIE_S),
         (wrong_ft(lambda t, w: 1e-2 * RNG.standard_normal(6), 0.0), PRESS_S - LIE_S),
+        (wrong_ft(lambda t, w: w + RNG.normal(0.0, 0.6, 6), 0.5), 0.7 - LIE_S),
     ],
 )
 def test_a_wrong_force_sensor_is_named(lie: Lie, within_s: float) -> None:
@@ -109,7 +110,7 @@ def test_wrong_joints_are_named(change: Callable[[Measurement], Measurement]) ->
 
 
 def test_a_tool_that_was_not_weighed_touches_nothing() -> None:
-    judge, silent = SensorJudge(), ForceComparison(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1)
+    judge, silent = SensorJudge(), ForceComparison(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.1, 0.1)
     assert not judge.judge(silent, -0.1)
     (breach,) = judge.judge(silent, -0.01)
     assert breach.culprit == FT

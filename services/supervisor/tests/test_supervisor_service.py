@@ -134,6 +134,26 @@ def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
     )
 
 
+def test_a_drift_while_the_arm_waits_is_no_bias() -> None:
+    sense = ToolSense(KNOWN.robot)
+    hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
+    drift = np.array([0.0, 0.0, 0.01, 0.0, 0.0, 0.0])
+    for n in range(600):
+        tool = sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), hanging + n * drift, HOLDING), 0.01)
+    assert tool.force == pytest.approx(5.5, abs=0.1)
+    assert sense.comparison.drift > 3.5
+
+
+def test_a_sensor_that_was_found_wrong_explains_an_earlier_stop() -> None:
+    latch, force = Latch(), Breach(Level.EMERGENCY, StopCause.FORCE, "external force 30 N")
+    latch.update(0, [force], release=False)
+    latch.update(
+        10 * MS, [force, Breach(Level.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")], release=False
+    )
+    assert (latch.level, latch.cause, latch.culprit) == (Level.EMERGENCY, StopCause.SENSOR, "ft/wrench")
+    assert "external force 30 N" in latch.reason
+
+
 def test_a_press_before_the_arm_moves_is_no_bias() -> None:
     sense = ToolSense(KNOWN.robot)
     pressed = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY - 9.0, 0.0, 0.0, 0.0])
