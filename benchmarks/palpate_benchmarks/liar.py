@@ -2,7 +2,8 @@
 
     PALPATE_LIE="ft/wrench wrench.force gain 0.3 12.5" palpate run clean --service robot=benchmarks/palpate_benchmarks/liar.py
 
-`palpate_benchmarks.lies` has the cases. The field `message` is the whole message. A sensor lies in all its topics.
+`palpate_benchmarks.lies` has the cases. The field `message` is the whole message; `displacement,forecast` are two fields.
+A sensor lies in all its topics.
 
 | lie | what is sent |
 |---|---|
@@ -143,9 +144,11 @@ class LyingTopic:
             pixels, first = message.data.view(np.float32), self._first.data.view(np.float32)
             changed = CHANGES[lie.kind](pixels, first, lie.amount, t / NS - lie.at_s)
             return replace(message, data=np.asarray(changed, np.float32).view(np.uint8))
-        first = numbers(self._first, lie.field)
-        values = numbers(message, lie.field)
-        return _filled(message, lie.field, CHANGES[lie.kind](values, first, lie.amount, t / NS - lie.at_s))
+        changed = message
+        for path in lie.field.split(","):
+            values = CHANGES[lie.kind](numbers(message, path), numbers(self._first, path), lie.amount, t / NS - lie.at_s)
+            changed = _filled(changed, path, values)
+        return changed
 
 
 def _stamped(message: Message, seconds: float) -> Message:

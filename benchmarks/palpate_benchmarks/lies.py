@@ -116,6 +116,8 @@ def cells() -> Iterator[tuple[Topic, str, str, float]]:
             continue
         for path in (*(() if why else (*topic.units, *_quaternions(topic))), *_codes(topic)):
             yield from ((topic, path, kind, amount) for kind, amount in _kinds(topic, path))
+        if topic.name == "perception/motion":
+            yield from ((topic, "displacement,forecast", kind, FACTORS.get(kind, 0.0)) for kind in ("sign", "gain", "zero"))
         if not topic.latched and not why:
             yield from ((topic, WHOLE, "late", float(delay)) for delay in DELAYS_MS)
             kinds = ("repeated", "disordered", *(("stale",) if _has(topic, "header") else ()))
