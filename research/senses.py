@@ -30,6 +30,7 @@ from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_supervisor.judge import SensorJudge
 from palpate_supervisor.senses import ForceComparison, Measurement
+from palpate_supervisor.service import TUNING as SUPERVISOR
 from palpate_supervisor.tool import ToolSense
 
 PERIOD_S: Final = 0.01
@@ -38,6 +39,7 @@ PRESSED_N: Final = 3.0
 TOPICS: Final = contract().topics
 SETTINGS: Final = ("exam.region_m=[0.06,0.06]", "exam.spacing_m=0.02", "camera.frames=10")
 COLUMNS: Final = ("seed", "length_s", "ended", "stops", "false_alarms", *ForceComparison._fields)
+CLEAR_M: Final = SUPERVISOR.clear_m
 WITHIN_S: Final = 10.0
 """Time in which a lie has to be seen."""
 
@@ -82,7 +84,7 @@ def judged(
     sense, judge = ToolSense(robot), SensorJudge()
     for i, (_, measured, depth) in enumerate(run):
         reading = measured if lie is None else measured._replace(wrench_S=lie(i, measured.wrench_S))
-        sense.sense(reading, PERIOD_S)
+        sense.sense(reading, PERIOD_S, clear=depth is not None and depth < -CLEAR_M)
         found = judge.judge(sense.comparison, depth)
         yield sense.comparison, found[0].culprit if found else ""
 

@@ -12,7 +12,10 @@ FT, JOINTS = "ft/wrench", "joint_states"
 class JudgeTuning:
     """Limits of the comparison. `research/senses.py` has the largest values of undisturbed examinations."""
 
-    disagreement_n: float = 3.0
+    disagreement_sd: float = 3.5
+    """In standard deviations of the force by the joints in the direction that they feel least (LBR at the abdomen: 1.0 N)."""
+    disagreement_n: tuple[float, float] = (3.0, 6.0)
+    """Bounds of that limit."""
     disagreements: int = 5
     """Measurements in a row beyond it: wrong joints turn the weight of the tool at once, and are recognised in this time."""
     remainder_sd: float = 10.0
@@ -42,12 +45,14 @@ class SensorJudge:
 
     def __init__(self) -> None:
         self._tested = False
-        self._disagreed = 0
+        self._disagreed, self._limit = 0, 0.0
 
     def judge(self, comparison: ForceComparison, depth: float | None) -> list[Breach]:
         """Return the breaches; `depth` [m] is that of the tool below the perceived surface, None while there is none."""
         c = comparison
-        self._disagreed = self._disagreed + 1 if c.disagreement > TUNING.disagreement_n else 0
+        least, most = TUNING.disagreement_n
+        self._limit = min(max(TUNING.disagreement_sd * c.joint_sd, least), most)
+        self._disagreed = self._disagreed + 1 if c.disagreement > self._limit else 0
         limit_sd = TUNING.remainder_sd if self._disagreed < TUNING.disagreements else TUNING.blamed_sd
         if c.remainder > limit_sd:
             return _joints(f"torques that no force at the tool explains, {c.remainder:.1f} standard deviations")
@@ -57,7 +62,7 @@ class SensorJudge:
 
     def _judge_ft(self, c: ForceComparison, depth: float | None) -> list[Breach]:
         if self._disagreed >= TUNING.disagreements:
-            return _ft(f"{c.disagreement:.1f} N from the force by the joints, limit {TUNING.disagreement_n:g} N")
+            return _ft(f"{c.disagreement:.1f} N from the force by the joints, limit {self._limit:.1f} N")
         for noise, limit, where in ((c.noise, TUNING.noise_n, ""), (c.rest_noise, TUNING.rest_noise_n, " at rest")):
             if noise > limit:
                 return _ft(f"noise of {noise:.1f} N{where}, limit {limit:g} N")

@@ -100,6 +100,8 @@ class ForceComparison(NamedTuple):
     """Root mean square change of the F/T reading from one sample to the next, as far as it is white noise."""
     rest_noise: float
     """The same at the latest rest in free air, where the arm's vibrations do not add to it."""
+    joint_sd: float = 0.0
+    """Standard deviation of the force by the joints in the direction that they feel least."""
 
 
 class ForceSenses:
@@ -114,8 +116,8 @@ class ForceSenses:
         self._started = False
 
     def compare(
-        self, measured: Measurement, residual: Array, J_W: Array, load_S: Array, R_WS: Array, speed: float, dt_s: float, *,
-        starting: bool,
+        self, measured: Measurement, residual: Array, J_W: Array, load_S: Array, R_WS: Array, speed: float, dt_s: float,
+        free: tuple[bool, bool],
     ) -> ForceComparison:  # fmt: skip
         """Return the comparison.
 
@@ -127,7 +129,7 @@ class ForceSenses:
             R_WS: orientation of the sensor, shape (3, 3).
             speed: of the indenter's centre [m/s].
             dt_s: time since the last measurement [s].
-            starting: True while the arm has not moved and nothing touches it.
+            free: the arm has not moved and nothing touches it; there is no patient where it is.
         """
         reading_S = measured.wrench_S[:3]
         if not self._started:
@@ -136,7 +138,7 @@ class ForceSenses:
             self._joints[0] = residual
             self._tool[:3], self._tool[5:10] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
         state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W)
-        return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, starting, TUNING))
+        return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, free, TUNING))
 
 
 @compiled
@@ -152,8 +154,8 @@ def _norm(x: Array) -> float:
 
 @compiled
 def _compare(
-    state: Arrays, motion: Arrays, ft: Arrays, speed: float, dt_s: float, starting: bool, tuning: SensesTuning
-) -> tuple[float, float, float, float, float, float, float, float, float]:
+    state: Arrays, motion: Arrays, ft: Arrays, speed: float, dt_s: float, free: tuple[bool, bool], tuning: SensesTuning
+) -> tuple[float, float, float, float, float, float, float, float, float, float]:
     """Return the fields of `ForceComparison`, and update `state`: the rows of `joints` and `tool`, and `sums`.
 
     `tool`: F/T bias, first bias and late F/T force (S), difference and force by the joints (W), smooth reading, smooth load and
@@ -171,10 +173,12 @@ def _compare(
     deviation = residual - offset - friction * sign
     J = J_W / tuning.torque_sd_nm
     torque = deviation / tuning.torque_sd_nm
-    force_W = np.linalg.solve(J @ J.T + np.eye(3) / tuning.force_max_n**2, J @ torque)
+    information = J @ J.T + np.eye(3) / tuning.force_max_n**2
+    force_W = np.linalg.solve(information, J @ torque)
     remainder = np.abs(torque - force_W @ J).max()
 
-    at_rest = _norm(ft_S) < tuning.free_ft_n and _norm(force_W) < tuning.free_joints_n
+    (starting, clear), still = free, speed < tuning.still_mps
+    at_rest = (clear and still) or (_norm(ft_S) < tuning.free_ft_n and _norm(force_W) < tuning.free_joints_n)
     if starting or at_rest or speed > tuning.fast_mps:
         slow = _share(dt_s, tuning.start_s if starting else tuning.tare_s)
         bias_S += slow * ft_S
@@ -193,7 +197,7 @@ def _compare(
     change_S = reading_S - tool[9]  # of white noise, the next change is half the other way; a step of the force has none
     white = -2 * (change_S * tool[10]).sum()
     sums[2] += _share(dt_s, tuning.noise_s) * (white - sums[2])
-    if at_rest and speed < tuning.still_mps:
+    if at_rest and still:
         sums[3] += _share(dt_s, tuning.noise_s) * (white - sums[3])
     tool[9], tool[10] = reading_S, change_S
     if starting:
@@ -203,4 +207,6 @@ def _compare(
     gain = sums[0] / sums[1] if sums[1] > 0.0 else 1.0
     drift = _norm(bias_S - first_S)
     noise, rest_noise = np.sqrt(max(sums[2], 0.0)), np.sqrt(max(sums[3], 0.0))
-    return _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift, gain, sums[1], noise, rest_noise
+    joint_sd = 1 / np.sqrt(np.linalg.eigvalsh(information)[0])
+    forces = _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift
+    return *forces, gain, sums[1], noise, rest_noise, joint_sd

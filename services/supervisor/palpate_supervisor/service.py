@@ -40,6 +40,8 @@ class ServiceTuning:
     """Published depth while there is no surface, and its lower bound."""
     deepest_m: float = 0.2
     """Upper bound of the published depth."""
+    clear_m: float = 0.1
+    """A tool this high above the perceived surface, and at rest, touches nothing: both senses are tared."""
 
 
 TUNING = ServiceTuning()
@@ -153,7 +155,8 @@ class SupervisorService(Service):
         if stamp != self._stamp:
             since_s = 0.0 if self._stamp is None else (stamp - self._stamp) / NS
             self._stamp, self._stamped = stamp, t
-            self._tool = self._sense.sense(measured, since_s)
+            clear = self._surface is not None and self._depth < -TUNING.clear_m
+            self._tool = self._sense.sense(measured, since_s, clear)
         tool = self._tool
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)

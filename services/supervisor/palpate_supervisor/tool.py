@@ -65,8 +65,8 @@ class ToolSense:
         self._weight_W = np.array((0.0, 0.0, -robot.tool_mass_kg * GRAVITY))
         self._bias_S, self._rested, self._rested_s, self._moved = np.zeros(3), 0, 0.0, False
 
-    def sense(self, measured: Measurement, dt_s: float) -> Tool:
-        """Return the tool state of a measurement that comes `dt_s` [s] after the one before."""
+    def sense(self, measured: Measurement, dt_s: float, clear: bool = False) -> Tool:
+        """Return the tool state of a measurement that comes `dt_s` [s] after the one before; `clear`: there is no patient."""
         model, data = self._model, self._data
         q, qd, wrench_S, torque = measured
         pin.forwardKinematics(model, data, q)
@@ -92,7 +92,7 @@ class ToolSense:
         acceleration_W = (velocity_W - before_W) / dt_s if dt_s > 0.0 else np.zeros(3)
         load_S = self._R_SW @ (self._weight_W - self._mass * acceleration_W)
         self.comparison = self._senses.compare(
-            measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, starting=not self._moved
+            measured, residual, observed.J_W, load_S, self._R_SW.T, speed, dt_s, (not self._moved, clear)
         )
         ft = _norm(force_S - self._bias_S)
         return Tool(self._p_WI.copy(), speed, max(ft, self.comparison.joint_force), self.comparison.joint_force)
