@@ -20,7 +20,7 @@ TOPIC = "truth/indentation"
 
 
 def rows(folder: Path, begin_s: float, end_s: float) -> pd.DataFrame:
-    """Return time [s], true force [N] and true depth [mm] every 20 ms."""
+    """Return time [s], true force [N] and true depth [mm] every 40 ms."""
     recording = open_recording(folder / "recording_mcap")
     values = [codec.decode(message.payload, contract().topics[TOPIC].type) for message in recording.messages((TOPIC,))]
     found = pd.DataFrame(
@@ -30,7 +30,7 @@ def rows(folder: Path, begin_s: float, end_s: float) -> pd.DataFrame:
             "depth_mm": [round(value.depth * 1e3, 2) for value in values],
         }
     )
-    return found[found.t_s.between(begin_s, end_s)][::2]
+    return found[found.t_s.between(begin_s, end_s)][::4]
 
 
 def main() -> None:
@@ -41,7 +41,7 @@ def main() -> None:
     shown = Figure(figsize=(8, 4.5), layout="constrained")
     force, depth = shown.subplots(2, sharex=True)
     for name, run in runs.items():
-        force.plot(run.t_s, run.force_N, label=name)
+        force.plot(run.t_s, run.force_N, label=f"{name}: {run.force_N.max():.1f} N")
         depth.plot(run.t_s, run.depth_mm.clip(lower=-30.0))
     force.axhline(15.0, color="grey", linestyle=":")
     force.set_ylabel("true force [N]")
