@@ -148,7 +148,8 @@ def main() -> None:
     if given.persons:
         first, last = map(int, given.persons.split("-"))
         collect(range(first, last + 1), given.out)
-    hours, alarms = 0.0, []
+    hours = 0.0
+    alarms: list[str] = []
     for folder in given.folders:
         robot, run = load_scenario(str(folder / "scenario.yaml")).robot, list(samples(folder))
         hours += len(run) * PERIOD_S / 3600
