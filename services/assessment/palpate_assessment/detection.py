@@ -289,8 +289,15 @@ def _best(regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bu
         start = np.array((*points, np.log(first.radius), np.log(first.edge)))
         simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
         limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
-        options = {"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2}
-        found.append(minimize(loss, start, method="Nelder-Mead", bounds=limits, options=options))
+        found.append(
+            minimize(
+                loss,
+                start,
+                method="Nelder-Mead",
+                bounds=limits,
+                options={"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2},
+            )
+        )
     best = min(found, key=lambda one: float(one.fun))
     return shape(best.x), -float(best.fun)
 
