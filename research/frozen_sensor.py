@@ -3,8 +3,6 @@
 Run: `python -m research.frozen_sensor FROM TO NAME=FOLDER...`, times in seconds; each FOLDER is of `palpate run --record full`.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -27,7 +27,7 @@ from palpate.report.evidence import peak_force
 from palpate.run.group import one_per_process
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, write_scenario_files
-from palpate.run.self_test import RATES, measure
+from palpate.run.self_test import RATES, SIMULATED_PROCESSES, measure
 from palpate_benchmarks.campaign import PATIENCE, SETTINGS, forks, signs_of
 from palpate_benchmarks.fault_cases import LIMITS
 from palpate_bus.contract import contract
@@ -99,7 +99,7 @@ class Struck:
 
 def kept_rate() -> float:
     """Return the rate that this machine sustains for a second."""
-    return measure().rate or RATES[-1]
+    return measure(SIMULATED_PROCESSES).rate or RATES[-1]
 
 
 def calm_rate() -> float:

@@ -1,7 +1,5 @@
 """Connections between a driver and the ROS side of its arm."""
 
-from __future__ import annotations
-
 from abc import ABC, abstractmethod
 from typing import Any, Final
 
