@@ -145,7 +145,8 @@ class _Source:
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
-            yield f"if m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
+            none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
+            yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
             yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
             yield "else: return False"
 
