@@ -34,7 +34,7 @@ from palpate.study.statistics.estimate import LEVEL, Estimate
 from palpate.truth.felt import PALPABLE
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
-from palpate_assessment.detection import FEATURES, FELT, SURE, Candidate
+from palpate_assessment.detection import FEATURES, FELT, STRUCTURES, SURE, Candidate
 from palpate_assessment.findings import causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
@@ -65,6 +65,8 @@ class WeighedPatient:
     """Of the candidates that are weighed."""
     signs: list[list[float]]
     """Of muscles about them."""
+    structures: list[list[float]]
+    """Evidence for structures instead."""
     real: list[bool]
     """True where a candidate is a lump of felt contrast FELT or more."""
     contrast: float
@@ -103,6 +105,7 @@ def weigh(seed: int) -> WeighedPatient:
         seed=seed,
         features=[candidate.features.tolist() for candidate in candidates],
         signs=[candidate.signs.features.tolist() for candidate in candidates],
+        structures=[candidate.structures().tolist() for candidate in candidates],
         real=[real(candidate, known) for candidate in candidates],
         contrast=max((float(np.exp(abs(np.log(lump.contrast)))) for lump in palpable), default=1.0),
         radius_m=max((float(np.sqrt(lump.area / np.pi)) for lump in palpable), default=0.0),
@@ -110,8 +113,8 @@ def weigh(seed: int) -> WeighedPatient:
 
 
 def real(candidate: Candidate, known: Truth) -> bool:
-    """Return True if a lump of felt contrast FELT or more is within a candidate's radius."""
-    bump, sign = candidate.bump, np.sign(candidate.log_contrast)
+    """Return True if a lump of felt contrast FELT or more is within a candidate's disc."""
+    bump, sign = candidate.disc, np.sign(candidate.log_contrast)
     angle, r = np.meshgrid(np.linspace(0, 2 * np.pi, 12, endpoint=False), np.linspace(0, 1, 4))
     ring = np.column_stack(((r * np.cos(angle)).ravel(), (r * np.sin(angle)).ravel()))
     there = known.touched.places(np.array((bump.x, bump.y)) + bump.radius * ring)
@@ -146,7 +149,8 @@ def _every(cases: list[WeighedPatient]) -> tuple[Array, Mask]:
 
 def reported(case: WeighedPatient, calibration: Calibration) -> Array:
     """Logits of the probabilities that the assessment reports of a patient's candidates, shape (k,)."""
-    return causes(calibration, np.array(case.features).reshape(-1, len(FEATURES)), np.array(case.signs).reshape(-1, 2))[0]
+    rows = zip((case.features, case.signs, case.structures), (len(FEATURES), 2, STRUCTURES), strict=True)
+    return causes(calibration, *(np.array(values).reshape(-1, width) for values, width in rows))[0]
 
 
 def evaluate(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:

@@ -81,7 +81,7 @@ def stiffness_map() -> Any:
 
 
 def findings(final: bool = True) -> Any:
-    one = Finding(Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999, 0.0)
+    one = Finding(Point(*FOUND, 0.0), "RLQ", 0.0028, 3.9, 3.5, 4.3, 0.999, *[0.0] * 4, Finding.KIND_LUMP)
     return Findings(header(60_000_000_000, "abdomen"), [one], [], final)
 
 

@@ -29,8 +29,8 @@ CONTACT_FLAGS = ("in_contact", "steady", "force_limited", "view_blocked")
 
 FREE_M = -0.02
 """At a smaller depth the tool is off the skin, and the force reading is sensor bias."""
-GUARDING_SHOWN = 0.05
-"""Least probability of a tensed muscle that is shown with a finding."""
+OTHERS_SHOWN = 0.05
+"""Least probability of another cause that is shown with a finding."""
 
 LEGEND = """
 | in the scene | |
@@ -138,10 +138,11 @@ def unassessed(codes: NDArray[np.uint8]) -> list[str]:
 
 def finding(f: Message) -> str:
     """Return a `palpation_msgs/Finding` as one line."""
-    muscle = f" ({100 * f.guarding:.0f} % a tensed muscle)" if f.guarding >= GUARDING_SHOWN else ""
+    causes = {"a tensed muscle": f.guarding, "a ridge": f.ridge, "bone": f.bone, "a soft defect": f.soft}
+    others = "".join(f", {100 * p:.0f} % {name}" for name, p in causes.items() if p >= OTHERS_SHOWN)
     return (
         f"{f.quadrant}: {f.ratio:.1f} x stiffer ({f.ratio_lower:.1f}-{f.ratio_upper:.1f}), {1e4 * f.area:.1f} cm2, "
-        f"confidence {100 * f.confidence:.0f} %{muscle}"
+        f"confidence {100 * f.confidence:.0f} %{others}"
     )
 
 

@@ -204,7 +204,7 @@ def stiffness_map(t: int, share: float) -> Any:
 
 
 def findings(t: int) -> Any:
-    item = Finding(Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99, 0.0)
+    item = Finding(Point(-0.05, -0.05, -0.01), "RLQ", 0.0028, 3.9, 3.4, 4.4, 0.99, *[0.0] * 4, Finding.KIND_LUMP)
     return Findings(header(t, "abdomen"), [item], [], True)
 
 

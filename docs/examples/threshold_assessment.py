@@ -42,7 +42,7 @@ class Threshold(Service):
         x, y, z = map(float, stiff.mean(axis=0))
         level = float(np.median(ratio[ratio > 2.0]))
         area = self.spacing**2 * len(np.unique(np.round(stiff[:, :2] / self.spacing), axis=0))
-        return [Finding(Point(x, y, z), quadrant(x, y), area, level, 2.0, level, 0.5, 0.0)]
+        return [Finding(Point(x, y, z), quadrant(x, y), area, level, 2.0, level, 0.5, *[0.0] * 4, Finding.KIND_LUMP)]
 
 
 def create(scenario):

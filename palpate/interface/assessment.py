@@ -237,11 +237,12 @@ def samples_frame(messages: list[Any]) -> pd.DataFrame:
 
 def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:
     """Return a row per finding: position [m], area [m^2], ratio of apparent stiffness to the surroundings with its 90 % band,
-    and the probabilities of a lump and of a tensed muscle.
+    and the probabilities of a lump, a tensed muscle, a ridge, bone and a soft defect.
     """
-    columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper", "confidence", "guarding")
-    values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, f.confidence, f.guarding) for f in rows]
-    return pd.DataFrame(values, columns=list(columns))
+    columns = ("quadrant", "x_m", "y_m", "z_m", "area_m2", "ratio", "ratio_lower", "ratio_upper")
+    kinds = ("confidence", "guarding", "ridge", "bone", "soft", "kind")
+    values = [(f.quadrant, *f.centroid_m, f.area_m2, f.ratio, *f.ratio_90, *(getattr(f, kind) for kind in kinds)) for f in rows]
+    return pd.DataFrame(values, columns=[*columns, *kinds])
 
 
 def findings_html(findings: pd.DataFrame) -> str:

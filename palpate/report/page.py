@@ -128,7 +128,7 @@ def verdict(report: Report) -> str:
         return f"Not assessed: {'; '.join(refused)}."
     if not report.assessed:
         return f"Not assessed: {report.samples} samples are too few for a map. {unknown}".strip()
-    return f"{found or 'No lump was found.'} {rows.tensed(report.candidates)} {unknown}".strip()
+    return f"{found or 'No lump was found.'} {rows.of_whom(report)}{rows.other_causes(report.candidates)} {unknown}".strip()
 
 
 def _reached(report: Report, evidence: Evidence) -> int:

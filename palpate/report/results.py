@@ -109,6 +109,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
         assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
+        prevalence=None if final is None else scenario.exam.prevalence,
         findings=[finding_row(f) for f in ([] if final is None else final.findings)],
         candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
         unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else evidence.unassessed_of(c.stiffness_map)),
@@ -240,12 +241,14 @@ def print_findings(console: Console, report: Report) -> None:
                 rows.confidence(f),
             )
         console.print(table)
+        if whom := rows.of_whom(report):
+            console.print(whom.rstrip(), highlight=False)
     elif report.assessed:
         console.print("no finding" if report.failure is None else "no finding in the scanned part")
     else:
         console.print(f"not assessed: {report.samples} samples are too few for a map")
-    if muscles := rows.tensed(report.candidates):
-        console.print(muscles.rstrip(), highlight=False, soft_wrap=True)
+    if others := rows.other_causes(report.candidates):
+        console.print(others.rstrip(), highlight=False, soft_wrap=True)
     if searched := report.services.get("search", {}).get("facts"):
         console.print(
             f"search: {searched['presses']} presses in {searched['seconds']:.0f} s; {searched['ended']}", highlight=False
@@ -301,6 +304,10 @@ def finding_row(f: Any) -> FindingRow:
         ratio_90=(f.ratio_lower, f.ratio_upper),
         confidence=f.confidence,
         guarding=f.guarding,
+        ridge=f.ridge,
+        bone=f.bone,
+        soft=f.soft,
+        kind=rows.KINDS[f.kind],
     )
 
 

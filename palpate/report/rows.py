@@ -15,6 +15,10 @@ class _Row(BaseModel):
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
 
+KINDS: Final = ("lump", "muscle", "ridge", "bone", "soft_defect")
+"""Names of the kinds of Finding.msg, by number."""
+
+
 class FindingRow(_Row):
     """A finding or a candidate of the examination."""
 
@@ -31,6 +35,14 @@ class FindingRow(_Row):
     """Probability that a lump of felt contrast 1.3 or more is there."""
     guarding: float
     """Probability that it is a tensed muscle, and no lump."""
+    ridge: float = 0.0
+    """Probability that it is a scar or another ridge."""
+    bone: float = 0.0
+    """Probability that it is bone."""
+    soft: float = 0.0
+    """Probability that it is a soft defect of the wall."""
+    kind: str = "lump"
+    """The most probable of lump, muscle, ridge, bone and soft_defect."""
 
 
 class LumpRow(_Row):
@@ -137,6 +149,8 @@ class Report(_Row):
     """RMS distance of the perceived from the true rest surface in the examined region, along the normal."""
     assessed: bool
     """True if there is a final list of findings, which may be empty."""
+    prevalence: float | None = None
+    """Assumed share of such persons who have a lump, to which confidence refers; null for a body without a prior."""
     findings: list[FindingRow]
     candidates: list[FindingRow] = []
     """Areas that were considered and not reported, the most probable first."""
@@ -164,7 +178,14 @@ class Report(_Row):
 
 _SURE: Final = 0.99
 _REPORTED: Final = 0.05
-"""Least probability of a tensed muscle that is reported."""
+"""Least probability of something else than a lump that is reported."""
+OTHERS: Final = {
+    "guarding": "a tensed muscle",
+    "ridge": "a scar or another ridge",
+    "bone": "bone",
+    "soft": "a soft defect of the wall",
+}
+"""What an area may be instead of a lump, by the field of its probability."""
 _LIKELY: Final = 0.5
 
 
@@ -173,6 +194,9 @@ class Probable(Protocol):
 
     confidence: float
     guarding: float
+    ridge: float
+    bone: float
+    soft: float
 
 
 def percent(probability: float) -> str:
@@ -181,16 +205,24 @@ def percent(probability: float) -> str:
 
 
 def confidence(found: Probable) -> str:
-    """Return the probability of a lump as text, with that of a tensed muscle if it is not negligible."""
-    muscle = f" ({percent(found.guarding)} a tensed muscle)" if found.guarding >= _REPORTED else ""
-    return percent(found.confidence) + muscle
+    """Return the probability of a lump as text, with those of other causes that are not negligible."""
+    others = [f"{percent(p)} {text}" for name, text in OTHERS.items() if (p := getattr(found, name)) >= _REPORTED]
+    return percent(found.confidence) + (f" ({', '.join(others)})" if others else "")
 
 
-def tensed(candidates: Iterable[FindingRow]) -> str:
-    """Return a sentence for each area that is not a finding and probably a tensed muscle."""
+def other_causes(candidates: Iterable[FindingRow]) -> str:
+    """Return a sentence for each area that is not a finding and probably something else than a lump."""
     return "".join(
-        f"The stiff area about ({1e3 * f.centroid_m[0]:+.0f}, {1e3 * f.centroid_m[1]:+.0f}) mm, in {f.quadrant}, is probably "
-        f"a tensed muscle ({percent(f.guarding)}) and no lump ({percent(f.confidence)}). "
+        f"The {'stiff' if f.ratio > 1 else 'soft'} area about ({1e3 * f.centroid_m[0]:+.0f}, {1e3 * f.centroid_m[1]:+.0f}) mm, "
+        f"in {f.quadrant}, is probably {text} ({percent(getattr(f, name))}) and no lump ({percent(f.confidence)}). "
         for f in candidates
-        if f.guarding > _LIKELY
+        for name, text in OTHERS.items()
+        if getattr(f, name) > _LIKELY
     )
+
+
+def of_whom(report: Report) -> str:
+    """Return the prevalence that confidence refers to as text; empty without findings, and for a body without a prior."""
+    if report.prevalence is None or not report.findings or not report.abdomen:
+        return ""
+    return f"Confidence holds if one in {1 / report.prevalence:.3g} such persons has a lump. "

@@ -94,7 +94,7 @@ def test_a_reassessed_examination_has_the_same_scores_and_with_an_offset_less_co
     assert row.startswith("| two | 2 |  | 0 of 2 (0 to 66 %) | 0 | ")
 
 
-TRUE = np.array((-4.0, 1.0, 0.2, 0.0, -0.5, -0.5, -1.0))
+TRUE = np.array((-4.0, 1.0, 0.2, 0.0, -0.5, -0.5))
 """Constant and weights of the features by which lumps are drawn here."""
 
 
@@ -103,10 +103,12 @@ def population(number: int, seed: int) -> list[WeighedPatient]:
     rng = np.random.default_rng(seed)
     found = []
     for k in range(number):
-        features = rng.normal((3.5, 0.0, 0.0, 0.3, 0.5, 0.1), (1.2, 1.0, 0.5, 0.3, 0.5, 0.2), (3, len(FEATURES)))
+        features = rng.normal((3.5, 0.0, 0.0, 0.3, 0.5), (1.2, 1.0, 0.5, 0.3, 0.5), (3, len(FEATURES)))
         real = rng.random(3) < expit(TRUE[0] + features @ TRUE[1:])
         signs = np.full((3, 2), -9.0)  # no muscle anywhere
-        found.append(WeighedPatient(k, features.tolist(), signs.tolist(), real.tolist(), 2.0 if real.any() else 1.0, 0.02))
+        none = [[-10.0, 0, 0, 3.0, 0, 0, 0, 0, -10.0, 0]] * 3  # nor any structure
+        contrast = 2.0 if real.any() else 1.0
+        found.append(WeighedPatient(k, features.tolist(), signs.tolist(), none, real.tolist(), contrast, 0.02))
     return found
 
 

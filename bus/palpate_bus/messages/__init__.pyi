@@ -203,6 +203,11 @@ class ExamState:
 @dataclass
 class Finding:
     __msgtype__: ClassVar[str]
+    KIND_LUMP: ClassVar[int]
+    KIND_MUSCLE: ClassVar[int]
+    KIND_RIDGE: ClassVar[int]
+    KIND_BONE: ClassVar[int]
+    KIND_SOFT_DEFECT: ClassVar[int]
     centroid: Point
     quadrant: str
     area: float
@@ -211,6 +216,10 @@ class Finding:
     ratio_upper: float
     confidence: float
     guarding: float
+    ridge: float
+    bone: float
+    soft: float
+    kind: int
 
 @dataclass
 class Findings:

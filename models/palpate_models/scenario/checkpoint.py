@@ -42,6 +42,8 @@ class FeltSoFar:
     """Number of the descent."""
     depth_uncertainty: Array
     """One sigma of the depth [m]."""
+    exponent: Array
+    """Of the descent to a held press; 0 for other samples."""
 
 
 @dataclass(frozen=True)

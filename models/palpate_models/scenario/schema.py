@@ -74,6 +74,14 @@ class Search(Section):
     """The search ends when the probability of an undetected lump falls below this value, or the budget is spent."""
 
 
+class Marked(Section):
+    """Skin marked as scarred."""
+
+    path_m: Annotated[tuple[Vec2, ...], Field(min_length=2)]
+    """Corners of its middle line in the abdomen frame."""
+    width_m: Annotated[float, Field(ge=0.002, le=0.2)] = 0.015
+
+
 class Exam(Section):
     """Region, pattern and mode of the examination."""
 
@@ -104,6 +112,10 @@ class Exam(Section):
     """Budget of a search."""
     false_findings: Annotated[float, Field(ge=1e-4, le=0.5)] = 0.02
     """Operating point: probability of a finding in a healthy examination. A smaller value misses more lumps."""
+    prevalence: Annotated[float, Field(ge=1e-4, le=0.9)] = 1 / 3
+    """Share of such persons who have a lump that can be felt; confidence refers to it. Which findings are reported does not."""
+    marked: tuple[Marked, ...] = ()
+    """Skin that the user has marked as scarred."""
 
     @property
     def searched(self) -> bool:

@@ -18,6 +18,7 @@ from palpate_assessment.observations import USABLE, Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Marked
 
 _MOST_CONTRADICTED = 0.3
 """When more than this part of the samples contradicts the rest, it is not known which of them is right: all stay in."""
@@ -53,12 +54,20 @@ class AssessedMap:
 
 
 def assess(
-    samples: Sequence[ForceSample], grid: MapGrid, reach: float, false_findings: float, standard: PressStandard = USUAL
+    samples: Sequence[ForceSample],
+    grid: MapGrid,
+    reach: float,
+    false_findings: float,
+    standard: PressStandard = USUAL,
+    *,
+    prevalence: float | None = None,
+    marked: Sequence[Marked] = (),
 ) -> AssessedMap | None:
     """Map and findings of a scan; None while there are too few samples.
 
     `reach`: distance within which a sample speaks for a node [m]. `false_findings`: how many a healthy examination may have;
-    without an anatomy, how probable it may be that a finding is none.
+    without an anatomy, how probable it may be that a finding is none. `prevalence`: share of such persons who have a lump; None
+    for that of the fit. `marked`: skin that is scarred.
     """
     o = observe(samples, standard)
     judged = None if o is None else weigh_all(o)
@@ -68,7 +77,8 @@ def assess(
     apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
     unassessed = reasons[nearest]
     unassessed[apart > reach] = UnassessedReason.NOT_REACHED
-    weighed = areas(regression, candidates, grid, unassessed == UnassessedReason.ASSESSED)
+    shift = 0.0 if prevalence is None else float(logit(prevalence) - logit(standard.calibration.prevalence))
+    weighed = areas(regression, candidates, grid, unassessed == UnassessedReason.ASSESSED, shift, marked)
     threshold = standard.calibration.threshold(false_findings) if standard.anatomy else float(logit(1.0 - false_findings))
     findings = [area for area in weighed if area.logit >= threshold]
     return _assessment(regression, grid, unassessed.astype(np.uint8), findings, weighed[len(findings) :])

@@ -22,7 +22,10 @@ class Calibration(BaseModel):
     conversion: float
     """Log of the ratio of sliding force at the depth of the press to the force of the press."""
     conversion_sd: float
-    """Its SD between people and tissues, and by the common depth error."""
+    """Its SD between people, tissues, speeds and indenters; presses held before slides tell the patient's own."""
+    held: float
+    """Log of the ratio of held presses to the standard press, as the slides near them tell it: beyond their wake, too, they are
+    a little weaker than elsewhere."""
     lead_s: float
     """A sliding indenter feels this much of its travel ahead [s]."""
     probability: tuple[float, ...]
@@ -30,6 +33,14 @@ class Calibration(BaseModel):
     guarding: tuple[float, float, float]
     """Weights of the signs of a tensed muscle (`guarding.Signs`) in its log odds against everything except a lump, the constant
     first."""
+    ridge: tuple[float, float, float, float]
+    """Weights of the evidence for a ridge (`Candidate.structures`) in its log odds against a lump, the constant first."""
+    bone: tuple[float, float, float, float, float]
+    """The same of bone."""
+    soft: tuple[float, float, float, float]
+    """The same of a soft defect."""
+    prevalence: float
+    """Share of the persons of the fit who have a lump that can be felt."""
     tail: tuple[float, float]
     """Location and scale of a healthy examination's greatest logit: P(greatest > s) = exp(-(s - location) / scale)."""
 
@@ -40,6 +51,11 @@ class Calibration(BaseModel):
     def muscle(self, features: Array) -> Array:
         """The logarithm of how much more probable a tensed muscle is than nothing, of signs' `features`, shape (k, 2) -> (k,)."""
         return np.asarray(self.guarding[0] + features @ np.array(self.guarding[1:]))
+
+    def structures(self, evidence: Array) -> Array:
+        """Logs of how much more probable a ridge, bone and a soft defect are than a lump, of `evidence` (k, 10) -> (k, 3)."""
+        parts = ((self.ridge, evidence[:, :3]), (self.bone, evidence[:, 3:7]), (self.soft, evidence[:, 7:]))
+        return np.column_stack([weights[0] + of @ np.array(weights[1:]) for weights, of in parts])
 
     def threshold(self, false_findings: float) -> float:
         """Return the logit that a healthy examination exceeds with the probability `false_findings`."""

@@ -48,7 +48,10 @@ class ShapeSearch:
     widest: float = 1.3
     """Largest radius over the largest one of the bumps that are tried first."""
     most: int = 4
-    """Largest number of lumps."""
+    """Largest number of lumps where there is probably no bone."""
+    most_with_bone: int = 7
+    bone: float = 0.6
+    """Prior of bone from which a place counts as bone."""
     weakest_t: float = 3.0
     """Least t with which a lump is weighed."""
     too_near: float = 0.7
@@ -73,6 +76,16 @@ class ShapeSearch:
     """Least share of a structure's outline that is within the samples where no anatomy is assumed: the border may be stiff."""
     narrow: float = 0.35
     """Largest radius, over the lesser width of the samples, where no anatomy is assumed: a wider lump has no surroundings."""
+    rival_offsets_m: tuple[float, ...] = (-0.012, 0.0, 0.012)
+    """Distances of the middles of ridges from the disc that they may be instead, along each axis."""
+    rival_tries: int = 80
+    """Evaluations for the strongest of them."""
+    border_m: float = 0.02
+    """Distance from the border over which bone becomes improbable."""
+    midline_m: float = 0.009
+    """Distance from the midline at which the linea alba and the umbilicus may be."""
+    preferred: float = 3.0
+    """Gain of the log evidence from which a ridge takes the place of a disc in the model."""
     crossed: float = 0.5
     """A stroke crosses a lump whose shape is at least this part of the highest value of any sample: its centre may be outside."""
 
@@ -108,12 +121,18 @@ def signs(regression: Regression, lump: Bump) -> Signs:
 
 FELT = 1.3
 """Felt contrast from which an area counts as a lump."""
-FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer", "bone")
+FEATURES = ("strength", "beyond", "log-radius", "log-radius squared", "softer")
 """Features of a candidate's probability: strength, confidence that its contrast is FELT or more, size and its difference from
-the usual one, sign, and the share of its strength that may be bone."""
+the usual one, and sign."""
 SOFTER = FEATURES.index("softer")
+STRUCTURES = 10
+"""Number of the columns of `Candidate.structures`."""
 SURE = 4.0
 """Standard deviations below FELT from which a candidate is rejected: 0 of 35 such candidates of tuning patients were lumps."""
+
+
+MOST_GAIN = 10.0
+"""Bound of the evidence of one shape against another: shapes are ideal."""
 
 
 @dataclass(frozen=True)
@@ -127,15 +146,36 @@ class Candidate:
     """E over its standard deviation, as far as more than one stroke says it (`agreed`)."""
     signs: Signs
     """Signs of a tensed muscle around it."""
+    disc: Bump
+    """Its shape if it is a lump of the abdomen."""
+    ridge: Bump | None = None
+    """The ridge that it may be instead."""
+    ridge_gain: float = 0.0
+    """Gain of the log evidence of the ridge over the disc, within MOST_GAIN."""
+    inside_m: float = 0.0
+    """Distance of its centre from the border of the samples, negative beyond it [m]."""
+    steeper: float = 0.0
+    """Exponent of the descents near it less the patient's median, the largest: bone yields less the deeper it is pressed."""
     evidence: float = 0.0
     """Log Bayes factor against the lumps found before it alone, where no anatomy is assumed."""
 
     @property
     def features(self) -> Array:
         """The FEATURES, shape (f,)."""
-        size = np.log(self.bump.radius / LENGTHS.radii_m[2])
-        under = float(ABDOMEN.bone(np.array([[self.bump.x, self.bump.y]]))[0])
-        return np.array((abs(self.t), self.beyond, size, size**2, float(self.log_contrast < 0), under**2 * abs(self.t)))
+        size, softer = np.log(self.disc.radius / LENGTHS.radii_m[2]), float(self.log_contrast < 0)
+        return np.array((abs(self.t), self.beyond, size, size**2, softer))
+
+    def structures(self, marked: float = 0.0) -> Array:
+        """Return the evidence for a ridge (3), bone (4) and a soft defect (3) instead of a lump, shape (10,).
+
+        `marked`: share of its area that the user has marked as scarred.
+        """
+        at = np.array([[self.disc.x, self.disc.y]])
+        midline = float(np.exp(-0.5 * (self.disc.x / SEARCH.midline_m) ** 2))
+        slim = float(np.log1p(self.ridge.length / (2 * self.ridge.radius))) if self.ridge else 0.0
+        inside = float(np.clip(self.inside_m / SEARCH.border_m, -1.0, 3.0))
+        bone = (inside, float(ABDOMEN.bone(at)[0]), self.steeper, abs(self.log_contrast))
+        return np.array((self.ridge_gain, slim, marked, *bone, midline, self.ridge_gain, slim))
 
     @property
     def beyond(self) -> float:
@@ -154,10 +194,15 @@ def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array
 def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
     """Return the regression with the detected lumps, and these lumps, each evaluated with the others in the model."""
     steps = [Regression(o, (), amplitudes(o, ()))]
-    for _ in range(SEARCH.most):
+    shapes: list[tuple[Bump, Bump | None]] = []
+    while len(steps) <= SEARCH.most_with_bone and _open_wall(steps[-1]) < SEARCH.most:
         last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmasked(steps[-1]))
         found = [strongest(last), *([] if o.standard.anatomy else [strongest_ridge(last)])]
-        lumps = [(*last.lumps, bump) for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
+        bumps = [bump for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
+        if o.standard.anatomy and bumps:
+            shapes.append((bumps[0], ridge_instead(last, bumps[0])))
+            bumps = [preferred(last, *shapes[-1])]
+        lumps = [(*last.lumps, bump) for bump in bumps]
         more = [Regression(o, some, amplitudes(o, some, last.log_amplitudes)) for some in lumps]
         if not more:
             break
@@ -165,10 +210,17 @@ def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
         if o.standard.anatomy is None and gained(steps[-1], best) < SEARCH.least_gain:
             break
         steps.append(best)
-    weighed = [weigh(steps[-1], lump) for lump in steps[-1].lumps]
+    both = shapes or [(lump, None) for lump in steps[-1].lumps]
+    weighed = [weigh(steps[-1], lump, *shape) for lump, shape in zip(steps[-1].lumps, both, strict=False)]
     if o.standard.anatomy is None:
         weighed = [replace(c, evidence=gained(*both)) for c, both in zip(weighed, pairwise(steps), strict=True)]
     return steps[-1], weighed
+
+
+def _open_wall(regression: Regression) -> int:
+    """Return the number of lumps where there is probably no bone."""
+    anatomy, centres = regression.observations.standard.anatomy, np.array([(b.x, b.y) for b in regression.lumps]).reshape(-1, 2)
+    return len(centres) if anatomy is None else int((anatomy.bone(centres) < SEARCH.bone).sum())
 
 
 def unmasked(regression: Regression) -> Array:
@@ -180,12 +232,47 @@ def unmasked(regression: Regression) -> Array:
     return np.concatenate((np.minimum(regression.log_amplitudes, usual)[:fields], regression.log_amplitudes[fields:]))
 
 
-def weigh(regression: Regression, lump: Bump) -> Candidate:
-    """Return a lump of a regression, tested under the regression without it."""
-    others = tuple(other for other in regression.lumps if other is not lump)
-    without = replace(regression, lumps=others)
+def weigh(regression: Regression, lump: Bump, disc: Bump, instead: Bump | None) -> Candidate:
+    """Return a lump of a regression, tested under the regression without it, with the disc and the ridge that it may be."""
+    without = replace(regression, lumps=tuple(other for other in regression.lumps if other is not lump))
     (log_contrast,), (t,) = matched(without, [lump])
-    return Candidate(lump, float(log_contrast), agreed(without, lump, float(t)), signs(regression, lump))
+    o, at = regression.observations, np.array([[disc.x, disc.y]])
+    candidate = Candidate(lump, float(log_contrast), agreed(without, lump, float(t)), signs(regression, disc), disc)
+    if o.standard.anatomy is None:
+        return candidate
+    felt = o.exponent > 0
+    steep = o.exponent[felt & (disc.distance(o.xy) < disc.radius + SEARCH.border_m)]
+    return replace(
+        candidate,
+        ridge=instead,
+        ridge_gain=ridge_gain(without, disc, instead),
+        inside_m=float(-(at @ o.hull.equations[:, :2].T + o.hull.equations[:, 2]).max()),
+        steeper=float(steep.max() - np.median(o.exponent[felt])) if len(steep) else 0.0,
+    )
+
+
+def ridge_gain(regression: Regression, disc: Bump, instead: Bump | None) -> float:
+    """Return the gain of the log evidence of a ridge over a disc under a regression without them, within MOST_GAIN."""
+    if instead is None:
+        return -MOST_GAIN
+    _, (t, other) = matched(regression, [disc, instead])
+    return float(np.clip(0.5 * (other**2 - t**2), -MOST_GAIN, MOST_GAIN))
+
+
+def preferred(regression: Regression, disc: Bump, instead: Bump | None) -> Bump:
+    """Return the shape that joins the model."""
+    return instead if instead and ridge_gain(regression, disc, instead) > SEARCH.preferred else disc
+
+
+def ridge_instead(regression: Regression, disc: Bump) -> Bump | None:
+    """Return the strongest ridge that may be there instead of a disc, under a regression without it."""
+    lengths = regression.observations.standard.lengths
+    (stiffer,) = np.sign(matched(regression, [disc])[0])
+    angles = np.linspace(0.0, np.pi, SEARCH.angles, endpoint=False)
+    halves = np.array([h * lengths.radii_m[-1] * np.array((np.cos(a), np.sin(a))) for a in angles for h in SEARCH.half_lengths])
+    centres = np.array([(disc.x + x, disc.y + y) for x in SEARCH.rival_offsets_m for y in SEARCH.rival_offsets_m])
+    ridges = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
+    return _best(regression, ridges, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])), SEARCH.rival_tries, stiffer)[0]
 
 
 def gained(before: Regression, after: Regression) -> float:
@@ -258,23 +345,26 @@ def _centres(regression: Regression) -> Array:
     return centres[cKDTree(xy).query(centres)[0] <= pitch]
 
 
-def _best(regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bump]) -> tuple[Bump | None, float]:
+def _best(
+    regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bump], tries: int = SEARCH.tries, sign: float = 0.0
+) -> tuple[Bump | None, float]:
     """Return the strongest of some bumps after place, radius and edge were refined, and its strength.
 
-    `shape`: the bump of its parameters: points [m], and the logarithms of radius and edge.
+    `shape`: the bump of its parameters: points [m], and the logarithms of radius and edge. `sign`: of the contrast of ridges; 0:
+    those which are stiffer than their surroundings, as vessels, scars and tendons are.
     """
     bumps = [bump for bump in bumps if _possible(regression, bump)]
     if not bumps:
         return None, 0.0
     xy, lengths = regression.observations.xy, regression.observations.standard.lengths
-    t = _strengths(regression, bumps)
+    t = _strengths(regression, bumps, sign)
 
     def loss(p: Array) -> float:
         bump = shape(p)
-        return -float(_strengths(regression, [bump])[0]) if _possible(regression, bump) else 0.0
+        return -float(_strengths(regression, [bump], sign)[0]) if _possible(regression, bump) else 0.0
 
     anatomy = regression.observations.standard.anatomy is not None
-    narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy else SEARCH.narrowest), lengths.edge_m))
+    narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy and not bumps[0].path else SEARCH.narrowest), lengths.edge_m))
     widest = np.log((lengths.radii_m[-1] * SEARCH.widest, lengths.wide_edge_m))
     low, high = xy.min(axis=0) - lengths.pitch_m, xy.max(axis=0) + lengths.pitch_m
     firsts: list[Bump] = []
@@ -286,26 +376,26 @@ def _best(regression: Regression, bumps: list[Bump], shape: Callable[[Array], Bu
     found = []
     for first in firsts:
         points = np.array(first.path or ((first.x, first.y),)).ravel()
-        start = np.array((*points, np.log(first.radius), np.log(first.edge)))
-        simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
         limits = Bounds((*np.resize(low, len(points)), *narrowest), (*np.resize(high, len(points)), *widest))
+        start: Array = np.clip((*points, np.log(first.radius), np.log(first.edge)), limits.lb, limits.ub)
+        simplex = start + np.vstack((np.zeros(len(start)), np.diag([lengths.refined_m] * len(points) + [0.25, 0.3])))
         found.append(
             minimize(
                 loss,
                 start,
                 method="Nelder-Mead",
                 bounds=limits,
-                options={"initial_simplex": simplex, "maxfev": SEARCH.tries, "xatol": 1e-4, "fatol": 1e-2},
+                options={"initial_simplex": simplex, "maxfev": tries, "xatol": 1e-4, "fatol": 1e-2},
             )
         )
     best = min(found, key=lambda one: float(one.fun))
     return shape(best.x), -float(best.fun)
 
 
-def _strengths(regression: Regression, bumps: Sequence[Bump]) -> Array:
-    """Return |t| of discs, and t of ridges, which are stiffer than their surroundings: vessels, scars, tendons; shape (k,)."""
+def _strengths(regression: Regression, bumps: Sequence[Bump], sign: float = 0.0) -> Array:
+    """Return |t| of discs, and t of ridges times the sign of their contrast, that of stiffer ones if 0; shape (k,)."""
     _, t = matched(regression, bumps)
-    return np.where([bool(bump.path) for bump in bumps], t, np.abs(t))
+    return np.where([bool(bump.path) for bump in bumps], t * (sign or 1.0), np.abs(t))
 
 
 def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,7 +13,9 @@ from palpate_assessment.calibration import Calibration
 from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression
+from palpate_assessment.shapes import Bump, ridge
 from palpate_models.numerics.frames import Array
+from palpate_models.scenario.schema import Marked
 
 Mask = NDArray[np.bool_]
 
@@ -37,6 +40,16 @@ class StatedPrior:
 STATED = StatedPrior()
 
 
+class Kind(IntEnum):
+    """What an area may be; numbers of Finding.msg."""
+
+    LUMP = 0
+    MUSCLE = 1
+    RIDGE = 2
+    BONE = 3
+    SOFT_DEFECT = 4
+
+
 @dataclass(frozen=True)
 class Area:
     """An area that is stiffer or softer than its surroundings, in the abdomen frame."""
@@ -55,16 +68,31 @@ class Area:
     confidence: float
     """Probability that a lump of felt contrast 1.3 or more is there."""
     logit: float
-    """The same as log-odds, by which the operating point is chosen."""
+    """Its log-odds at the prevalence of the fit, by which the operating point is chosen."""
     guarding: float
     """Probability that it is a tensed muscle."""
+    ridge: float
+    """Probability that it is a scar or another ridge."""
+    bone: float
+    """Probability that it is bone."""
+    soft: float
+    """Probability that it is a soft defect of the wall, such as a hernia."""
+    kind: Kind
+    """The most probable of these."""
     strength: float
     """Its log-contrast over the SD of that."""
     length: float
     """Length of a ridge [m]; 0 for a disc."""
 
 
-def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid, assessed: Mask) -> list[Area]:
+def areas(
+    regression: Regression,
+    candidates: Sequence[Candidate],
+    grid: MapGrid,
+    assessed: Mask,
+    shift: float = 0.0,
+    marked: Sequence[Marked] = (),
+) -> list[Area]:
     """The areas of candidates, most probable first; a candidate that lies in the area of a more probable one belongs to that.
 
     What is there, but surely of less contrast than a lump, is none: a navel, say, where everything else is known well.
@@ -74,18 +102,20 @@ def areas(regression: Regression, candidates: Sequence[Candidate], grid: MapGrid
     if not candidates:
         return []
     if regression.observations.standard.anatomy is None:
-        logits, guarding = np.array([stated(c) for c in candidates]), np.zeros(len(candidates))
+        logits = np.array([stated(c) for c in candidates])
+        kinds = np.column_stack((expit(logits), np.zeros((len(logits), len(Kind) - 1))))
     else:
         features, signs = np.array([c.features for c in candidates]), np.array([c.signs.features for c in candidates])
-        logits, guarding = causes(regression.observations.standard.calibration, features, signs)
+        evidence = np.array([c.structures(marked_share(marked, c.bump)) for c in candidates])
+        logits, kinds = causes(regression.observations.standard.calibration, features, signs, evidence, shift)
     found: list[Area] = []
-    for index in np.argsort(-logits):
-        if expit(logits[index]) < WEIGHED:
+    for index in np.argsort(-kinds.sum(axis=1) - kinds[:, Kind.LUMP]):
+        if kinds[index].sum() < WEIGHED:
             break
-        area = _area(regression, candidates[index], grid, assessed, (float(logits[index]), float(guarding[index])))
+        area = _area(regression, candidates[index], grid, assessed, float(logits[index]), kinds[index])
         if area is not None and not any((area.nodes & other.nodes).any() for other in found):
             found.append(area)
-    return found
+    return sorted(found, key=lambda area: -area.logit)
 
 
 def stated(candidate: Candidate) -> float:
@@ -95,25 +125,43 @@ def stated(candidate: Candidate) -> float:
     return candidate.evidence + float(log_ndtr((contrast - np.log(STATED.contrast)) / sd) + np.log(STATED.structures))
 
 
-def causes(calibration: Calibration, features: Array, signs: Array) -> tuple[Array, Array]:
-    """Return the logit that each candidate is a lump, and the probability that it is a tensed muscle, shape (k,) each.
+def causes(calibration: Calibration, features: Array, signs: Array, evidence: Array, shift: float = 0.0) -> tuple[Array, Array]:
+    """Return the logit that each candidate is a lump, shape (k,), and the probability of each `Kind`, shape (k, 5).
 
-    `features`, `signs`: of candidates and of muscles about them, shapes (k, f) and (k, 2). Three causes compete, of weights
-    exp(l) a lump, exp(g) a muscle, 1 neither. A muscle that is tensed is never softer.
+    `features`, `signs`, `evidence`: of candidates, of muscles about them and of structures, shapes (k, f), (k, 2), (k, 10).
+    The causes compete: a lump has the weight exp(l), a muscle exp(g), a structure s exp(l + s), nothing 1. What is softer is
+    neither a muscle nor bone, and what is stiffer is no soft defect. `shift`: of the log odds of a lump, by its prevalence; the
+    logits that decide what is reported are those of the fit.
     """
-    lump = calibration.logit(features)
-    muscle = np.where(features[:, SOFTER] > 0, -np.inf, calibration.muscle(signs))
-    return lump - np.logaddexp(0, muscle), np.exp(muscle - np.logaddexp(np.logaddexp(0, lump), muscle))
+    softer = features[:, SOFTER] > 0
+    lump, muscle = calibration.logit(features), np.where(softer, -np.inf, calibration.muscle(signs))
+    ridge, bone, soft = calibration.structures(evidence).T
+    structures = (ridge, np.where(softer, -np.inf, bone), np.where(softer, soft, -np.inf))
+    weights = np.column_stack((lump, muscle, *(lump + one for one in structures)))
+    other = np.logaddexp.reduce(np.column_stack((weights[:, 1:], np.zeros(len(lump)))), axis=1)
+    weights[:, Kind.LUMP] += shift
+    return lump - other, np.exp(weights - np.logaddexp(weights[:, :1], other[:, None]))
 
 
-def _area(
-    regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, probability: tuple[float, float]
-) -> Area | None:
+def marked_share(marked: Sequence[Marked], shape: Bump) -> float:
+    """Return the share of a shape's area that the user has marked as scarred."""
+    if not marked:
+        return 0.0
+    points = np.array(shape.path or ((shape.x, shape.y),))
+    low, high = points.min(axis=0) - shape.radius, points.max(axis=0) + shape.radius
+    xy = np.stack(np.meshgrid(*np.linspace(low, high, 25).T), axis=-1).reshape(-1, 2)
+    inside = xy[shape.distance(xy) < shape.radius]
+    scarred = np.any(
+        [ridge(np.array(one.path_m), one.width_m / 2, 1e-3).distance(inside) < one.width_m / 2 for one in marked], axis=0
+    )
+    return float(scarred.mean()) if len(inside) else 0.0
+
+
+def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, logit: float, kinds: Array) -> Area | None:
     """Return the connected nodes about a candidate's peak with at least half of its log-contrast; None if nothing of it is left.
 
-    `probability`: as of `causes`.
+    `logit`, `kinds`: as of `causes`.
     """
-    logit, guarding = probability
     xy, standard = grid.nodes[:, :2], regression.observations.standard
     bump, sign = candidate.bump, float(np.sign(candidate.log_contrast))
     near = np.flatnonzero(bump(xy, 0.5 * bump.radius + standard.lengths.pitch_m) > 1e-3)
@@ -138,9 +186,13 @@ def _area(
         ratio=float(np.exp(middle)),
         ratio_lower=float(np.exp(middle - Z90 * sd)),
         ratio_upper=float(np.exp(middle + Z90 * sd)),
-        confidence=float(expit(logit)),
+        confidence=float(kinds[Kind.LUMP]),
         logit=logit,
-        guarding=guarding,
+        guarding=float(kinds[Kind.MUSCLE]),
+        ridge=float(kinds[Kind.RIDGE]),
+        bone=float(kinds[Kind.BONE]),
+        soft=float(kinds[Kind.SOFT_DEFECT]),
+        kind=Kind(int(np.argmax(kinds))),
         strength=abs(candidate.t),
         length=bump.length,
     )

@@ -90,13 +90,17 @@ def lump_covariance(lump: Bump, a: Array, b: Array, standard: PressStandard) -> 
 
 
 def errors(o: Observations) -> list[Array]:
-    """Unit covariances of errors whose amplitude is found: stroke zero, breathing [m], zero of force [N], noise [1]; (m, m)."""
+    """Unit covariances of errors whose amplitude is found: stroke zero, breathing [m], zero of force [N], noise [1]; (m, m).
+
+    The zero that strokes share counts by one force for all: strokes over soft places are weak, so that by their own forces a soft
+    place would be evidence for a zero, and raise the level.
+    """
     lever, weakness = np.outer(o.per_metre, o.per_metre), np.outer(o.per_newton, o.per_newton)
     breathing = np.exp(-np.abs(o.time[:, None] - o.time) / o.standard.errors.breathing_s)
     return [
         lever * o.same_stroke,
         lever * breathing,
-        weakness * (o.standard.errors.shared_tare + o.same_stroke),
+        weakness * o.same_stroke + o.standard.errors.shared_tare * float(np.median(o.per_newton)) ** 2,
         np.eye(len(o.y)),
     ]
 
@@ -107,7 +111,9 @@ def fixed(o: Observations) -> Array:
     lever = np.outer(o.per_metre, o.per_metre)
     surface = e.surface_share**2 * smooth(o.xy, o.xy, e.surface_m) + e.wide_share**2 * smooth(o.xy, o.xy, e.wide_m)
     surface = (surface * np.outer(o.depth_uncertainty, o.depth_uncertainty) + e.onset_m**2) * lever
-    covariance = PRIOR.level_sd**2 + o.standard.calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
+    calibration = o.standard.calibration
+    covariance = PRIOR.level_sd**2 + calibration.exponent_sd**2 * np.outer(o.log_depth, o.log_depth) + surface
+    covariance += calibration.conversion_sd**2 * np.outer(o.slid, o.slid) + e.rate_sd**2 * np.outer(o.rate, o.rate)
     covariance[np.diag_indices(len(o.y))] += o.noise**2
     return np.asarray(covariance)
 
@@ -168,12 +174,12 @@ class Regression:
 
     @cached_property
     def transfer_variance(self) -> float:
-        """Variance of the log force of a standard press about the field: of its conversion from slides, or, where presses were
-        felt themselves, of the errors that each press has of its own.
+        """Variance of the log force of a standard press about the field: of its difference from held presses and slides, or,
+        where presses were felt themselves, of the errors that each press has of its own.
         """
-        o, calibration = self.observations, self.observations.standard.calibration
+        o, e = self.observations, self.observations.standard.errors
         if o.standard.anatomy is not None:
-            return calibration.conversion_sd**2 + o.standard.errors.slide_sd**2
+            return e.press_sd**2 + e.slide_sd**2
         own = sum(
             np.exp(2 * size) * np.diag(part) for size, part in zip(self.log_amplitudes[-KINDS_OF_ERROR:], errors(o), strict=True)
         )

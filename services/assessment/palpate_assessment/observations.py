@@ -33,6 +33,10 @@ class Usable:
     of samples at random places are larger."""
     neighbours: int = 9
     """Presses, itself among them, whose median is the usual force at a place."""
+    slide_mps: float = 0.003
+    """A sample slides from this speed on; a slower one is a press."""
+    wake_m: float = 0.02
+    """So far from a held press the slide that follows feels tissue that has relaxed: it does not count."""
 
 
 USABLE = Usable()
@@ -49,7 +53,11 @@ class Observations:
     """[s]"""
     stroke: NDArray[np.intp]
     y: Array
-    """log F - n log(depth / press depth) - conversion, shape (m,)."""
+    """log F - n log(depth / press depth), less the usual conversion of slides or held presses, shape (m,)."""
+    slid: NDArray[np.bool_]
+    """True for samples of slides, which share this patient's own conversion; presses are felt as they are."""
+    rate: Array
+    """Log of a slide's speed over the median one, shape (m,); 0 for presses."""
     touched_for: Array
     """Time since the stroke touched [s]."""
     log_depth: Array
@@ -63,6 +71,8 @@ class Observations:
     """Standard deviation of the force's white noise, over the force [1]."""
     depth_uncertainty: Array
     """SD of the depth, as reported [m], shape (m,)."""
+    exponent: Array
+    """n of F ~ depth^n in the descent to a held press, shape (m,); 0 for other samples."""
     yielded: NDArray[np.bool_]
     """True if the force limit was met at a depth too small to estimate the force of a full press."""
 
@@ -103,16 +113,29 @@ class Observations:
         return replace(self, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "standard"})
 
 
+def _slides(sample: ForceSample) -> bool:
+    return float(np.linalg.norm(sample.velocity)) > USABLE.slide_mps
+
+
 def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observations | None:
     """Return the usable samples; None if they are too few."""
     shallowest, weakest = USABLE.depth * standard.depth_m, USABLE.force * standard.force_n
-    good = [s for s in samples if s.depth >= shallowest and s.force >= weakest]
+    pressed = {} if standard.anatomy is None else {s.stroke: s.position for s in samples if not _slides(s)}
+    good = [
+        s
+        for s in samples
+        if s.depth >= shallowest
+        and s.force >= weakest
+        and not (s.stroke in pressed and _slides(s) and np.linalg.norm(s.position - pressed[s.stroke]) < USABLE.wake_m)
+    ]
     calibration = standard.calibration
     if len(good) < USABLE.fewest:
         return None
     position, velocity = np.array([s.position for s in good]), np.array([s.velocity for s in good])
     depth, force = np.array([s.depth for s in good]), np.array([s.force for s in good])
     log_depth, stroke = np.log(depth / standard.depth_m), np.array([s.stroke for s in good])
+    speed = np.linalg.norm(velocity, axis=1)
+    slid = (speed > USABLE.slide_mps) & (standard.anatomy is not None)
     xy = (position + calibration.lead_s * velocity)[:, :2]
     if standard.anatomy is None:  # each press is a stroke
         usual = np.median(force[cKDTree(xy).query(xy, USABLE.neighbours)[1]], axis=1)
@@ -124,12 +147,15 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
         xy=xy,
         time=np.array([s.time for s in good]),
         stroke=stroke,
-        y=np.log(force) - calibration.exponent * log_depth - calibration.conversion,
+        y=np.log(force) - calibration.exponent * log_depth - np.where(slid, calibration.conversion, calibration.held),
+        slid=slid,
+        rate=np.where(slid, np.log(np.maximum(speed, USABLE.slide_mps) / (np.median(speed[slid]) if slid.any() else 1.0)), 0.0),
         touched_for=np.array([s.time_in_contact for s in good]),
         log_depth=log_depth,
         per_metre=calibration.exponent / depth,
         per_newton=1.0 / usual,
         noise=np.array([s.force_noise for s in good]) / force,
         depth_uncertainty=np.array([s.depth_uncertainty for s in good]),
+        exponent=np.array([s.exponent for s in good]),
         yielded=np.array([s.force_limited for s in good]) & (depth < USABLE.limited_depth * standard.depth_m),
     )

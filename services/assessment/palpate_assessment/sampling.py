@@ -1,7 +1,8 @@
 """States of the examination at 100 Hz to samples: one every few millimetres of travel, by averaging."""
 
+from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from math import sqrt
 
 import numpy as np
@@ -15,6 +16,28 @@ LONGEST = 0.4
 """Time that one sample averages at most [s], for an indenter that stands still."""
 _FEWEST = 3
 """States that make a sample."""
+
+
+@dataclass(frozen=True)
+class HeldPress:
+    """A press that is held before a slide begins: the standard press, felt itself."""
+
+    states: int = 200
+    """Latest states that are kept: descent and hold."""
+    still_m: float = 0.0002
+    """They are at one place if this close to the first."""
+    deep: float = 0.95
+    """Part of the last depth from which the hold counts."""
+    read_s: tuple[float, float] = (0.32, 0.42)
+    """Times from then on that are averaged: the standard press is read after 0.4 to 0.5 s, and descends in 0.5 instead of 0.67 s,
+    so that the middle of its descent is 0.08 s later."""
+    settled_m: float = 0.001
+    """Largest range of depths within these times."""
+    rise: tuple[float, float] = (0.5, 0.97)
+    """Parts of the last depth between which the exponent of the descent is fitted."""
+
+
+PRESS = HeldPress()
 
 
 @dataclass(frozen=True)
@@ -68,6 +91,8 @@ class ForceSample:
     """Number of the descent: samples of one stroke share the zero of depth and of force."""
     depth_uncertainty: float = 0.0
     """One sigma of the depth [m]."""
+    exponent: float = 0.0
+    """n of F ~ depth^n in the descent to a held press; 0 for other samples."""
 
 
 class Sampler:
@@ -76,18 +101,23 @@ class Sampler:
     def __init__(self, travel: float = TRAVEL) -> None:
         self._travel = travel
         self._block: list[ContactState] = []
+        self._before: deque[ContactState] = deque(maxlen=PRESS.states)
         self._onset: float | None = None
 
     def add(self, state: ContactState) -> ForceSample | None:
         """Take the next state; return the sample that it completes, if any."""
         if not state.in_contact:
             sample, self._onset = self._average(), None
+            self._before.clear()
             return sample
         if self._onset is None:
             self._onset = state.time
         if not state.counts:
+            self._before.append(state)
             return self._average()
         self._block.append(state)
+        if self._before:
+            return self._press(state)
         first = self._block[0]
         way = state.position - first.position
         complete = sqrt(way.dot(way)) >= self._travel or state.time - first.time >= LONGEST
@@ -96,9 +126,34 @@ class Sampler:
     def forget(self) -> None:
         """Forget the states of a sample that is not complete, and the touch."""
         self._block, self._onset = [], None
+        self._before.clear()
+
+    def _press(self, state: ContactState) -> ForceSample | None:
+        """Return the press that was held before the indenter slid to `state`, if one was."""
+        before = list(self._before)
+        self._before.clear()
+        place = np.array([s.position for s in before])
+        held = [s for s, p in zip(before, place, strict=True) if np.linalg.norm(p - place[0]) < PRESS.still_m]
+        if len(held) == len(before) and np.linalg.norm(state.position - place[0]) < PRESS.still_m:
+            return None  # it does not slide
+        deep = next(s.time for s in held if s.depth > PRESS.deep * held[-1].depth)
+        read = [s for s in held if PRESS.read_s[0] <= s.time - deep <= PRESS.read_s[1]]
+        depths = [s.depth for s in read]
+        complete = held[-1].time - deep >= PRESS.read_s[1] and max(depths) - min(depths) < PRESS.settled_m
+        sample = self._averaged(read) if complete else None
+        fall = np.array([(s.depth, s.force) for s in held if s.time <= deep and s.force > 0])
+        fall = fall[(fall[:, 0] > PRESS.rise[0] * held[-1].depth) & (fall[:, 0] < PRESS.rise[1] * held[-1].depth)]
+        if sample is None or len(fall) < _FEWEST:
+            return sample
+        log_depth, log_force = np.log(fall.T)
+        return replace(sample, exponent=float(np.polyfit(log_depth, log_force, 1)[0]))
 
     def _average(self) -> ForceSample | None:
+        """Return the sample of the present block, and begin the next one."""
         block, self._block = self._block, []
+        return self._averaged(block)
+
+    def _averaged(self, block: Sequence[ContactState]) -> ForceSample | None:
         if len(block) < _FEWEST or self._onset is None:
             return None
         time = np.array([s.time for s in block])

@@ -206,7 +206,14 @@ class AssessmentService(Service):
         if self._skin is not None:
             self.samples = self._skin.again(self.samples)
         if self._surface is not None:
-            self._final = assess(self.samples, self._grid(MAP.pitch_m), self._reach, self._exam.false_findings)
+            self._final = assess(
+                self.samples,
+                self._grid(MAP.pitch_m),
+                self._reach,
+                self._exam.false_findings,
+                prevalence=self._exam.prevalence,
+                marked=self._exam.marked,
+            )
         if self._final is None:
             return {"assessment/findings": findings_message(t, [], [])}
         return {
@@ -279,4 +286,8 @@ def finding_message(area: Area) -> Message:
         ratio_upper=area.ratio_upper,
         confidence=area.confidence,
         guarding=area.guarding,
+        ridge=area.ridge,
+        bone=area.bone,
+        soft=area.soft,
+        kind=area.kind,
     )

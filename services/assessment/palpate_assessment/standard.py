@@ -23,16 +23,16 @@ from palpate_models.scenario import press
 class AnatomyPrior:
     """Prior of ribs, iliac crests and muscles of an abdomen, in A."""
 
-    arch_m: float = 0.18
+    arch_m: float = 0.17
     """Height of the costal arch above the umbilicus, on the midline."""
-    arch_slope: float = 0.7
-    """Its descent per metre off the midline."""
-    arch_width_m: float = 0.025
-    """Uncertainty of both."""
-    iliac_m: tuple[float, float] = (0.135, -0.12)
-    """Position of the iliac spines: lateral, and above the umbilicus."""
-    iliac_width_m: float = 0.04
-    """Width of the bone around them."""
+    arch_slope: float = 1.0
+    """Its descent per metre off the midline: an infrasternal angle of 90 degrees."""
+    arch_width_m: float = 0.028
+    """Scale of the logistic distribution of its place: SD 50 mm, of which 20 mm are of the registered umbilicus."""
+    iliac_m: tuple[float, float] = (0.12, -0.09)
+    """Position of the iliac spines: half their usual distance of 24 cm lateral, and above the umbilicus."""
+    iliac_width_m: float = 0.045
+    """SD of the bone's place around them."""
     bone_m: float = 0.022
     """Length over which bone changes the force."""
     strip_m: tuple[float, float] = (0.018, 0.08)
@@ -97,6 +97,10 @@ class ErrorPrior:
     """Variance of the zero of the force that all strokes share, over that of a single one: with poor equipment 0.08 N [C]."""
     white_sd: float = 0.01
     """Prior median of the independent error of a sample, over its force."""
+    press_sd: float = 0.02
+    """SD of the log difference of held presses and the standard press, common to an examination."""
+    rate_sd: float = 0.06
+    """SD of the exponent with which slides depend on their speed: strokes are slower at their ends."""
     slide_sd: float = 0.015
     """SD of the log difference of slide and press from place to place, besides the common one."""
     unlike: float = 0.1
@@ -104,7 +108,15 @@ class ErrorPrior:
 
 
 OWN_ZERO = ErrorPrior(
-    least_depth_m=0.00003, surface_share=0.0, wide_share=0.0, onset_m=0.0, shared_tare=0.0, slide_sd=0.0, unlike=0.0
+    least_depth_m=0.00003,
+    surface_share=0.0,
+    wide_share=0.0,
+    onset_m=0.0,
+    shared_tare=0.0,
+    press_sd=0.0,
+    rate_sd=0.0,
+    slide_sd=0.0,
+    unlike=0.0,
 )
 """Errors of presses whose depth counts from their own onset, and which are themselves what the map is of."""
 ABDOMEN = AnatomyPrior()
@@ -132,7 +144,14 @@ class PressStandard:
         """Return the standard of presses of another body: their own depth, force and exponent, and no anatomy."""
         depth_m = float(np.median([sample.depth for sample in samples]))
         force_n = float(np.median([sample.force for sample in samples]))
-        tissue = {"exponent": exponent, "exponent_sd": exponent_sd, "conversion": 0.0, "conversion_sd": 0.0, "lead_s": 0.0}
+        tissue = {
+            "exponent": exponent,
+            "exponent_sd": exponent_sd,
+            "conversion": 0.0,
+            "conversion_sd": 0.0,
+            "held": 0.0,
+            "lead_s": 0.0,
+        }
         return cls(radius_m, depth_m, force_n, None, learned().model_copy(update=tissue), OWN_ZERO)
 
     @property

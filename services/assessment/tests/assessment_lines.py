@@ -38,8 +38,18 @@ def natural(seed: int, sd: float, length: float = 0.05) -> Field:
     return lambda xy: sd * np.sqrt(2 / 256) * np.cos(xy @ frequencies + phases).sum(axis=1)
 
 
-def lines(field: Field, seed: int = 0, stroke_m: float = 0.0, breathing_m: float = 0.0, noise: float = 0.01) -> list[ForceSample]:
-    """A stroke for each line, there and back; `stroke_m` is the error of each one's zero, `breathing_m` what breathing leaves."""
+def lines(
+    field: Field,
+    seed: int = 0,
+    stroke_m: float = 0.0,
+    breathing_m: float = 0.0,
+    noise: float = 0.01,
+    conversion: float = 0.0,
+    exponent: Field | None = None,
+) -> list[ForceSample]:
+    """A stroke for each line, there and back, each from a held press; `stroke_m` is the error of each one's zero, `breathing_m`
+    what breathing leaves, `conversion` the log of slide over press less the usual one, `exponent` that of the descents.
+    """
     rng = np.random.Generator(np.random.PCG64(seed))
     calibration = learned()
     along = np.arange(-REGION / 2, REGION / 2 + 1e-9, ALONG)
@@ -50,14 +60,15 @@ def lines(field: Field, seed: int = 0, stroke_m: float = 0.0, breathing_m: float
         for k, x in enumerate(along[::forth]):
             time = 10.0 * stroke + k * ALONG / SPEED
             wrong = zero + breathing_m * np.sqrt(2) * np.sin(2 * np.pi * time / 4.3)
-            felt = np.array((x + calibration.lead_s * forth * SPEED, y))
-            log_force = field(felt[None])[0] + calibration.conversion + calibration.exponent * np.log1p(wrong / 0.01)
+            felt = np.array((x + (calibration.lead_s * forth * SPEED if k else 0.0), y))
+            log_force = field(felt[None])[0] + calibration.exponent * np.log1p(wrong / 0.01)
+            log_force += calibration.conversion + conversion if k else calibration.held
             samples.append(
                 ForceSample(
                     time=time,
                     position=np.array((x, y, 0.0)),
                     normal=np.array((0.0, 0.0, 1.0)),
-                    velocity=np.array((forth * SPEED, 0.0, 0.0)),
+                    velocity=np.array((forth * SPEED if k else 0.0, 0.0, 0.0)),
                     depth=0.010,
                     force=float(np.exp(log_force + noise * rng.standard_normal())),
                     force_noise=0.01,
@@ -65,6 +76,7 @@ def lines(field: Field, seed: int = 0, stroke_m: float = 0.0, breathing_m: float
                     force_limited=False,
                     stroke=stroke,
                     depth_uncertainty=float(np.hypot(stroke_m, breathing_m)),
+                    exponent=0.0 if k else float(calibration.exponent if exponent is None else exponent(felt[None])[0]),
                 )
             )
     return samples

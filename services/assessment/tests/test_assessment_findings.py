@@ -10,13 +10,14 @@ from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import Candidate, Signs, signs
-from palpate_assessment.findings import causes
+from palpate_assessment.findings import Kind, causes
 from palpate_assessment.model import Regression, amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
 from palpate_bus.messages import StiffnessMap
+from palpate_models.scenario.schema import Marked
 
 REACH, FALSE_FINDINGS = 0.010, 0.02
 
@@ -45,12 +46,13 @@ def test_a_lump_is_found_where_and_as_it_is(contrast: float, radius: float) -> N
     centre, wall = (-0.015, 0.01), natural(4, 0.1)
     result = examine(lines(lambda xy: LEVEL + wall(xy) + lump(xy, centre, radius, contrast)))
     (found,) = result.findings
+    assert found.kind is Kind.LUMP
     assert np.linalg.norm(found.centroid[:2] - centre) < 0.004
     assert found.area == pytest.approx(np.pi * radius**2, rel=0.25)
     truth = lump(result.grid.nodes[found.nodes, :2], centre, radius, contrast)
     assert np.log(found.ratio) == pytest.approx(truth.mean(), abs=0.15)
     assert found.ratio_lower < found.ratio < found.ratio_upper
-    assert found.confidence > 0.9
+    assert found.confidence > (0.9 if contrast > 1 else 0.6)  # a soft area near the midline may be a defect of the wall
 
 
 def test_two_lumps_are_two_findings() -> None:
@@ -181,14 +183,55 @@ def test_a_muscle_that_lets_go_is_seen_to_fade() -> None:
 
 def test_lump_muscle_and_neither_compete() -> None:
     bump = Bump(0.0, 0.0, 0.02)
-    stiff, soft = (Candidate(bump, e, 6.0, Signs(0.8, 0.2)) for e in (0.5, -0.5))
+    stiff, soft = (Candidate(bump, e, 6.0, Signs(0.8, 0.2), bump, inside_m=0.05) for e in (0.5, -0.5))
     alone = replace(stiff, signs=Signs(0.0, -0.1))
     features, muscles = (
         np.array(rows) for rows in zip(*((c.features, c.signs.features) for c in (stiff, soft, alone)), strict=True)
     )
-    logits, guarding = causes(learned(), features, muscles)
-    lump_alone = learned().logit(features)
+    evidence = np.array([c.structures() for c in (stiff, soft, alone)])
+    logits, kinds = causes(learned(), features, muscles, evidence)
+    guarding = kinds[:, Kind.MUSCLE]
     assert guarding[0] > 0.1 > guarding[2]
-    assert logits[0] < lump_alone[0]
-    assert guarding[1] == 0
-    assert logits[1] == pytest.approx(lump_alone[1])
+    assert guarding[1] == kinds[1, Kind.BONE] == kinds[0, Kind.SOFT_DEFECT] == 0
+    rare, kinds_if_rare = causes(learned(), features, muscles, evidence, shift=-3.0)
+    assert rare == pytest.approx(logits)
+    assert (kinds_if_rare[:, Kind.LUMP] < kinds[:, Kind.LUMP]).all()
+
+
+@pytest.mark.parametrize("conversion", [-0.2, 0.2])
+def test_held_presses_tell_how_slides_convert(conversion: float) -> None:
+    result = examine(lines(lambda xy: LEVEL + WALL(xy), conversion=conversion))
+    assert result.background == pytest.approx(np.exp(LEVEL), rel=0.1)
+    assert held(result, np.exp(LEVEL + WALL(result.grid.nodes[:, :2]))) > 0.85
+
+
+def test_without_held_presses_the_band_is_wide() -> None:
+    samples = lines(level, conversion=0.15)
+    result = examine([s for s in samples if np.any(s.velocity)])
+    assert held(result, np.full(len(result.apparent), np.exp(LEVEL))) > 0.95
+
+
+def ridge_field(xy: np.ndarray) -> np.ndarray:
+    along, across = np.abs(xy @ (0.8, 0.6)), np.abs(xy @ (-0.6, 0.8))
+    return LEVEL + np.log(2.2) / (1 + np.exp((across - 0.005) / 0.003)) / (1 + np.exp((along - 0.04) / 0.003))
+
+
+def test_a_ridge_is_named_and_marked_skin_is_believed() -> None:
+    samples, scar = lines(ridge_field), Marked(path_m=((-0.032, -0.024), (0.032, 0.024)), width_m=0.02)
+    ridges = []
+    for marked in ((), (scar,)):
+        result = assess(samples, flat_grid(), REACH, FALSE_FINDINGS, marked=marked)
+        assert result is not None
+        ridges.append(max(result.findings + result.candidates, key=lambda area: area.strength))
+    assert ridges[0].kind is Kind.RIDGE
+    assert ridges[1].ridge > ridges[0].ridge
+
+
+def test_bone_is_stiff_beyond_the_border_and_steeper() -> None:
+    def bone(xy: np.ndarray) -> np.ndarray:
+        return 1 / (1 + np.exp((0.05 - xy[:, 0]) / 0.008))
+
+    samples = lines(lambda xy: LEVEL + 1.2 * bone(xy), exponent=lambda xy: 1.4 + 1.2 * bone(xy))
+    result = examine(samples)
+    assert not result.findings
+    assert max(result.candidates, key=lambda area: area.strength).kind is Kind.BONE

@@ -7,15 +7,15 @@ import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.assess import AssessedMap, assess
-from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.calibration import Calibration
 from palpate_assessment.check import contradicted, pieces
-from palpate_assessment.detection import Candidate, Signs, agreed, matched, strongest
+from palpate_assessment.detection import agreed, matched, strongest
 from palpate_assessment.grid import map_grid
 from palpate_assessment.model import Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.shapes import Bump, ridge
-from palpate_assessment.standard import ABDOMEN, LENGTHS, USUAL, PressStandard
+from palpate_assessment.standard import LENGTHS, USUAL, PressStandard
 
 
 def observations(samples: list[ForceSample]) -> Observations:
@@ -133,21 +133,20 @@ def test_a_model_that_holds_is_not_contradicted() -> None:
     assert not contradicted(Regression(o, (), usual_amplitudes(o))).any()
 
 
-def test_what_may_be_bone_is_less_probably_a_lump() -> None:
-    open_wall, spine = (Candidate(Bump(x, y, 0.02), 0.6, 5.0, Signs(0.0, 0.0)) for x, y in ((0.0, 0.0), ABDOMEN.iliac_m))
-    logits = learned().logit(np.array((open_wall.features, spine.features)))
-    assert logits[1] < logits[0] - 0.5
-
-
 def test_less_false_findings_need_more_evidence() -> None:
     calibration = Calibration(
         exponent=1.3,
         exponent_sd=0.1,
         conversion=0,
         conversion_sd=0.03,
+        held=0,
         lead_s=0,
         probability=(-5, 1),
         guarding=(-2, 5, 4),
+        ridge=(0, 0, 0, 0),
+        bone=(0, 0, 0, 0, 0),
+        soft=(0, 0, 0, 0),
+        prevalence=0.3,
         tail=(-1.0, 0.8),
     )
     thresholds = [calibration.threshold(rate) for rate in (0.2, 0.02, 0.002)]

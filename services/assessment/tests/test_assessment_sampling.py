@@ -56,6 +56,20 @@ def test_a_stroke_that_ends_hands_over_what_it_has() -> None:
     assert sample.time_in_contact == pytest.approx(1.035)
 
 
+def test_a_press_held_before_a_slide_is_a_sample() -> None:
+    depth = np.minimum(0.00015 * np.arange(130), 0.010)
+    force = 2.0 * (depth / 0.010) ** 1.7 * np.where(np.arange(130) < 67, 1.0, np.exp(-0.002 * (np.arange(130) - 67)))
+    down = [state(k, depth=d, force=f, counts=False) for k, (d, f) in enumerate(zip(depth, force, strict=True))]
+    slide = [state(130 + k, x=0.0003 * (k + 2)) for k in range(100)]
+    press, *rest = run(down + slide)
+    assert press.exponent == pytest.approx(1.7, abs=0.02)
+    assert press.time == pytest.approx(0.64 + 0.37, abs=0.02)
+    assert not press.velocity.any()
+    assert all(s.exponent == 0 and s.velocity[0] > 0 for s in rest)
+    hurried = run(down[:90] + slide)
+    assert all(s.exponent == 0 for s in hurried)
+
+
 def test_a_sample_that_was_forgotten_does_not_come_out() -> None:
     sampler = Sampler()
     for k in range(8):

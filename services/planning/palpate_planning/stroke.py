@@ -30,6 +30,8 @@ class StrokeTuning:
     """An indentation has settled when its depth error stays below this for `settled_s`, or after `settle_timeout_s`."""
     settled_s: float = 0.08
     settle_timeout_s: float = 0.8
+    press_s: float = 0.5
+    """Time at depth before a slide: the hold of the standard press, by which slides are converted for this patient."""
     hold_s: float = 0.3
     """Time at a point in which samples are taken."""
     steady_speed_fraction: float = 0.5
@@ -164,9 +166,10 @@ def _descend(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
 
 
 def _settle(motion: StrokeMotion) -> Stages[None]:
-    """Wait until the depth error is small."""
+    """Wait until the depth error is small; before a slide also for the hold of a standard press."""
     settled, waited = Duration(motion.period_s), Duration(motion.period_s)
-    while settled.s < STROKE.settled_s and waited.s < STROKE.settle_timeout_s:
+    least_s = STROKE.press_s if motion.segment.path.length > 0 else 0.0
+    while waited.s < least_s or (settled.s < STROKE.settled_s and waited.s < STROKE.settle_timeout_s):
         now = yield StrokeStage.SETTLE
         motion.deepen()
         settled.update(abs(motion.regulation.reference - now.contact.depth) < STROKE.settled_error_m)

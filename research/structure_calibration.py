@@ -1,0 +1,228 @@
+"""Fits what an area may be instead of a lump (scar, bone, soft defect), on variants of persons that the population does not have.
+
+    python -m research.structure_calibration --persons 20 -o FOLDER
+
+Each variant changes persons of tuning seeds, which the quick tier examines: other relaxation, other equipment, bones 25 to 45 mm
+nearer to the umbilicus, scars, hernias, a wide linea alba. The evidence of each candidate is kept in FOLDER. A candidate has the
+set of causes that are true of it; the weights maximise the likelihood of these under normal priors about START.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Final
+
+import numpy as np
+import typer
+import yaml
+from numpy.typing import NDArray
+from pydantic import TypeAdapter
+from scipy.optimize import minimize
+
+import palpate_assessment
+from palpate.quick.case import assess, examined
+from palpate.report.results import truth_of_run
+from palpate_assessment.assess import weigh_all
+from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.detection import SOFTER, SURE, Candidate
+from palpate_assessment.findings import Kind, causes
+from palpate_assessment.observations import observe
+from palpate_assessment.service import AssessmentService
+from palpate_assessment.standard import USUAL
+from palpate_models.numerics.frames import Array
+from palpate_models.patient.person import drawn
+from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.scenario.load import exam_input
+from palpate_models.scenario.schema import Scenario
+from research.assessment_calibration import real, scenario
+
+NOTHING: Final = len(Kind)
+Change = Callable[[Phantom, np.random.Generator], Phantom]
+
+
+def relaxing(*terms: tuple[float, float]) -> Change:
+    """Return the change to a wall that relaxes by these fractions with these times [s]."""
+    prony = {"prony_g": tuple(g for g, _ in terms), "prony_tau_s": tuple(tau for _, tau in terms)}
+    return lambda person, _: person.model_copy(update={"stiffness": person.stiffness.model_copy(update=prony)})
+
+
+def nearer_bones(person: Phantom, rng: np.random.Generator) -> Phantom:
+    """Return a person whose ribs and iliac spines are 25 to 45 mm nearer to the umbilicus."""
+    assert person.anatomy is not None
+    ribs, iliac = rng.uniform(0.025, 0.045, 2)
+    skeleton = person.anatomy.skeleton
+    x, y = skeleton.iliac_crest_m
+    near = {"costal_arch_m": skeleton.costal_arch_m - ribs, "iliac_crest_m": (x - 0.75 * iliac, y + 0.66 * iliac)}
+    return person.model_copy(update={"anatomy": person.anatomy.model_copy(update={"skeleton": skeleton.model_copy(update=near)})})
+
+
+def oblique_scar(rng: np.random.Generator) -> list[Lesion]:
+    """Return a scar of 50 to 90 mm in any direction, as a row of small lumps."""
+    (x, y), angle = rng.uniform((-0.07, -0.07), (0.07, 0.05)), rng.uniform(0, np.pi)
+    half, radius, contrast = rng.uniform(0.025, 0.045), rng.uniform(0.002, 0.0045), rng.uniform(2, 4)
+    along = np.arange(-half, half + 1e-9, 0.004)
+    places = [(x + a * np.cos(angle), y + a * np.sin(angle)) for a in along.tolist()]
+    return [Lesion(centre_m=place, radii_m=(radius, radius), contrast=contrast) for place in places]
+
+
+def midline_scar(rng: np.random.Generator) -> list[Lesion]:
+    """Return a scar of 80 to 160 mm along the midline."""
+    centre, radii = (rng.uniform(-0.006, 0.006), rng.uniform(-0.05, 0.05)), (rng.uniform(0.002, 0.004), rng.uniform(0.04, 0.08))
+    return [Lesion(centre_m=centre, radii_m=radii, contrast=rng.uniform(1.8, 3.5))]
+
+
+def hernia(rng: np.random.Generator) -> list[Lesion]:
+    """Return a soft spot at the umbilicus or on the midline."""
+    at_umbilicus, radius = rng.random() < 0.5, rng.uniform(0.008, 0.02)
+    centre = (0.0, 0.0) if at_umbilicus else (rng.uniform(-0.01, 0.01), rng.uniform(-0.05, 0.09))
+    return [Lesion(centre_m=centre, radii_m=(radius, radius), contrast=rng.uniform(0.15, 0.5))]
+
+
+def wide_linea_alba(rng: np.random.Generator) -> list[Lesion]:
+    """Return a linea alba that is 24 to 60 mm wide and soft."""
+    radii = (rng.uniform(0.012, 0.03), rng.uniform(0.05, 0.09))
+    return [Lesion(centre_m=(0.0, rng.uniform(0.0, 0.05)), radii_m=radii, contrast=rng.uniform(0.35, 0.65))]
+
+
+def having(structure: Callable[[np.random.Generator], list[Lesion]]) -> Change:
+    """Return the change that adds a structure."""
+    return lambda person, rng: person.model_copy(update={"lesions": (*person.lesions, *structure(rng))})
+
+
+PERSONS: Final[dict[str, Change]] = {
+    "as drawn": lambda person, _: person,
+    "fast relaxation": relaxing((0.6, 0.6), (0.1, 30.0)),
+    "bones nearer": nearer_bones,
+}
+STRUCTURES: Final[dict[str, tuple[Change, Kind]]] = {
+    "oblique scar": (having(oblique_scar), Kind.RIDGE),
+    "midline scar": (having(midline_scar), Kind.RIDGE),
+    "hernia": (having(hernia), Kind.SOFT_DEFECT),
+    "wide linea alba": (having(wide_linea_alba), Kind.SOFT_DEFECT),
+}
+SHARE: Final = 0.5
+"""Weight of a candidate of a person with a structure: in the population they are rarer."""
+
+
+@dataclass(frozen=True)
+class Evidence:
+    """A candidate's evidence, and the causes that are true of it."""
+
+    features: list[float]
+    signs: list[float]
+    structures: list[float]
+    true: list[int]
+
+
+def variant(name: str, seed: int) -> Scenario:
+    """Return the scenario of a variant's person; those with a structure have no lump."""
+    made = scenario(seed) if name in PERSONS else scenario(2 * seed)
+    change = PERSONS[name] if name in PERSONS else STRUCTURES[name][0]
+    person = change(drawn(made.phantom, made.seed), np.random.default_rng(8000 + seed))
+    return made.model_copy(update={"phantom": person})
+
+
+def evidence(name: str, seed: int) -> list[Evidence]:
+    """Return the candidates of a variant's person."""
+    patient = variant(name, seed)
+    gathered = examined(patient)
+    known = truth_of_run(patient, gathered).felt if name in PERSONS else None
+    gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
+    service = AssessmentService(exam_input(patient))
+    assess(service, gathered)
+    observations = observe(service.samples, USUAL)
+    judged = None if observations is None else weigh_all(observations)
+    assert judged is not None
+    rows = []
+    for one in judged[1]:
+        if one.beyond > -SURE:
+            is_lump = known is not None and real(one, known)
+            true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.lesions))
+            rows.append(Evidence(one.features.tolist(), one.signs.features.tolist(), one.structures().tolist(), true))
+    return rows
+
+
+def _other_causes(name: str, one: Candidate, lesions: tuple[Lesion, ...]) -> set[int]:
+    """Return what a candidate that is not a lump may truly be."""
+    if name in STRUCTURES:
+        kind, at = STRUCTURES[name][1], np.array((one.disc.x, one.disc.y))
+        near = any((((at - a.centre_m) / (np.array(a.radii_m) + one.disc.radius)) ** 2).sum() < 1 for a in lesions)
+        if near and (one.log_contrast < 0) == (kind is Kind.SOFT_DEFECT):
+            return {int(kind)}
+    at_border = one.inside_m < 0.02
+    if name == "bones nearer" and at_border and abs(one.t) > 4 and one.log_contrast > np.log(1.5):
+        return {int(Kind.BONE)}
+    return {int(Kind.MUSCLE), NOTHING} | ({int(Kind.BONE)} if at_border else set())
+
+
+FIELDS: Final = ("probability", "ridge", "bone", "soft")
+START: Final = {"ridge": (-4.0, 0.5, 0.7, 4.0), "bone": (-2.0, -1.0, 3.0, 2.0, 1.0), "soft": (-1.5, 3.0, 0.3, 0.3)}
+SPREAD: Final = np.array(
+    (0.5, 0.1, 0.1, 0.2, 0.2, 0.3, 2.0, 0.3, 0.6, 0.01, 1.5, 1.0, 1.5, 1.5, 0.8, 1.5, 1.5, 0.3, 0.5), dtype=np.float64
+)
+"""SD of the prior of each weight about START, or about the probability of a lump as it is."""
+
+
+def with_weights(calibration: Calibration, weights: Array) -> Calibration:
+    """Return the calibration with these weights of FIELDS, one after the other."""
+    ends = np.cumsum([len(getattr(calibration, name)) for name in FIELDS])[:-1]
+    parts = np.split(weights, ends)
+    return calibration.model_copy(update={name: tuple(part.tolist()) for name, part in zip(FIELDS, parts, strict=True)})
+
+
+def fitted(rows: list[Evidence], weight: Array, calibration: Calibration) -> Calibration:
+    """Return the calibration with the weights of lump, ridge, bone and soft defect fitted to rows of this weight, shape (k,)."""
+    columns = [np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures")]
+    true: NDArray[np.bool_] = np.zeros((len(rows), NOTHING + 1), dtype=bool)
+    for row, mask in zip(rows, true, strict=True):
+        mask[row.true] = True
+    start = np.concatenate((calibration.probability, *(START[name] for name in FIELDS[1:])))
+
+    def loss(w: Array) -> float:
+        _, kinds = causes(with_weights(calibration, w), *columns)
+        every = np.column_stack((kinds, 1 - kinds.sum(axis=1)))
+        likelihood = np.clip((every * true).sum(axis=1), 1e-9, 1.0)
+        return float(0.5 * (((w - start) / SPREAD) ** 2).sum() - weight @ np.log(likelihood))
+
+    return with_weights(calibration, np.round(minimize(loss, start, method="L-BFGS-B").x, 3))
+
+
+def kept(name: str, seed: int, folder: Path) -> list[Evidence]:
+    """Return the candidates of a variant's person, from the folder if present."""
+    path, kind = folder / f"{name.replace(' ', '-')}-{seed}.json", TypeAdapter(list[Evidence])
+    if not path.is_file():
+        path.write_bytes(kind.dump_json(evidence(name, seed)))
+    return kind.validate_json(path.read_bytes())
+
+
+def main(
+    persons: Annotated[int, typer.Option(min=2, help="Persons of each variant, seeds 0 on; ten times as many as drawn.")] = 20,
+    out: Annotated[Path, typer.Option("-o", "--out", help="Where evidence is kept.")] = Path("out/structures"),
+) -> None:
+    """Fit the weights, write them to calibration.yaml, and print what each variant's candidates are called."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows: list[Evidence] = []
+    names: list[str] = []
+    for name in (*PERSONS, *STRUCTURES):
+        for seed in range(10 * persons if name == "as drawn" else persons):
+            found = kept(name, seed, out)
+            rows, names = rows + found, names + [name] * len(found)
+    weight = np.array([SHARE if name in STRUCTURES else 1.0 for name in names])
+    calibration = fitted(rows, weight, learned())
+    path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
+    path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
+    columns = [np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures")]
+    _, kinds = causes(calibration, *columns)
+    softer = columns[0][:, SOFTER] > 0
+    for name in (*PERSONS, *STRUCTURES):
+        here = np.array([one == name for one in names])
+        named = {
+            kind.name.lower(): int((kinds[here].argmax(axis=1) == kind)[kinds[here].sum(axis=1) > 0.5].sum()) for kind in Kind
+        }
+        print(f"{name}: {here.sum()} candidates, {softer[here].sum()} softer; {named}")
+
+
+if __name__ == "__main__":
+    typer.run(main)
