@@ -22,6 +22,7 @@ from palpate_bus.recordings import open_recording
 ADDED: Final = {
     "palpation_msgs/msg/JointTorqueCommand": re.compile("position"),
     "palpation_msgs/msg/PalpationTargets": re.compile("reason|[A-Z_]+"),
+    "palpation_msgs/msg/Finding": re.compile("ridge|bone|soft|kind|KIND_[A-Z_]+"),
     "palpation_msgs/msg/ExamState": re.compile("reason|REASON_[A-Z_]+"),
     "palpation_msgs/msg/RobotStatus": re.compile("measured_torque"),
     "palpation_msgs/msg/SupervisorState": re.compile("joint_force|CAUSE_SENSOR"),

@@ -7,8 +7,6 @@ nearer to the umbilicus, scars, hernias, a wide linea alba. The evidence of each
 set of causes that are true of it; the weights maximise the likelihood of these under normal priors about START.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
