@@ -185,7 +185,7 @@ OTHERS: Final = {
     "bone": "bone",
     "soft": "a soft defect of the wall",
 }
-"""What an area may be instead of a lump, by the field of its probability."""
+"""Causes of an area other than a lump, by the field of their probability."""
 _LIKELY: Final = 0.5
 
 

@@ -22,9 +22,9 @@ class Calibration(BaseModel):
     conversion: float
     """Log of the ratio of sliding force at the depth of the press to the force of the press."""
     conversion_sd: float
-    """Its SD between people, tissues, speeds and indenters; presses held before slides tell the patient's own."""
+    """Its SD between people, tissues, speeds and indenters; presses held before slides determine the patient's own."""
     held: float
-    """Log of the ratio of held presses to the standard press, as the slides near them tell it: beyond their wake, too, they are
+    """Log of the ratio of held presses to the standard press, against the slides near them: beyond their wake, too, slides are
     a little weaker than elsewhere."""
     lead_s: float
     """A sliding indenter feels this much of its travel ahead [s]."""

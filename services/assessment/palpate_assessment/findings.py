@@ -41,7 +41,7 @@ STATED = StatedPrior()
 
 
 class Kind(IntEnum):
-    """What an area may be; numbers of Finding.msg."""
+    """Causes of an area; numbers of Finding.msg."""
 
     LUMP = 0
     MUSCLE = 1
@@ -130,7 +130,7 @@ def causes(calibration: Calibration, features: Array, signs: Array, evidence: Ar
 
     `features`, `signs`, `evidence`: of candidates, of muscles about them and of structures, shapes (k, f), (k, 2), (k, 10).
     The causes compete: a lump has the weight exp(l), a muscle exp(g), a structure s exp(l + s), nothing 1. What is softer is
-    neither a muscle nor bone, and what is stiffer is no soft defect. `shift`: of the log odds of a lump, by its prevalence; the
+    neither a muscle nor bone, and what is stiffer is not a soft defect. `shift`: of the log odds of a lump, by its prevalence; the
     logits that decide what is reported are those of the fit.
     """
     softer = features[:, SOFTER] > 0

@@ -36,7 +36,7 @@ class Usable:
     slide_mps: float = 0.003
     """A sample slides from this speed on; a slower one is a press."""
     wake_m: float = 0.02
-    """So far from a held press the slide that follows feels tissue that has relaxed: it does not count."""
+    """Distance from a held press within which samples of the slide that follows are left out: the tissue there has relaxed."""
 
 
 USABLE = Usable()

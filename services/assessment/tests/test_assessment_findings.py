@@ -199,7 +199,7 @@ def test_lump_muscle_and_neither_compete() -> None:
 
 
 @pytest.mark.parametrize("conversion", [-0.2, 0.2])
-def test_held_presses_tell_how_slides_convert(conversion: float) -> None:
+def test_held_presses_determine_the_conversion_of_slides(conversion: float) -> None:
     result = examine(lines(lambda xy: LEVEL + WALL(xy), conversion=conversion))
     assert result.background == pytest.approx(np.exp(LEVEL), rel=0.1)
     assert held(result, np.exp(LEVEL + WALL(result.grid.nodes[:, :2]))) > 0.85
