@@ -126,7 +126,12 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
         for s in samples
         if s.depth >= shallowest
         and s.force >= weakest
-        and not (s.stroke in pressed and _slides(s) and np.linalg.norm(s.position - pressed[s.stroke]) < USABLE.wake_m)
+        and not (
+            s.stroke in pressed
+            and _slides(s)
+            and not s.force_limited
+            and np.linalg.norm(s.position - pressed[s.stroke]) < USABLE.wake_m
+        )
     ]
     calibration = standard.calibration
     if len(good) < USABLE.fewest:
