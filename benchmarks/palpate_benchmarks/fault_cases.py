@@ -1,6 +1,7 @@
 """Cases of the fault campaign and their findings: kinds of faults, outcomes, and the CSV file of the findings."""
 
 import csv
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -147,6 +148,12 @@ class FaultFinding:
             and not self.left_behind
             and (self.outcome.unharmed or self.named)
         )
+
+
+def by_code(findings: Sequence[FaultFinding]) -> str:
+    """Return how many cases were run by which code."""
+    counts = Counter(f.code or "earlier code" for f in findings)
+    return f"Cases by code: {', '.join(f'{code} {count}' for code, count in counts.most_common())}."
 
 
 FIELDS: Final = tuple(field.name for field in fields(FaultFinding))

@@ -13,7 +13,7 @@ from rich.table import Table
 
 from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, output_file, refuse
 from palpate.report.files import docs_option, write_part, write_text
-from palpate_benchmarks.fault_cases import KINDS, LIE, CaseOutcome, FaultFinding, csv_text, from_csv, in_order
+from palpate_benchmarks.fault_cases import KINDS, LIE, CaseOutcome, FaultFinding, by_code, csv_text, from_csv, in_order
 
 MODES = ("lockstep", "wallclock")
 WIDTH = 200
@@ -121,12 +121,6 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
     lines += _markdown_table(SUMMARY, _summary(findings))
     bad = [f"**!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in in_order(findings) if not f.good]
     return "\n".join([*lines, *([""] if bad else []), *bad]) + "\n"
-
-
-def by_code(findings: Sequence[FaultFinding]) -> str:
-    """Return how many cases were run by which code."""
-    counts = Counter(f.code or "earlier code" for f in findings)
-    return f"Cases by code: {', '.join(f'{code} {count}' for code, count in counts.most_common())}."
 
 
 def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:

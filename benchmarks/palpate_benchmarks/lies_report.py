@@ -9,7 +9,7 @@ import numpy as np
 from matplotlib.colors import ListedColormap
 from matplotlib.figure import Figure
 
-from palpate_benchmarks.fault_cases import FaultFinding
+from palpate_benchmarks.fault_cases import FaultFinding, by_code
 from palpate_benchmarks.liar import KINDS
 from palpate_benchmarks.lies import LEFT_OUT, UNDETECTABLE, left_out
 from palpate_bus.contract import contract
@@ -80,7 +80,12 @@ def markdown(findings: Sequence[FaultFinding]) -> str:
             lines.append(f"| {kind} | {len(mine)} | {' | '.join(str(counts[one]) for one in RANKS)} | {force:.1f} |")
     good = sum(f.good for f in findings)
     wallclock = sum(f.mode == "wall clock" for f in findings)
-    lines = [f"{good} of {len(findings)} cases passed, {wallclock} of them in wall-clock mode.", "", *lines, ""]
+    lines = [
+        f"{good} of {len(findings)} cases passed, {wallclock} of them in wall-clock mode. {by_code(findings)}",
+        "",
+        *lines,
+        "",
+    ]
     lines += [f"- **!** {f.where}: {f.ended}" for f in findings if not f.good]
     lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]
     out = {topic.name: left_out(topic) for topic in contract().topics.values() if left_out(topic)} | LEFT_OUT
