@@ -200,8 +200,8 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
             return Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), False
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
         wrong = state is not None and state.level != SupervisorState.LEVEL_OK and state.cause in FINAL
-        reason, culprit = (state.reason, state.culprit) if wrong else (status.reason, status.culprit)
-        return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {reason}", culprit), False
+        source = state if state is not None and wrong else status
+        return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {source.reason}", source.culprit), False
     if status is not None and status.mode == RobotStatus.MODE_IDLE and (commanded or status.cause != RobotStatus.CAUSE_NONE):
         return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason or 'no command yet'}", "robot"), False
     if state is None or state.level == SupervisorState.LEVEL_OK:
