@@ -150,7 +150,8 @@ def _every(cases: list[WeighedPatient]) -> tuple[Array, Mask]:
 def reported(case: WeighedPatient, calibration: Calibration) -> Array:
     """Logits of the probabilities that the assessment reports of a patient's candidates, shape (k,)."""
     rows = zip((case.features, case.signs, case.structures), (len(FEATURES), 2, STRUCTURES), strict=True)
-    return causes(calibration, *(np.array(values).reshape(-1, width) for values, width in rows))[0]
+    features, signs, evidence = (np.array(values).reshape(-1, width) for values, width in rows)
+    return causes(calibration, features, signs, evidence)[0]
 
 
 def evaluate(cases: list[WeighedPatient], calibration: Calibration, false_findings: float = 0.02) -> None:

@@ -172,14 +172,14 @@ def with_weights(calibration: Calibration, weights: Array) -> Calibration:
 
 def fitted(rows: list[Evidence], weight: Array, calibration: Calibration) -> Calibration:
     """Return the calibration with the weights of lump, ridge, bone and soft defect fitted to rows of this weight, shape (k,)."""
-    columns = [np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures")]
+    features, signs, evidence = (np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures"))
     true: NDArray[np.bool_] = np.zeros((len(rows), NOTHING + 1), dtype=bool)
     for row, mask in zip(rows, true, strict=True):
         mask[row.true] = True
     start = np.concatenate((calibration.probability, *(START[name] for name in FIELDS[1:])))
 
     def loss(w: Array) -> float:
-        _, kinds = causes(with_weights(calibration, w), *columns)
+        _, kinds = causes(with_weights(calibration, w), features, signs, evidence)
         every = np.column_stack((kinds, 1 - kinds.sum(axis=1)))
         likelihood = np.clip((every * true).sum(axis=1), 1e-9, 1.0)
         return float(0.5 * (((w - start) / SPREAD) ** 2).sum() - weight @ np.log(likelihood))
@@ -211,9 +211,9 @@ def main(
     calibration = fitted(rows, weight, learned())
     path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
     path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
-    columns = [np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures")]
-    _, kinds = causes(calibration, *columns)
-    softer = columns[0][:, SOFTER] > 0
+    features, signs, evidence = (np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures"))
+    _, kinds = causes(calibration, features, signs, evidence)
+    softer = features[:, SOFTER] > 0
     for name in (*PERSONS, *STRUCTURES):
         here = np.array([one == name for one in names])
         named = {

@@ -374,7 +374,7 @@ def _judged(finding: FaultFinding, lie: Lie, outcome: LieOutcome, twin: Healthy)
         blamed |= {*failure.roles, *failure.topics}
         finding.ended = str(failure)
     elif felt < LEAST_SHARE * twin.felt:
-        finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {c.exam.message}"
+        finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {c.exam.message if c.exam else ''}"
     elif findings == twin.findings and abs(background - twin.background) <= SAME_BACKGROUND * twin.background:
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:

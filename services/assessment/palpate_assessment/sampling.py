@@ -136,10 +136,12 @@ class Sampler:
         held = [s for s, p in zip(before, place, strict=True) if np.linalg.norm(p - place[0]) < PRESS.still_m]
         if len(held) == len(before) and np.linalg.norm(state.position - place[0]) < PRESS.still_m:
             return None  # it does not slide
+        if held[-1].depth <= 0:
+            return None  # it is above the skin that is perceived
         deep = next(s.time for s in held if s.depth > PRESS.deep * held[-1].depth)
         read = [s for s in held if PRESS.read_s[0] <= s.time - deep <= PRESS.read_s[1]]
         depths = [s.depth for s in read]
-        complete = held[-1].time - deep >= PRESS.read_s[1] and max(depths) - min(depths) < PRESS.settled_m
+        complete = len(read) > 0 and held[-1].time - deep >= PRESS.read_s[1] and max(depths) - min(depths) < PRESS.settled_m
         sample = self._averaged(read) if complete else None
         fall = np.array([(s.depth, s.force) for s in held if s.time <= deep and s.force > 0])
         fall = fall[(fall[:, 0] > PRESS.rise[0] * held[-1].depth) & (fall[:, 0] < PRESS.rise[1] * held[-1].depth)]

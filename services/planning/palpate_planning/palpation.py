@@ -402,7 +402,7 @@ class Palpation:
             self.leave(self._watch.ended)
         elif self._watch.spoiled and self.stage in PRESSING:
             back = TUNING.repeat_m if sliding else 0.0
-            if self._watch.leaps:  # a cough or deep breath is no fault of the place: only the time of waiting bounds the repeats
+            if self._watch.leaps:  # a cough or deep breath: only the time of waiting bounds the repeats
                 self._recovery.take_up(self._motion.along.position, back)
             else:
                 self._recovery.repeat(self._motion.segment, self._motion.along.position, back, NOT_TRACKED)
