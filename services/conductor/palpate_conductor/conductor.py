@@ -22,7 +22,8 @@ from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
-from palpate_conductor.grants import EXAM_SILENT_S, Grants, Slots
+from palpate_conductor.grants import EXAM_SILENT_S, Grants
+from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunOutcome, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
 from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog

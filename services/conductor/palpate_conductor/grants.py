@@ -1,14 +1,12 @@
-"""Grants of simulated time, and replacement of services.
+"""Grants of simulated time.
 
 Time is granted up to `WINDOW` beyond the newest exam state, so that the end tick, which planning announces a second ahead, is
 never overrun; up to a second beyond what the recorder has written; in real time not beyond the wall clock; not at all while
-paused. In wall-clock mode only the common start and the end are granted, and another process may replace that of a service.
+paused. In wall-clock mode only the common start and the end are granted.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
 from time import monotonic, time_ns
-from typing import Final
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
@@ -17,52 +15,6 @@ from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed, Timing
 from palpate_errors import UserError
-
-REPLACEABLE: Final = frozenset({"camera", "assessment"})
-
-
-@dataclass
-class Slots:
-    """Roles whose process left, and roles that a replacement has.
-
-    Only for roles whose absence is safe and whose work another process can continue. A run ends without the roles that move the
-    arm, measure or supervise, and a perception that did not process the first scan has no surface to continue with.
-    """
-
-    patience_s: float = 0.0
-    """Time for which a slot is kept; 0 keeps none."""
-    empty: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """Roles without a process: time [s] at which it left, and how."""
-    replaced: set[str] = field(default_factory=set)
-    """Roles of a replacement. The end of their first process is ignored."""
-
-    def keeps(self, role: str) -> bool:
-        """Return True if the slot of `role` is kept when its process leaves."""
-        return self.patience_s > 0 and role in REPLACEABLE
-
-    def leave(self, role: str, how: str) -> bool:
-        """Mark a slot empty; return False if it was empty."""
-        if role in self.empty:
-            return False
-        self.empty[role] = (monotonic(), how)
-        return True
-
-    def fill(self, role: str) -> bool:
-        """Mark a slot filled after a report of `role`; return False if it was not empty."""
-        if role not in self.empty:
-            return False
-        del self.empty[role]
-        self.replaced.add(role)
-        return True
-
-    def expired(self) -> dict[str, str]:
-        """Remove and return the slots that were not filled in time, with how each process left."""
-        now = monotonic()
-        late = {role: how for role, (since, how) in self.empty.items() if now - since > self.patience_s}
-        for role in late:
-            del self.empty[role]
-        return late
-
 
 WINDOW = 500 * MS
 """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""

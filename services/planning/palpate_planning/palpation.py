@@ -431,7 +431,8 @@ class Palpation:
             return FOR_REQUEST
         if stage in (StrokeStage.REST, StrokeStage.LIFT) and not self._watch.calm:
             return FOR_WALL if open_gate else FOR_BREATH
-        if stage in (StrokeStage.REST, StrokeStage.LIFT, StrokeStage.TRANSFER) and self._recovery.displacement is not None:
+        returns = stage in (StrokeStage.REST, StrokeStage.LIFT, StrokeStage.TRANSFER)
+        if self._motion.behind or (returns and self._recovery.displacement is not None):
             return FOR_ARM
         return FOR_BREATH if stage in (StrokeStage.SLIDE, StrokeStage.HOLD) and not open_gate else None
 

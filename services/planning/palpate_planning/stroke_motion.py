@@ -200,7 +200,13 @@ class StrokeMotion:
         last = len(self.segment.free) - 1.0
         self._following = True
         self._sample = min(self._sample + rate, last)
-        return self._sample >= last and self._behind_rad < MOTION.behind_rad
+        return self._sample >= last and not self.behind
+
+    @property
+    def behind(self) -> bool:
+        """True if the arm is not yet at the end of a free motion whose set-points are."""
+        free = self.segment.free
+        return free is not None and self._sample >= len(free) - 1.0 and self._behind_rad >= MOTION.behind_rad
 
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
         """Regulate the measured depth towards the target depth.

@@ -47,9 +47,9 @@ FOR_BREATH: Final = _wait(
 )
 FOR_ARM: Final = _wait(
     Reason.WAITS_FOR_ARM,
-    "waiting for the arm, which was pushed aside, to return to its path",
+    "waiting for the arm, which was pushed aside or is slow, to reach its path",
     Reason.ARM_DISPLACED,
-    "the arm did not return to its path",
+    "the arm did not reach its path",
 )
 FOR_REQUEST: Final = _wait(
     Reason.WAITS_FOR_REQUEST,

@@ -17,10 +17,12 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import TIMING, JointTrajectory, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
+from palpate_planning.reasons import Reason
 from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
+from palpate_planning.waits import WAIT
 from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import WallEstimate, plane
 
@@ -179,6 +181,15 @@ def test_after_a_pause_in_a_free_motion_the_palpation_continues_with_the_next_se
     palpation.step(0, ABOVE)
     palpation.pause()
     palpation.skip_free_motion()
-    steps = [palpation.step(t, ABOVE) for t in ticks(0, 10 * MS, len(MOTION))]
+    steps = [palpation.step(t, ABOVE._replace(q=q)) for t, q in zip(ticks(0, 10 * MS, len(MOTION)), MOTION.q, strict=True)]
     assert steps[-1].stage is StrokeStage.DONE
     assert np.array_equal(steps[-1].setpoint.q, MOTION.q[-1])
+
+
+def test_an_arm_that_does_not_arrive_ends_the_strokes() -> None:
+    palpation = free_palpation()
+    times = ticks(0, 10 * MS, len(MOTION) + round((WAIT.limit_s + 1) / 0.01))
+    steps = [palpation.step(t, ABOVE) for t in times]
+    assert steps[len(MOTION)].stage is StrokeStage.TRANSFER
+    assert palpation.failed.reason is Reason.ARM_DISPLACED
+    assert steps[-1].stage is StrokeStage.DONE

@@ -42,7 +42,7 @@ class Rig:
 
     def command(self, torque: np.ndarray, valid_ms: int = 50) -> None:
         self.inbox.messages["control/joint_torque"] = COMMAND(
-            header(self.t), np.asarray(torque), duration_message(valid_ms * MS), "", ""
+            header(self.t), np.asarray(torque), np.empty(0), duration_message(valid_ms * MS), "", ""
         )
 
     def press(self, fx: float, fy: float, fz: float) -> None:
@@ -243,7 +243,7 @@ def test_in_contact_with_tissue_that_stands_still_it_holds(rig: Rig) -> None:
 
 def test_a_controller_that_gives_up_is_obeyed_however_far_its_clock_is_ahead(rig: Rig) -> None:
     rig.servo(50)
-    late = COMMAND(header(rig.t + 180 * MS), np.zeros(7), duration_message(0), "joint_states are 34 ms old", "")
+    late = COMMAND(header(rig.t + 180 * MS), np.zeros(7), np.empty(0), duration_message(0), "joint_states are 34 ms old", "")
     rig.inbox.messages["control/joint_torque"] = late
     rig.tick(20)
     assert rig.mode == (STATUS.MODE_SAFE_HOLD, STATUS.CAUSE_COMMAND_EXPIRED)
