@@ -13,7 +13,7 @@ from toy_runs import Running, assert_failed, at, once, run_toys
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointTorqueCommand, RunControl, codec
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages.stamps import duration_message
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.rmw import AttachmentWriter, make_key, message_key, topic_key, unpack
@@ -25,30 +25,38 @@ TORQUE = contract().topics["control/joint_torque"]
 class Clone:
     """Copies the identity of a sender and sends under it."""
 
-    def __init__(self, key: str, payload: bytes) -> None:
-        self._key, self._payload = key, payload
-        self._received: list[bytes] = []
+    def __init__(self, key: str, forge: Callable[[bytes], bytes]) -> None:
+        """`forge` makes the false payload of the latest true one."""
+        self._key, self._forge = key, forge
+        self._received: list[tuple[bytes, bytes]] = []
         self._subscriber: object = None
         self.struck: list[bool] = []
 
     def listen(self, session: zenoh.Session) -> None:
         if self._subscriber is None:
             self._subscriber = session.declare_subscriber(
-                self._key, zenoh.handlers.Callback(lambda s: self._received.append(s.attachment.to_bytes()), indirect=False)
+                self._key,
+                zenoh.handlers.Callback(
+                    lambda s: self._received.append((s.attachment.to_bytes(), s.payload.to_bytes())), indirect=False
+                ),
             )
 
     def strike(self, session: zenoh.Session) -> None:
-        sequence, sent, gid = unpack(self._received[-1])
-        session.put(self._key, self._payload, attachment=AttachmentWriter(gid).pack(sequence + 5, sent + 1))
+        attachment, payload = self._received[-1]
+        sequence, sent, gid = unpack(attachment)
+        session.put(self._key, self._forge(payload), attachment=AttachmentWriter(gid).pack(sequence + 5, sent + 1))
 
 
 def abort() -> Clone:
-    return Clone(CONTROL_KEY, codec.encode(RunControl(RunControl.ABORT, 0, False, "", "forged"), CONTROL_TYPE))
+    return Clone(CONTROL_KEY, lambda _: codec.encode(RunControl(RunControl.ABORT, 0, False, "", "forged"), CONTROL_TYPE))
 
 
 def torque() -> Clone:
-    command = JointTorqueCommand(header(0), np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", "")
-    return Clone(topic_key(TORQUE, 0), codec.encode(command, TORQUE.type))
+    def forge(payload: bytes) -> bytes:
+        now = codec.decode(payload, TORQUE.type).header
+        return codec.encode(JointTorqueCommand(now, np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", ""), TORQUE.type)
+
+    return Clone(topic_key(TORQUE, 0), forge)
 
 
 def meddling(*clones: Clone) -> Callable[[Running], None]:

@@ -26,7 +26,7 @@ CUTS = {
     "tissue": (28.66, 0.1),  # from the air, since a tissue that begins deformed recoils
     "planning": (0.0, 3.0),
     "supervisor": (28.5, 1.0),
-    "assessment": (28.0, 2.0),
+    "assessment": (31.0, 2.0),
     "camera": (0.0, 1.2),
     "perception": (0.0, 1.5),
     "search": (0.0, 60.0),

@@ -72,10 +72,9 @@ def row(name: str) -> Disturbance:
     return found
 
 
-def test_an_unknown_offset_lowers_the_coverage() -> None:
-    plain, off = (np.mean([examined(row(name), seed, 0.1)[1] for seed in (3, 4)]) for name in ("no errors", "depth off by 1 mm"))
-    assert plain > 0.75
-    assert off < plain - 0.1
+def test_without_held_presses_the_band_is_wide_enough_for_an_unknown_offset() -> None:
+    for name in ("no errors", "depth off by 1 mm"):
+        assert np.mean([examined(row(name), seed, 0.1)[1] for seed in (3, 4)]) > 0.75
 
 
 def test_a_line_of_the_table_counts_patients() -> None:

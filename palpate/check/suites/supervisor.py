@@ -120,7 +120,8 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
     _released(rig, arm, report, "and is released above the surface")
     arm.qd = _turning(arm, 2.0 * limits.speed_mps)
-    _stops(rig, arm, report, "a tool too fast", EMERGENCY, SupervisorState.CAUSE_SPEED, EXPECTED.react_ms)
+    jump = (SupervisorState.CAUSE_SPEED, SupervisorState.CAUSE_SENSOR)  # the played arm jumps to that speed without torques
+    _stops(rig, arm, report, "a tool too fast", EMERGENCY, jump, EXPECTED.react_ms)
     _released(rig, arm, report, "and is released at rest")
     _workspace(rig, arm, report)
 
@@ -205,18 +206,25 @@ def _workspace(rig: Rig, arm: PlayedArm, report: ConformanceReport) -> None:
 
 
 def _stops(
-    rig: Rig, arm: PlayedArm, report: ConformanceReport, what: str, levels: tuple[int, ...], cause: int, within_ms: float
+    rig: Rig,
+    arm: PlayedArm,
+    report: ConformanceReport,
+    what: str,
+    levels: tuple[int, ...],
+    cause: int | tuple[int, ...],
+    within_ms: float,
 ) -> None:
-    """Expect a stop with the right cause and a reason."""
+    """Expect a stop with the right cause, or one of several, and a reason."""
+    causes = cause if isinstance(cause, tuple) else (cause,)
     start = rig.t
     received = rig.run(0.5, arm.feed())[STATE]
     first = next((item for item in received if item.message.level in levels), None)
-    wanted = f"level {' or '.join(map(str, levels))}, cause {cause}, a reason"
+    wanted = f"level {' or '.join(map(str, levels))}, cause {' or '.join(map(str, causes))}, a reason"
     if not report.expect(f"stops for {what}", first is not None, wanted, _text(received)):
         return
     assert first is not None
     state = first.message
-    report.expect(f"and states the cause: {what}", state.cause == cause and bool(state.reason), wanted, _text([first]))
+    report.expect(f"and states the cause: {what}", state.cause in causes and bool(state.reason), wanted, _text([first]))
     after = (first.t - start - rig.slack) / MS
     report.expect(f"in time: {what}", after <= within_ms, f"within {within_ms:.0f} ms", f"{after:.0f} ms")
 
