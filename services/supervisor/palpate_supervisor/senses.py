@@ -47,7 +47,9 @@ class SensesTuning(NamedTuple):
     slow_radps: float = 0.003
     """v_0: joint speed at which friction is half of its value."""
     torque_sd_nm: float = 0.3
-    """Standard deviation of a joint's external torque."""
+    """Least standard deviation of a joint's external torque."""
+    torque_sd_share: float = 0.005
+    """The same over the torque of a joint with a torque sensor: friction and errors of mass grow with the load."""
     force_max_n: float = 100.0
     """Prior of the force by the joints."""
     lag_s: float = 1 / GAIN_PER_S
@@ -62,7 +64,9 @@ class SensesTuning(NamedTuple):
     """Tool speed below which the tool is at rest."""
 
 
-TUNING: Final = SensesTuning()
+BY_SENSORS: Final = SensesTuning()
+BY_CURRENT: Final = BY_SENSORS._replace(torque_sd_share=0.04)
+"""For an arm that takes positions: its torques are those of the drives' currents, with the friction of the gears."""
 Arrays = tuple[Array, Array, Array]
 
 
@@ -107,7 +111,8 @@ class ForceComparison(NamedTuple):
 class ForceSenses:
     """Compares the senses at every measurement."""
 
-    def __init__(self, joints: int) -> None:
+    def __init__(self, joints: int, tuning: SensesTuning = BY_SENSORS) -> None:
+        self._tuning = tuning
         self._joints = np.zeros((4, joints))
         """Rows: offset, friction, the late sign of the speed, and its mean."""
         self._tool = np.zeros((11, 3))
@@ -137,8 +142,8 @@ class ForceSenses:
             unloaded_S = reading_S - load_S
             self._joints[0] = residual
             self._tool[:3], self._tool[5:10] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
-        state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W)
-        return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, free, TUNING))
+        state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W, measured.torque)
+        return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, free, self._tuning))
 
 
 @compiled
@@ -154,7 +159,13 @@ def _norm(x: Array) -> float:
 
 @compiled
 def _compare(
-    state: Arrays, motion: Arrays, ft: Arrays, speed: float, dt_s: float, free: tuple[bool, bool], tuning: SensesTuning
+    state: Arrays,
+    motion: tuple[Array, Array, Array, Array],
+    ft: Arrays,
+    speed: float,
+    dt_s: float,
+    free: tuple[bool, bool],
+    tuning: SensesTuning,
 ) -> tuple[float, float, float, float, float, float, float, float, float, float]:
     """Return the fields of `ForceComparison`, and update `state`: the rows of `joints` and `tool`, and `sums`.
 
@@ -162,7 +173,7 @@ def _compare(
     their means in free air, last reading (S). `sums`: reading times load, load squared, squared change of the reading, and the
     same at rest [N^2].
     """
-    (joints, tool, sums), (qd, residual, J_W), (reading_S, load_S, R_WS) = state, motion, ft
+    (joints, tool, sums), (qd, residual, J_W, load), (reading_S, load_S, R_WS) = state, motion, ft
     offset, friction, sign, mean_sign = joints[0], joints[1], joints[2], joints[3]
     bias_S, first_S, late_S, difference_W, joints_W = tool[0], tool[1], tool[2], tool[3], tool[4]
     lag, smooth = _share(dt_s, tuning.lag_s), _share(dt_s, tuning.smooth_s)
@@ -171,8 +182,8 @@ def _compare(
     ft_S = late_S - bias_S
 
     deviation = residual - offset - friction * sign
-    J = J_W / tuning.torque_sd_nm
-    torque = deviation / tuning.torque_sd_nm
+    sd = np.maximum(tuning.torque_sd_nm, tuning.torque_sd_share * np.abs(load))
+    J, torque = J_W / sd, deviation / sd
     information = J @ J.T + np.eye(3) / tuning.force_max_n**2
     force_W = np.linalg.solve(information, J @ torque)
     remainder = np.abs(torque - force_W @ J).max()
@@ -191,9 +202,9 @@ def _compare(
         tool[6] += _share(dt_s, tuning.load_s) * (load_S - tool[6])
         tool[7] += slow * (tool[5] - tool[7])
         tool[8] += slow * (tool[6] - tool[8])
-        load = tool[6] - tool[8]
-        sums[0] += (load * (tool[5] - tool[7])).sum()
-        sums[1] += (load * load).sum()
+        change = tool[6] - tool[8]
+        sums[0] += (change * (tool[5] - tool[7])).sum()
+        sums[1] += (change * change).sum()
     change_S = reading_S - tool[9]  # of white noise, the next change is half the other way; a step of the force has none
     white = -2 * (change_S * tool[10]).sum()
     sums[2] += _share(dt_s, tuning.noise_s) * (white - sums[2])

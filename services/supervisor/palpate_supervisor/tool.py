@@ -10,9 +10,10 @@ import pinocchio as pin
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.numerics.vectors import nearest_vertex
 from palpate_models.robot.arm import urdf
+from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
 from palpate_supervisor.observer import MomentumObserver
-from palpate_supervisor.senses import ForceComparison, ForceSenses, Measurement
+from palpate_supervisor.senses import BY_CURRENT, BY_SENSORS, ForceComparison, ForceSenses, Measurement
 
 
 @dataclass(frozen=True)
@@ -52,7 +53,7 @@ class ToolSense:
         self._model = pin.buildModelFromXML(urdf(robot, geometry=False))
         self._data = self._model.createData()
         self._observer = MomentumObserver(self._model, "indenter")
-        self._senses = ForceSenses(self._model.nv)
+        self._senses = ForceSenses(self._model.nv, BY_CURRENT if robot.level is CommandLevel.POSITION else BY_SENSORS)
         self._mass = robot.tool_mass_kg
         self._velocity_W: Array | None = None
         self.comparison: ForceComparison
