@@ -23,7 +23,7 @@ from palpate_bus.wire.zenoh_config import BusOptions, session
 from palpate_models.scenario.load import load_scenario
 
 SCENARIO = load_scenario("clean", STILL)
-HARDWARE = {"robot.lbr", "camera.ros", "camera.replay"}
+HARDWARE = {"robot.lbr", "robot.ros2_control", "camera.ros", "camera.replay"}
 """Implementations for wall-clock mode, which `palpate check` checks live, and the replay, which has its own tests."""
 SLOW = {"robot.mujoco", "tissue.elastic"}
 IMPLEMENTATIONS = sorted({f"{role}.{name}" for role in SUITES for name in names(role)} - HARDWARE)
