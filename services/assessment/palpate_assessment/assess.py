@@ -14,7 +14,7 @@ from palpate_assessment.detection import Candidate, detect
 from palpate_assessment.findings import Z90, Area, areas
 from palpate_assessment.grid import MapGrid
 from palpate_assessment.model import Regression, usual_amplitudes
-from palpate_assessment.observations import USABLE, Observations, observe
+from palpate_assessment.observations import USABLE, Observations, distance_to_samples, observe
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_models.numerics.frames import Array
@@ -74,9 +74,8 @@ def assess(
     if o is None or judged is None:
         return None
     regression, candidates, reasons = judged
-    apart, nearest = cKDTree(o.xy).query(grid.nodes[:, :2])
-    unassessed = reasons[nearest]
-    unassessed[apart > reach] = UnassessedReason.NOT_REACHED
+    unassessed = reasons[cKDTree(o.xy).query(grid.nodes[:, :2])[1]]
+    unassessed[distance_to_samples(grid.nodes[:, :2], samples, standard) > reach] = UnassessedReason.NOT_REACHED
     shift = 0.0 if prevalence is None else float(logit(prevalence) - logit(standard.calibration.prevalence))
     weighed = areas(regression, candidates, grid, unassessed == UnassessedReason.ASSESSED, shift, marked)
     threshold = standard.calibration.threshold(false_findings) if standard.anatomy else float(logit(1.0 - false_findings))
@@ -106,7 +105,7 @@ def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float, standar
     o = observe(samples, standard)
     if o is None:
         return None
-    apart, _ = cKDTree(o.xy).query(grid.nodes[:, :2])
+    apart = distance_to_samples(grid.nodes[:, :2], samples, standard)
     unassessed = np.where(apart <= reach, UnassessedReason.ASSESSED, UnassessedReason.NOT_REACHED).astype(np.uint8)
     return _assessment(Regression(o, (), usual_amplitudes(o)), grid, unassessed, [], [])
 

@@ -117,16 +117,27 @@ def _slides(sample: ForceSample) -> bool:
     return float(np.linalg.norm(sample.velocity)) > USABLE.slide_mps
 
 
+def firm(samples: Sequence[ForceSample], standard: PressStandard) -> list[ForceSample]:
+    """Return the samples that are deep and strong enough, those next to held presses included."""
+    shallowest, weakest = USABLE.depth * standard.depth_m, USABLE.force * standard.force_n
+    return [s for s in samples if s.depth >= shallowest and s.force >= weakest]
+
+
+def distance_to_samples(places: Array, samples: Sequence[ForceSample], standard: PressStandard) -> Array:
+    """Return the distance of places [m], shape (k, 2), from the nearest firm sample, shape (k,).
+
+    What lies between a held press and its slide is interpolated, and counts as felt.
+    """
+    return np.asarray(cKDTree(np.array([s.position[:2] for s in firm(samples, standard)])).query(places)[0])
+
+
 def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observations | None:
     """Return the usable samples; None if they are too few."""
-    shallowest, weakest = USABLE.depth * standard.depth_m, USABLE.force * standard.force_n
     pressed = {} if standard.anatomy is None else {s.stroke: s.position for s in samples if not _slides(s)}
     good = [
         s
-        for s in samples
-        if s.depth >= shallowest
-        and s.force >= weakest
-        and not (
+        for s in firm(samples, standard)
+        if not (
             s.stroke in pressed
             and _slides(s)
             and not s.force_limited
