@@ -7,6 +7,7 @@ import numpy as np
 from palpate_bus.messages import codec
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header
+from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import FT_TO_INDENTER_M, arm_of
 from palpate_models.scenario.arm_file import CommandLevel
@@ -43,8 +44,11 @@ class Ros2Port(ArmPort):
         return StackStatus()
 
     def pose(self, X_BF: Array) -> None:
-        """Send the desired pose of the flange in the arm's base, shape (4, 4), to a Cartesian controller of the stack."""
-        raise NotImplementedError
+        """Send the desired pose of the flange in the arm's base, shape (4, 4), to a Cartesian controller of the stack.
+
+        Raises UserError where the stack has none.
+        """
+        raise UserError("robot.level: this stack takes no set-points; want torque or position")
 
 
 def array_message(values: Array) -> Any:
