@@ -49,7 +49,8 @@ class SensesTuning(NamedTuple):
     torque_sd_nm: float = 0.3
     """Least standard deviation of a joint's external torque."""
     torque_sd_share: float = 0.005
-    """The same over the torque of a joint with a torque sensor: friction and errors of mass grow with the load."""
+    """The same over the torque of a joint with a torque sensor, for friction, and over its change from the mean of the last
+    `tare_s` in free air, for errors of mass: after a fast motion the offset is still that of another posture."""
     force_max_n: float = 100.0
     """Prior of the force by the joints."""
     lag_s: float = 1 / GAIN_PER_S
@@ -113,8 +114,8 @@ class ForceSenses:
 
     def __init__(self, joints: int, tuning: SensesTuning = BY_SENSORS) -> None:
         self._tuning = tuning
-        self._joints = np.zeros((4, joints))
-        """Rows: offset, friction, the late sign of the speed, and its mean."""
+        self._joints = np.zeros((5, joints))
+        """Rows: offset, friction, the late sign of the speed, its mean, and the mean load in free air."""
         self._tool = np.zeros((11, 3))
         """Rows of `_compare`."""
         self._sums = np.zeros(4)
@@ -140,7 +141,7 @@ class ForceSenses:
         if not self._started:
             self._started = True
             unloaded_S = reading_S - load_S
-            self._joints[0] = residual
+            self._joints[0], self._joints[4] = residual, measured.torque
             self._tool[:3], self._tool[5:10] = unloaded_S, (reading_S, load_S, reading_S, load_S, reading_S)
         state, motion = (self._joints, self._tool, self._sums), (measured.qd, residual, J_W, measured.torque)
         return ForceComparison(*_compare(state, motion, (reading_S, load_S, R_WS), speed, dt_s, free, self._tuning))
@@ -174,7 +175,7 @@ def _compare(
     same at rest [N^2].
     """
     (joints, tool, sums), (qd, residual, J_W, load), (reading_S, load_S, R_WS) = state, motion, ft
-    offset, friction, sign, mean_sign = joints[0], joints[1], joints[2], joints[3]
+    offset, friction, sign, mean_sign, usual = joints[0], joints[1], joints[2], joints[3], joints[4]
     bias_S, first_S, late_S, difference_W, joints_W = tool[0], tool[1], tool[2], tool[3], tool[4]
     lag, smooth = _share(dt_s, tuning.lag_s), _share(dt_s, tuning.smooth_s)
     late_S += lag * (reading_S - load_S - late_S)
@@ -182,7 +183,7 @@ def _compare(
     ft_S = late_S - bias_S
 
     deviation = residual - offset - friction * sign
-    sd = np.maximum(tuning.torque_sd_nm, tuning.torque_sd_share * np.abs(load))
+    sd = np.maximum(tuning.torque_sd_nm, tuning.torque_sd_share * np.maximum(np.abs(load), np.abs(load - usual)))
     J, torque = J_W / sd, deviation / sd
     information = J @ J.T + np.eye(3) / tuning.force_max_n**2
     force_W = np.linalg.solve(information, J @ torque)
@@ -196,6 +197,7 @@ def _compare(
         travel = np.abs(qd).sum() * dt_s / tuning.offset_rad
         settled = 1 - (1 - slow) * exp(-travel)
         offset += settled * deviation
+        usual += slow * (load - usual)
         mean_sign += settled * (sign - mean_sign)
         friction += tuning.friction_gain * (sign - mean_sign) * deviation
         tool[5] += _share(dt_s, tuning.load_s) * (reading_S - tool[5])

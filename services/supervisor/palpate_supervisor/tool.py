@@ -80,6 +80,7 @@ class ToolSense:
             residual = observed.residual
         else:  # an arm without joint torques has one sense: the F/T sensor takes the place of the other, and both agree
             observed.place(q)
+            measured = measured._replace(torque=np.zeros(model.nv))
             residual = observed.J_W.T @ self._R_SW.T @ force_S
         velocity_W = observed.J_W @ qd
         before_W = velocity_W if self._velocity_W is None else self._velocity_W

@@ -12,7 +12,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_supervisor.judge import FT, JOINTS, SensorJudge
-from palpate_supervisor.senses import ForceComparison, Measurement
+from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement
 from palpate_supervisor.tool import ToolSense
 
 ROBOT = exam_input(load_scenario("clean")).robot
@@ -61,8 +61,9 @@ def wrong_ft(change: Callable[[float, np.ndarray], np.ndarray], since_s: float =
     return lambda t, true: true._replace(wrench_S=change(t, true.wrench_S)) if t >= since_s else true
 
 
-def test_true_senses_agree() -> None:
-    assert first_breach() is None
+@pytest.mark.parametrize("lie", [lambda t, true: true, lambda t, true: true._replace(torque=np.zeros(0))])
+def test_true_senses_agree(lie: Lie) -> None:
+    assert first_breach(lie) is None
 
 
 RNG = np.random.default_rng(3)
@@ -114,3 +115,13 @@ def test_a_tool_that_was_not_weighed_touches_nothing() -> None:
     assert not judge.judge(silent, -0.1)
     (breach,) = judge.judge(silent, -0.01)
     assert breach.culprit == FT
+
+
+def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_learned() -> None:
+    senses, J = ForceSenses(6, BY_CURRENT), 0.6 * np.eye(3, 6)
+    sd = []
+    for t in np.arange(0.0, 10.0, DT):
+        reading = Measurement(np.zeros(6), np.zeros(6), np.zeros(6), np.full(6, -100.0 if t < 3.0 else -10.0))
+        sd.append(senses.compare(reading, np.zeros(6), J, np.zeros(3), np.eye(3), 0.0, DT, (t < 1.0, True)).joint_sd)
+    assert sd[310] > 2 * sd[-1]
+    assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
