@@ -11,7 +11,6 @@ from typing import Any
 
 import zenoh
 
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, ReceivedMessage, Rig, RigSettings
 from palpate.live.topic import TopicReader
 from palpate_bus.contract import MS
@@ -19,9 +18,10 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.announcement import NoBus
-from palpate_bus.wire.liveliness import EntityKind, GraphWatch, NodeTokens, gid
-from palpate_bus.wire.rmw import AttachmentWriter, message_key, topic_key
-from palpate_bus.wire.transport import Publisher, Subscription
+from palpate_bus.runtime.member import Member
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch, gid
+from palpate_bus.wire.rmw import AttachmentWriter, topic_key
+from palpate_bus.wire.transport import Transport
 from palpate_inputs import parse_json
 
 
@@ -53,16 +53,12 @@ class LiveRig(Rig):
         self._session = session
         self._domain = domain
         self.graph = GraphWatch(session, domain)
-        self._tokens: dict[str, NodeTokens] = {}
-        self._publishers: dict[str, Publisher] = {}
-        for topic, _ in self.rules.inputs(role):
-            tokens = self._tokens.setdefault(topic.producer, NodeTokens(session, topic.producer, domain))
-            qos = self.rules.qos[topic.qos]
-            self._publishers[topic.name] = Publisher(session, topic_key(topic, domain), qos, tokens.publisher(topic, qos))
-        conductor = self._tokens.setdefault("conductor", NodeTokens(session, "conductor", domain))
-        key = message_key("palpate/control", CONTROL, domain)
-        self._control = Publisher(session, key, self.rules.qos["event"], conductor.node.gid)
-        self._reports = Subscription(session, message_key(f"palpate/report/{role}", REPORT, domain))
+        producers = {"conductor", *(topic.producer for topic, _ in self.rules.inputs(role))}
+        transport = Transport(session)
+        self._members = {name: Member(session, name, self.rules, domain, transport) for name in sorted(producers)}
+        self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.rules.inputs(role)}
+        self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL, "event")
+        self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT)
         self._readers = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
@@ -76,9 +72,9 @@ class LiveRig(Rig):
 
     # -- protocol
 
-    def await_implementation(self, seconds: float, report: ConformanceReport) -> None:
+    def await_implementation(self, seconds: float) -> None:
         """Wait for the role to appear, send hello and start it. Raises NoBus if it does not appear within `seconds`."""
-        report.section("protocol")
+        self.section("protocol")
         gc.freeze()  # a full collection during a check would delay commands beyond their validity
         end = monotonic() + seconds
         while self.role.name not in self._others():
@@ -88,9 +84,9 @@ class LiveRig(Rig):
                 )
             self._say(RunControl.HELLO)
             sleep(TIMING.hello_s)
-        report.expect("joins as a node of its role", True, self.role.name, self.role.name)
-        self._greet(report)
-        self._check_graph(report)
+        self.expect("joins as a node of its role", True, self.role.name, self.role.name)
+        self._greet()
+        self._check_graph()
         self._epoch = time_ns() + TIMING.lead_ns
         self._say(RunControl.GRANT, self._epoch)
         while time_ns() < self._epoch:
@@ -101,7 +97,7 @@ class LiveRig(Rig):
         ours = str(self._session.zid())
         return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
 
-    def _greet(self, report: ConformanceReport) -> None:
+    def _greet(self) -> None:
         end = monotonic() + TIMING.ready_s
         missing: list[str] | None = None
         while missing != [] and monotonic() < end:
@@ -116,9 +112,9 @@ class LiveRig(Rig):
         got = (
             "READY" if self.ready else "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
         )
-        report.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
+        self.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
 
-    def _check_graph(self, report: ConformanceReport) -> None:
+    def _check_graph(self) -> None:
         self.graph.changes()
         ours = str(self._session.zid())
         ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
@@ -128,16 +124,16 @@ class LiveRig(Rig):
             wanted = f"{topic.type} {topic.type_hash[:15]}"
             got = "no publisher's token" if end is None else f"{end.type} {end.type_hash[:15]}"
             if end is None and topic.name.startswith("sim/"):
-                report.skip(f"publishes {topic.name}", "hardware has no such sensor")
+                self.skip(f"publishes {topic.name}", "hardware has no such sensor")
                 continue
-            report.expect(f"publishes {topic.name}", got == wanted, wanted, got)
-        report.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
+            self.equal(f"publishes {topic.name}", got, wanted)
+        self.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
 
-    def finish(self, report: ConformanceReport) -> None:
+    def finish(self) -> None:
         """Send garbage to it, end it, and check its reactions."""
-        report.section("garbage")
-        self._disturb(report)
-        report.section("end")
+        self.section("garbage")
+        self._disturb()
+        self.section("end")
         self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
         end = monotonic() + TIMING.finish_s
         while not self.finished and monotonic() < end:
@@ -145,20 +141,20 @@ class LiveRig(Rig):
             self._drain()
             sleep(0.02)
         got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
-        report.expect("reports FINISHED at the end", self.finished, f"within {TIMING.finish_s:.0f} s", got)
+        self.expect("reports FINISHED at the end", self.finished, f"within {TIMING.finish_s:.0f} s", got)
         self._say(RunControl.END)
 
     def close(self) -> None:
         """Abort an implementation that still runs, and leave the bus."""
         self._say(RunControl.ABORT, reason="the conformance check is over")
-        for tokens in self._tokens.values():
-            tokens.undeclare()
+        for member in self._members.values():
+            member.leave()
         self.graph.close()
         for reader in self._readers.values():
             reader.close()
         self._reports.close()
 
-    def _disturb(self, report: ConformanceReport) -> None:
+    def _disturb(self) -> None:
         """Send undecodable bytes and messages of an unknown sender on every input."""
         stranger = AttachmentWriter(gid("a stranger")).pack
         for name in self._publishers:
@@ -172,16 +168,9 @@ class LiveRig(Rig):
         self._received_reports()
         silent = [t.name for t in self.rules.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
         there = self.role.name in self._others()
-        got = (
-            "gone"
-            if not there
-            else f"silent on {', '.join(silent)}"
-            if silent
-            else f"failed: {self.error}"
-            if self.error
-            else "continues"
-        )
-        report.expect("garbage on its inputs does not stop it", got == "continues", "continues", got)
+        states = {"gone": not there, f"silent on {', '.join(silent)}": silent, f"failed: {self.error}": self.error}
+        got = next((text for text, so in states.items() if so), "continues")
+        self.equal("garbage on its inputs does not stop it", got, "continues")
 
     def _received_reports(self) -> list[Any]:
         received = []

@@ -16,9 +16,8 @@ from rich.text import Text
 
 from palpate.apart import guarded, shared_numbers
 from palpate.check.live_rig import LiveRig
-from palpate.check.report import ConformanceReport, Verdict
-from palpate.check.rig import Rig, RigSettings, ServiceRig
-from palpate.check.suites import DURATION_S, check
+from palpate.check.rig import ConformanceReport, Rig, RigSettings, ServiceRig, Verdict
+from palpate.check.suites import SUITES, check
 from palpate.console import SteadyConsole, table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
@@ -63,20 +62,20 @@ def started(command: str | None, role: str, settings: RigSettings, endpoint: str
 class CheckDisplay(Progress):
     """A bar that follows the clock of a rig, for a `with` block; nothing without a terminal."""
 
-    def __init__(self, rig: Rig, report: ConformanceReport) -> None:
-        """Read rig and report about ten times a second while the suite runs."""
+    def __init__(self, rig: Rig) -> None:
+        """Read the rig about ten times a second while the suite runs."""
         console = SteadyConsole(stderr=True)
         text = TextColumn("{task.description}, {task.fields[checks]} checks")
         columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._rig, self._report = rig, report
-        self._shown = self.add_task(rig.role.name, total=DURATION_S[rig.role.name], checks=0)
+        self._rig = rig
+        self._shown = self.add_task(rig.role.name, total=SUITES[rig.role.name][1], checks=0)
 
     def get_renderables(self) -> Iterable[RenderableType]:
         """Update the task and return what to draw; rich calls it at each refresh."""
         if self.task_ids:  # rich also draws before there is a task
-            about = f"{self._rig.role.name}: {self._report.group}"
-            checks = len(self._report.results)
+            about = f"{self._rig.role.name}: {self._rig.report.group}"
+            checks = len(self._rig.report.results)
             self.update(self._shown, completed=self._rig.t / NS, description=about, checks=checks)
         yield from super().get_renderables()
 
@@ -91,10 +90,9 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
     steps = shared_numbers()
 
     def perform() -> ConformanceReport:
-        service = implementations.create(role, choice, settings.scenario)
-        rig, report = ServiceRig(service, settings, steps), ConformanceReport(role)
-        with CheckDisplay(rig, report):
-            return check(rig, report)
+        rig = ServiceRig(implementations.create(role, choice, settings.scenario), settings, steps)
+        with CheckDisplay(rig):
+            return check(rig)
 
     limits = Settings.read()
     return guarded(f"services.{role} = {choice!r}", perform, limits.start_limit_s, place=lambda: (steps[0],))
@@ -105,20 +103,19 @@ def check_live(
 ) -> ConformanceReport:
     """Wait for an implementation on the bus and check it there. Raises NoBus if none joins."""
     options = BusOptions(connect=tuple(connect)) if connect else BusOptions(mode="router", listen=(listen,))
-    report = ConformanceReport(role)
     with session(options) as bus:
         where = ", ".join(connect) if connect else listen
         typer.echo(f"waiting for {role} at {where}, domain {domain}", err=True)
         rig = LiveRig(bus, role, settings, domain)
         try:
             with started(start, role, settings, where, domain):
-                rig.await_implementation(wait, report)
-                with CheckDisplay(rig, report):
-                    check(rig, report)
-                    rig.finish(report)
+                rig.await_implementation(wait)
+                with CheckDisplay(rig):
+                    check(rig)
+                    rig.finish()
         finally:
             rig.close()
-    return report
+    return rig.report
 
 
 def print_report(report: ConformanceReport, failures: bool) -> None:

@@ -6,15 +6,17 @@ a bus, in wall-clock mode. The same suites run on both.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableSequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, field
+from enum import StrEnum
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.contract.port_check import RefusedMessage
-from palpate_bus.messages import codec
+from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
 from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.lockstep import Packet, Sent, Stepper
 from palpate_bus.service import Service
 from palpate_models.scenario.schema import Scenario
@@ -28,6 +30,58 @@ Feed = Mapping[str, Source]
 def sensed(values: Any, t: int) -> Any:
     """Return the values as a live sensor reads them at `t` [ns]: ports refuse what repeats."""
     return np.asarray(values, dtype=float) + 1e-15 * t
+
+
+def robot_status(
+    t: int, q: Any, qd: Any, force: Any, torque: Any, mode: int = RobotStatus.MODE_ACTIVE, cause: int = 0, reason: str = ""
+) -> Message:
+    """Return the status of an arm at `t` [ns] as a live one sends it: joints, force on the F/T sensor, joint torques."""
+    wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
+    q, qd, torque = sensed(q, t), sensed(qd, t), sensed(torque, t)
+    return RobotStatus(header(t), mode, cause, reason, q, qd, wrench, np.zeros_like(q), 0, "", torque)
+
+
+class Verdict(StrEnum):
+    """Verdict of one check."""
+
+    PASSED = "passed"
+    FAILED = "failed"
+    SKIPPED = "skipped"
+
+
+@dataclass(frozen=True)
+class Result:
+    """One check."""
+
+    group: str
+    name: str
+    verdict: Verdict
+    expected: str = ""
+    got: str = ""
+    """The value received, or the reason for a skip."""
+
+
+@dataclass
+class ConformanceReport:
+    """All checks of one implementation."""
+
+    role: str
+    results: list[Result] = field(default_factory=list)
+    group: str = ""
+
+    @property
+    def failed(self) -> list[Result]:
+        """Failed checks."""
+        return [result for result in self.results if result.verdict is Verdict.FAILED]
+
+    @property
+    def passed(self) -> bool:
+        """True if at least one check passed and none failed."""
+        return not self.failed and any(result.verdict is Verdict.PASSED for result in self.results)
+
+    def as_json(self) -> dict[str, Any]:
+        """Return the report as JSON data."""
+        return {"role": self.role, "passed": self.passed, "results": [asdict(result) for result in self.results]}
 
 
 class ReceivedMessage(NamedTuple):
@@ -70,11 +124,62 @@ class Rig(ABC):
         """Now [ns]."""
         self.memory: dict[str, int] = {}
         """State that a suite keeps between checks."""
+        self.report = ConformanceReport(role)
 
     @property
     def slack(self) -> int:
         """Allowance for transport and scheduling [ns]; 0 in simulated time."""
         return round(self.settings.slack_ms * MS) if self.live else 0
+
+    @property
+    def slack_s(self) -> float:
+        """The same [s]."""
+        return self.slack / 1e9
+
+    # -- checks
+
+    def section(self, name: str) -> None:
+        """Begin a group of checks."""
+        self.report.group = name
+
+    def expect(self, name: str, ok: bool, expected: object, got: object = None) -> bool:
+        """Record a check; returns True if it passed. `got`: the value received, by default that it is as expected or not."""
+        got = ("as expected" if ok else "not as expected") if got is None else got
+        verdict = Verdict.PASSED if ok else Verdict.FAILED
+        self.report.results.append(Result(self.report.group, name, verdict, str(expected), str(got)))
+        return ok
+
+    def equal(self, name: str, got: object, wanted: object) -> bool:
+        """Record that a value is the wanted one."""
+        return self.expect(name, got == wanted, wanted, got)
+
+    def below(self, name: str, value: Any, limit: float, unit: str, scale: float = 1.0) -> bool:
+        """Record that a value is below a limit; the report has both times `scale`, in `unit`."""
+        return self.expect(name, bool(value < limit), f"below {scale * limit:.3g} {unit}", f"{scale * value:.3g} {unit}")
+
+    def within(self, name: str, values: Any, least: float, most: float, unit: str) -> bool:
+        """Record that all `values` are from `least` to `most`, and that there are any."""
+        v = np.atleast_1d(np.asarray(values, dtype=float))
+        got = f"{v.min():.3g} to {v.max():.3g} {unit}" if v.size else "nothing"
+        return self.expect(name, bool(v.size and np.all((v >= least) & (v <= most))), f"{least:.3g} to {most:.3g} {unit}", got)
+
+    def arrives(self, name: str, received: object, wanted: object) -> bool:
+        """Record that something was received."""
+        there = bool(received) if isinstance(received, list) else received is not None
+        return self.expect(name, there, wanted, "as expected" if there else "nothing")
+
+    def skip(self, name: str, why: str) -> None:
+        """Record a check that was not made."""
+        self.report.results.append(Result(self.report.group, name, Verdict.SKIPPED, "", why))
+
+    # -- messages
+
+    def await_message(self, topic: str, seconds: float, feed: Feed) -> list[ReceivedMessage]:
+        """Send `feed` until there is a message on `topic`, at most for `seconds`; return all on that topic."""
+        end = self.t + round(seconds * 1e9)
+        while not self.log[topic] and self.t < end:
+            self.run(0.5, feed)
+        return self.log[topic]
 
     def run(self, seconds: float, feed: Feed) -> dict[str, list[ReceivedMessage]]:
         """Advance by `seconds` while `feed` is sent; return the messages received in this time, by topic."""

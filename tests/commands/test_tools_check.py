@@ -11,9 +11,8 @@ import pytest
 
 from palpate.check.live_rig import LiveRig
 from palpate.check.perform import started
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites import DURATION_S, SUITES, check
+from palpate.check.suites import SUITES, check
 from palpate.check.suites.tissue import STILL
 from palpate_bus.implementations import create, names
 from palpate_bus.messages import Point, Pose, SupervisorState
@@ -39,7 +38,7 @@ def test_an_implementation_conforms(name: str) -> None:
     rig = ServiceRig(made(name), RigSettings(SCENARIO))
     report = check(rig)
     assert report.failed == []
-    assert rig.t / NS == pytest.approx(DURATION_S[rig.role.name], rel=0.25)
+    assert rig.t / NS == pytest.approx(SUITES[rig.role.name][1], rel=0.25)
     assert report.passed
     assert len(report.results) > 10
 
@@ -164,14 +163,13 @@ TIMELY = ("rate", "stamps", "within", "sequence")
 def test_a_process_on_a_live_bus_conforms(role: str, tmp_path: Any) -> None:
     where = f"unixsock-stream/{tmp_path}/router.sock"
     settings = RigSettings(SCENARIO, slack_ms=3000)
-    report = ConformanceReport(role)
     with session(BusOptions(mode="router", listen=(where,))) as bus:
         rig = LiveRig(bus, role, settings)
         try:
             with started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0):
-                rig.await_implementation(90, report)
-                check(rig, report)
-                rig.finish(report)
+                rig.await_implementation(90)
+                report = check(rig)
+                rig.finish()
         finally:
             rig.close()
     assert [result for result in report.failed if not any(word in result.name for word in TIMELY)] == []

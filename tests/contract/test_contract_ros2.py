@@ -16,7 +16,6 @@ import pytest
 
 from palpate.check.live_rig import LiveRig
 from palpate.check.perform import started
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet
@@ -156,8 +155,8 @@ def test_a_ros_2_user_receives_robot_and_camera_and_stops_the_robot(tmp_path: Pa
             rig = rigs[role] = LiveRig(bus, role, settings)
             stack.callback(rig.close)
             stack.enter_context(started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0))
-        for role, rig in rigs.items():
-            rig.await_implementation(120, ConformanceReport(role))
+        for rig in rigs.values():
+            rig.await_implementation(120)
         reading = threading.Thread(target=lambda: lines.extend(client.stdout or ()), daemon=True)
         reading.start()
         surface = {"sim/surface": plane(np.array(settings.scenario.camera.look_at_m))}

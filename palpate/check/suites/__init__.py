@@ -1,40 +1,116 @@
-"""Suites: requirements on an implementation of each role, from the contract and the documentation of its messages."""
+"""Suites: requirements on an implementation of each role, from the contract and the documentation of its messages.
+
+Those of the contract on every implementation are here, checked over all messages that it sent during its suite.
+"""
 
 from collections.abc import Callable
+from itertools import pairwise
 
-from palpate.check.report import ConformanceReport
-from palpate.check.rig import Rig
-from palpate.check.suites import assessment, camera, common, control, perception, planning, robot, search, supervisor, tissue
+import numpy as np
 
-SUITES: dict[str, Callable[[Rig, ConformanceReport], None]] = {
-    "robot": robot.suite,
-    "tissue": tissue.suite,
-    "control": control.suite,
-    "planning": planning.suite,
-    "camera": camera.suite,
-    "perception": perception.suite,
-    "assessment": assessment.suite,
-    "search": search.suite,
-    "supervisor": supervisor.suite,
+from palpate.check.rig import ConformanceReport, ReceivedMessage, Rig
+from palpate.check.suites import assessment, camera, control, perception, planning, robot, search, supervisor, tissue
+from palpate_bus.contract import MS, Topic
+from palpate_bus.contract.conformance import Checker
+
+SUITES: dict[str, tuple[Callable[[Rig], None], float]] = {
+    "robot": (robot.suite, 9.0),
+    "tissue": (tissue.suite, 4.0),
+    "control": (control.suite, 7.0),
+    "planning": (planning.suite, 2.0),
+    "camera": (camera.suite, 2.5),
+    "perception": (perception.suite, 4.5),
+    "assessment": (assessment.suite, 31.0),
+    "search": (search.suite, 7.5),
+    "supervisor": (supervisor.suite, 26.0),
 }
-"""The suite of each role."""
-DURATION_S = {
-    "robot": 9.0,
-    "tissue": 4.0,
-    "control": 7.0,
-    "planning": 2.0,
-    "camera": 2.5,
-    "perception": 4.5,
-    "assessment": 31.0,
-    "search": 7.5,
-    "supervisor": 26.0,
-}
-"""Duration of each suite on the rig's clock with a conforming implementation; for the progress display."""
+"""The suite of each role, and its duration [s] on the rig's clock with a conforming implementation."""
 
 
-def check(rig: Rig, report: ConformanceReport | None = None) -> ConformanceReport:
-    """Run the suite of a rig's role, then the common checks, and return the report."""
-    report = report or ConformanceReport(rig.role.name)
-    SUITES[rig.role.name](rig, report)
-    common.suite(rig, report)
-    return report
+def check(rig: Rig) -> ConformanceReport:
+    """Run the suite of a rig's role, then the checks of the contract, and return the report."""
+    SUITES[rig.role.name][0](rig)
+    _contract(rig)
+    return rig.report
+
+
+RATE_TOLERANCE = 0.2
+"""Largest relative error of a live implementation's rate, over the whole check."""
+STAMP_TOLERANCE_MS = 100.0
+"""Largest median difference of stamps from the check's clock, in addition to the slack."""
+MAX_LOST_SHARE = 0.05
+"""Largest share of a live implementation's messages that may be lost in transport."""
+
+
+def _contract(rig: Rig) -> None:
+    """Check topics, rates, stamps and values."""
+    rig.section("contract")
+    for topic in rig.rules.outputs(rig.role.name):
+        received = rig.log[topic.name]
+        if not received:
+            if topic.event:
+                rig.skip(f"{topic.name}", "an event topic without an event")
+            else:
+                rig.arrives(f"{topic.name} is sent", received, "once" if topic.latched else f"every {topic.period_ms} ms")
+            continue
+        _values(rig, topic, received)
+        if topic.periodic:
+            _rate(rig, topic, received)
+            _stamps(rig, topic, received)
+        _sequence(rig, topic, received)
+    if rig.live:
+        rig.equal("every message can be decoded", rig.undecodable[:3], [])
+
+
+def _values(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
+    checker = Checker(topic)
+    faults = [fault for item in received for fault in checker(item.message)]
+    wanted = "frame, ranges and finite numbers as in its row"
+    got = f"{len(received)} messages, all valid"
+    if faults:
+        first = faults[0]
+        got = f"{len(faults)} faults, first: {first.field} is {first.got}, allowed {first.expected}"
+    rig.expect(f"{topic.name}: values", not faults, wanted, got)
+
+
+def _rate(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
+    """Check that every tick has its message; on a live bus, the mean rate by the sender's clock."""
+    wanted = f"{1000 / topic.period_ms:g} Hz"
+    if not rig.live:
+        times = [item.t for item in received]
+        due = list(range(0, rig.t, topic.period))
+        rig.expect(f"{topic.name}: rate", times == due, f"{len(due)} messages, one on each tick", f"{len(times)}")
+        return
+    seconds = (received[-1].sent - received[0].sent) / 1e9
+    rate = (len(received) - 1) / seconds if seconds > 0 else 0.0
+    off = abs(rate * topic.period_ms / 1000 - 1)
+    longest = max((b.sent - a.sent for a, b in pairwise(received)), default=0) / MS
+    rig.expect(f"{topic.name}: rate", off < RATE_TOLERANCE, wanted, f"{rate:.4g} Hz, longest pause {longest:.0f} ms")
+
+
+def _stamps(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
+    checker = Checker(topic)
+    stamps = [(item.t, stamp) for item in received if (stamp := checker.stamp(item.message)) is not None]
+    if not stamps:
+        return
+    back = [(a, b) for (_, a), (_, b) in pairwise(stamps) if b < a]
+    got = f"{back[0][1]} after {back[0][0]} ns" if back else None
+    rig.expect(f"{topic.name}: stamps rise", not back, "never backwards", got)
+    if rig.live:
+        off = abs(np.median([(t - stamp) / MS for t, stamp in stamps]))
+        rig.below(f"{topic.name}: stamps", off, STAMP_TOLERANCE_MS + rig.settings.slack_ms, "ms off this check's clock (median)")
+    else:
+        own_rate = rig.settings.scenario.robot.driver.emulated and topic.max_age_ms is not None  # 500 Hz, say
+        age = topic.max_age if own_rate else 0
+        wrong = [(t, stamp) for t, stamp in stamps if not t - age <= stamp <= t]
+        expected = f"at most {age / MS:g} ms before the tick" if age else "the tick"
+        got = f"{wrong[0][1]} at {wrong[0][0]} ns" if wrong else None
+        rig.expect(f"{topic.name}: stamps", not wrong, expected, got)
+
+
+def _sequence(rig: Rig, topic: Topic, received: list[ReceivedMessage]) -> None:
+    steps = np.diff([item.sequence for item in received])
+    jumps = int(np.sum(steps != 1))
+    ok = bool(np.all(steps > 0)) and jumps <= (MAX_LOST_SHARE * len(steps) if rig.live else 0)
+    got = f"{jumps} jumps among {len(received)}" if jumps else "without a gap"
+    rig.expect(f"{topic.name}: sequence", ok, "numbered 1, 2, 3, ... in the attachment", got)

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 
 from palpate.check import shapes
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
-from palpate_bus.messages import ExamState, SurfaceMesh
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.geometry import mesh_message, vectors
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.scenario.load import exam_input
@@ -86,85 +86,57 @@ class PlayedScan:
         return 1.0 + (BELLY.contrast - 1.0) / (1.0 + float(np.exp((r - BELLY.stiff_radius_m) / 0.004)))
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check silence before contact, samples, map and findings."""
     exam = rig.settings.scenario.exam
     half = min(0.05, exam.region_m[0] / 2, exam.region_m[1] / 2)
     X_WA = np.array(exam_input(rig.settings.scenario).X_WA)
-    report.section("before contact")
+    rig.section("before contact")
     vertices, normals, triangles = shapes.mesh(0.12, 0.006)
-    flat = (apply(X_WA, vertices).astype(np.float32).ravel(), (normals @ X_WA[:3, :3].T).astype(np.float32).ravel())
-    rig.send(
-        "perception/surface",
-        SurfaceMesh(header(rig.t, "world"), *flat, triangles.astype(np.uint32).ravel(), np.empty(0, np.float32)),
-    )
+    surface = mesh_message(header(rig.t, "world"), apply(X_WA, vertices), normals @ X_WA[:3, :3].T, triangles)
+    rig.send("perception/surface", surface)
     rig.run(0.2, {})
-    quiet = len(rig.log[SAMPLES]) + len(rig.log[FINDINGS])
-    report.expect("finds nothing before contact", quiet == 0, "no samples, no findings", quiet)
+    rig.equal("finds nothing before contact", len(rig.log[SAMPLES]) + len(rig.log[FINDINGS]), 0)
     play = PlayedScan(X_WA, exam.depth_m, half, rig.t)
     rig.run(play.duration, {"exam/state": play.state})
-    _samples(rig, half, report)
-    _findings(rig, play, report)
+    _samples(rig, half)
+    _findings(rig, play)
 
 
-def _samples(rig: Rig, half: float, report: ConformanceReport) -> None:
-    report.section("samples")
+def _samples(rig: Rig, half: float) -> None:
+    rig.section("samples")
     received = [item.message for item in rig.log[SAMPLES]]
-    if not report.expect("takes samples", len(received) > 20, "many", len(received)):
+    if not rig.expect("takes samples", len(received) > 20, "many", len(received)):
         return
-    p = np.array([(m.position.x, m.position.y, m.position.z) for m in received])
-    off = float(np.max(np.abs(p[:, 2] - shapes.height(p[:, 0], p[:, 1]))))
-    report.expect("on the surface, in the abdomen frame", off < 0.003, "within 3 mm", f"{off * 1e3:.2f} mm")
-    inside = float(np.max(np.abs(p[:, :2]))) <= half + 0.003
-    report.expect(
-        "where the indenter was", inside, f"within {half * 1e3:.0f} mm of the umbilicus", np.abs(p[:, :2]).max(axis=0).round(3)
-    )
-    force = np.array([m.normal_force for m in received])
-    ok = bool(np.all((force > 0.5 * BELLY.force_n) & (force < 1.5 * BELLY.contrast * BELLY.force_n)))
-    report.expect(
-        "with the force that was measured",
-        ok,
-        f"{BELLY.force_n} to {BELLY.contrast * BELLY.force_n} N",
-        f"{force.min():.2f} to {force.max():.2f} N",
-    )
+    p = vectors(m.position for m in received)
+    off = np.max(np.abs(p[:, 2] - shapes.height(p[:, 0], p[:, 1])))
+    rig.below("on the surface, in the abdomen frame", off, 0.003, "mm", 1e3)
+    rig.below("where the indenter was", np.max(np.abs(p[:, :2])), half + 0.003, "mm", 1e3)
+    force = [m.normal_force for m in received]
+    rig.within("with the force that was measured", force, 0.5 * BELLY.force_n, 1.5 * BELLY.contrast * BELLY.force_n, "N")
 
 
-def _findings(rig: Rig, play: PlayedScan, report: ConformanceReport) -> None:
-    report.section("findings")
-    waited = 0.0
-    while not rig.log[FINDINGS] and waited < SCAN.answer_s:
-        rig.run(0.5, {"exam/state": play.state})
-        waited += 0.5
-    final = [item.message for item in rig.log[FINDINGS] if item.message.final]
-    if not report.expect("final findings once", len(final) == 1, 1, len(final)):
+def _findings(rig: Rig, play: PlayedScan) -> None:
+    rig.section("findings")
+    answer = rig.await_message(FINDINGS, SCAN.answer_s, {"exam/state": play.state})
+    final = [item.message for item in answer if item.message.final]
+    if not rig.equal("final findings once", len(final), 1):
         return
     found = final[0].findings
-    report.expect("finds the one stiff area", len(found) == 1, "1 finding", len(found))
+    rig.equal("finds the one stiff area", len(found), 1)
     if found:
         c = found[0].centroid
-        off = float(np.hypot(c.x - BELLY.stiff_at_m[0], c.y - BELLY.stiff_at_m[1]))
-        report.expect("where it is", off < 0.012, "within 12 mm", f"{off * 1e3:.1f} mm")
-        ratio = found[0].ratio
-        report.expect(
-            "stiffer than its surroundings", 1.3 < ratio < 2 * BELLY.contrast, f"up to {BELLY.contrast:g} x", f"{ratio:.2f} x"
-        )
-        band = found[0].ratio_lower <= ratio <= found[0].ratio_upper
-        report.expect(
-            "with a band about its ratio",
-            band,
-            "lower <= ratio <= upper",
-            f"{found[0].ratio_lower:.2f} to {found[0].ratio_upper:.2f}",
-        )
+        rig.below("where it is", np.hypot(c.x - BELLY.stiff_at_m[0], c.y - BELLY.stiff_at_m[1]), 0.012, "mm", 1e3)
+        rig.within("stiffer than its surroundings", found[0].ratio, 1.3, 2 * BELLY.contrast, "x")
+        rig.within("with a band about its ratio", found[0].ratio, found[0].ratio_lower, found[0].ratio_upper, "x")
     last = rig.last(MAP)
-    if report.expect("a map comes with them", last is not None, "assessment/map", "there" if last is not None else "none"):
+    if rig.arrives("a map comes with them", last, "assessment/map"):
         n = len(last.vertices) // 3
         sizes = {n, len(last.apparent), len(last.lower), len(last.upper), len(last.force), len(last.scanned), len(last.finding)}
-        report.expect("one value per vertex", sizes == {n}, n, sorted(sizes))
+        rig.equal("one value per vertex", sizes, {n})
         ordered = bool(np.all(last.lower <= last.apparent)) and bool(np.all(last.apparent <= last.upper))
-        report.expect("bands include their value", ordered, "lower <= apparent <= upper")
+        rig.expect("bands include their value", ordered, "lower <= apparent <= upper")
         scanned, member = np.asarray(last.scanned, dtype=bool), np.asarray(last.finding) >= 0
         rest = float(np.median(last.apparent[scanned & ~member]))
         near = 0.5 * BELLY.force_n < rest < 2 * BELLY.force_n
-        report.expect(
-            "in newtons of the standard press", near, f"about {BELLY.force_n:g} N outside the findings", f"{rest:.2f} N"
-        )
+        rig.expect("in newtons of the standard press", near, f"about {BELLY.force_n:g} N outside the findings", f"{rest:.2f} N")

@@ -1,11 +1,9 @@
 """Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
 
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
 from palpate_bus.contract import MS
@@ -44,94 +42,72 @@ def plane(centre: Array) -> Source:
     return lambda t: level(t, HALF_M, PITCH_M, centre)
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check pose, bursts, format and geometry."""
-    report.section("pose")
+    rig.section("pose")
     centre = np.array(rig.settings.scenario.camera.look_at_m)
     feed = {"sim/surface": plane(centre)}
     silent = rig.run(0.5, feed)
     calibrated = rig.last("tf_static")
     X_WC = None if calibrated is None else pose_of(calibrated)
-    report.expect(
-        "tf_static has the optical frame in world",
-        X_WC is not None,
-        f"world -> {FRAME}",
-        "none" if X_WC is None else X_WC[:3, 3].round(3),
-    )
-    report.section("small images")
-    _small(silent[SMALL_IMAGE], silent[SMALL_INFO], report)
-    report.section("bursts")
-    report.expect("takes no full frame without a request", not silent[IMAGE], "none", len(silent[IMAGE]))
+    rig.arrives("tf_static has the optical frame in world", X_WC, f"world -> {FRAME}")
+    rig.section("small images")
+    _small(rig, silent[SMALL_IMAGE], silent[SMALL_INFO])
+    rig.section("bursts")
+    rig.equal("takes no full frame without a request", len(silent[IMAGE]), 0)
     burst = _burst(rig, feed)
     images, infos = burst[IMAGE], burst[INFO]
-    report.expect("takes as many frames as asked", len(images) == FRAMES, FRAMES, len(images))
-    same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
-    report.expect("intrinsics with every image, of the same stamp", same, f"{len(images)} pairs", f"{len(infos)} camera_info")
+    rig.equal("takes as many frames as asked", len(images), FRAMES)
+    rig.equal("intrinsics with every image, of the same stamp", _stamps(infos), stamps := _stamps(images))
     period = rig.rules.topics[IMAGE].period
-    gaps = [nanoseconds(b.message.header.stamp) - nanoseconds(a.message.header.stamp) for a, b in pairwise(images)]
-    report.expect(
-        "at its rate",
-        all(abs(gap - period) <= rig.slack for gap in gaps),
-        f"{period / MS:.0f} ms apart",
-        [gap / MS for gap in gaps],
-    )
-    again = _burst(rig, feed)[IMAGE]
-    report.expect("a second burst too", len(again) == FRAMES, FRAMES, len(again))
+    rig.below("at its rate", max(abs(np.diff(stamps) - period), default=0), rig.slack + 1, "ms off", 1 / MS)
+    rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), FRAMES)
     if not images or not infos:
         return
-    report.section("images")
-    depth = _format(images[-1], infos[-1], report)
+    rig.section("images")
+    depth = _format(rig, images[-1], infos[-1])
     if depth is not None and X_WC is not None:
-        _geometry(depth, infos[-1].message, X_WC, centre, rig, report)
+        _geometry(rig, depth, infos[-1].message, X_WC, centre)
 
 
-def _small(images: list[ReceivedMessage], infos: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _stamps(received: list[ReceivedMessage]) -> list[int]:
+    return [nanoseconds(item.message.header.stamp) for item in received]
+
+
+def _small(rig: Rig, images: list[ReceivedMessage], infos: list[ReceivedMessage]) -> None:
     """Check the small images, by which perception follows the wall: sent continuously, with their own intrinsics."""
-    if not report.expect("sent without a request", bool(images), "some in half a second", len(images)):
+    if not rig.expect("sent without a request", bool(images), "some in half a second", len(images)):
         return
-    same = [i.message.header.stamp for i in images] == [i.message.header.stamp for i in infos]
-    report.expect("intrinsics with every one, of the same stamp", same, f"{len(images)} pairs", f"{len(infos)} camera_info")
-    width = int(images[-1].message.width)
-    least, most = SMALL_WIDTHS
-    report.expect("are small", least <= width <= most, f"{least} to {most} pixels wide", width)
+    rig.equal("intrinsics with every one, of the same stamp", _stamps(infos), _stamps(images))
+    rig.within("are small", images[-1].message.width, *SMALL_WIDTHS, "pixels wide")
     if infos:
-        _format(images[-1], infos[-1], report)
+        _format(rig, images[-1], infos[-1])
 
 
 def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[ReceivedMessage]]:
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
-    return rig.run(0.1 * FRAMES + 0.5 + rig.slack / 1e9, feed)
+    return rig.run(0.1 * FRAMES + 0.5 + rig.slack_s, feed)
 
 
-def _format(image: ReceivedMessage, info: ReceivedMessage, report: ConformanceReport) -> Array | None:
+def _format(rig: Rig, image: ReceivedMessage, info: ReceivedMessage) -> Array | None:
     m, k = image.message, np.asarray(info.message.k, np.float64).reshape(3, 3)
-    report.expect("encoding", m.encoding == "32FC1" and not m.is_bigendian, "32FC1 [m], little-endian", f"{m.encoding}")
+    rig.expect("encoding", m.encoding == "32FC1" and not m.is_bigendian, "32FC1 [m], little-endian", f"{m.encoding}")
     fits = m.step >= 4 * m.width and len(m.data) == m.step * m.height
-    report.expect("data fits the size", fits, "height x step bytes", f"{len(m.data)} bytes for {m.height} x {m.step}")
-    size = (info.message.height, info.message.width)
-    report.expect("camera_info is of that size", size == (m.height, m.width), (m.height, m.width), size)
+    rig.expect("data fits the size", fits, "height x step bytes", f"{len(m.data)} bytes for {m.height} x {m.step}")
+    rig.equal("camera_info is of that size", (info.message.height, info.message.width), (m.height, m.width))
     good = k[0, 0] > 0 and k[1, 1] > 0 and 0 < k[0, 2] < m.width and 0 < k[1, 2] < m.height and k[2, 2] == 1
-    report.expect(
-        "intrinsics are plausible", bool(good), "positive focal lengths, principal point in the image", k.round(1).tolist()
-    )
+    rig.expect("intrinsics are plausible", bool(good), "focal lengths > 0, principal point in the image", k.round(1).tolist())
     if m.encoding != "32FC1" or not fits:
         return None
     depth = depths(m)
-    valid = depth[np.isfinite(depth)]
-    ok = valid.size > 0 and bool(np.all((valid > 0) & (valid < 20)))
-    report.expect(
-        "depth is in metres, NaN where invalid",
-        ok,
-        "0 to 20 m",
-        f"{valid.size} valid, {valid.min():.3g} to {valid.max():.3g}" if valid.size else "none",
-    )
+    rig.within("depth is in metres, NaN where invalid", depth[np.isfinite(depth)], 1e-3, 20.0, "m")
     return depth
 
 
-def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, report: ConformanceReport) -> None:
+def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> None:
     """Check the depth of the pixels that see the plane."""
     if not rig.settings.motion:
-        report.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")
+        rig.skip("geometry", "a real camera does not see sim/surface; look at a board of known pose")
         return
     k = np.asarray(info.k, np.float64).reshape(3, 3)
     v, u = np.indices(depth.shape)
@@ -140,11 +116,5 @@ def _geometry(depth: Array, info: Any, X_WC: Array, centre: Array, rig: Rig, rep
     hit = X_WC[:3, 3] + rays * expected[..., None]
     on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF_M) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF_M) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
-    seen = error.size / max(int(on.sum()), 1)
-    bias = float(np.median(error)) if error.size else np.inf
-    report.expect(
-        "a level plane is where it is",
-        seen > 0.5 and abs(bias) < TOLERANCE_M,
-        f"within {TOLERANCE_M * 1e3:.0f} mm on most of its pixels",
-        f"median {bias * 1e3:.2f} mm off on {100 * seen:.0f} % of them",
-    )
+    most = error.size > 0.5 * max(int(on.sum()), 1)
+    rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, TOLERANCE_M, "mm off", 1e3)

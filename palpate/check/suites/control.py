@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, sensed
+from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, robot_status, sensed
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus, Twist, Vector3, Wrench
+from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_models.numerics.frames import GRAVITY, Array
@@ -44,9 +43,7 @@ class Played:
         """Return the status of the arm: nothing but the tool loads its F/T sensor."""
         weight_W = np.array((0.0, 0.0, -self.robot.tool_mass_kg * GRAVITY))
         force = tool_pose(self.home, self.robot)[:3, :3].T @ weight_W
-        wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
-        q, qd, torque = sensed(self.home, t), sensed(self.rest, t), sensed(self.rest, t)
-        return RobotStatus(header(t), RobotStatus.MODE_ACTIVE, 0, "", q, qd, wrench, self.rest, 0, "", torque)
+        return robot_status(t, self.home, self.rest, force, self.rest)
 
     def joint_target(self, q: Any, stiffness: float) -> Source:
         """Return the source of a set-point of mode JOINT."""
@@ -72,28 +69,24 @@ class Played:
         return sources
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check signs, limits, expiry and reactions to garbage."""
     arm = Played(rig)
-    report.section("law")
+    rig.section("law")
     idle = rig.run(0.3, arm.feed())[COMMAND]
     wanted = arm.home if arm.positions else arm.rest
-    off = max((float(np.max(np.abs(arm.values(item.message) - wanted))) for item in idle), default=np.inf)
-    report.expect(
-        "without a set-point it commands no torque, or the arm's position",
-        off < 1e-6 or _ceased(idle),
-        f"{wanted.round(2)} {arm.unit}, or expired commands",
-        f"{off:.3g} {arm.unit} off",
-    )
-    _joint_sign(rig, arm, report)
-    _cartesian_sign(rig, arm, report)
-    _limits(rig, arm, report)
-    report.section("expiry")
-    _expiry(rig, arm, report)
-    report.section("garbage")
-    _garbage(rig, arm, report)
-    report.section("silence")
-    _silence(rig, arm, report)
+    off = max((np.max(np.abs(arm.values(item.message) - wanted)) for item in idle), default=np.inf)
+    name = "without a set-point it commands no torque, or the arm's position"
+    rig.below(name, 0.0 if _ceased(idle) else off, 1e-6, f"{arm.unit} off")
+    _joint_sign(rig, arm)
+    _cartesian_sign(rig, arm)
+    _limits(rig, arm)
+    rig.section("expiry")
+    _expiry(rig, arm)
+    rig.section("garbage")
+    _garbage(rig, arm)
+    rig.section("silence")
+    _silence(rig, arm)
 
 
 def _ceased(received: list[ReceivedMessage]) -> bool:
@@ -107,7 +100,7 @@ def _command(rig: Rig, arm: Played, sources: Feed, seconds: float = 0.3) -> Arra
     return np.mean([arm.values(item.message) for item in received], axis=0) if received else np.full_like(arm.rest, np.nan)
 
 
-def _joint_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+def _joint_sign(rig: Rig, arm: Played) -> None:
     wrong = []
     for joint, name in enumerate(arm.arm.joint_names):
         target = arm.home.copy()
@@ -116,15 +109,12 @@ def _joint_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
         off = np.abs(command - (target if arm.positions else 100.0 * (target - arm.home)))
         if not np.all(off < (0.005 if arm.positions else 1.0)):
             wrong.append(f"{name}: {command.round(2)}")
-    report.expect(
-        "mode JOINT: stiffness times offset on that joint alone, or the position",
-        not wrong,
-        "the position" if arm.positions else "+5 N m for +0.05 rad at 100 N m/rad",
-        "; ".join(wrong) or "all joints",
-    )
+    wanted = "the position" if arm.positions else "+5 N m for +0.05 rad at 100 N m/rad"
+    name = "mode JOINT: stiffness times offset on that joint alone, or the position"
+    rig.expect(name, not wrong, wanted, "; ".join(wrong) or "all joints")
 
 
-def _cartesian_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+def _cartesian_sign(rig: Rig, arm: Played) -> None:
     X_WI = tool_pose(arm.home, arm.robot)
     J = tool_jacobian(arm.home, arm.robot)
     wrong = []
@@ -139,45 +129,37 @@ def _cartesian_sign(rig: Rig, arm: Played, report: ConformanceReport) -> None:
             allowed = 0.15 * float(np.linalg.norm(wanted))
         if not np.linalg.norm(got - wanted) < allowed:
             wrong.append(f"{name}: {got.round(3)}, not {wanted.round(3)}")
-    report.expect(
-        "mode CARTESIAN: the torques of stiffness times offset, J^T F, or the positions of the pose",
-        not wrong,
-        "the pose, within 1 mm" if arm.positions else "10 N for 10 mm at 1000 N/m, within 15 %",
-        "; ".join(wrong) or "x, y and z",
-    )
+    expected = "the pose, within 1 mm" if arm.positions else "10 N for 10 mm at 1000 N/m, within 15 %"
+    name = "mode CARTESIAN: the torques of stiffness times offset, J^T F, or the positions of the pose"
+    rig.expect(name, not wrong, expected, "; ".join(wrong) or "x, y and z")
 
 
-def _limits(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+def _limits(rig: Rig, arm: Played) -> None:
     rig.run(0.6, arm.feed(arm.joint_target(arm.home + np.where(arm.home > arm.arm.middle_rad, -1.0, 1.0), 2000.0)))
     rig.run(0.6, arm.feed(arm.joint_target(arm.home, 100.0)))
     values = np.array([arm.values(item.message) for item in rig.log[COMMAND]])
-    if arm.positions:
-        ok = bool(np.all((values >= arm.arm.lower_rad) & (values <= arm.arm.upper_rad)))
-        report.expect(
-            "positions stay within the joints' limits for any set-point", ok, "the arm's", np.abs(values).max(axis=0).round(2)
-        )
-        return
-    worst, limit = np.max(np.abs(values), axis=0), arm.arm.torque_nm
-    ok = bool(np.all(worst <= limit))
-    report.expect("torques stay within the joints' limits for any set-point", ok, f"{limit} N m", worst.round(1))
+    worst, torque = np.max(np.abs(values), axis=0).round(2), arm.arm.torque_nm
+    low, high = (arm.arm.lower_rad, arm.arm.upper_rad) if arm.positions else (-torque, torque)
+    inside = bool(np.all((values >= low) & (values <= high)))
+    rig.expect("commands stay within the joints' limits for any set-point", inside, f"{low} to {high} {arm.unit}", worst)
 
 
-def _expiry(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+def _expiry(rig: Rig, arm: Played) -> None:
     rig.run(0.3, arm.feed(arm.joint_target(arm.home, 100.0)))
     ended = rig.t
-    received = rig.run(0.6 + rig.slack / 1e9, arm.feed())[COMMAND]
+    received = rig.run(0.6 + rig.slack_s, arm.feed())[COMMAND]
     expired = next((item.t - ended for item in received if nanoseconds(item.message.valid_for) == 0), None)
     limit = VALID + 12 * MS + rig.slack
     silent = received[-1].t - ended if received else 0
     ok = (expired is not None and expired <= limit and _ceased(received)) or (expired is None and silent <= limit)
     got = f"after {expired / MS:.0f} ms" if expired is not None else f"last command after {silent / MS:.0f} ms"
-    report.expect("stops commanding when set-points cease", ok, f"expired commands or none within {limit / MS:.0f} ms", got)
+    rig.expect("stops commanding when set-points cease", ok, f"expired commands or none within {limit / MS:.0f} ms", got)
     command = _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
     ok = not _ceased(rig.log[COMMAND]) and bool(np.all(np.isfinite(command)))
-    report.expect("commands again on a new set-point", ok, "valid commands", f"{command.round(2)} {arm.unit}")
+    rig.expect("commands again on a new set-point", ok, "valid commands", f"{command.round(2)} {arm.unit}")
 
 
-def _garbage(rig: Rig, arm: Played, report: ConformanceReport) -> None:
+def _garbage(rig: Rig, arm: Played) -> None:
     target = arm.home.copy()
     target[0] += 0.05
     good = arm.joint_target(target, 100.0)
@@ -185,32 +167,28 @@ def _garbage(rig: Rig, arm: Played, report: ConformanceReport) -> None:
     nothing = np.full_like(arm.rest, np.nan)
     received = rig.run(0.2, arm.feed(arm.joint_target(nothing, 100.0)))[COMMAND]
     finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
-    got = "as expected" if finite else "NaN"
-    report.expect("a set-point that is not a number makes no such command", finite, "finite commands", got)
+    rig.expect("a set-point that is not a number makes no such command", finite, "finite commands")
     still = float(np.max(np.abs(arm.values(received[-1].message) - before))) if received else np.inf
     calm = still < (0.01 if arm.positions else 1.0) or _ceased(received)
-    report.expect(
-        "and is not followed", calm, "the command of the last good set-point, or expired ones", f"{still:.2f} {arm.unit} off"
-    )
-    received = rig.run(0.3 + rig.slack / 1e9, arm.feed(good, arm.joints(nothing)))[COMMAND]
+    rig.expect("and is not followed", calm, "the last good set-point's command, or expired ones", f"{still:.2f} {arm.unit} off")
+    received = rig.run(0.3 + rig.slack_s, arm.feed(good, arm.joints(nothing)))[COMMAND]
     finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
-    report.expect(
-        "joint states that are not numbers: it ceases",
-        finite and _ceased(received),
-        "expired commands or none",
-        _last(arm, received),
-    )
+    _ceases(rig, arm, "joint states that are not numbers", received, finite)
     wrong = tuple(reversed(arm.arm.joint_names))
-    received = rig.run(0.3 + rig.slack / 1e9, arm.feed(good, arm.joints(names=wrong)))[COMMAND]
-    report.expect("joint states in another order: it ceases", _ceased(received), "expired commands or none", _last(arm, received))
+    received = rig.run(0.3 + rig.slack_s, arm.feed(good, arm.joints(names=wrong)))[COMMAND]
+    _ceases(rig, arm, "joint states in another order", received)
     _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
     received = rig.log[COMMAND]
-    report.expect("and recovers with good ones", not _ceased(received), "valid commands", _last(arm, received))
+    rig.expect("and recovers with good ones", not _ceased(received), "valid commands", _last(arm, received))
 
 
-def _silence(rig: Rig, arm: Played, report: ConformanceReport) -> None:
-    received = rig.run(0.4 + rig.slack / 1e9, {"planning/setpoint": arm.joint_target(arm.home, 100.0)})[COMMAND]
-    report.expect("no joint states: it ceases", _ceased(received), "expired commands or none", _last(arm, received))
+def _silence(rig: Rig, arm: Played) -> None:
+    received = rig.run(0.4 + rig.slack_s, {"planning/setpoint": arm.joint_target(arm.home, 100.0)})[COMMAND]
+    _ceases(rig, arm, "no joint states", received)
+
+
+def _ceases(rig: Rig, arm: Played, when: str, received: list[ReceivedMessage], finite: bool = True) -> None:
+    rig.expect(f"{when}: it ceases", finite and _ceased(received), "expired commands or none", _last(arm, received))
 
 
 def _last(arm: Played, received: list[ReceivedMessage]) -> str:

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import ConformanceReport
-from palpate.check.rig import Feed, ReceivedMessage, Rig, sensed
+from palpate.check.rig import Feed, ReceivedMessage, Rig, robot_status
 from palpate_bus.contract import MS
-from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus, Vector3, Wrench
+from palpate_bus.messages import ExamState, ImpedanceSetpoint, OperatorRequest, RobotStatus
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
@@ -36,110 +35,70 @@ class PerfectFollower:
         velocity = np.zeros_like(self.q)
         if setpoint is not None and setpoint.mode == ImpedanceSetpoint.MODE_JOINT and self.mode == RobotStatus.MODE_ACTIVE:
             self.q, velocity = np.array(setpoint.joint_position), np.array(setpoint.joint_velocity)
-        weight = Wrench(Vector3(*sensed((0.0, 0.0, WEIGHT_N), t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
         cause = RobotStatus.CAUSE_STOP_REQUESTED if self.mode == RobotStatus.MODE_SAFE_HOLD else RobotStatus.CAUSE_NONE
         reason = "conformance check" if cause else ""
-        return RobotStatus(
-            header(t),
-            self.mode,
-            cause,
-            reason,
-            sensed(self.q, t),
-            sensed(velocity, t),
-            weight,
-            np.zeros_like(self.q),
-            0,
-            "",
-            sensed(np.zeros_like(self.q), t),
-        )
+        return robot_status(t, self.q, velocity, (0.0, 0.0, WEIGHT_N), np.zeros_like(self.q), self.mode, cause, reason)
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check set-points, the phases up to the first camera burst, and a stop."""
-    report.section("set-points")
+    rig.section("set-points")
     arm = PerfectFollower(rig)
     rig.run(0.5, arm.feed())
     received = rig.log[SETPOINT]
-    if not report.expect("set-points come", bool(received), "100 Hz", len(received)):
+    if not rig.expect("set-points come", bool(received), "100 Hz", len(received)):
         return
-    _first(arm.arm, received, report)
-    report.section("examination")
-    waited = 0.0
-    while not rig.log["planning/camera_trigger"] and waited < AWAIT_S:
-        rig.run(0.5, arm.feed())
-        waited += 0.5
-    triggers = rig.log["planning/camera_trigger"]
-    report.expect(
-        "asks for depth frames",
-        bool(triggers),
-        f"a camera_trigger within {AWAIT_S:.0f} s",
-        f"{len(triggers)} after {waited:.1f} s",
-    )
-    wanted = rig.settings.scenario.camera.frames
-    if triggers:
-        report.expect("as many as in the scenario", triggers[0].message.frames == wanted, wanted, triggers[0].message.frames)
-    _safe(arm.arm, rig.log[SETPOINT], report)
-    _phases(rig.log[STATE], report)
-    report.section("stop")
+    _first(rig, arm.arm, received)
+    rig.section("examination")
+    triggers = rig.await_message("planning/camera_trigger", AWAIT_S, arm.feed())
+    if rig.arrives("asks for depth frames", triggers, f"a camera_trigger within {AWAIT_S:.0f} s"):
+        rig.equal("as many as in the scenario", triggers[0].message.frames, rig.settings.scenario.camera.frames)
+    _safe(rig, arm.arm, rig.log[SETPOINT])
+    _phases(rig, rig.log[STATE])
+    rig.section("stop")
     arm.mode = RobotStatus.MODE_SAFE_HOLD
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
     after = rig.run(1.0, arm.feed())
-    held = {getattr(ExamState, name) for name in ("PHASE_ABORTED", "PHASE_HELD") if hasattr(ExamState, name)}
     state = rig.last(STATE)
-    ok = state is not None and int(state.phase) in held and bool(state.message)
-    report.expect(
-        "an operator's stop ends or holds the examination, with the reason",
-        ok,
-        "aborted or held",
-        "no state" if state is None else f"phase {state.phase}: {state.message}",
-    )
+    ok = state is not None and state.phase in (ExamState.PHASE_ABORTED, ExamState.PHASE_HELD) and bool(state.message)
+    got = "no state" if state is None else f"phase {state.phase}: {state.message}"
+    rig.expect("an operator's stop ends or holds the examination, with the reason", ok, "aborted or held", got)
     q = np.array([item.message.joint_position for item in after[SETPOINT][20:]])
-    moved = float(np.max(np.abs(q - q[0]))) if len(q) else 0.0
-    report.expect("and its set-points stand still", moved < 0.05, "below 0.05 rad in a second", f"{moved:.3f} rad")
-    report.section("silence")
+    rig.below("and its set-points stand still", np.max(np.abs(q - q[0])) if len(q) else 0.0, 0.05, "rad in a second")
+    rig.section("silence")
     quiet = rig.run(0.5, {})
-    report.expect("continues without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
+    rig.expect("continues without robot/status", len(quiet[STATE]) > 0, "exam/state at its rate", len(quiet[STATE]))
 
 
-def _first(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _first(rig: Rig, arm: Arm, received: list[ReceivedMessage]) -> None:
     """Check that the first set-point is at the arm's position."""
     message = received[0].message
     if message.mode == ImpedanceSetpoint.MODE_JOINT:
-        off = float(np.max(np.abs(np.asarray(message.joint_position) - arm.home_rad)))
-        report.expect("the first set-point is where the arm is", off < 0.02, "within 0.02 rad", f"{off:.4f} rad")
+        off = np.max(np.abs(np.asarray(message.joint_position) - arm.home_rad))
+        rig.below("the first set-point is where the arm is", off, 0.02, "rad off")
     else:
-        report.skip("the first set-point is where the arm is", "it is not of mode JOINT")
+        rig.skip("the first set-point is where the arm is", "it is not of mode JOINT")
 
 
-def _safe(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _safe(rig: Rig, arm: Arm, received: list[ReceivedMessage]) -> None:
     joint = [item.message for item in received if item.message.mode == ImpedanceSetpoint.MODE_JOINT]
     q = np.array([m.joint_position for m in joint])
     t = np.array([nanoseconds(m.header.stamp) / 1e9 for m in joint])
     inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
-    report.expect("joint targets stay within the limits", inside, "the arm's", np.abs(q).max(axis=0).round(2))
+    rig.expect("joint targets stay within the limits", inside, "the arm's", np.abs(q).max(axis=0).round(2))
     speed: Array = np.abs(np.diff(q, axis=0)) / np.maximum(np.diff(t), 1e-3)[:, None]
     worst = speed.max(axis=0) if len(speed) else np.zeros(arm.joints)
-    report.expect(
-        "and move no faster than the joints can",
-        bool(np.all(worst <= arm.velocity_radps)),
-        arm.velocity_radps.round(2),
-        worst.round(2),
-    )
-    valid = [nanoseconds(item.message.valid_for) for item in received]
-    ok = all(0 < value <= 250 * MS for value in valid)
-    report.expect("every set-point expires", ok, "0 to 250 ms", f"{min(valid) / MS:.0f} to {max(valid) / MS:.0f} ms")
+    slow = bool(np.all(worst <= arm.velocity_radps))
+    rig.expect("and move no faster than the joints can", slow, arm.velocity_radps.round(2), worst.round(2))
+    rig.within("every set-point expires", [nanoseconds(item.message.valid_for) / MS for item in received], 1e-6, 250, "ms")
     cartesian = [item.message for item in received if item.message.mode == ImpedanceSetpoint.MODE_CARTESIAN]
-    unit = max((abs(_norm(m.pose.orientation) - 1) for m in cartesian), default=0.0)
-    report.expect("orientations are unit quaternions", unit < 1e-3, "length 1", f"{unit:.2g} off")
+    quaternions = [m.pose.orientation for m in cartesian]
+    off = max((abs(np.linalg.norm((q.x, q.y, q.z, q.w)) - 1) for q in quaternions), default=0.0)
+    rig.below("orientations are unit quaternions", off, 1e-3, "off a length of 1")
 
 
-def _norm(q: Any) -> float:
-    return float(np.sqrt(q.x**2 + q.y**2 + q.z**2 + q.w**2))
-
-
-def _phases(received: list[ReceivedMessage], report: ConformanceReport) -> None:
+def _phases(rig: Rig, received: list[ReceivedMessage]) -> None:
     phases = list(dict.fromkeys(int(item.message.phase) for item in received))
     ok = phases == sorted(phases) and phases[-1] <= ExamState.PHASE_PLAN
-    report.expect("phases follow their order", ok, "HOME, LOOK, PLAN", phases)
-    undecided = all(item.message.end_tick < 0 for item in received)
-    report.expect("no end is announced yet", undecided, "end_tick -1", "as expected" if undecided else "decided")
+    rig.expect("phases follow their order", ok, "HOME, LOOK, PLAN", phases)
+    rig.expect("no end is announced yet", all(item.message.end_tick < 0 for item in received), "end_tick -1")

@@ -4,12 +4,11 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
 from palpate_bus.contract import MS
 from palpate_bus.messages import JointTorqueCommand, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench, WrenchStamped
-from palpate_bus.messages.geometry import rotation
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages.geometry import rotation, vectors
+from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.chain import Arm
@@ -24,6 +23,7 @@ PUSH_S = 0.06
 MOVED_RAD = 2e-4
 DRIFT_RAD = 0.05
 PRESS_N = 10.0
+CEASED = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
 
 
 def quiet(rig: Rig, level: int = SupervisorState.LEVEL_OK) -> dict[str, Source]:
@@ -61,91 +61,75 @@ def commanding(rig: Rig, push: Any, level: int = SupervisorState.LEVEL_OK) -> Fe
     return {**quiet(rig, level), COMMAND: lambda t: JointTorqueCommand(header(t), torque, position, valid, "", "")}
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check signs, gravity, holds, latches and limits."""
-    report.section("joints")
+    rig.section("joints")
     rest = rig.run(0.5, quiet(rig))
-    _joints(_arm(rig), rest["joint_states"], report)
-    report.expect("starts idle, without a command", _mode(rig) == RobotStatus.MODE_IDLE, "MODE_IDLE", _mode_name(rig))
-    _description(rig, report)
+    _joints(rig, _arm(rig), rest["joint_states"])
+    _expect_mode(rig, "starts idle, without a command", RobotStatus.MODE_IDLE)
+    _description(rig)
     if not rig.settings.motion:
-        report.section("commands")
-        report.skip("signs, expiry, limits, holds", "they move the arm; allow it with --motion")
+        rig.section("commands")
+        rig.skip("signs, expiry, limits, holds", "they move the arm; allow it with --motion")
         return
-    report.section("commands")
-    _gravity(rig, report)
-    _signs(rig, report)
-    report.section("safe hold")
-    _expiry(rig, report)
-    _invalid(rig, report)
-    _stop(rig, report)
-    _emergency(rig, report)
-    report.section("sensor")
-    _force(rig, report)
-    _twist(rig, report)
-    report.section("safe hold")
-    _lost(rig, report)
-    _limits(rig, report)
+    rig.section("commands")
+    _gravity(rig)
+    _signs(rig)
+    rig.section("safe hold")
+    _expiry(rig)
+    _invalid(rig)
+    _stop(rig)
+    _emergency(rig)
+    rig.section("sensor")
+    _force(rig)
+    _twist(rig)
+    rig.section("safe hold")
+    _lost(rig)
+    _limits(rig)
 
 
-def _mode(rig: Rig) -> int:
+MODES = {RobotStatus.MODE_IDLE: "MODE_IDLE", RobotStatus.MODE_ACTIVE: "MODE_ACTIVE", RobotStatus.MODE_SAFE_HOLD: "MODE_SAFE_HOLD"}
+
+
+def _expect_mode(rig: Rig, name: str, mode: int) -> None:
+    """Expect the newest status to have a mode."""
     status = rig.last("robot/status")
-    return -1 if status is None else int(status.mode)
+    got = "no robot/status" if status is None else f"{MODES.get(status.mode)}, cause {status.cause}: {status.reason}"
+    rig.expect(name, status is not None and status.mode == mode, MODES[mode], got)
 
 
-def _mode_name(rig: Rig) -> str:
-    status = rig.last("robot/status")
-    names = {0: "MODE_IDLE", 1: "MODE_ACTIVE", 2: "MODE_SAFE_HOLD"}
-    return (
-        "no robot/status"
-        if status is None
-        else f"{names.get(int(status.mode), status.mode)}, cause {status.cause}: {status.reason}"
-    )
-
-
-def _joints(arm: Arm, received: list[ReceivedMessage], report: ConformanceReport) -> None:
-    if not report.expect("joint_states come", len(received) > 0, "messages", f"{len(received)}"):
+def _joints(rig: Rig, arm: Arm, received: list[ReceivedMessage]) -> None:
+    if not rig.arrives("joint_states come", received, "messages"):
         return
     last = received[-1].message
-    names = list(last.name)
-    report.expect("joint names, in order", names == list(arm.joint_names), ", ".join(arm.joint_names), ", ".join(names))
+    rig.equal("joint names, in order", tuple(last.name), tuple(arm.joint_names))
     shapes = [np.shape(values) for values in (last.position, last.velocity, last.effort)]
     n = arm.joints
-    report.expect("a position, velocity and effort of each joint", shapes == [(n,)] * 3, f"3 x ({n},)", shapes)
+    rig.equal("a position, velocity and effort of each joint", shapes, [(n,)] * 3)
     q = np.array([item.message.position for item in received if np.shape(item.message.position) == (n,)])
     inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
     limits = f"{np.rad2deg(arm.lower_rad).round()} to {np.rad2deg(arm.upper_rad).round()} deg"
-    report.expect("joints within their limits", inside, limits, np.rad2deg(q[-1]).round(1))
-    drift = float(np.max(np.abs(q[-1] - q[0])))
-    report.expect("holds still without commands", drift < DRIFT_RAD, f"drift below {DRIFT_RAD} rad in 0.5 s", f"{drift:.4f} rad")
+    rig.expect("joints within their limits", inside, limits, np.rad2deg(q[-1]).round(1))
+    rig.below("holds still without commands", np.max(np.abs(q[-1] - q[0])), DRIFT_RAD, "rad in 0.5 s")
 
 
-def _description(rig: Rig, report: ConformanceReport) -> None:
+def _description(rig: Rig) -> None:
     described = rig.last("robot_description")
     text = "" if described is None else str(described.data)
     missing = [name for name in (*_arm(rig).joint_names, "indenter") if f'name="{name}"' not in text]
-    report.expect(
-        "robot_description is a URDF of the arm and tool",
-        "<robot" in text and not missing,
-        "all joints, link indenter",
-        "as expected" if not missing else f"without {', '.join(missing)}",
-    )
+    got = f"without {', '.join(missing)}" if missing else None
+    rig.expect("robot_description is a URDF of the arm and tool", "<robot" in text and not missing, "all joints, indenter", got)
 
 
-def _gravity(rig: Rig, report: ConformanceReport) -> None:
+def _gravity(rig: Rig) -> None:
     """Check that commands exclude gravity: with zero torque, or at its position, the arm stays where it is."""
     moved = rig.run(0.4, commanding(rig, _still(rig)))["joint_states"]
-    report.expect("obeys commands", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
-    drift = float(np.max(np.abs(moved[-1].message.position - moved[0].message.position))) if moved else np.inf
-    report.expect(
-        "stays where it is when commanded nothing else: commands exclude gravity",
-        drift < DRIFT_RAD,
-        f"drift below {DRIFT_RAD} rad in 0.4 s",
-        f"{drift:.4f} rad",
-    )
+    _expect_mode(rig, "obeys commands", RobotStatus.MODE_ACTIVE)
+    drift = np.max(np.abs(moved[-1].message.position - moved[0].message.position)) if moved else np.inf
+    rig.below("stays where it is when commanded nothing else: commands exclude gravity", drift, DRIFT_RAD, "rad in 0.4 s")
 
 
-def _signs(rig: Rig, report: ConformanceReport) -> None:
+def _signs(rig: Rig) -> None:
     """Check that a positive command moves its joint positively and that its torque is reported with that sign."""
     wrong, unreported = [], []
     settle(rig)
@@ -162,11 +146,11 @@ def _signs(rig: Rig, report: ConformanceReport) -> None:
         if not any(abs(item.message.effort[joint] - push[joint]) < 0.2 * push[joint] for item in received):
             unreported.append(name)
     got = f"not {', '.join(wrong)}" if wrong else "all of them"
-    report.expect("a positive command moves its joint positively", not wrong, "all joints", got)
+    rig.expect("a positive command moves its joint positively", not wrong, "all joints", got)
     if _positions(rig):
         return
     got = f"not {', '.join(unreported)}" if unreported else "all of them"
-    report.expect("effort reports the applied torque", not unreported, "within 20 % of the command", got)
+    rig.expect("effort reports the applied torque", not unreported, "within 20 % of the command", got)
 
 
 def settle(rig: Rig) -> None:
@@ -178,92 +162,72 @@ def release(rig: Rig) -> None:
     """Send a release, as the supervisor grants it."""
     rig.run(0.02, quiet(rig))
     rig.memory["releases"] = rig.memory.get("releases", 0) + 1
-    rig.run(0.05 + rig.slack / 1e9, quiet(rig))
+    rig.run(0.05 + rig.slack_s, quiet(rig))
 
 
 def _activate(rig: Rig) -> None:
     release(rig)
-    rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig)))
+    rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig)))
 
 
-def _holds(rig: Rig, received: list[ReceivedMessage]) -> ReceivedMessage | None:
+def _hold(received: list[ReceivedMessage]) -> ReceivedMessage | None:
     return next((item for item in received if item.message.mode == RobotStatus.MODE_SAFE_HOLD), None)
 
 
-def _how(hold: ReceivedMessage | None) -> str:
-    return "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+def _expect_hold(rig: Rig, name: str, received: list[ReceivedMessage], *causes: int) -> None:
+    """Expect a safe hold among the statuses, for one of the causes if there are any, with a reason."""
+    hold = _hold(received)
+    got = "no hold" if hold is None else f"cause {hold.message.cause}: {hold.message.reason}"
+    ok = hold is not None and (not causes or hold.message.cause in causes) and bool(hold.message.reason)
+    rig.expect(name, ok, f"MODE_SAFE_HOLD{', cause ' if causes else ''}{' or '.join(map(str, causes))}, a reason", got)
 
 
-def _expiry(rig: Rig, report: ConformanceReport) -> None:
+def _expiry(rig: Rig) -> None:
     _activate(rig)
-    report.expect("a release and a command make it active", _mode(rig) == RobotStatus.MODE_ACTIVE, "MODE_ACTIVE", _mode_name(rig))
+    _expect_mode(rig, "a release and a command make it active", RobotStatus.MODE_ACTIVE)
     ended = rig.t
-    received = rig.run(0.5 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, received)
+    received = rig.run(0.5 + rig.slack_s, quiet(rig))["robot/status"]
+    hold = _hold(received)
     expiry = rig.rules.topics[COMMAND].expiry_ms or 0
-    limit = (expiry + rig.rules.topics["robot/status"].period_ms + 2) * MS + rig.slack
-    late = None if hold is None else hold.t - ended
-    report.expect(
-        "holds safely when commands cease",
-        late is not None and late <= limit,
-        f"MODE_SAFE_HOLD within {limit / MS:.0f} ms",
-        "no hold" if late is None else f"after {late / MS:.0f} ms",
-    )
-    cause = -1 if hold is None else int(hold.message.cause)
-    causes = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
-    report.expect(
-        "and states the reason",
-        cause in causes and bool(hold and hold.message.reason),
-        "CAUSE_COMMAND_EXPIRED with a reason",
-        _mode_name(rig),
-    )
-    v = np.abs(rig.last("joint_states").velocity).max()
-    report.expect("and comes to rest", v < 0.1, "below 0.1 rad/s", f"{v:.3f} rad/s")
+    limit = (expiry + rig.rules.topics["robot/status"].period_ms + 3) * MS + rig.slack
+    rig.below("holds safely when commands cease", np.inf if hold is None else hold.t - ended, limit, "ms", 1 / MS)
+    _expect_hold(rig, "and states the reason", received, *CEASED)
+    rig.below("and comes to rest", np.abs(rig.last("joint_states").velocity).max(), 0.1, "rad/s")
     rig.run(0.3, commanding(rig, _still(rig)))
-    latched = _mode(rig) == RobotStatus.MODE_SAFE_HOLD
-    report.expect("the hold is latched: new commands do not end it", latched, "MODE_SAFE_HOLD", _mode_name(rig))
+    _expect_mode(rig, "the hold is latched: new commands do not end it", RobotStatus.MODE_SAFE_HOLD)
 
 
-def _provoke(rig: Rig, report: ConformanceReport, what: str, push: Any, cause: int) -> None:
+def _provoke(rig: Rig, what: str, push: Any, cause: int) -> None:
     _activate(rig)
     received = rig.run(0.1, commanding(rig, push))["robot/status"]
-    received += rig.run(0.05 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, received)
-    got = _how(hold)
-    report.expect(
-        f"{what} makes it hold", hold is not None and hold.message.cause == cause, f"MODE_SAFE_HOLD, cause {cause}", got
-    )
+    received += rig.run(0.05 + rig.slack_s, quiet(rig))["robot/status"]
+    _expect_hold(rig, f"{what} makes it hold", received, cause)
 
 
-def _invalid(rig: Rig, report: ConformanceReport) -> None:
+def _invalid(rig: Rig) -> None:
     bad = _still(rig)
     bad[3] = np.nan
-    _provoke(rig, report, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
+    _provoke(rig, "a command that is not a number", bad, RobotStatus.CAUSE_INVALID_COMMAND)
     huge = _still(rig)
     if _positions(rig):
         huge[0] = 1.0
-        _provoke(rig, report, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND)
+        _provoke(rig, "a jump of a position", huge, RobotStatus.CAUSE_INVALID_COMMAND)
         return
     huge[0] = 10 * _arm(rig).torque_nm[0]
-    _provoke(rig, report, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
+    _provoke(rig, "a torque beyond its limit", huge, RobotStatus.CAUSE_TORQUE_LIMIT)
 
 
-def _stop(rig: Rig, report: ConformanceReport) -> None:
+def _stop(rig: Rig) -> None:
     _activate(rig)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
-    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig)))["robot/status"]
-    hold = _holds(rig, received)
-    got = _how(hold)
-    ok = hold is not None and hold.message.cause == RobotStatus.CAUSE_STOP_REQUESTED
-    report.expect("an operator's stop makes it hold", ok, "MODE_SAFE_HOLD, CAUSE_STOP_REQUESTED", got)
+    received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig)))["robot/status"]
+    _expect_hold(rig, "an operator's stop makes it hold", received, RobotStatus.CAUSE_STOP_REQUESTED)
 
 
-def _emergency(rig: Rig, report: ConformanceReport) -> None:
+def _emergency(rig: Rig) -> None:
     _activate(rig)
-    received = rig.run(0.1 + rig.slack / 1e9, commanding(rig, _still(rig), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
-    hold = _holds(rig, received)
-    got = _how(hold)
-    report.expect("the supervisor's emergency stop makes it hold", hold is not None, "MODE_SAFE_HOLD", got)
+    received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
+    _expect_hold(rig, "the supervisor's emergency stop makes it hold", received)
 
 
 def _pressing(rig: Rig, force_W: Any) -> Feed:
@@ -271,10 +235,10 @@ def _pressing(rig: Rig, force_W: Any) -> Feed:
     return {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
 
 
-def _force(rig: Rig, report: ConformanceReport) -> None:
+def _force(rig: Rig) -> None:
     """Check the sign of `ft/wrench`, the wrench of tool and environment on the sensor in its axes."""
     if not rig.log["sim/tool_state"]:
-        report.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
+        rig.skip("the F/T sensor's sign", "no sim/tool_state: no simulated arm; press the tool by hand and look at ft/wrench")
         return
     _activate(rig)
     rig.run(0.4, quiet(rig))
@@ -282,63 +246,43 @@ def _force(rig: Rig, report: ConformanceReport) -> None:
     force_W = np.array([0.0, 0.0, PRESS_N])
     pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
     R_WI = rotation(rig.last("sim/tool_state").pose.orientation)
-    expected = R_WI.T @ force_W
-    got = pressed - before
+    off = np.linalg.norm(pressed - before - R_WI.T @ force_W)
     rig.run(0.3, quiet(rig))
-    ok = bool(np.linalg.norm(got - expected) < 0.3 * PRESS_N)
-    report.expect(
-        "ft/wrench shows a push of 10 N with its sign", ok, f"{expected.round(1)} N in the sensor's axes", f"{got.round(1)} N"
-    )
+    rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * PRESS_N, "N off in the sensor's axes")
 
 
-def _mean_force(received: list[ReceivedMessage]) -> np.ndarray[Any, Any]:
-    forces = [item.message.wrench.force for item in received]
-    return np.mean([(f.x, f.y, f.z) for f in forces], axis=0) if forces else np.full(3, np.nan)
+def _mean_force(received: list[ReceivedMessage]) -> Array:
+    return vectors(item.message.wrench.force for item in received).mean(axis=0) if received else np.full(3, np.nan)
 
 
-def _twist(rig: Rig, report: ConformanceReport) -> None:
+def _twist(rig: Rig) -> None:
     """Check that the twist is the pose's rate of change, over the whole suite."""
     states = [item.message for item in rig.log["sim/tool_state"]]
     if not states:
-        report.skip("sim/tool_state: twist", "not simulated")
+        rig.skip("sim/tool_state: twist", "not simulated")
         return
-    t = np.array([m.header.stamp.sec + 1e-9 * m.header.stamp.nanosec for m in states])
-    p = np.array([(m.pose.position.x, m.pose.position.y, m.pose.position.z) for m in states])
-    v = np.array([(m.twist.linear.x, m.twist.linear.y, m.twist.linear.z) for m in states])
+    t = np.array([nanoseconds(m.header.stamp) / 1e9 for m in states])
+    p, v = vectors(m.pose.position for m in states), vectors(m.twist.linear for m in states)
     dt = t[2:] - t[:-2]
     steady = (dt > 0) & (dt < 0.0025)  # neighbouring ticks only; a live check has pauses
     error = np.linalg.norm((p[2:] - p[:-2])[steady] / dt[steady, None] - v[1:-1][steady], axis=1)
     worst, speed = float(np.quantile(error, 0.99)), float(np.max(np.linalg.norm(v, axis=1)))
-    report.expect(
-        "sim/tool_state: twist is the rate of the pose",
-        worst < 0.02 + 0.05 * speed,
-        f"within {0.02 + 0.05 * speed:.3f} m/s",
-        f"{worst:.4f} m/s",
-    )
+    rig.below("sim/tool_state: twist is the rate of the pose", worst, 0.02 + 0.05 * speed, "m/s off")
 
 
-def _lost(rig: Rig, report: ConformanceReport) -> None:
+def _lost(rig: Rig) -> None:
     _activate(rig)
     rig.lose("control")
-    received = rig.run(0.1 + rig.slack / 1e9, quiet(rig))["robot/status"]
-    hold = _holds(rig, received)
-    got = _how(hold)
-    causes = (RobotStatus.CAUSE_COMMANDER_LOST, RobotStatus.CAUSE_COMMAND_EXPIRED)
-    report.expect("the loss of control makes it hold", hold is not None and hold.message.cause in causes, "MODE_SAFE_HOLD", got)
+    received = rig.run(0.1 + rig.slack_s, quiet(rig))["robot/status"]
+    _expect_hold(rig, "the loss of control makes it hold", received, *CEASED)
 
 
-def _limits(rig: Rig, report: ConformanceReport) -> None:
+def _limits(rig: Rig) -> None:
     """Check the limits over the whole suite."""
-    arm, states = (
-        _arm(rig),
-        [item.message for item in rig.log["joint_states"] if np.shape(item.message.effort) == (_arm(rig).joints,)],
-    )
+    arm = _arm(rig)
+    states = [item.message for item in rig.log["joint_states"] if np.shape(item.message.effort) == (arm.joints,)]
     if not _positions(rig):
         worst = np.max(np.abs([state.effort for state in states]), axis=0)
-        ok = bool(np.all(worst <= arm.torque_nm))
-        report.expect("applied torques never leave their limits", ok, f"{arm.torque_nm} N m", worst.round(1))
+        rig.within("applied torques never leave their limits", worst / arm.torque_nm, 0.0, 1.0, "of the limit")
     speeds = np.max(np.abs([state.velocity for state in states]), axis=0)
-    margin = arm.velocity_radps * 1.05
-    report.expect(
-        "joint speeds never leave their limits", bool(np.all(speeds <= margin)), f"{margin.round(2)} rad/s", speeds.round(2)
-    )
+    rig.below("joint speeds never leave their limits", np.max(speeds / arm.velocity_radps), 1.05, "of the limit")

@@ -5,7 +5,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import Rig
 from palpate.exam_state import exam_state
 from palpate_bus.messages import ExamState, PalpationSample, Point, SearchRequest, Vector3
@@ -45,17 +44,17 @@ class Play:
         )
 
 
-def suite(rig: Rig, report: ConformanceReport) -> None:
+def suite(rig: Rig) -> None:
     """Check silence before contact, one request at a time, places in the region, and an end within the budget."""
     exam = rig.settings.scenario.exam
     stiff_at = np.array(exam.centre_m) + 0.2 * np.array(exam.region_m)
     play = Play()
-    report.section("requests")
+    rig.section("requests")
     rig.run(0.2, {"exam/state": play.state})
-    report.expect("requests nothing before contact", not rig.log[REQUEST], "no request", len(rig.log[REQUEST]))
+    rig.equal("requests nothing before contact", len(rig.log[REQUEST]), 0)
     play.phase = ExamState.PHASE_RETRACT
     rig.run(0.5, {"exam/state": play.state})
-    report.expect("requests once and waits", len(rig.log[REQUEST]) == 1, "1 request", len(rig.log[REQUEST]))
+    rig.equal("requests once and waits", len(rig.log[REQUEST]), 1)
     early = 0
     while rig.log[REQUEST] and rig.last(REQUEST).request == SearchRequest.PRESS and play.over < MOST:
         asked = rig.last(REQUEST)
@@ -66,26 +65,21 @@ def suite(rig: Rig, report: ConformanceReport) -> None:
         play.over = int(asked.number)
         rig.run(PRESS_S / 2, {"exam/state": play.state})
     received = [item.message for item in rig.log[REQUEST]]
-    report.expect("waits until a press is over", early == 0, "no request during a press", early)
-    report.expect("then requests the next", len(received) == play.over + 1, f"{play.over + 1} requests", len(received))
-    valid = all(0 <= message.lump <= 1 for message in received)
-    report.expect("reports the probability of a lump", valid, "0 to 1", received[-1].lump if received else "nothing")
-    numbers = [int(message.number) for message in received]
-    report.expect("numbers its requests", numbers == list(range(1, len(numbers) + 1)), "1, 2, 3, ...", numbers[:5])
+    rig.equal("waits until a press is over", early, 0)
+    rig.equal("then requests the next", len(received), play.over + 1)
+    rig.within("reports the probability of a lump", [message.lump for message in received], 0, 1, "")
+    rig.equal("numbers its requests", [int(message.number) for message in received], list(range(1, len(received) + 1)))
     presses = [message for message in received if message.request == SearchRequest.PRESS]
     xy = np.array([(message.place.x, message.place.y) for message in presses]).reshape(-1, 2)
     inside = bool(np.all(np.abs(xy - exam.centre_m) <= 0.5 * np.array(exam.region_m) + 1e-9))
-    report.expect("presses inside the region", inside, f"{exam.region_m} m about {exam.centre_m} m", f"{len(xy)} places")
-    deepest = rig.settings.scenario.limits.depth_m
-    ok = all(0 < message.depth <= deepest for message in presses)
-    report.expect("presses no deeper than the limit", ok, f"up to {deepest} m", max((m.depth for m in presses), default=0.0))
-    done = bool(received) and received[-1].request == SearchRequest.DONE
-    on_budget = len(presses) <= exam.budget.presses
-    report.expect("keeps to its budget", on_budget, f"{exam.budget.presses} presses", len(presses))
-    if done:
-        report.expect("ends with a reason", bool(received[-1].reason), "a reason", received[-1].reason)
+    rig.expect("presses inside the region", inside, f"{exam.region_m} m about {exam.centre_m} m", f"{len(xy)} places")
+    depths = [message.depth for message in presses]
+    rig.within("presses no deeper than the limit", depths, 1e-6, rig.settings.scenario.limits.depth_m, "m")
+    rig.within("keeps to its budget", len(presses), 0, exam.budget.presses, "presses")
+    if received and received[-1].request == SearchRequest.DONE:
+        rig.expect("ends with a reason", bool(received[-1].reason), "a reason", received[-1].reason)
     else:
-        report.skip("an end", f"it continued beyond {len(presses)} presses")
+        rig.skip("an end", f"it continued beyond {len(presses)} presses")
 
 
 def pressed(t: int, asked: Any, stiff_at: Any) -> Message:

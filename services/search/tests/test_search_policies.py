@@ -10,7 +10,6 @@ import pytest
 from scipy.ndimage import correlate
 from scipy.stats import multivariate_normal
 
-from palpate.check.report import ConformanceReport
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
 from palpate_assessment.calibration import learned
@@ -229,17 +228,17 @@ def test_information_is_the_entropy_that_an_observation_takes_away() -> None:
     assert found[1] == 0.0
 
 
-def played(**exam: Any) -> tuple[ServiceRig, ConformanceReport]:
+def played(**exam: Any) -> ServiceRig:
     """Return the conformance suite's examination, of a small region."""
     scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", **exam))
-    rig, report = ServiceRig(create(scenario), RigSettings(scenario)), ConformanceReport("search")
-    suite(rig, report)
-    return rig, report
+    rig = ServiceRig(create(scenario), RigSettings(scenario))
+    suite(rig)
+    return rig
 
 
 def test_it_finds_the_stiff_area_and_ends() -> None:
-    rig, report = played()
-    assert report.passed
+    rig = played()
+    assert rig.report.passed
     requests = [item.message for item in rig.log[REQUEST]]
     assert requests[-1].request == SearchRequest.DONE
     assert requests[-1].lump < Search().missed
@@ -249,14 +248,14 @@ def test_it_finds_the_stiff_area_and_ends() -> None:
 
 
 def test_it_keeps_to_the_budget_of_presses() -> None:
-    rig, report = played(budget=SearchBudget(presses=5))
-    assert report.passed
+    rig = played(budget=SearchBudget(presses=5))
+    assert rig.report.passed
     assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
     assert "5 presses made" in rig.last(REQUEST).reason
 
 
 def test_it_keeps_to_the_budget_of_time() -> None:
-    rig, _ = played(budget=SearchBudget(seconds=2.0))
+    rig = played(budget=SearchBudget(seconds=2.0))
     assert rig.last(REQUEST).request == SearchRequest.DONE
     assert rig.last(REQUEST).reason == "2 s elapsed"
 
@@ -331,7 +330,7 @@ def test_the_edge_of_the_region_and_the_greatest_depth_may_be_pressed() -> None:
 def test_the_report_says_what_it_took() -> None:
     scenario = Scenario(exam=Exam(region_m=(0.1, 0.1), pattern="search", budget=SearchBudget(presses=5)))
     service = create(scenario)
-    suite(ServiceRig(service, RigSettings(scenario)), ConformanceReport("search"))
+    suite(ServiceRig(service, RigSettings(scenario)))
     facts = service.finish()
     assert facts["presses"] == 5
     assert 4 * PRESS_S <= facts["seconds"] <= 6 * PRESS_S + 0.5
