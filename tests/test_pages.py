@@ -23,7 +23,7 @@ from palpate.report.evidence import samples_of
 from palpate.report.results import sample_columns
 from palpate.run.roles import checked, settings_of
 from palpate_bus.contract import MS, contract
-from palpate_bus.contract.conformance import violations
+from palpate_bus.contract.port_check import violations
 from palpate_bus.implementations import create
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header

@@ -12,8 +12,7 @@ from message_strategies import messages
 from toy_services import TOYS, Robot
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.contract.conformance import Checker
-from palpate_bus.contract.port_check import PortCheck, RefusedMessage
+from palpate_bus.contract.port_check import Checker, PortCheck, RefusedMessage
 from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed

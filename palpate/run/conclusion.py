@@ -16,7 +16,7 @@ from palpate.report.rows import Report
 from palpate.run.folder import another_folder, megabytes_of
 from palpate.run.roles import write_scenario_files
 from palpate_bus.contract import contract
-from palpate_bus.contract.conformance import violations
+from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import ExamState, RobotStatus
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import FailureCode

@@ -12,7 +12,8 @@ from message_strategies import messages
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Edge, Role, Topic, Visibility, contract, parse
-from palpate_bus.contract.conformance import leaves, numbers, violations
+from palpate_bus.contract.conformance import leaves, numbers
+from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import header
 
@@ -209,9 +210,9 @@ def test_violations_of_a_row_are_described() -> None:
     bad = WrenchStamped(header(6, "world"), Wrench(Vector3(0.0, float("nan"), 0.0), Vector3(41.0, 0.0, 0.0)))
     assert violations(topic, bad, 5) == [
         "ft/wrench: header.frame_id: expected 'ft_sensor', got 'world'",
-        "ft/wrench: header.stamp: expected 5 ns, got 6 ns",
         "ft/wrench: wrench.force: expected -200..200 [N], got nan",
         "ft/wrench: wrench.torque: expected -40..40 [N m], got 41",
+        "ft/wrench: header.stamp: expected 5 ns, got 6 ns",
     ]
     assert violations(topic, Vector3(0.0, 0.0, 0.0)) == [
         "ft/wrench: message: expected geometry_msgs/msg/WrenchStamped, got geometry_msgs/msg/Vector3"

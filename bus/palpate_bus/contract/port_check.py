@@ -4,11 +4,15 @@ A message is checked by itself (type, frame, ranges, finite numbers, unit quater
 same port (order and age of stamps, rates of change, values that repeat). The runtimes hold one `PortCheck` per port, where a
 service sends and where messages of other processes are received. In lockstep a refused message ends the run. In wall-clock mode
 it is dropped and reported, so its readers act as on silence. No service needs a check of its own.
+
+`Checker` names what is wrong with a message by itself; `violations` does the same as text. A value that is out of range but
+plausible in a related unit (degrees for radians, millimetres for metres) is reported as a unit error.
 """
 
 import sys
 from collections.abc import Callable, Iterator
 from functools import cache
+from math import hypot
 from typing import Any
 
 import numpy as np
@@ -18,22 +22,25 @@ from palpate_bus.contract.conformance import (
     AHEAD_NS,
     NORM,
     QUATERNION,
-    Checker,
+    LeafField,
     MessageViolation,
     PastMessages,
     ViolationKind,
     broken_past,
     leaves,
+    numbers,
     repeats,
 )
 from palpate_bus.contract.rows import Topic
 from palpate_bus.messages.codec import Message, message_type, store
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_errors import RunError
 
 FEW = 32
 """Up to this number of values a loop in Python is faster than numpy."""
 LARGE = 1e9
 """Larger limits are not compared with a sum of squares, which could overflow."""
+_NO_PAST = PastMessages([])
 
 
 class RefusedMessage(RunError):
@@ -71,11 +78,97 @@ class PortCheck:
             return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error))
 
 
+_CONFUSED: dict[str, tuple[tuple[str, float], ...]] = {
+    "rad": (("deg", np.pi / 180),),
+    "rad/s": (("deg/s", np.pi / 180),),
+    "m": (("mm", 1e-3),),
+    "m/s": (("mm/s", 1e-3),),
+}
+"""Units that are often confused with the key, with their conversion factor."""
+
+
+class Checker:
+    """Names the violations of the messages of one topic, each by itself. Fast for messages that conform."""
+
+    def __init__(self, topic: Topic) -> None:
+        self._topic, self._conforms = topic, conforms(topic.model_dump_json(), sends=False, alone=True)
+        self._all = leaves(topic.type)
+        self._ranges = {path: _paths(leaves(topic.type, path)) for path in topic.ranges}
+        ranged = {path for paths in self._ranges.values() for path in paths}
+        self._finite = [leaf.path for leaf in self._all if leaf.base.startswith("float") and leaf.path not in ranged]
+
+    def __call__(self, message: Message, t: int | None = None) -> list[MessageViolation]:
+        """Return the violations of a message. `t`: expected stamp of its headers [ns]; None: not checked."""
+        found = [] if self._conforms(message, _NO_PAST, 0) else list(self._violations(message))
+        stamps = [nanoseconds(header.stamp) for header in _headers(message)] if t is not None else []
+        if wrong := [stamp for stamp in stamps if stamp != t]:
+            found.append(MessageViolation(ViolationKind.STAMP, "header.stamp", f"{t} ns", f"{wrong[0]} ns"))
+        return found
+
+    def _violations(self, message: Message) -> Iterator[MessageViolation]:
+        topic, kind = self._topic, message_type(self._topic.type)
+        if message.__class__ is not kind:
+            got = getattr(message, "__msgtype__", message.__class__.__name__)
+            yield MessageViolation(ViolationKind.TYPE, "", kind.__msgtype__, got)
+            return
+        frames = [header.frame_id for header in _headers(message)] if topic.frame is not None else []
+        if wrong := [frame for frame in frames if frame != topic.frame]:
+            yield MessageViolation(ViolationKind.FRAME, "header.frame_id", repr(topic.frame), repr(wrong[0]))
+        for path, paths in self._ranges.items():
+            values = np.concatenate([numbers(message, one) for one in paths])
+            if not np.all((values >= topic.ranges[path][0]) & (values <= topic.ranges[path][1])):
+                yield _out_of_range(path, values, *topic.ranges[path], topic.units.get(path, "1"))
+        for path in self._finite:
+            values = numbers(message, path)
+            if not np.isfinite(values).all():
+                yield MessageViolation(ViolationKind.NAN, path, "finite numbers", f"{values[~np.isfinite(values)][0]:g}")
+        for path in (leaf.path[:-2] for leaf in self._all if leaf.message == QUATERNION and leaf.path.endswith(".w")):
+            values = numbers(message, path).reshape(-1, 4)
+            norm = [hypot(*one) for one in values.tolist()]
+            if off := [k for k, one in enumerate(norm) if not NORM[0] <= one * one <= NORM[1]]:
+                got = f"{values[off[0]].tolist()} with norm {norm[off[0]]:g}"
+                yield MessageViolation(ViolationKind.NORM, path, "a norm of 1", got)
+
+    def stamp(self, message: Message) -> int | None:
+        """Return the stamp [ns] of the message's header or of its first transform; None without a header."""
+        return next((nanoseconds(header.stamp) for header in _headers(message)), None)
+
+
+def _paths(fields: list[LeafField]) -> list[str]:
+    return [leaf.path for leaf in fields if leaf.base != "string"]
+
+
+def _headers(message: Message) -> list[Any]:
+    if hasattr(message, "header"):
+        return [message.header]
+    return [transform.header for transform in getattr(message, "transforms", ())]
+
+
+def violations(topic: Topic, message: Message, t: int | None = None) -> list[str]:
+    """Return the violations of a message as text. `t` as for `Checker`."""
+    return [f"{topic.name}: {violation}" for violation in Checker(topic)(message, t)]
+
+
+def _out_of_range(path: str, values: np.ndarray[Any, Any], least: float, most: float, unit: str) -> MessageViolation:
+    wrong = values[~((values >= least) & (values <= most))]
+    allowed = f"{least:g}..{most:g} [{unit}]"
+    unfit = wrong[~np.isfinite(wrong)]
+    if unfit.size:
+        return MessageViolation(ViolationKind.NAN, path, allowed, f"{unfit[0]:g}")
+    for name, factor in _CONFUSED.get(unit, ()):
+        if np.all((values * factor >= least) & (values * factor <= most)):
+            return MessageViolation(ViolationKind.UNIT, path, allowed, f"{wrong[0]:g}, plausible if it is in {name}")
+    return MessageViolation(ViolationKind.RANGE, path, allowed, f"{wrong[0]:g}")
+
+
 @cache
-def conforms(row: str, sends: bool) -> Callable[[Message, PastMessages, int], bool]:
-    """Return a function that is True for a message that conforms to its topic, a row as JSON, and enters it into the past."""
+def conforms(row: str, sends: bool, alone: bool = False) -> Callable[[Message, PastMessages, int], bool]:
+    """Return a function that is True for a message that conforms to its topic, a row as JSON, and enters it into the past.
+
+    `alone`: without the past.
+    """
     topic = Topic.model_validate_json(row)
-    body = list(_Source(topic, sends).lines())
+    body = list(_Source(topic, sends, alone).lines())
     text = "\n".join(
         ("def conforms(m, past, t):", " try:", *(f"  {line}" for line in body), " except Exception: return False", " return True")
     )
@@ -95,9 +188,9 @@ def conforms(row: str, sends: bool) -> Callable[[Message, PastMessages, int], bo
 class _Source:
     """Writes the lines of a check."""
 
-    def __init__(self, topic: Topic, sends: bool) -> None:
+    def __init__(self, topic: Topic, sends: bool, alone: bool) -> None:
         self._topic = topic
-        self._sends = sends
+        self._sends, self._alone = sends, alone
         self._count = 0
 
     def lines(self) -> Iterator[str]:
@@ -109,7 +202,7 @@ class _Source:
             yield "for one in m.transforms:"
             yield " if one.header.frame_id != frame: return False"
         yield from self._message(self._topic.type, "m", "")
-        if "header" in names and (self._topic.periodic or self._topic.max_age_ms):
+        if not self._alone and "header" in names and (self._topic.periodic or self._topic.max_age_ms):
             yield from self._past()
 
     def _past(self) -> Iterator[str]:

@@ -22,8 +22,8 @@ from typing import Any
 import zenoh
 
 from palpate_bus.contract import MS, Contract, Topic
-from palpate_bus.contract.conformance import Checker
 from palpate_bus.contract.conformance import ViolationKind as Kind
+from palpate_bus.contract.port_check import Checker
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
 from palpate_bus.monitor.streams import TUNING, BusTime, Stream, bus_time, is_due, timing_problems

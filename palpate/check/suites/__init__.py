@@ -11,7 +11,7 @@ import numpy as np
 from palpate.check.rig import ConformanceReport, ReceivedMessage, Rig
 from palpate.check.suites import assessment, camera, control, perception, planning, robot, search, supervisor, tissue
 from palpate_bus.contract import MS, Topic
-from palpate_bus.contract.conformance import Checker
+from palpate_bus.contract.port_check import Checker
 
 SUITES: dict[str, tuple[Callable[[Rig], None], float]] = {
     "robot": (robot.suite, 9.0),

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.contract.conformance import violations
+from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import (
     CameraInfo,
     CameraTrigger,
