@@ -152,12 +152,9 @@ def result(c: Collected, failure: str | None = None) -> RunResult:
         runtime="composed",
         collected=c,
         run_hash=None if failure else "0" * 64,
-        digests={},
         sim_time_s=60.0,
         wall_time_s=15.0,
         start_time_s=0.5,
-        blame={},
-        counters={},
         failure=Failure(FailureCode.ROLE_LOST, failure, ("tissue",)) if failure else None,
         lost={"tissue": 12_345_000_000} if failure else {},
     )

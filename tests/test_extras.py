@@ -41,7 +41,6 @@ NEEDS = {
     "research.search.whole": "study",
     "palpate.study": "study",
     "palpate_bus": BARE,
-    "palpate_bus.decompression": "recordings group",
     "palpate_bus.recordings": "recordings group",
     "palpate_bus.security.keys": "conductor group",
     "palpate_errors": BARE,

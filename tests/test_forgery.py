@@ -88,7 +88,7 @@ def test_with_a_key_forged_messages_are_reported_and_ignored(tmp_path: Path, mon
     outcome = run_toys(meddling(abort(), torque()), {"TOY_END_S": "3"})
     assert outcome.failure is None
     assert outcome.run_hash == composed_hash_of(3)
-    assert outcome.reports["robot"]["forged"] == 1
+    assert outcome.counters["robot"]["forged"] == 1
     for topic in ("palpate/control", "control/joint_torque"):
         assert [line for line in outcome.trouble if line.startswith(f"{topic}: ") and "tag" in line], outcome.trouble
 

@@ -68,9 +68,9 @@ def with_own_process(*groups: tuple[str, ...]) -> list[tuple[str, ...]]:
 def test_every_placement_gives_the_run_hash_of_the_composed_run(groups: Sequence[tuple[str, ...]]) -> None:
     outcome = run_toys(groups=groups)
     assert outcome.failure is None
-    assert outcome.last_tick == toy_services.END
+    assert outcome.sim_time_s * NS == toy_services.END
     assert outcome.run_hash == composed_hash()
-    assert set(outcome.reports) == set(ROLES)
+    assert set(outcome.counters) == set(ROLES)
 
 
 def test_all_roles_of_a_killed_process_are_lost_and_the_others_run_one_more_second() -> None:
@@ -81,7 +81,7 @@ def test_all_roles_of_a_killed_process_are_lost_and_the_others_run_one_more_seco
     assert outcome.lost.keys() == set(pair), outcome.trouble
     assert_failed(outcome, FailureCode.ROLE_LOST, *pair)
     assert outcome.run_hash is None
-    assert abs(outcome.last_tick - outcome.lost["control"] - NS) <= NS // 2
+    assert abs(outcome.sim_time_s * NS - outcome.lost["control"] - NS) <= NS // 2
 
 
 def test_a_killed_tissue_ends_the_run_at_once() -> None:
@@ -104,7 +104,7 @@ def test_all_roles_of_a_frozen_process_are_lost_and_reported_once() -> None:
     def freeze(running: Running) -> None:
         if at(running, 0.3, done):
             running.processes["planning"].send_signal(signal.SIGSTOP)
-        reported.extend(text for text in running.conductor.outcome.trouble if text not in reported)
+        reported.extend(text for text in running.conductor.result.trouble if text not in reported)
 
     patience = Patience(soft=0.5, hard=60.0, frozen=1.0)
     outcome = run_toys(freeze, {"TOY_END_S": "30"}, patience, groups=with_own_process(LOOP, PAIR))
@@ -120,7 +120,7 @@ def test_an_interrupted_run_ends_every_service() -> None:
     outcome = run_toys(once(0.5, interrupt), {"TOY_END_S": "300"})
     assert outcome.interrupted
     assert_failed(outcome, FailureCode.INTERRUPTED)
-    assert 0 < outcome.last_tick < 300 * NS, "the machine's speed decides how far it gets"
+    assert 0 < outcome.sim_time_s * NS < 300 * NS, "the machine's speed decides how far it gets"
     assert outcome.run_hash is None
 
 
@@ -162,8 +162,8 @@ def test_garbage_and_foreign_messages_are_counted_and_ignored() -> None:
     outcome = run_toys(once(0.2, shout))
     assert outcome.failure is None
     assert outcome.run_hash == composed_hash()
-    assert sum(report["garbage"] for report in outcome.reports.values()) >= 2
-    assert sum(report["foreign"] for report in outcome.reports.values()) >= 1
+    assert sum(report["garbage"] for report in outcome.counters.values()) >= 2
+    assert sum(report["foreign"] for report in outcome.counters.values()) >= 1
 
 
 def test_in_lockstep_a_reader_that_receives_nan_ends_the_run_and_names_the_sender() -> None:
@@ -177,7 +177,7 @@ def test_in_lockstep_a_reader_that_receives_nan_ends_the_run_and_names_the_sende
 def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
     outcome = run_toys(wallclock=True, faults={"robot": ("joint_states", "nan", "0.5")})
     assert outcome.failure is None
-    assert outcome.reports["control"]["refused"] > 0
+    assert outcome.counters["control"]["refused"] > 0
     assert sum("joint_states from robot refused" in text for text in outcome.trouble) == 1
 
 
@@ -236,7 +236,7 @@ def test_a_service_that_does_not_answer_is_named() -> None:
         conductor = Conductor(session, contract(), 0, ("robot",), Collector(), Patience(start=0.5, quiet=0.1))
         shown: list[str] = []
         with pytest.raises(RunFailed) as failed:
-            conductor.run(tell=lambda c: shown.extend(c.outcome.trouble))
+            conductor.run(tell=lambda c: shown.extend(c.result.trouble))
         assert [text for text in shown if "robot" in text], "while it is awaited"
         assert (failed.value.failure.code, failed.value.failure.roles) == (FailureCode.NO_ANSWER, ("robot",))
         close_session(session)
@@ -256,8 +256,8 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
         report = ("recorder", SimpleNamespace(state=ServiceReport.FINISHED), {})
         monkeypatch.setattr(conductor, "_receive_reports", lambda: [report] if gone else [])
         conductor._end(exited, lambda _: None)
-        assert conductor.outcome.trouble == []
-        assert conductor.outcome.reports.keys() == {"recorder"}
+        assert conductor.result.trouble == []
+        assert conductor.result.counters.keys() == {"recorder"}
     finally:
         close_session(session)
 
@@ -265,9 +265,9 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
 def test_a_wall_clock_run_ends_at_the_announced_time() -> None:
     outcome = run_toys(wallclock=True)
     assert outcome.failure is None
-    assert outcome.last_tick >= toy_services.END
-    steps = outcome.reports["control"]["blame"]["steps"]
-    assert 0.1 * toy_services.END / MS < steps <= outcome.last_tick / MS + 1, "a late service continues at the present tick"
+    assert outcome.sim_time_s * NS >= toy_services.END
+    steps = outcome.blame["control"]["steps"]
+    assert 0.1 * toy_services.END / MS < steps <= outcome.sim_time_s * NS / MS + 1, "a late service continues at the present tick"
 
 
 def test_a_wall_clock_run_without_exam_states_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -288,7 +288,7 @@ def test_a_peer_with_another_definition_of_a_message_is_named_within_a_second() 
             tokens.append(NodeTokens(running.session, "stranger", 0))
             tokens[0].subscription(outdated, contract().qos["control"])
             said.append(time.monotonic())
-        if done and len(said) == 1 and any("joint_states" in text for text in running.conductor.outcome.trouble):
+        if done and len(said) == 1 and any("joint_states" in text for text in running.conductor.result.trouble):
             said.append(time.monotonic())
 
     outcome = run_toys(join, {"TOY_END_S": "4"})

@@ -17,7 +17,7 @@ from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
-from palpate_conductor.outcome import Patience, RunOutcome, Timing
+from palpate_conductor.outcome import Patience, RunResult, Timing
 
 TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
 sys.path.insert(0, str(TOYS.parent))
@@ -44,7 +44,7 @@ def run_toys(
     faults: Mapping[str, tuple[str, ...]] | None = None,
     groups: Sequence[tuple[str, ...]] = APART,
     router: str = "",
-) -> RunOutcome:
+) -> RunResult:
     """Run the toy services.
 
     Args:
@@ -96,7 +96,7 @@ def run_toys(
             close_session(session)
 
 
-def assert_failed(outcome: RunOutcome, code: FailureCode, *roles: str) -> None:
+def assert_failed(outcome: RunResult, code: FailureCode, *roles: str) -> None:
     assert outcome.failure.code is code, outcome.failure
     assert set(outcome.failure.roles) == set(roles), outcome.failure
 

@@ -20,8 +20,8 @@ from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate_benchmarks.fault_cases import LIMITS, MESSAGE_KINDS, PROCESS_KINDS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.faulty import InjectedFault, command
+from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.implementations import module
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import FailureCode
@@ -179,7 +179,7 @@ def signs_of(progress: RunProgress) -> list[Sign]:
 def forks() -> Forks:
     """Return the fork server that starts the processes of all cases."""
     scenario = load_scenario("clean", SETTINGS)
-    return Forks(module(role, choice(scenario, role)) for role in WORKERS)
+    return Forks(implementations.kind(role).entry_point(choice(scenario, role)).module for role in WORKERS)
 
 
 def run_case(case: FaultCase, folder: Path, forks: Forks | None = None) -> FaultFinding:

@@ -4,6 +4,7 @@ import heapq
 import re
 import shlex
 import struct
+from bz2 import BZ2Decompressor
 from collections import Counter
 from collections.abc import Collection, Iterator
 from contextlib import ExitStack, suppress
@@ -12,9 +13,10 @@ from io import BytesIO
 from mmap import ACCESS_READ, mmap
 from operator import attrgetter
 from pathlib import Path, PurePath
-from typing import IO, NamedTuple
+from typing import IO, Any, NamedTuple
 
 import zstandard
+from mcap import stream_reader
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
@@ -22,13 +24,14 @@ from mcap.reader import McapReader, NonSeekingReader, make_reader
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
+from rosbags.rosbag1 import reader as rosbag1_reader
+from rosbags.rosbag2 import storage_mcap
 
-from palpate_bus import decompression  # noqa: F401 - bounds what the libraries decompress
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import KEPT_EVERY, RECORDING
 from palpate_errors import UserError
-from palpate_inputs import MB, InputFile, bounds, read_yaml
+from palpate_inputs import MB, InputFile, bounds, over, read_yaml
 
 SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
@@ -46,6 +49,54 @@ BROKEN = (
     struct.error,
 )
 """Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum or length."""
+
+
+# -- decompression within `chunk_mb`: mcap and rosbags believe any size that a file states
+
+_lz4 = stream_reader.lz4
+
+
+def _checked(size: int) -> None:
+    if size > bounds().chunk_mb * MB:
+        raise over("a chunk of the recording", f"{size / MB:.0f} MB decompressed", "chunk_mb")
+
+
+def _whole(frame: Any, data: bytes) -> bytes:
+    """Return the content of a frame, by a decompressor that stops at a length."""
+    content = bytes(frame.decompress(data, max_length=bounds().chunk_mb * MB + 1))
+    _checked(len(content))
+    if not frame.eof:
+        raise EOFError("a chunk that is not whole")
+    return content
+
+
+def zstd(data: bytes, size: int) -> bytes:
+    """Return the content of a zstd frame; `size`: as its chunk states it [bytes]. Raises InputError if it is too large."""
+    stated = zstandard.get_frame_parameters(data).content_size
+    _checked(size if stated == zstandard.CONTENTSIZE_UNKNOWN else max(size, stated))
+    return bytes(zstandard.decompress(data, size))
+
+
+def lz4(data: bytes, _: int = 0) -> bytes:
+    """Return the content of an lz4 frame. Raises InputError if it is too large."""
+    return _whole(_lz4.LZ4FrameDecompressor(), data)
+
+
+def bz2(data: bytes) -> bytes:
+    """Return the content of a bzip2 file. Raises InputError if it is too large."""
+    return _whole(BZ2Decompressor(), data)
+
+
+class _Library:
+    """A module of a compression as mcap calls it."""
+
+    def __init__(self, decompress: Any) -> None:
+        self.decompress = decompress
+
+
+stream_reader.zstandard, stream_reader.lz4 = _Library(zstd), _Library(lz4)
+storage_mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
+rosbag1_reader.decompressors.update(bz2=bz2, lz4=lz4)
 
 
 class RecordingError(UserError):

@@ -308,5 +308,5 @@ def file_targets() -> Iterator[FuzzTarget]:
     yield _target("results:checkpoint", "input.npz", read_checkpoint, (_checkpoint(True), _checkpoint(False)))
     yield _target("json", "input.json", lambda path: parse_json(path.read_bytes(), "input"), (_REPORT,))
     yield _target("study", "input.yaml", lambda path: load_study(str(path)).error_levels(), (_STUDY,))
-    yield _target("service-file", "input.py", lambda path: implementations.check("assessment", f"./{path}"), (_SERVICE,))
+    yield _target("service-file", "input.py", lambda path: implementations.kind("assessment").check(f"./{path}"), (_SERVICE,))
     yield _target("compose", "input.yaml", partial(read_processes, roles=("robot", "tissue")), (_COMPOSE,))

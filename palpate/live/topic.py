@@ -23,6 +23,7 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
+from palpate_bus.wire.transport import subscribe
 
 REPORT_PERIOD_S = 1.0
 SILENT_S = 5.0
@@ -174,12 +175,7 @@ class TopicReader:
         """Messages without a valid attachment."""
         key = topic_key(topic, domain)
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
-        if topic.latched:
-            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session, key, handler, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            )
-        else:
-            self._subscriber = session.declare_subscriber(key, handler)
+        self._subscriber = subscribe(session, key, handler, history=topic.latched)
 
     def get(self, timeout: float = 0.0) -> Received | None:
         """Return the next message, or None after `timeout` [s]; 0 does not wait."""

@@ -147,11 +147,7 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
         digests=digests,
         sim_time_s=nanoseconds(gathered.exam_states[-1].header.stamp) / NS,
         wall_time_s=elapsed_s,
-        start_time_s=0.0,
-        blame={},
         counters={"assessment": {"facts": facts}},
-        failure=None,
-        lost={},
     )
     report = assemble(scenario, result, truth_of_run(scenario, gathered))
     return QuickCase(report, gathered, simulated - begin, assessed - simulated, process_time() - assessed)

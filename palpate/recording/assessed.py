@@ -117,19 +117,7 @@ def write_assessed(folder: Path, recording: PalpationRecording) -> tuple[Report,
     """Write the results of a recording into a folder, as those of a run; return report and page."""
     gathered, scenario = collected(recording), scenario_of(recording)
     times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]
-    result = RunResult(
-        runtime=RUNTIME,
-        collected=gathered,
-        run_hash=None,
-        digests={},
-        sim_time_s=max(times, default=0.0),
-        wall_time_s=0.0,
-        start_time_s=0.0,
-        blame={},
-        counters={},
-        failure=None,
-        lost={},
-    )
+    result = RunResult(RUNTIME, gathered, sim_time_s=max(times, default=0.0))
     faults = [
         FaultRow(code=f.code, count=f.count, of=f.of, text=f.text, refused=f.remedy is Remedy.REFUSED) for f in recording.faults
     ]

@@ -187,7 +187,7 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     if role not in workers:
         raise PluginError(f"--service {choice}: there is no service {role!r}; allowed are {', '.join(workers)}")
     if name:
-        implementations.check(role, name)
+        implementations.kind(role).check(name)
     recording = open_recording(path)
     text = read_text(scenario) if scenario else recording.scenario or _scenario_near(path, role)
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]

@@ -68,13 +68,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
     return run.scenario, RunResult(
         runtime=RUNTIME,
         collected=collected,
-        run_hash=None,
-        digests={},
         sim_time_s=recording.last / NS,
-        wall_time_s=0.0,
-        start_time_s=0.0,
-        blame={},
-        counters={},
         failure=Failure(code, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
         lost={"conductor": recording.last},
         earlier=earlier,

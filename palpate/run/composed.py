@@ -146,13 +146,9 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         result = RunResult(
             runtime="composed",
             collected=collected,
-            run_hash=None,
-            digests={},
             sim_time_s=place.t / NS,
             wall_time_s=now - (start or now),
             start_time_s=start or now,
-            blame={},
-            counters={},
             failure=limits.failure(error) if isinstance(error, RunError) else failure_of(error, place.t),
             lost={} if place.role is None else {place.role: place.t},
         )

@@ -25,7 +25,7 @@ from palpate.run.processes import SecureBus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
 from palpate.run.self_test import RATES, REAL_PROCESSES, SIMULATED_PROCESSES, measure
-from palpate_bus.implementations import check_libraries
+from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_conductor.outcome import RunResult, Tell, Timing
 from palpate_errors import UserError
@@ -81,7 +81,7 @@ def _observers(scenario: Scenario, options: RunOptions) -> tuple[str, ...]:
 def _missing_for_dashboard(scenario: Scenario) -> str:
     """Return the module that the dashboard lacks and how to install it; empty if it lacks none."""
     try:
-        check_libraries("dashboard", choice(scenario, "dashboard"))
+        kind("dashboard").check_libraries(choice(scenario, "dashboard"))
     except PluginError as error:
         return str(error).partition(": ")[2]
     return ""

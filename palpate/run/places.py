@@ -21,7 +21,7 @@ from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run, named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_conductor.handover import REPLACEABLE
+from palpate_conductor.watchdog import REPLACEABLE
 from palpate_errors import UserError
 from palpate_inputs import read_json
 from palpate_plugins import is_file
@@ -123,7 +123,7 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
     """Return the command of the process: that of the run, or of the chosen implementation. Raises PluginError."""
     if service is None:
         return place.command
-    implementations.check(role, service)
+    implementations.kind(role).check(service)
     word = str(Path(service).resolve()) if is_file(service) else service
     return service_command(role, word)
 

@@ -69,9 +69,9 @@ def checked(scenario: Scenario) -> Scenario:
         if (role, name) == ("tissue", NONE) or (name == "default" and _ROLES[role].optional and role not in workers(scenario)):
             continue
         try:
-            implementations.check(role, name)
+            implementations.kind(role).check(name)
             if role not in OBSERVERS:  # a run without the dashboard's libraries has no dashboard
-                implementations.check_libraries(role, name)
+                implementations.kind(role).check_libraries(name)
         except PluginError as error:
             raise PluginError(f"{scenario.name}: {error}") from error
         if is_file(name):

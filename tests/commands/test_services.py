@@ -7,7 +7,7 @@ import pytest
 import palpate_plugins
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
-from palpate_bus.implementations import check, check_libraries, create, create_for, names
+from palpate_bus.implementations import create, kind
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.testing import HandInbox
 from palpate_models.scenario.load import load_scenario
@@ -25,10 +25,10 @@ def test_every_role_has_a_choice_and_its_default_is_installed() -> None:
     assert set(Services.model_fields) == {*WORKERS, *OBSERVERS, "search"}
     scenario = chosen()
     for role in Services.model_fields:
-        assert choice(scenario, role) in names(role)
-    assert names("robot") == ("dart", "lbr", "mujoco", "ros2_control")
-    assert names("tissue") == ("elastic", "fmu", "winkler")
-    assert names("camera") == ("kinect", "replay", "ros")
+        assert choice(scenario, role) in kind(role).names()
+    assert kind("robot").names() == ("dart", "lbr", "mujoco", "ros2_control")
+    assert kind("tissue").names() == ("elastic", "fmu", "winkler")
+    assert kind("camera").names() == ("kinect", "replay", "ros")
 
 
 @pytest.mark.parametrize("option", ["assessment", "tisue=a.py", "conductor=a.py"])
@@ -117,14 +117,14 @@ def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytes
     def fails(_: object) -> None:
         raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")
 
-    check_libraries("robot", "mujoco")
+    kind("robot").check_libraries("mujoco")
     palpate_plugins.missing_libraries.cache_clear()
     monkeypatch.setattr(palpate_plugins, "_installed", lambda name: name != "mujoco")
     monkeypatch.setattr("importlib.metadata.EntryPoint.load", fails)
-    check("robot", "mujoco")
+    kind("robot").check("mujoco")
     said = r"services\.robot = 'mujoco': needs mujoco, not installed: pip install 'palpate\[mujoco\]'"
     with pytest.raises(PluginError, match=said):
-        check_libraries("robot", "mujoco")
+        kind("robot").check_libraries("mujoco")
     with pytest.raises(PluginError, match=said):
-        create_for("robot", "mujoco")
+        kind("robot").load("mujoco")
     palpate_plugins.missing_libraries.cache_clear()

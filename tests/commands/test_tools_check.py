@@ -14,7 +14,7 @@ from palpate.check.perform import started
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import SUITES, check
 from palpate.check.suites.tissue import STILL
-from palpate_bus.implementations import create, names
+from palpate_bus.implementations import create, kind
 from palpate_bus.messages import Point, Pose, SupervisorState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
@@ -25,7 +25,7 @@ SCENARIO = load_scenario("clean", STILL)
 HARDWARE = {"robot.lbr", "robot.ros2_control", "camera.ros", "camera.replay"}
 """Implementations for wall-clock mode, which `palpate check` checks live, and the replay, which has its own tests."""
 SLOW = {"robot.mujoco", "tissue.elastic"}
-IMPLEMENTATIONS = sorted({f"{role}.{name}" for role in SUITES for name in names(role)} - HARDWARE)
+IMPLEMENTATIONS = sorted({f"{role}.{name}" for role in SUITES for name in kind(role).names()} - HARDWARE)
 
 
 def made(name: str) -> Service:

@@ -1,9 +1,18 @@
-"""Findings of a monitor: the health of each topic and violations of the contract, also as `diagnostic_msgs/DiagnosticStatus`."""
+"""Streams of messages with their rate, silence and age, and the findings of a monitor, also as `DiagnosticStatus`.
 
-from collections.abc import Iterable
-from dataclasses import dataclass
+A rate is the number of messages over the time that passed by their own stamps, so that a run at a third of real time has correct
+rates and a busy monitor does not misjudge; in wall-clock mode, by their source times and the rate of the run. A topic is silent
+if nothing was received while the time of the bus, the median of all periodic topics' stamps, advanced.
+"""
 
-from palpate_bus.contract import Topic, contract
+from collections import deque
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from statistics import median
+from typing import NamedTuple
+
+from palpate_bus.contract import MS, Topic, contract
+from palpate_bus.contract.conformance import MessageViolation
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import header
@@ -114,3 +123,134 @@ def _how_often(seen: SeenViolation) -> str:
 def diagnostics(health: Iterable[TopicHealth], active: Iterable[SeenViolation], t: int, now: float) -> codec.Message:
     """Return the statuses as `diagnostic_msgs/DiagnosticArray` stamped `t` [ns]."""
     return DiagnosticArray(header(t), topic_statuses(health, active, now))
+
+
+@dataclass(frozen=True)
+class StreamTuning:
+    """Tolerances of rate, silence and age."""
+
+    window_s: float = 0.7
+    """Averaging window of rates [s], wall time; a wrong rate is found within a second."""
+    rate_tolerance: float = 0.2
+    least_off: int = 3
+    """A rate is wrong when more than this many messages, and more than `rate_tolerance` of them, are missing or too many."""
+    silence_ns: int = 100 * MS
+    """Bus time without a message after which a topic is silent."""
+    grace_s: float = 0.5
+    """Time after a first message until its rate is checked."""
+    ages: int = 5
+    """Number of checks over which the median age is taken."""
+    slack_ms: float = 100.0
+    """Wall time of one check of all topics [ms]."""
+
+
+TUNING = StreamTuning()
+
+
+class Passed(NamedTuple):
+    """Progress of a stream over the window."""
+
+    seconds: float
+    messages: int
+    bytes: int
+    stamps: int | None
+    """Progress of the stamps [ns]."""
+    sent: int
+    """Progress of the source times [ns]."""
+
+
+@dataclass
+class Stream:
+    """Messages of one sender on one topic, counted over a window of wall time."""
+
+    sender: str
+    began: float
+    count: int = 0
+    size: int = 0
+    missing: int = 0
+    sequence: int = 0
+    stamp: int | None = None
+    sent: int = 0
+    window: deque[tuple[float, int, int, int | None, int]] = field(default_factory=deque)
+    """(now, messages, bytes, stamp, source time) at each check of the last `TUNING.window_s`."""
+    ages: deque[float] = field(default_factory=lambda: deque(maxlen=16))
+
+    def mark(self, now: float) -> None:
+        """Add the current counts to the window."""
+        self.window.append((now, self.count, self.size, self.stamp, self.sent))
+        while len(self.window) > 2 and now - self.window[1][0] >= TUNING.window_s:
+            self.window.popleft()
+
+    def passed(self) -> Passed:
+        """Return the progress over the window."""
+        first, last = self.window[0], self.window[-1]
+        progress = None if first[3] is None or last[3] is None else last[3] - first[3]
+        return Passed(last[0] - first[0], last[1] - first[1], last[2] - first[2], progress, last[4] - first[4])
+
+
+class BusTime(NamedTuple):
+    """Progress of the bus time over the window."""
+
+    seconds: float
+    """Wall time [s]."""
+    passed: int
+    """Bus time [ns]; in wall-clock mode wall time times the rate of the run."""
+    now: int | None
+    """Newest bus time [ns]; None before the first stamped message."""
+
+    @property
+    def progress(self) -> float | None:
+        """Bus time per wall time; None if unknown."""
+        return self.passed / 1e9 / self.seconds if self.now is not None else None
+
+
+def bus_time(streams: Iterable[Stream], rate: float | None) -> BusTime:
+    """Return the median over the streams of the periodic topics; `rate` as for `Monitor`."""
+    moved, newest = [], []
+    for stream in streams:
+        passed = stream.passed()
+        if passed.stamps is not None and passed.seconds >= TUNING.grace_s:
+            moved.append((passed.stamps, passed.seconds))
+            newest.append(stream.stamp or 0)
+    if not moved:
+        return BusTime(0.0, 0, None)
+    seconds = median(s for _, s in moved)
+    progress = seconds * 1e9 * rate if rate else median(p for p, _ in moved)
+    return BusTime(seconds, int(progress), int(median(newest)))
+
+
+def timing_violations(topic: Topic, stream: Stream, time: BusTime, rate: float | None, now: float) -> Iterator[MessageViolation]:
+    """Yield violations of rate and age of a periodic topic's stream; `now` [s] is the clock of its marks."""
+    own = stream.passed()
+    if now - stream.began < TUNING.grace_s or own.seconds < TUNING.grace_s:
+        return
+    wanted = f"{1000 / topic.period_ms:g} {'Hz' if rate == 1.0 else 'Hz of simulated time'}"
+    if not own.messages:
+        if is_due(topic, time) and time.passed > TUNING.silence_ns:
+            yield MessageViolation(Kind.SILENT, "", wanted, f"nothing for {own.seconds:.1f} s")
+        return
+    spent = own.sent * rate if rate else own.stamps
+    if spent:
+        off = abs(own.messages - spent / topic.period)
+        if off > TUNING.least_off and off > TUNING.rate_tolerance * spent / topic.period:
+            unit = wanted.partition(" ")[2]
+            yield MessageViolation(Kind.RATE, "", wanted, f"{own.messages * 1e9 / spent:.4g} {unit}")
+    yield from _age(topic, stream, time, rate)
+
+
+def is_due(topic: Topic, time: BusTime) -> bool:
+    """Return True if enough bus time passed for several messages of a periodic topic."""
+    return time.passed / topic.period > TUNING.least_off
+
+
+def _age(topic: Topic, stream: Stream, time: BusTime, rate: float | None) -> Iterator[MessageViolation]:
+    if topic.max_age_ms is None or len(stream.ages) < TUNING.ages:
+        return
+    if rate:
+        age = median(stream.ages) * rate
+        if age > topic.max_age_ms + topic.period_ms:
+            yield MessageViolation(Kind.AGE, "", f"at most {topic.max_age_ms} ms", f"{age:.0f} ms")
+    elif stream.stamp is not None and time.now is not None:
+        behind = (time.now - stream.stamp) / MS - topic.period_ms
+        if behind > topic.max_age_ms + TUNING.slack_ms * max(time.progress or 0.0, 1.0):
+            yield MessageViolation(Kind.AGE, "", f"at most {topic.max_age_ms} ms", f"{behind:.0f} ms behind the others")

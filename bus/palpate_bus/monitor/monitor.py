@@ -25,10 +25,20 @@ from palpate_bus.contract import MS, Contract, Topic
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.contract.port_check import Checker
 from palpate_bus.messages import RunControl, ServiceReport, codec
-from palpate_bus.monitor.health import SeenViolation, TopicHealth, Violation
-from palpate_bus.monitor.streams import TUNING, BusTime, Stream, bus_time, is_due, timing_problems
+from palpate_bus.monitor.health import (
+    TUNING,
+    BusTime,
+    SeenViolation,
+    Stream,
+    TopicHealth,
+    Violation,
+    bus_time,
+    is_due,
+    timing_violations,
+)  # fmt: skip
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
+from palpate_bus.wire.transport import subscribe
 
 
 class Monitor:
@@ -138,7 +148,7 @@ class Monitor:
         for topic, streams in periodic:
             for gid, stream in streams.items():
                 if not self._nodes or gid in self._nodes:
-                    for problem in timing_problems(topic, stream, self.time, self.rate, now):
+                    for problem in timing_violations(topic, stream, self.time, self.rate, now):
                         self._note(topic, stream.sender, problem.kind, problem.expected, problem.got, now)
         self._check_silent(now)
         news, self._news = self._news, []
@@ -335,12 +345,7 @@ class _Listener:
         self.topic = topic
         key = any_type_key(topic.name, domain)
         channel: Any = zenoh.handlers.FifoChannel(ROOM)
-        if topic.latched:
-            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            )
-        else:
-            self._subscriber = session.declare_subscriber(key, channel)
+        self._subscriber = subscribe(session, key, channel, history=topic.latched)
         self._receive = self._subscriber.handler.try_recv
         self._wanted = (topic.type, topic.type_hash)
 

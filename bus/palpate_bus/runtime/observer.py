@@ -21,7 +21,7 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
-from palpate_bus.wire.transport import decoded
+from palpate_bus.wire.transport import decoded, subscribe
 
 log = logging.getLogger(__name__)
 
@@ -50,12 +50,7 @@ class _Feed:
         self.topic = topic
         key = member.observed(topic)
         channel: Any = zenoh.handlers.FifoChannel(LIMITS.fifo) if lossless else zenoh.handlers.RingChannel(LIMITS.ring)
-        if topic.latched:
-            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                member.session, key, channel, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            )
-        else:
-            self._subscriber = member.session.declare_subscriber(key, channel)
+        self._subscriber = subscribe(member.session, key, channel, history=topic.latched)
         self._try = self._subscriber.handler.try_recv
         self._decode = codec.decoder(topic.type)
         self._check = PortCheck(topic)

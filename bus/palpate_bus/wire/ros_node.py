@@ -11,7 +11,7 @@ from palpate_bus.contract import Qos, Topic
 from palpate_bus.messages import codec
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
-from palpate_bus.wire.transport import Publisher
+from palpate_bus.wire.transport import Publisher, subscribe
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
 
 RING = 16
@@ -49,12 +49,7 @@ class RosSubscription:
     def __init__(self, session: zenoh.Session, key: str, type_name: str, *, latched: bool = False) -> None:
         self._decode = codec.decoder(type_name)
         channel: Any = zenoh.handlers.RingChannel(RING)
-        self._subscriber: Any
-        if latched:
-            history = zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            self._subscriber = zenoh.ext.declare_advanced_subscriber(session, key, channel, history=history)
-        else:
-            self._subscriber = session.declare_subscriber(key, channel)
+        self._subscriber = subscribe(session, key, channel, history=latched)
         self._try = self._subscriber.handler.try_recv
         self.garbage = 0
         """Messages that could not be decoded."""

@@ -21,6 +21,14 @@ HELLO = 0
 """Sequence number of the empty message that tests an edge before the first tick; data starts at 1."""
 
 
+def subscribe(session: zenoh.Session, key: str, handler: Any, *, history: bool = False) -> Any:
+    """Declare a subscriber; with `history` it also receives the earlier messages of a latched topic."""
+    if not history:
+        return session.declare_subscriber(key, handler)
+    late = zenoh.ext.HistoryConfig(detect_late_publishers=True)
+    return zenoh.ext.declare_advanced_subscriber(session, key, handler, history=late)
+
+
 class ReceivedSample(NamedTuple):
     """A message received on a subscription."""
 
@@ -151,12 +159,7 @@ class Subscription:
         self._retired: bytes | None = None
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
-        if history:
-            self._subscriber: Any = zenoh.ext.declare_advanced_subscriber(
-                session, key, handler, history=zenoh.ext.HistoryConfig(detect_late_publishers=True)
-            )
-        else:
-            self._subscriber = session.declare_subscriber(key, handler)
+        self._subscriber = subscribe(session, key, handler, history=history)
         # declared last: a producer whose hello arrives here has discovered both
         self._hellos: Any = session.declare_subscriber(hello_key(key), handler)
 

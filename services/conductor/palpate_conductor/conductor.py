@@ -15,7 +15,7 @@ from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport, cod
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.runtime.conductor_link import CONDUCTOR, TRANSPORT_LOST
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_bus.runtime.lockstep import NEVER
+from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import ObservedService
 from palpate_bus.runtime.process import rare_collections
@@ -23,10 +23,9 @@ from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import EXAM_SILENT_S, Grants
-from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
-from palpate_conductor.outcome import Patience, RunFailed, RunOutcome, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
-from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
+from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
+from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog, Slots
 from palpate_inputs import InputError, parse_json
 
 log = logging.getLogger(__name__)
@@ -87,7 +86,7 @@ class Conductor:
         self._heartbeat = Heartbeat(member, rules, timing.wallclock)
         self._freezes = FreezeWatch(self._patience)
         self.watchdog = RunWatchdog(roles, {name: topic.producer for name, topic in rules.topics.items()})
-        self.outcome = RunOutcome()
+        self.result = RunResult("wallclock" if timing.wallclock else "distributed", collector.collected)
         self._contract = ContractWatch(session, rules, domain, timing.wallclock_rate)
         collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._send(RunControl.GRANT, tick, last), timing)
@@ -137,23 +136,23 @@ class Conductor:
         return reports
 
     def _notify(self, text: str) -> None:
-        self.outcome.trouble.append(text)
+        self.result.trouble.append(text)
 
     def _notify_once(self, texts: Iterable[str]) -> None:
         for text in texts:
-            if text not in self.outcome.trouble:
+            if text not in self.result.trouble:
                 self._notify(text)
 
     def diagnose(self) -> list[Any]:
         """Return the statuses of services, then topics, for `diagnostics`."""
-        services = service_statuses(self.watchdog.progress, self.outcome.lost, self._patience.soft, self._contract.violations)
+        services = service_statuses(self.watchdog.progress, self.result.lost, self._patience.soft, self._contract.violations)
         return [*services, *self._contract.statuses()]
 
     # -- the run
 
     def run(
         self, exited: Callable[[], Mapping[str, str]] = dict, tell: Callable[[Conductor], None] = lambda _: None
-    ) -> RunOutcome:
+    ) -> RunResult:
         """Run to the end. `exited` gives the roles whose process ended, with a text of the reason; `tell` is called often.
 
         Raises RunFailed if the run cannot start; later failures, KeyboardInterrupt included, are in the outcome.
@@ -164,11 +163,11 @@ class Conductor:
         finally:
             self._heartbeat.stop()
 
-    def _run(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> RunOutcome:
+    def _run(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> RunResult:
         try:
             self._handshake(exited, tell)
         except KeyboardInterrupt:
-            self.outcome.interrupted = True
+            self.result.interrupted = True
             self.abort("interrupted")
             raise RunFailed(FailureCode.INTERRUPTED, "interrupted before the first tick") from None
         self._started_at = monotonic()
@@ -177,16 +176,16 @@ class Conductor:
         self.grants.begin()
         try:
             self._conduct(exited, tell)
-            self.outcome.wall_time_s = monotonic() - self._started_at
+            self.result.wall_time_s = monotonic() - self._started_at
             self._end(exited, tell)
             tell(self)
         except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report needs what was measured, whatever ended the run
-            self.outcome.interrupted = isinstance(error, KeyboardInterrupt)
+            self.result.interrupted = isinstance(error, KeyboardInterrupt)
             failure = failure_of(error, self._observed.now)
             self._collect_heartbeat_timeouts()
-            known = self.outcome.failure is not None and failure.roles and set(failure.roles) <= self.outcome.lost.keys()
-            self.outcome.failure = self.outcome.failure or failure
-            self.outcome.wall_time_s = monotonic() - self._started_at
+            known = self.result.failure is not None and failure.roles and set(failure.roles) <= self.result.lost.keys()
+            self.result.failure = self.result.failure or failure
+            self.result.wall_time_s = monotonic() - self._started_at
             self.abort(failure.text)
             if isinstance(error, RunFailed):  # before the services end and the report is written, which takes seconds
                 if not known:
@@ -194,9 +193,11 @@ class Conductor:
                 tell(self)
         self._operator_requests.close()
         self._contract.close()
-        self.outcome.last_tick = max((p.tick for p in self.watchdog.progress.values()), default=NEVER)
+        self.result.sim_time_s = max(0, *(p.tick for p in self.watchdog.progress.values())) / NS
         self._observed.drain_and_step(last=True)
-        return self.outcome
+        if not (self.result.failure or self._wallclock):
+            self.result.run_hash = run_hash(self.result.digests)
+        return self.result
 
     def _handshake(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Send hellos until every service has answered and has a sender on every input."""
@@ -259,7 +260,7 @@ class Conductor:
     def _conduct(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Grant time until every worker has finished or is lost."""
         finished: set[str] = set()
-        while not finished >= set(self._workers) - self.outcome.lost.keys():
+        while not finished >= set(self._workers) - self.result.lost.keys():
             self._heartbeat.loop_turned()
             self._observed.drain_and_step()
             for role, message, detail in self._receive_reports():
@@ -311,14 +312,14 @@ class Conductor:
         if self.grants.exam_silent_s > self._patience.quiet:
             self._notify_once([f"waiting for exam/state of planning, {EXAM_SILENT_S:g} s at most"])
         collected = self._collector.collected
-        records = "recorder" in self._observers and "recorder" not in self.outcome.lost
+        records = "recorder" in self._observers and "recorder" not in self.result.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
         self.grants.extend(collected.exam_time, collected.end_tick, recorded)
 
     def _check_progress(self, finished: Set[str]) -> None:
         """Warn about a stall, and end the run if it lasts too long, or a step of a foreign service does."""
         limit_s = self._patience.foreign_step
-        roles = [role for role in self._workers if role not in self.outcome.lost and role not in self._slots.empty]
+        roles = [role for role in self._workers if role not in self.result.lost and role not in self._slots.empty]
         stalled = self.watchdog.longest_stall(roles) if self._wallclock else self.watchdog.stalled_for()
         stuck = [] if self._wallclock else self.watchdog.silent(self._patience.foreign & {*roles} - finished, limit_s)
         if stuck and self.watchdog.silent_for() < TUNING.silent_s:
@@ -341,18 +342,18 @@ class Conductor:
     def _lose_frozen(self, finished: Container[str]) -> None:
         """Mark frozen services lost. In lockstep no other service can react without them, so the run ends."""
         for role, how in self._freezes.frozen().items():
-            if role in finished or role in self.outcome.lost:
+            if role in finished or role in self.result.lost:
                 continue
             self._keep_slot_or_lose(role, Failure(FailureCode.FROZEN, how))
             if not self._wallclock and not self._rules.roles[role].observer:
-                failure = self.outcome.failure or Failure(FailureCode.FROZEN, how)
+                failure = self.result.failure or Failure(FailureCode.FROZEN, how)
                 raise RunFailed(failure.code, failure.text, *failure.roles)
 
     def _exited_roles(self, exited: Callable[[], Mapping[str, str]]) -> dict[str, str]:
         """Return the roles whose process or connection ended, with a text that says how."""
         ended = {role: how for role, how in exited().items() if role not in self._slots.replaced}
         gone = self._member.gone()
-        texts = {role: self._freezes.connection_lost(role) for role in gone - self.outcome.lost.keys() - ended.keys()}
+        texts = {role: self._freezes.connection_lost(role) for role in gone - self.result.lost.keys() - ended.keys()}
         if gone and self._member.transport_lost():  # checked last: services disappear before their router does
             reached = max(progress.tick for progress in self.watchdog.progress.values())
             text = f"transport lost at {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault"
@@ -361,7 +362,7 @@ class Conductor:
 
     def _keep_slot_or_lose(self, role: str, cause: Failure) -> None:
         """Keep the slot of a role that left, or mark the role lost."""
-        if not self._slots.keeps(role) or role in self.outcome.lost:
+        if not self._slots.keeps(role) or role in self.result.lost:
             self._mark_lost(role, cause)
             return
         if self._slots.leave(role, cause.text):
@@ -372,24 +373,24 @@ class Conductor:
 
     def _mark_lost(self, role: str, cause: Failure) -> None:
         """Mark all roles of a process lost at their last reported tick, and let the others react."""
-        if role in self.outcome.lost:
+        if role in self.result.lost:
             return
         lost = self._process_roles[role]
         texts = []
         for one in lost:
             tick = max(self.watchdog.progress[one].tick, 0)
-            self.outcome.lost[one] = tick
+            self.result.lost[one] = tick
             texts.append(f"{one} lost at {tick / NS:.3f} s: {cause}")
-        self.outcome.trouble += texts
+        self.result.trouble += texts
         failure = Failure(cause.code, "; ".join(texts), tuple(dict.fromkeys((*lost, *cause.roles))), cause.topics)
         if self._rules.roles[role].observer:
             log.warning("%s; the run continues", failure)
             return
-        self.outcome.failure = self.outcome.failure or failure
+        self.result.failure = self.result.failure or failure
         if any(self._rules.roles[one].critical for one in lost):
             raise RunFailed(failure.code, failure.text, *failure.roles, topics=failure.topics)
         for one in lost:
-            self._send(RunControl.LOST, self.outcome.lost[one], role=one, reason=cause.text)
+            self._send(RunControl.LOST, self.result.lost[one], role=one, reason=cause.text)
         reached = max(progress.tick for progress in self.watchdog.progress.values())
         end = reached - reached % MS + TUNING.after_loss_ns
         self.grants.grant(min(end, self.grants.horizon) if self.grants.last else end, last=True)
@@ -399,30 +400,31 @@ class Conductor:
         for role, message, detail in self._receive_reports():
             if message.waiting_for == CONDUCTOR:
                 self._on_heartbeat_timeout(role, message.tick, detail.get("conductor_lost", ""))
-        if self._heartbeat.stood_still_s and CONDUCTOR not in self.outcome.lost:
+        if self._heartbeat.stood_still_s and CONDUCTOR not in self.result.lost:
             tick = self.watchdog.progress[self._workers[0]].tick
             self._on_heartbeat_timeout("", tick, "the services left without it")
 
     def _on_heartbeat_timeout(self, role: str, tick: int, why: str) -> None:
         """End the examination: the service `role`, if known, received no heartbeat of this conductor for the deadline."""
-        if CONDUCTOR in self.outcome.lost:
+        if CONDUCTOR in self.result.lost:
             return
-        self.outcome.lost[CONDUCTOR] = max(tick, 0)
+        self.result.lost[CONDUCTOR] = max(tick, 0)
         stood = f"; it stood still for {self._heartbeat.stood_still_s:.1f} s" if self._heartbeat.stood_still_s else ""
         reported = f"{role} reports: {why}" if role else why
         text = f"conductor lost at {max(tick, 0) / NS:.3f} s: {reported}{stood}"
         self._notify(text)
-        self.outcome.failure = Failure(FailureCode.CONDUCTOR_LOST, text, (CONDUCTOR,))
+        self.result.failure = Failure(FailureCode.CONDUCTOR_LOST, text, (CONDUCTOR,))
 
     # -- the end
 
     def _store_report(self, role: str, detail: dict[str, Any]) -> None:
-        self.outcome.reports[role] = detail
-        self.outcome.digests.update(detail.get("digests", {}))
+        self.result.blame[role] = detail.pop("blame", None)
+        self.result.digests |= detail.pop("digests", {})
+        self.result.counters[role] = detail
 
     def _end(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Let the observers take in what is left and close their files."""
-        waiting = set(self._observers) - self.outcome.lost.keys()
+        waiting = set(self._observers) - self.result.lost.keys()
         begin, warned = monotonic(), False
         self._send(RunControl.END)
         while waiting and monotonic() - begin < TUNING.observers_finish_s:
@@ -463,38 +465,22 @@ def conduct(
     `perf_counter`; `tree` makes `tf`.
     """
     begin = perf_counter() if begin is None else begin
-    timing = timing or Timing()
     collector = Collector(tree=tree)
     conductor = Conductor(session, contract(), Settings.read().domain, roles, collector, patience, timing)
 
     def report(c: Conductor) -> None:
         wall = max(c.elapsed_s, 1e-9)
         t = max(collector.collected.exam_time, 0)
-        tell(RunProgress(t, t / NS / wall, collector.collected, tuple(c.outcome.trouble), c.request if c.elapsed_s else None))
+        tell(RunProgress(t, t / NS / wall, collector.collected, tuple(c.result.trouble), c.request if c.elapsed_s else None))
 
+    result = conductor.result
     try:
         with rare_collections():
-            outcome = conductor.run(exited, report)
-        failure = outcome.failure or gave_up(collector.collected)
-        if failure and (interruption := conductor.watchdog.interruption):
-            failure = failure.with_note(interruption)
+            conductor.run(exited, report)
+        result.failure = result.failure or gave_up(collector.collected)
+        if result.failure and (interruption := conductor.watchdog.interruption):
+            result.failure = result.failure.with_note(interruption)
     except RunFailed as error:
-        outcome = conductor.outcome
-        failure = error.failure
-    return RunResult(
-        runtime="wallclock" if timing.wallclock else "distributed",
-        collected=collector.collected,
-        run_hash=None if timing.wallclock else outcome.run_hash,
-        digests=outcome.digests,
-        sim_time_s=max(outcome.last_tick, 0) / NS,
-        wall_time_s=outcome.wall_time_s,
-        start_time_s=(conductor.started_at_perf or perf_counter()) - begin,
-        blame={role: detail.get("blame") for role, detail in outcome.reports.items()},
-        counters={
-            role: {key: value for key, value in detail.items() if key not in ("blame", "digests")}
-            for role, detail in outcome.reports.items()
-        },
-        failure=failure,
-        lost=outcome.lost,
-        interrupted=outcome.interrupted,
-    )
+        result.failure = error.failure
+    result.start_time_s = (conductor.started_at_perf or perf_counter()) - begin
+    return result

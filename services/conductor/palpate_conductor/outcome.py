@@ -1,14 +1,13 @@
 """Settings and results of a run: how time passes, how long the conductor waits, how the run ended."""
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.failure import Failure, FailureCode
-from palpate_bus.runtime.lockstep import NEVER, run_hash
 from palpate_conductor.collector import Collected
 from palpate_errors import RunError
 
@@ -31,7 +30,7 @@ class Timing:
     limit: int = SIM_LIMIT
     """Simulated time [ns] at which the run ends at the latest."""
     handover_s: float = 0.0
-    """Wall-clock mode: time for which the slot of a service that left is kept [s], see `handover`; 0 keeps none."""
+    """Wall-clock mode: time for which the slot of a service that left is kept [s], see `watchdog.Slots`; 0 keeps none."""
 
     @property
     def wallclock_rate(self) -> float | None:
@@ -75,51 +74,33 @@ class Patience:
 
 
 @dataclass
-class RunOutcome:
-    """Outcome of a conducted run."""
-
-    digests: dict[str, str] = field(default_factory=dict)
-    reports: dict[str, Mapping[str, Any]] = field(default_factory=dict)
-    """Last report of each service: blame, counters, facts."""
-    wall_time_s: float = 0.0
-    last_tick: int = NEVER
-    trouble: list[str] = field(default_factory=list)
-    """Messages for the user about lost services and the like."""
-    lost: dict[str, int] = field(default_factory=dict)
-    """Last reported tick [ns] of each lost service."""
-    failure: Failure | None = None
-    """None for a completed run."""
-    interrupted: bool = False
-    """True if Ctrl-C or SIGTERM ended it."""
-
-    @property
-    def run_hash(self) -> str | None:
-        """The run hash, None for a run that did not complete."""
-        return None if self.failure else run_hash(self.digests)
-
-
-@dataclass
 class RunResult:
     """Result of a run, in memory."""
 
     runtime: str
     collected: Collected
-    run_hash: str | None
-    digests: dict[str, str]
+    run_hash: str | None = None
+    """None for a run that did not complete or is not deterministic."""
+    digests: dict[str, str] = field(default_factory=dict)
     """SHA-256 over the messages of each hashed topic; shows the topic in which two runs differ."""
-    sim_time_s: float
-    wall_time_s: float
-    start_time_s: float
+    sim_time_s: float = 0.0
+    wall_time_s: float = 0.0
+    start_time_s: float = 0.0
     """From the command to the first tick."""
-    blame: dict[str, Any]
-    counters: dict[str, Any]
-    failure: Failure | None
+    blame: dict[str, Any] = field(default_factory=dict)
+    """Time of each service by cause."""
+    counters: dict[str, Any] = field(default_factory=dict)
+    """Counters and facts of each service."""
+    failure: Failure | None = None
     """None for a completed examination."""
-    lost: dict[str, int]
+    lost: dict[str, int] = field(default_factory=dict)
+    """Last reported tick [ns] of each lost service."""
     earlier: tuple[Collected, ...] = ()
     """Messages of the interrupted examinations that this one resumed, oldest first; its samples include theirs."""
     interrupted: bool = False
     """True if Ctrl-C or SIGTERM ended it."""
+    trouble: list[str] = field(default_factory=list)
+    """Messages for the user about lost services and the like."""
 
     @property
     def unbegun(self) -> bool:
@@ -136,7 +117,7 @@ class RunProgress:
     real_time_factor: float
     collected: Collected
     trouble: tuple[str, ...] = ()
-    """Messages for the user so far, see `RunOutcome`."""
+    """Messages for the user so far, see `RunResult`."""
     request: Callable[[int, str], None] | None = None
     """Sends an operator's request with its reason; None where there is no bus."""
 

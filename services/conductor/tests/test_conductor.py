@@ -73,7 +73,7 @@ def test_a_pause_has_a_bound_and_is_named() -> None:
             conductor.grants.begin()
             conductor.grants.pace("pause", 0)
             conductor._extend_grant()
-            assert any("palpate resume" in text for text in conductor.outcome.trouble)
+            assert any("palpate resume" in text for text in conductor.result.trouble)
             sleep(0.2)
             conductor.grants.pace("pause", 0)  # counts on
             sleep(0.2)

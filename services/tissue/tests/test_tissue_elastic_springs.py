@@ -10,7 +10,7 @@ import pytest
 from scipy.optimize import minimize
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.implementations import create_for
+from palpate_bus.implementations import kind
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.stamps import header
@@ -207,7 +207,7 @@ def tool_state(t, p, radius=0.015):
 def test_the_scenario_chooses_it():
     scenario = load_scenario("deep_lesion")
     assert scenario.phantom.lesions[0].depth_m == 0.008
-    assert create_for("tissue", scenario.services.tissue) is create
+    assert kind("tissue").load(scenario.services.tissue) is create
 
 
 def test_it_publishes_what_the_contract_says_and_presses_back():
