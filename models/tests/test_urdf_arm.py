@@ -1,6 +1,7 @@
 """Arms from a URDF: the tables agree with pinocchio, and what is broken is named with its link or joint."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pinocchio as pin
@@ -16,10 +17,11 @@ from palpate_models.scenario.schema import Robot
 TWISTS = ("0 0 0", "-1.5708 0 0", "0 1.5708 0", "1.5708 0 0", "0 -1.5708 0.3", "0.2 0 0")
 TENSOR = '<inertia ixx="{x}" iyy="{y}" izz="{z}" ixy="0" ixz="0" iyz="0"/>'
 INERTIAL = f'<inertial><origin xyz="0 0 0.05"/><mass value="{{m}}"/>{TENSOR}</inertial>'
+XACRO = '<robot xmlns:xacro="http://www.ros.org/wiki/xacro"><xacro:arm/></robot>'
 GOOD = {"m": 2.0, "x": 0.02, "y": 0.02, "z": 0.01}
 
 
-def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: str) -> str:
+def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: Any) -> str:
     """Return the YAML file of an arm of six joints; `changes` replace parts of its third joint and link, or of the YAML file."""
     given = {"urdf": "arm.urdf", "flange": "tip", "home_rad": [0.0, 0.3, -0.4, 0.2, 0.5, 0.0]} | {
         key: value for key, value in changes.items() if key in ("flange", "home_rad", "urdf", "wrong")
@@ -44,7 +46,8 @@ def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: s
     slide = '<parent link="tip"/><child link="gripper"/><limit lower="0" upper="0.1" velocity="1" effort="1"/>'
     links.append(f'<link name="tip"/><joint name="mount" type="fixed">{mount}</joint>')
     links.append(f'<link name="gripper"/><joint name="slide" type="prismatic">{slide}</joint>')
-    (folder / "arm.urdf").write_text(changes.get("text", f'<robot name="arm">{"".join(links)}</robot>'))
+    whole = f'<robot name="arm">{"".join(links)}</robot>'
+    (folder / "arm.urdf").write_text(changes.get("text", whole.replace(*changes.get("swap", ("", "")), 1)))
     path = folder / "arm.yaml"
     path.write_text(yaml.safe_dump(given))
     return str(path)
@@ -78,7 +81,7 @@ BROKEN = {
     "no mass": ({"inertial": ""}, "link link_3: no mass"),
     "negative inertia": ({"inertia": {"z": -0.01}}, "link link_3: inertia is not positive"),
     "triangle": ({"inertia": {"x": 0.2}}, "link link_3: inertia against the triangle inequality"),
-    "not a number": ({"inertia": {"x": float("nan")}}, "link link_3: mass or inertia is not finite"),
+    "not a number": ({"inertia": {"x": float("nan")}}, "link link_3: ixx is not finite"),
     "no mesh": ({"collision": '<geometry><mesh filename="no.stl"/></geometry>'}, "link link_3: mesh no.stl is not there"),
     "no limits": ({"limit": "<unlimited/>"}, "joint joint_3: no limit"),
     "empty range": ({"limit": '<limit lower="1" upper="1" velocity="2" effort="80"/>'}, "joint joint_3: its range"),
@@ -88,13 +91,41 @@ BROKEN = {
     "one joint less": ({"kind": "fixed"}, "5 joints"),
     "no flange": ({"flange": "tool"}, "no link 'tool'"),
     "home outside": ({"home_rad": [0.0, 0.0, 3.0, 0.0, 0.0, 0.0]}, "home_rad: 3.000 of joint_3"),
+    "unknown parent": (
+        {"swap": ('parent link="link_2"', 'parent link="x"')},
+        "joint joint_3: no link 'x' in the file, its parent",
+    ),
+    "no child": ({"swap": ('<child link="link_3"/>', "")}, "joint joint_3: no link ''"),
+    "loop": ({"swap": ('parent link="link_0"', 'parent link="link_6"')}, "link link_6: its joints form a circle"),
+    "two roots": ({"swap": ("</robot>", '<link name="x"/></robot>')}, "links link_0, x: 2 roots"),
+    "two joints above": ({"swap": ('child link="gripper"', 'child link="link_3"')}, "link link_3: has two joints above it"),
+    "name twice": ({"swap": ('<link name="link_0"/>', '<link name="link_0"/>' * 2)}, "link 'link_0': 2 of this name"),
+    "joint without name": ({"swap": ('joint name="joint_3"', "joint")}, "joint ''"),
+    "mimic": ({"limit": '<mimic joint="joint_2"/>'}, "joint joint_3: mimics"),
+    "axis": ({"swap": ('"0 0 2"', '"0 0 0"')}, "joint joint_1: its axis is zero"),
+    "axis without z": ({"swap": ('"0 0 2"', '"0 1"')}, "joint joint_1: xyz is '0 1', want 3"),
+    "origin": ({"swap": ("0.02 0 0.2", "nan 0 0.2")}, "joint joint_1: xyz is not finite"),
+    "millimetres": ({"swap": ("0.02 0 0.2", "20 0 200")}, "joint joint_1: its origin is farther than 2 m"),
+    "centre of mass": ({"swap": ("0 0 0.05", "0 0 50")}, "link link_1: its centre of mass is farther than 2 m"),
+    "xacro left": ({"inertia": {"m": "${m}"}}, "link link_3: value is '${m}'"),
+    "unit of inertia": ({"inertia": {"x": 2e4, "y": 2e4}}, "link link_3: inertia of 2e+04 kg m^2"),
+    "endless range": (
+        {"limit": '<limit lower="-inf" upper="inf" velocity="2" effort="80"/>'},
+        "joint joint_3: lower is not finite",
+    ),
+    "no size": ({"collision": '<geometry><box size="0.1 0 0.1"/></geometry>'}, "link link_3: size of its box"),
+    "shape": ({"collision": '<geometry><capsule radius="0.1"/></geometry>'}, "link link_3: shape capsule"),
+    "not a mesh": (
+        {"collision": '<geometry><mesh filename="arm.urdf"/></geometry>'},
+        "link link_3: mesh arm.urdf cannot be read",
+    ),
     "short home": ({"home_rad": [0.0, 0.0, 0.0, 0.0]}, "home_rad: 4 values, want 6"),
 }
 
 
 @pytest.mark.parametrize(("changes", "named"), BROKEN.values(), ids=BROKEN)
-def test_what_is_broken_is_named(tmp_path: Path, changes: dict[str, str], named: str) -> None:
-    arm, faults = read_arm(write(tmp_path, **changes))  # type: ignore[arg-type]
+def test_what_is_broken_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
+    arm, faults = read_arm(write(tmp_path, **changes))
     assert arm is None
     assert any(named in fault for fault in faults), faults
 
@@ -113,15 +144,21 @@ def test_a_mesh_in_millimetres_is_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize(
     ("changes", "named"),
-    [({"text": "<robot"}, "not a URDF"), ({"urdf": "other.urdf"}, "other.urdf"), ({"wrong": "1"}, "wrong: Extra inputs")],
+    [
+        ({"text": "<robot"}, "not a URDF"),
+        ({"text": "<sdf/>"}, "its root element is sdf"),
+        ({"text": XACRO}, "has xacro elements"),
+        ({"urdf": "other.urdf"}, "other.urdf"),
+        ({"wrong": "1"}, "wrong: Extra inputs"),
+    ],
 )
-def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, str], named: str) -> None:
+def test_a_file_that_cannot_be_read_is_named(tmp_path: Path, changes: dict[str, Any], named: str) -> None:
     with pytest.raises(UserError, match=named):
-        read_arm(write(tmp_path, **changes))  # type: ignore[arg-type]
+        read_arm(write(tmp_path, **changes))
 
 
 def test_a_home_posture_is_found(tmp_path: Path) -> None:
-    arm, faults = read_arm(write(tmp_path, home_rad=None))  # type: ignore[arg-type]
+    arm, faults = read_arm(write(tmp_path, home_rad=None))
     assert arm is not None, faults
     assert arm.posture(arm.home_rad)[1] == pytest.approx([0.0, 0.0, -1.0], abs=0.05)
     assert ((arm.lower_rad < arm.home_rad) & (arm.home_rad < arm.upper_rad)).all()

@@ -17,10 +17,10 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError
-from palpate_inputs import read_text
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_posture
+from palpate_models.robot.urdf_tree import UrdfTree, linked
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 
 
@@ -82,51 +82,30 @@ def _coal() -> Any:
         raise UserError("the meshes of an arm need coal: pip install 'palpate[run]'") from error
 
 
-def _numbers(element: ElementTree.Element | None, attribute: str, default: str = "0 0 0") -> Array:
-    text = default if element is None else element.get(attribute, default)
-    return np.array([float(part) for part in text.split()])
-
-
-def _pose(element: ElementTree.Element | None) -> Array:
-    """Return the pose of an `origin`, shape (4, 4)."""
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_euler("xyz", _numbers(element, "rpy")).as_matrix()
-    X[:3, 3] = _numbers(element, "xyz")
-    return X
-
-
 class _Reader:
     """Reads the chain from base to flange of one URDF and collects faults."""
 
     def __init__(self, given: ArmFile, path: Path) -> None:
         self._given, self._path = given, path
-        self.faults: list[str] = []
-        try:
-            text = read_text(path)
-            if "<!ENTITY" in text:
-                raise UserError(f"{path}: has XML entities, which may name other files: write their text")
-            root = ElementTree.fromstring(text)
-        except (OSError, ElementTree.ParseError) as error:
-            raise UserError(f"{path}: not a URDF: {error}") from error
-        self._links = {link.get("name", ""): link for link in root.findall("link")}
-        self._joint_of = {}
-        for joint in root.findall("joint"):
-            child = joint.find("child")
-            if child is not None and joint.find("parent") is not None:
-                self._joint_of[child.get("link", "")] = joint
+        self._tree = UrdfTree(path)
+        self._links, self._joint_of = self._tree.links, self._tree.joint_of
+        self._numbers, self._pose = self._tree.numbers, self._tree.pose
+        self.faults = list(self._tree.faults)
 
     def read(self, name: str) -> tuple[Arm | None, list[str]]:
         """Return the arm, None if it is unusable, and the faults."""
         try:
-            return self._arm(name)
-        except (ValueError, KeyError) as error:
+            return (None, self.faults) if self.faults else self._arm(name)
+        except UserError:
+            raise
+        except ValueError as error:
             return None, [*self.faults, f"{self._path.name}: {error}"]
 
     def _arm(self, name: str) -> tuple[Arm | None, list[str]]:
         if self._given.flange not in self._links:
             near = get_close_matches(self._given.flange, self._links, 6, 0.4) or list(self._links)[-6:]
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
-        chain = self._chain()
+        chain = self._tree.chain(self._given.flange)
         poses, moving = self._placed(chain)
         n = len(moving)
         if n not in (6, 7):
@@ -134,19 +113,21 @@ class _Reader:
         limits = self._limits(moving)
         R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
-        frames = [np.eye(4), *(poses[chain.index(self._child(joint))] for joint in moving)]
+        frames = [np.eye(4), *(poses[chain.index(linked(joint, "child"))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
         inertias = tuple(
             self._inertia(group, R_BF, origin, name=links[0], fixed=k == 0)
             for k, (group, origin, links) in enumerate(zip(groups, origins, [[g[0][0]] for g in groups], strict=True))
         )
         capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
+        if not any(capsules):
+            self.faults.append(f"links {chain[0]} to {self._given.flange}: none has a shape, so collisions cannot be seen")
         home = np.zeros(n) if self._given.home_rad is None else np.array(self._given.home_rad)
         if len(home) != n:
             self.faults.append(f"home_rad: {len(home)} values, want {n}")
         if self.faults:
             return None, self.faults
-        given_axes = [_unit(_numbers(joint.find("axis"), "xyz", "1 0 0")) for joint in moving]
+        given_axes = [self._axis(joint) for joint in moving]
         axes = np.array([X[:3, :3] @ axis for X, axis in zip(frames[1:], given_axes, strict=True)])
         lower, upper, velocity, torque = limits
         given = self._given
@@ -157,7 +138,7 @@ class _Reader:
         arm = Arm(
             name=name,
             joint_names=tuple(joint.get("name", "") for joint in moving),
-            link_names=(chain[0], *(self._child(joint) for joint in moving), self._flange_name(moving)),
+            link_names=(chain[0], *(linked(joint, "child") for joint in moving), self._flange_name(moving)),
             origin_m=np.diff(origins, axis=0) @ R_BF,
             axis=axes @ R_BF,
             flange_m=R_BF.T @ (poses[-1][:3, 3] - origins[-1]),
@@ -183,36 +164,35 @@ class _Reader:
                 arm = replace(arm, home_rad=found)
         return (None if self.faults else arm), self.faults
 
+    def _axis(self, joint: ElementTree.Element) -> Array:
+        """Return the unit axis of a joint."""
+        self._tree.part = f"joint {joint.get('name')}"
+        axis = self._numbers(joint.find("axis"), "xyz", "1 0 0")
+        if not axis.any():
+            raise ValueError(f"{self._tree.part}: its axis is zero")
+        return axis / np.linalg.norm(axis)
+
     def _flange_name(self, moving: list[ElementTree.Element]) -> str:
-        last = self._child(moving[-1])
+        last = linked(moving[-1], "child")
         return self._given.flange if self._given.flange != last else f"{last}_flange"
-
-    def _chain(self) -> list[str]:
-        """Return the links from the root to the flange."""
-        chain = [self._given.flange]
-        while joint := self._joint_of.get(chain[-1]):
-            parent = _child_of(joint, "parent")
-            if parent in chain:
-                raise ValueError(f"link {parent}: its joints form a circle")
-            chain.append(parent)
-        chain = chain[::-1]
-        return chain[1:] if chain[0] == "world" and len(chain) > 2 else chain
-
-    def _child(self, joint: ElementTree.Element) -> str:
-        return _child_of(joint, "child")
 
     def _placed(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
         """Return the pose of each link in the root at zero, and the joints that turn."""
         X, poses, moving = np.eye(4), [np.eye(4)], []
         for link in chain[1:]:
             joint = self._joint_of[link]
-            X = X @ _pose(joint.find("origin"))
+            self._tree.part = f"joint {joint.get('name')}"
+            X = X @ self._pose(joint.find("origin"))
             poses.append(X)
             kind = joint.get("type")
+            if np.linalg.norm(self._numbers(joint.find("origin"), "xyz")) > TUNING.largest_link_m:
+                self.faults.append(f"{self._tree.part}: its origin is farther than {TUNING.largest_link_m:g} m: want metres")
+            if joint.find("mimic") is not None:
+                self.faults.append(f"{self._tree.part}: mimics another joint; want joints that turn by themselves")
             if kind in ("revolute", "continuous"):
                 moving.append(joint)
             elif kind != "fixed":
-                raise ValueError(f"joint {joint.get('name')}: is {kind}; want joints that turn")
+                raise ValueError(f"{self._tree.part}: is {kind}; want joints that turn")
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> tuple[Array, Array, Array, Array]:
@@ -220,21 +200,21 @@ class _Reader:
         table = np.zeros((4, len(moving)))
         for k, joint in enumerate(moving):
             limit, name = joint.find("limit"), joint.get("name")
+            self._tree.part = f"joint {name}"
             endless = joint.get("type") == "continuous"
             for row, (attribute, field, usual) in enumerate(
                 (("lower", "lower_rad", -TUNING.continuous_rad), ("upper", "upper_rad", TUNING.continuous_rad),
                  ("velocity", "velocity_radps", None), ("effort", "torque_nm", None))
             ):  # fmt: skip
                 given = getattr(self._given, field)
-                text = None if limit is None else limit.get(attribute)
                 if given is not None and k < len(given):
                     table[row, k] = given[k]
                 elif endless and usual is not None:
                     table[row, k] = usual
-                elif text is None:
+                elif limit is None or attribute not in limit.attrib:
                     self.faults.append(f"joint {name}: no limit {attribute!r}; give {field} in the YAML file")
                 else:
-                    table[row, k] = float(text)
+                    table[row, k] = self._numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
             if not upper > lower:
                 self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad")
@@ -251,7 +231,7 @@ class _Reader:
         Links behind the flange are left out; other fixed branches belong to the arm.
         """
         carrier: dict[str, int] = {}
-        movers = {self._child(joint): k + 1 for k, joint in enumerate(moving)}
+        movers = {linked(joint, "child"): k + 1 for k, joint in enumerate(moving)}
         groups: list[list[tuple[str, Array]]] = [[] for _ in range(len(moving) + 1)]
         current = 0
         for link in chain:
@@ -262,8 +242,8 @@ class _Reader:
         while todo:
             parent = todo.pop()
             for child, joint in self._joint_of.items():
-                if child not in carrier and _child_of(joint, "parent") == parent and joint.get("type") == "fixed":
-                    poses[child] = poses[parent] @ _pose(joint.find("origin"))
+                if child not in carrier and linked(joint, "parent") == parent and joint.get("type") == "fixed":
+                    poses[child] = poses[parent] @ self._pose(joint.find("origin"))
                     carrier[child] = carrier[parent]
                     groups[carrier[parent]].append((child, poses[child]))
                     todo.append(child)
@@ -276,14 +256,20 @@ class _Reader:
             inertial = self._links[link].find("inertial") if link in self._links else None
             if inertial is None:
                 continue
-            mass = float(_numbers(inertial.find("mass"), "value", "0")[0])
+            self._tree.part = f"link {link}"
+            mass = float(self._numbers(inertial.find("mass"), "value", "0")[0])
             entries = inertial.find("inertia")
-            xx, yy, zz, xy, xz, yz = (float(_numbers(entries, key, "0")[0]) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
+            xx, yy, zz, xy, xz, yz = (
+                float(self._numbers(entries, key, "0")[0]) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+            )
             tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
             if mass == 0 and not tensor.any():
                 continue
             self._check_inertia(link, mass, tensor)
-            X_C = X @ _pose(inertial.find("origin"))
+            offset = self._pose(inertial.find("origin"))
+            if np.linalg.norm(offset[:3, 3]) > TUNING.largest_link_m:
+                self.faults.append(f"link {link}: its centre of mass is farther than {TUNING.largest_link_m:g} m: want metres")
+            X_C = X @ offset
             parts.append((mass, X_C[:3, 3], X_C[:3, :3] @ tensor @ X_C[:3, :3].T))
         total = sum(mass for mass, _, _ in parts)
         if total <= 0:
@@ -306,9 +292,6 @@ class _Reader:
         )
 
     def _check_inertia(self, link: str, mass: float, tensor: Array) -> None:
-        if not (np.isfinite(mass) and np.isfinite(tensor).all()):
-            self.faults.append(f"link {link}: mass or inertia is not finite")
-            return
         if mass <= 0:
             self.faults.append(f"link {link}: mass is {mass:g} kg, want more than 0")
         a, b, c = np.linalg.eigvalsh(tensor)
@@ -318,6 +301,8 @@ class _Reader:
             self.faults.append(
                 f"link {link}: inertia against the triangle inequality: {c:.3g} kg m^2 is more than {a:.3g} and {b:.3g} together"
             )
+        elif c > mass * TUNING.largest_link_m**2 > 0:
+            self.faults.append(f"link {link}: inertia of {c:.3g} kg m^2 with {mass:g} kg: its unit is not kg m^2")
 
     def _shape(self, group: list[tuple[str, Array]], R_BF: Array, origin: Array) -> tuple[Capsule, ...]:
         """Return a capsule about the collision geometry of each link of a group (visual where there is none)."""
@@ -327,6 +312,7 @@ class _Reader:
             if element is None:
                 continue
             shapes = element.findall("collision") or element.findall("visual")
+            self._tree.part = f"link {link}"
             clouds = [points for shape in shapes if len(points := self._points(link, X, shape))]
             if clouds:
                 found.append(enclosing_capsule((np.concatenate(clouds) - origin) @ R_BF))
@@ -334,23 +320,28 @@ class _Reader:
 
     def _points(self, link: str, X: Array, shape: ElementTree.Element) -> Array:
         """Return points of a shape's surface in the axes of the root, shape (n, 3)."""
-        X = X @ _pose(shape.find("origin"))
+        X = X @ self._pose(shape.find("origin"))
         geometry = shape.find("geometry")
         kind = None if geometry is None or not len(geometry) else geometry[0]
         if kind is None:
             return np.zeros((0, 3))
         if kind.tag == "mesh":
-            points = self._mesh(link, kind)
-        elif kind.tag == "box":
-            points = np.array(np.meshgrid(*((-s / 2, s / 2) for s in _numbers(kind, "size")))).reshape(3, -1).T
-        else:
-            radius = float(kind.get("radius", "0"))
-            half = float(kind.get("length", "0")) / 2
+            return np.asarray(self._mesh(link, kind) @ X[:3, :3].T + X[:3, 3])
+        if kind.tag == "box":
+            size = self._numbers(kind, "size")
+            points = np.array(np.meshgrid(*((-side / 2, side / 2) for side in size))).reshape(3, -1).T
+        elif kind.tag in ("sphere", "cylinder"):
+            radius, half = size = np.append(self._numbers(kind, "radius", "0"), self._numbers(kind, "length", "0") / 2)
+            size = size[: 1 if kind.tag == "sphere" else 2]
             turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
             ring = radius * np.column_stack((np.cos(turn), np.sin(turn), 0 * turn))
             tips = np.array(((0, 0, radius), (0, 0, -radius))) if kind.tag == "sphere" else np.zeros((0, 3))
             top = np.array((0.0, 0.0, half))
             points = np.concatenate((ring + top, ring - top, tips))
+        else:
+            raise ValueError(f"{self._tree.part}: shape {kind.tag}; want mesh, box, sphere or cylinder")
+        if not (size > 0).all():
+            raise ValueError(f"{self._tree.part}: size of its {kind.tag} is {size}, want more than 0")
         return np.asarray(points @ X[:3, :3].T + X[:3, 3])
 
     def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:
@@ -360,11 +351,12 @@ class _Reader:
         if not path.is_file():
             self.faults.append(f"link {link}: mesh {name} is not there")
             return np.zeros((0, 3))
+        scale = self._numbers(mesh, "scale", "1 1 1")
         try:
-            vertices = np.array(_coal().MeshLoader().load(str(path), _numbers(mesh, "scale", "1 1 1")).vertices())
+            vertices = np.array(_coal().MeshLoader().load(str(path), scale).vertices())
             hull = vertices[ConvexHull(vertices).vertices]
-        except (RuntimeError, ValueError, QhullError) as error:
-            self.faults.append(f"link {link}: mesh {name} cannot be read: {error}")
+        except (RuntimeError, ValueError, QhullError):
+            self.faults.append(f"link {link}: mesh {name} cannot be read")
             return np.zeros((0, 3))
         size = float(np.ptp(hull, axis=0).max())
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
@@ -372,14 +364,5 @@ class _Reader:
         return np.asarray(hull)
 
 
-def _unit(axis: Array) -> Array:
-    return axis / np.linalg.norm(axis)
-
-
 def _or(given: tuple[float, ...] | None, usual: Array) -> Array:
     return usual if given is None else np.array(given)
-
-
-def _child_of(joint: ElementTree.Element, tag: str) -> str:
-    element = joint.find(tag)
-    return "" if element is None else element.get("link", "")
