@@ -65,8 +65,8 @@ def test_a_stopped_assessment_is_replaced_in_a_wall_clock_run(tmp_path: Path) ->
     assert second.wait(timeout=20) == 0
     text = "".join(lines)
     assert status == 0, text
-    assert "its place is kept" in text
-    assert "another process plays assessment" in text
+    assert "its slot is kept" in text
+    assert "another process replaces assessment" in text
     report = Finished(status, text, tmp_path).report
     assert report["services"]["assessment"]["facts"]["samples"] >= 0
     assert report["failure"] is None

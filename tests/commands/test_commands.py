@@ -19,7 +19,7 @@ from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
 from palpate.run.options import RunOptions
 from palpate_models.scenario.load import load_scenario
-from palpate_plugins import PluginError
+from palpate_plugins import PluginError, PluginKind
 
 
 def walked(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
@@ -87,12 +87,12 @@ def test_a_command_that_lacks_its_libraries_names_the_extra(
 
 
 def test_a_run_without_the_libraries_of_the_dashboard_has_no_dashboard(monkeypatch: pytest.MonkeyPatch) -> None:
-    def lacking(role: str, choice: str) -> None:
-        raise PluginError(f"services.{role} = {choice!r}: needs rerun-sdk, not installed: pip install 'palpate[dashboard]'")
+    def lacking(kind: PluginKind, choice: str) -> None:
+        raise PluginError(f"{kind.field} = {choice!r}: needs rerun-sdk, not installed: pip install 'palpate[dashboard]'")
 
     options = RunOptions(composed=True)
     assert examine._observers(load_scenario("clean"), options) == ("dashboard", "recorder")
-    monkeypatch.setattr(examine, "check_libraries", lacking)
+    monkeypatch.setattr(PluginKind, "check_libraries", lacking)
     assert examine._observers(load_scenario("clean"), options) == ("recorder",)
     assert "pip install 'palpate[dashboard]'" in examine._missing_for_dashboard(load_scenario("clean"))
     assert examine._observers(load_scenario("clean"), replace(options, record="none")) == ()
