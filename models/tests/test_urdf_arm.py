@@ -44,7 +44,8 @@ def write(folder: Path, *, inertia: dict[str, float] | None = None, **changes: A
         )
     mount = '<parent link="link_6"/><child link="tip"/><origin xyz="0 0 0.1" rpy="0 0.4 0"/>'
     slide = '<parent link="tip"/><child link="gripper"/><limit lower="0" upper="0.1" velocity="1" effort="1"/>'
-    links.append(f'<link name="tip"/><joint name="mount" type="fixed">{mount}</joint>')
+    light = INERTIAL.format(m=0.01, x=1e-6, y=1e-6, z=1e-6)  # behind the flange: left out
+    links.append(f'<link name="tip">{light}</link><joint name="mount" type="fixed">{mount}</joint>')
     links.append(f'<link name="gripper"/><joint name="slide" type="prismatic">{slide}</joint>')
     whole = f'<robot name="arm">{"".join(links)}</robot>'
     (folder / "arm.urdf").write_text(changes.get("text", whole.replace(*changes.get("swap", ("", "")), 1)))

@@ -27,6 +27,9 @@ def check(arm: Name) -> None:
     from palpate_models.robot.arm import checked_arm
 
     found, faults = checked_arm(arm)
+    if found is not None and (pairs := _touching(arm)):
+        advice = "is the flange in front of the arm, with z out of it?"
+        found, faults = None, [f"home_rad: {pair} touch: {advice}" for pair in pairs]
     for fault in faults:
         say(f"{arm}: {fault}")
     if found is None:
@@ -58,9 +61,12 @@ def place(
     from rich.console import Console
 
     from palpate.arm.placement import RAISED_M, best_placement, describe, scan_targets
+    from palpate.console import say
     from palpate.run.inputs import usable
     from palpate_models.robot.arm import arm_of
+    from palpate_models.scenario.load import exam_input
     from palpate_planning.placement.redundancy import plan_redundancy
+    from palpate_planning.strokes.plan import look_postures
 
     chosen = usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
     console = Console()
@@ -77,7 +83,23 @@ def place(
         highlight=False,
     )
     _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
+    at = chosen.model_copy(update={"robot": robot})
+    if not look_postures(exam_input(at)):
+        say("no posture to look from is free of collisions here: give another home_rad, or move the base by hand")
     console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
+
+
+def _touching(arm: str) -> list[str]:
+    """Return the pairs of shapes of an arm, tool included, that are too close at home, wherever its base stands."""
+    from palpate_models.robot.arm import arm_of
+    from palpate_models.robot.table import boxes
+    from palpate_models.scenario.schema import Limits, Robot
+    from palpate_planning.motion.kinematics import ArmKinematics
+    from palpate_planning.motion.scene import CollisionScene
+
+    robot = Robot(arm=arm)
+    found = CollisionScene(ArmKinematics(robot, Limits()), robot).collisions(arm_of(robot).home_rad)
+    return [pair for pair in found if not any(pair.endswith(box.name) for box in boxes(robot))]
 
 
 def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base_xy: tuple[float, float]) -> None:

@@ -4,6 +4,7 @@ Behind the arm's flange follow `ft_sensor` (origin at the measuring face) and `i
 the flange.
 """
 
+import warnings
 from typing import Final
 
 import numpy as np
@@ -169,7 +170,8 @@ def urdf(robot: Robot, *, geometry: bool = True) -> str:
         seen = shapes[link] if geometry else ()
         primitives = "".join(_geometry(tag, capsule) for tag in ("visual", "collision") for capsule in seen)
         parts.append(f'<link name="{link}">{_inertial(inertia[link])}{primitives}</link>')
-    rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
+    with warnings.catch_warnings(action="ignore"):  # an arm whose z points along the table is at a gimbal lock
+        rpy = Rotation.from_matrix(X_WB[:3, :3]).as_euler("xyz")
     parts.append(_joint(f"{arm.name}_base", "fixed", "world", links[0], X_WB[:3, 3], rpy))
     parts += [_revolute(arm, i, robot) for i in range(arm.joints)]
     flange = arm.link_names[-1]

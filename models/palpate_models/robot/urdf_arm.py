@@ -228,7 +228,7 @@ class _Reader:
     ) -> list[list[tuple[str, Array]]]:
         """Return for the base and each moving link the links fixed to it, with their pose in the root at zero.
 
-        Links behind the flange are left out; other fixed branches belong to the arm.
+        A flange that is fixed to the last link is left out, and so is what is behind it; other fixed branches belong to the arm.
         """
         carrier: dict[str, int] = {}
         movers = {linked(joint, "child"): k + 1 for k, joint in enumerate(moving)}
@@ -237,7 +237,8 @@ class _Reader:
         for link in chain:
             current = movers.get(link, current)
             carrier[link] = current
-            groups[current].append((link, poses[link]))
+            if link != self._given.flange or link in movers:
+                groups[current].append((link, poses[link]))
         todo = list(chain[:-1])
         while todo:
             parent = todo.pop()
