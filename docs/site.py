@@ -2,10 +2,10 @@
 
     python docs/site.py out/site-pages && mkdocs build --strict
 
-Reference pages are generated from contract, tables, models and commands. Links between pages stay as they are in the
-repository. A link to a folder becomes a link to its README. A link whose text is a file name gets the title of that page. A
-link to a file that the site does not have, such as source code, becomes plain text. The notebooks of docs/notebooks are
-executed and become pages with their output.
+Reference pages are generated from contract, tables, models and commands, and the pages of studies from their tables. Links
+between pages stay as they are in the repository. A link to a folder becomes a link to its README, or to the page of its study.
+A link whose text is a file name gets the title of that page. A link to a file that the site does not have, such as source code,
+becomes plain text. The notebooks of docs/notebooks are executed and become pages with their output.
 """
 
 import re
@@ -22,17 +22,28 @@ from nbclient.exceptions import CellExecutionError
 from nbconvert import MarkdownExporter
 from nbconvert.writers import FilesWriter
 
+from palpate.study.summary import summarise
+
 ROOT = Path(__file__).resolve().parents[1]
 NOTEBOOKS = Path("docs/notebooks")
 GENERATED = {
     "docs/topics.md": "topics",
     "docs/settings.md": "settings",
+    "docs/fault-tables.md": "faults",
+    "docs/validation.md": "validation",
     "docs/errors.md": "errors",
     "docs/scenario.md": "scenario",
     "docs/reference/commands.md": "commands",
     "docs/reference/messages.md": "messages",
 }
 """Modules of docs/generate by the page that they generate."""
+STUDIES = {
+    "detectability": "palpate study detectability --number 60",
+    "guarding": "palpate study guarding",
+    "operating-point": "palpate study operating-point",
+    "release": "palpate study release --number 8",
+}
+"""Folders of docs/studies whose page study.html is generated from the tables, with the command that runs the study again."""
 ASSETS = {".png", ".gif", ".svg", ".mp4", ".csv", ".css", ".json"}
 DIAGRAM = re.compile(r"```mermaid\n.*?```\n", re.DOTALL)
 """A browser would draw such a diagram with a library from the network."""
@@ -59,6 +70,9 @@ def gather(into: Path) -> None:
             shutil.copy(ROOT / file, target)
         elif file.parent == NOTEBOOKS:
             execute(file, into / NOTEBOOKS)
+    import_module("generate.faults").figure(into / "docs" / "images" / "lies.png")
+    for name, command in STUDIES.items():
+        study(ROOT / "docs" / "studies" / name, command, into / "docs" / "studies" / name)
 
 
 def generated() -> dict[Path, str]:
@@ -85,6 +99,12 @@ def execute(notebook: Path, into: Path) -> None:
     FilesWriter(build_directory=str(into)).write(text, resources, notebook_name=notebook.stem)
 
 
+def study(tables: Path, command: str, into: Path) -> None:
+    """Write study.html and study.json of a study into a folder, from its tables; takes about ten seconds."""
+    shutil.copytree(tables, into)
+    summarise(into, command)
+
+
 def title(text: str) -> str:
     """Return the first heading of a page, up to a colon or comma."""
     heading = next(line for line in text.splitlines() if line.startswith("# "))
@@ -101,6 +121,8 @@ def within_the_site(page: Path, pages: dict[Path, str]) -> str:
         target = (ROOT / page.parent / where).resolve().relative_to(ROOT)
         if target in pages and words.endswith(".md"):
             words = title(pages[target])
+        if target.name in STUDIES and target.parent.name == "studies":
+            return f"[{words}]({where.rstrip('/')}/study.html)"
         if target / "README.md" in pages:
             return f"[{words}]({where.rstrip('/')}/README.md{anchor})"
         if target == Path("README.md"):

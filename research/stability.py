@@ -109,16 +109,8 @@ def section(found: Stability | None = None) -> PageSection:
         "arm's seven joints, linearised, by Nyquist's criterion. Beyond the margin a ring grows until the driver "
         "holds (crosses)."
     )
-    data = {
-        "delays_ms": DELAYS_MS,
-        "swing_by_delay_n": {f"x{c:g}": [r.swing for r in found.delay[c]] for c in CONTRASTS},
-        "held_by_delay": {f"x{c:g}": [r.held for r in found.delay[c]] for c in CONTRASTS},
-        "swing_by_jitter_n": {f"x{c:g}": [r.swing for r in found.jitter[c]] for c in CONTRASTS},
-        "held_by_jitter": {f"x{c:g}": [r.held for r in found.jitter[c]] for c in CONTRASTS},
-        "margins": [vars(margin) for margin in found.margins],
-    }
     return PageSection(
-        "stability", "Contact under bus delay and jitter", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6), data
+        "stability", "Contact under bus delay and jitter", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6)
     )
 
 

@@ -22,6 +22,7 @@ from palpate.commands import app_for
 from palpate.report.evidence import samples_of
 from palpate.report.results import sample_columns
 from palpate.run.roles import checked, settings_of
+from palpate.study.statistics.reading import read_tables
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.port_check import violations
 from palpate_bus.implementations import create
@@ -111,6 +112,7 @@ def test_the_site_builds_without_warnings_or_network(tmp_path: Path, monkeypatch
     site = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(site)
     monkeypatch.setattr(site, "execute", _titled)  # tests/test_library.py executes the notebooks
+    monkeypatch.setattr(site, "study", _empty)  # tests/study/test_summary.py makes such pages
     site.gather(tmp_path / "pages")
     config = tmp_path / "mkdocs.yml"
     config.write_text(
@@ -130,6 +132,12 @@ def test_the_site_builds_without_warnings_or_network(tmp_path: Path, monkeypatch
 def _titled(notebook: Path, into: Path) -> None:
     into.mkdir(parents=True, exist_ok=True)
     (into / notebook.with_suffix(".md").name).write_text(f"# {notebook.stem}\n", encoding="utf-8")
+
+
+def _empty(tables: Path, _: str, into: Path) -> None:
+    read_tables(tables)
+    into.mkdir(parents=True)
+    (into / "study.html").touch()
 
 
 EXAMPLES = ROOT / "docs" / "examples"
@@ -295,9 +303,9 @@ def test_a_tutorial_shows_what_its_command_prints(page: str, tmp_path: Path) -> 
 @pytest.fixture(scope="module")
 def pages() -> dict[str, str]:
     sys.path.insert(0, str(ROOT / "docs"))
-    from generate import commands, errors, messages, scenario, settings, topics
+    from generate import commands, errors, faults, messages, scenario, settings, topics, validation
 
-    modules = (commands, errors, messages, scenario, settings, topics)
+    modules = (commands, errors, faults, messages, scenario, settings, topics, validation)
     return {module.__name__.partition(".")[2]: module.page() for module in modules}
 
 
@@ -332,6 +340,13 @@ def test_settings_commands_and_messages(pages: dict[str, str]) -> None:
     assert all(f"| `{variable(name)}` |" in pages["settings"] for name in Settings.model_fields)
     assert all(f"### palpate {word}" in pages["commands"] for word in COMMANDS)
     assert all(f"## {name}\n" in pages["messages"] for name in PACKAGES["palpation_msgs"])
+
+
+def test_faults_and_validation(pages: dict[str, str]) -> None:
+    assert "| lockstep | kill | 41 | 41 | 12 | 34, 97 | 10.1 |" in pages["faults"]
+    assert "| frozen |" in pages["faults"]
+    assert "## Guarding\n" in pages["validation"]
+    assert "| at most 10 | Hertz, 10 kPa, nu 0.49 |" in pages["validation"]
 
 
 def test_every_column_of_the_samples_is_documented() -> None:

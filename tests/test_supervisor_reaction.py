@@ -1,14 +1,11 @@
 """Reaction times of the supervisor to faults of planning and other services, measured on the real services in simulated time.
 
-Run as a program it prints the table of docs/faults.md, or writes it there:
-`python tests/test_supervisor_reaction.py --docs FILE`.
+Run as a program it prints the table of docs/faults.md.
 """
 
 import dataclasses
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -233,9 +230,6 @@ def test_every_cause_of_simulated_time_has_a_case() -> None:
     assert {case.cause for case in CASES.values()} == causes - others
 
 
-BEGIN, END = "<!-- reactions: begin -->\n", "<!-- reactions: end -->\n"
-
-
 def table() -> str:
     """All cases, measured, as Markdown."""
     names = {int(value): name.removeprefix("CAUSE_") for name, value in vars(SupervisorState).items() if "CAUSE_" in name}
@@ -248,9 +242,4 @@ def table() -> str:
 
 
 if __name__ == "__main__":
-    measured = table()
-    print(measured)
-    if sys.argv[1:2] == ["--docs"]:
-        doc = Path(sys.argv[2])
-        before, _, rest = doc.read_text(encoding="utf-8").partition(BEGIN)
-        doc.write_text(f"{before}{BEGIN}{measured}{END}{rest.partition(END)[2]}", encoding="utf-8")
+    print(table())

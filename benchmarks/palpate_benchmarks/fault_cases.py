@@ -1,7 +1,6 @@
 """Cases of the fault campaign and their findings: kinds of faults, outcomes, and the CSV file of the findings."""
 
 import csv
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
@@ -59,6 +58,16 @@ class CaseOutcome(StrEnum):
     def unharmed(self) -> bool:
         """True if no cause has to be named."""
         return self in (CaseOutcome.COMPLETED, CaseOutcome.CONTINUED)
+
+
+class LieVerdict(StrEnum):
+    """Result of a lie, from the best to the worst."""
+
+    REFUSED = "refused at the port"
+    NAMED = "named by a service"
+    HARMLESS = "no harm"
+    UNDETECTABLE = "not detectable"
+    BAD = "bad"
 
 
 @dataclass(frozen=True)
@@ -149,11 +158,16 @@ class FaultFinding:
             and (self.outcome.unharmed or self.named)
         )
 
-
-def by_code(findings: Sequence[FaultFinding]) -> str:
-    """Return how many cases were run by which code."""
-    counts = Counter(f.code or "earlier code" for f in findings)
-    return f"Cases by code: {', '.join(f'{code} {count}' for code, count in counts.most_common())}."
+    @property
+    def lie_verdict(self) -> LieVerdict:
+        """Verdict on a lie."""
+        if not self.good:
+            return LieVerdict.BAD
+        if self.outcome.unharmed:
+            return LieVerdict.HARMLESS
+        if self.sign.startswith("not detectable"):
+            return LieVerdict.UNDETECTABLE
+        return LieVerdict.REFUSED if " refused: " in self.ended else LieVerdict.NAMED
 
 
 FIELDS: Final = tuple(field.name for field in fields(FaultFinding))

@@ -1,35 +1,31 @@
-"""`palpate faults`: runs the fault campaign and shows its findings in the terminal and on docs/faults.md."""
+"""`palpate faults`: runs the fault campaign and shows its findings; `make docs` makes docs/fault-tables.md from its CSV files."""
 
 import tempfile
-from collections import Counter
 from collections.abc import Sequence
 from itertools import chain
 from pathlib import Path
-from statistics import median
 from typing import Annotated
 
 import typer
 from rich.table import Table
 
 from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, output_file, refuse
-from palpate.report.files import docs_option, write_part, write_text
-from palpate_benchmarks.fault_cases import KINDS, LIE, CaseOutcome, FaultFinding, by_code, csv_text, from_csv, in_order
+from palpate.report.files import write_text
+from palpate_benchmarks.fault_cases import KINDS, LIE, FaultFinding, csv_text, from_csv, in_order
 
 MODES = ("lockstep", "wallclock")
 WIDTH = 200
 """Least width of the table in characters."""
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
-SUMMARY = ("mode", "fault", "cases", "passed", "detected", "after: median, longest [ms]", "largest force [N]", "outcomes")
 
 
-def faults(  # noqa: PLR0913 - the options of a command
+def faults(
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
     out: Annotated[
         Path, output_file("File for the findings; cases in it by the present code are skipped.", "--out", "-o")
     ] = Path("faults.csv"),
-    docs: Annotated[Path | None, docs_option("faults")] = None,
     again: Annotated[bool, typer.Option("--again", help="Repeat cases that are in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
     random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
@@ -40,7 +36,7 @@ def faults(  # noqa: PLR0913 - the options of a command
     `--kind lie`: services that send wrong values.
     """
     from palpate.study.folder import code_digest
-    from palpate_benchmarks import lies, lies_report
+    from palpate_benchmarks import lies
     from palpate_benchmarks.campaign import cases, forks, run_case
     from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
 
@@ -77,12 +73,6 @@ def faults(  # noqa: PLR0913 - the options of a command
             write_text(out, csv_text(found))
             display.show(number, len(todo), f"{'ok' if finding.good else 'bad'} {finding.where}: {finding.sign or finding.ended}")
     SteadyConsole(width=max(WIDTH, SteadyConsole().width)).print(table(found))
-    if docs is not None:
-        if LIE in kinds:
-            write_part(docs, "lies", lies_report.markdown(found))
-            lies_report.figure(found, docs.parent / "images" / "lies.png")
-        else:
-            write_part(docs, "faults", markdown(found))
     if any(not finding.good for finding in found):
         raise typer.Exit(EXIT_FAILED)
 
@@ -111,42 +101,3 @@ def _row(finding: FaultFinding) -> tuple[str, ...]:
     peak = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
     force = f"{finding.peak_force_before_n:.1f}, {peak}"
     return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
-
-
-def markdown(findings: Sequence[FaultFinding]) -> str:
-    """Return the summary for the documentation; `csv_text` has every case."""
-    good = sum(f.good for f in findings)
-    largest = max((f.peak_force_n or 0.0 for f in findings), default=0.0)
-    lines = [f"{good} of {len(findings)} cases passed; the largest force was {largest:.1f} N. {by_code(findings)}", ""]
-    lines += _markdown_table(SUMMARY, _summary(findings))
-    bad = [f"**!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in in_order(findings) if not f.good]
-    return "\n".join([*lines, *([""] if bad else []), *bad]) + "\n"
-
-
-def _markdown_table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> list[str]:
-    def line(cells: Sequence[str]) -> str:
-        return "| " + " | ".join(cell.replace("|", "/").replace("\n", " ") for cell in cells) + " |"
-
-    return [line(head), "|---" * len(head) + "|", *map(line, rows)]
-
-
-def _summary(findings: Sequence[FaultFinding]) -> list[tuple[str, ...]]:
-    """Return one row per mode and kind."""
-    rows: list[tuple[str, ...]] = []
-    for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
-        cases = [f for f in findings if (f.mode, f.kind) == (mode, kind)]
-        after = [f.detected_ms for f in cases if f.detected_ms is not None]
-        outcomes = Counter(f.reaction if f.outcome is CaseOutcome.ENDED else "continued" for f in cases)
-        rows.append(
-            (
-                mode,
-                kind,
-                str(len(cases)),
-                str(sum(f.good for f in cases)),
-                str(len(after)),
-                f"{median(after):.0f}, {max(after):.0f}" if after else "",
-                f"{max(f.peak_force_n or 0.0 for f in cases):.1f}",
-                ", ".join(f"{outcome} {count}" for outcome, count in outcomes.most_common()),
-            )
-        )
-    return rows

@@ -166,9 +166,7 @@ def section(found: Measured | None = None) -> PageSection:
         f"{1 / SETUP.step_s:g} Hz, without access to the table of breaths. Duration and depth are log-normal and correlated "
         "from breath to breath; pause, depth in millimetres and coughs are assumed. Sighs are not modelled."
     )
-    data = {"time_s": found.time, **{f"{name}_m": curve for name, curve in found.curves.items()}}
-    data |= {"quiet_duration_s": _pooled(quiet, "duration"), "quiet_depth_m": _pooled(quiet, "depth")}
-    return PageSection("breathing", "Breathing", text, checks, lambda f: draw(f, found), (7.0, 5.0), data)
+    return PageSection("breathing", "Breathing", text, checks, lambda f: draw(f, found), (7.0, 5.0))
 
 
 def draw(figure: Figure, found: Measured) -> None:

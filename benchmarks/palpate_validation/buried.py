@@ -117,14 +117,7 @@ def section(found: Array | None = None) -> PageSection:
         "of 2 to 8, in a linear slab of 0.12 m. The surface tier has a formula for lumps below the skin, and four of its "
         "constants were fitted to this table, so its errors are those of the fit; the elastic tier was not fitted."
     )
-    data = {
-        "lumps": [
-            {"radius_m": b.radius_m, "depth_m": b.depth_m, "contrast": b.contrast, "finite_elements": b.ratio}
-            for b in FINITE_ELEMENTS
-        ],
-        "surface": found,
-    }
-    return PageSection("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4), data)
+    return PageSection("buried", "Lumps below the skin", text, checks, lambda f: draw(f, found), (4.2, 3.4))
 
 
 def _largest(error: Array) -> float:

@@ -1,13 +1,13 @@
-"""Result of a comparison: checks with bounds, a figure in the common style, and the data of both."""
+"""Result of a comparison: checks with bounds, and a figure in the common style."""
 
 import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from math import isfinite
 from pathlib import Path
 from typing import Any
 
 import matplotlib as mpl
-import numpy as np
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
@@ -26,8 +26,6 @@ class Check:
     high: float | None = None
     against: str = ""
     """Reference."""
-    timed: bool = False
-    """True for a cost: its bound is printed but not tested."""
 
     @property
     def passed(self) -> bool | None:
@@ -36,7 +34,7 @@ class Check:
             return None
         above = self.low is None or self.measured >= self.low
         below = self.high is None or self.measured <= self.high
-        return above and below
+        return bool(above and below)
 
     @property
     def bound(self) -> str:
@@ -60,8 +58,6 @@ class PageSection:
     draw: Draw | None = None
     size_in: tuple[float, float] = (7.0, 3.2)
     """Width and height of the figure [inch]."""
-    data: Mapping[str, Any] = field(default_factory=dict)
-    """Numbers of the figure for validate.json: JSON values and arrays."""
 
 
 INK = "#1b2a33"
@@ -83,7 +79,7 @@ STYLE: Any = {
 }
 
 
-def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.2), dpi: int = 110) -> None:
+def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.2), dpi: int = 90) -> None:
     """Draw and write a PNG; `size_in` [inch]. The folder must exist."""
     with mpl.rc_context(STYLE):
         figure = Figure(figsize=size_in, layout="constrained")
@@ -127,40 +123,19 @@ def write(sections: Sequence[PageSection], out: Path) -> None:
         section.name: {
             "title": section.title,
             "text": section.text,
-            "checks": [
-                {"name": c.name, "measured": c.measured, "unit": c.unit, "low": c.low, "high": c.high, "against": c.against,
-                 "passed": c.passed}
-                for c in section.checks
-            ],
-            "data": section.data,
+            "checks": [asdict(c) | {"measured": _number(c.measured), "passed": c.passed} for c in section.checks],
         }
         for section in sections
-    }  # fmt: skip
-    (out / "validate.json").write_text(json.dumps(_plain(facts), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+    }
+    (out / "validate.json").write_text(json.dumps(facts, indent=1, allow_nan=False, ensure_ascii=False) + "\n", encoding="utf-8")
     last = sections[-1]
     if last.draw is not None:
         write_figure(last.draw, out / f"{last.name}.png", last.size_in)
 
 
-def write_page(sections: Sequence[PageSection], page: Path, images: Path) -> None:
-    """Write the Markdown page, and its small PNGs to the folder `images`, which is created if needed."""
-    images.mkdir(parents=True, exist_ok=True)
-    where = images.relative_to(page.parent).as_posix()
-    lines = [
-        "# Validation",
-        "",
-        "The physics against independent references, measured by `palpate validate --docs docs/validation.md`.",
-        "Every bound is a test in `tests/benchmarks`. Costs were measured on a busy two-core machine: compare ratios.",
-    ]
-    for section in sections:
-        lines += ["", f"## {section.title}", "", section.text, "", "| | measured | bound | against |", "|---|---|---|---|"]
-        for c in section.checks:
-            verdict = {True: "", False: " **missed**", None: ""}[c.passed]
-            lines.append(f"| {c.name} | {number(c.measured)} {c.unit}{verdict} | {c.bound} | {c.against} |".replace("  ", " "))
-        if section.draw is not None:
-            write_figure(section.draw, images / f"{section.name}.png", section.size_in, dpi=90)
-            lines += ["", f"![{section.title}]({where}/{section.name}.png)"]
-    page.write_text("\n".join(lines) + "\n", encoding="utf-8")
+def _number(value: float) -> float | None:
+    """Return a number for JSON: seven digits, null if not finite."""
+    return float(f"{value:.7g}") if isfinite(value) else None
 
 
 def show(section: PageSection, out: Path = Path("out/research")) -> None:
@@ -169,15 +144,3 @@ def show(section: PageSection, out: Path = Path("out/research")) -> None:
     console = Console()
     Console(width=max(150, console.width)).print(table([section]))
     console.print(section.text)
-
-
-def _plain(value: Any) -> Any:
-    """Return the value for JSON: floats with seven digits, null if not finite."""
-    plain = value.tolist() if isinstance(value, (np.ndarray, np.generic)) else value
-    if isinstance(plain, Mapping):
-        return {str(key): _plain(item) for key, item in plain.items()}
-    if isinstance(plain, (list, tuple)):
-        return [_plain(item) for item in plain]
-    if isinstance(plain, float):
-        return float(f"{plain:.7g}") if np.isfinite(plain) else None
-    return plain

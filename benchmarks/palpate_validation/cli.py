@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from palpate.console import CaseDisplay, output_file, output_folder, refuse
+from palpate.console import CaseDisplay, output_folder, refuse
 
 if TYPE_CHECKING:
     from palpate_validation.check import PageSection
@@ -18,7 +18,6 @@ EXIT_MISSED = 3
 SECTIONS = {
     "hertz": "hertz",
     "elastic": "elastic",
-    "lumps": "lumps",
     "mesh": "meshes",
     "people": "people",
     "population": "population",
@@ -47,10 +46,9 @@ def validate(
     only: Annotated[
         list[str] | None, typer.Option("--only", metavar="SECTION", help=f"One of: {', '.join(SECTIONS)}. May be repeated.")
     ] = None,
-    docs: Annotated[Path | None, output_file("Also write this Markdown page, with PNGs next to it.")] = None,
 ) -> None:
     """Measure the physics against Hertz, measured people, DART and theory. The exit status is 3 if a bound is missed."""
-    from palpate_validation.check import failures, table, write, write_page
+    from palpate_validation.check import failures, table, write
 
     console = Console(stderr=True)
     unknown = [name for name in only or () if name not in SECTIONS]
@@ -64,8 +62,6 @@ def validate(
                 display.show(number, len(wanted), f"measuring {name}")
                 sections.append(run_section(name))
                 write(sections, out)  # an error or Ctrl-C in a later section keeps these
-        if docs is not None:
-            write_page(sections, docs, docs.parent / "images" / "validation")
     except OSError as error:
         refuse(error)
     shown = Console()

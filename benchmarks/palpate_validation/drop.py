@@ -27,73 +27,24 @@ HEAVY_KG = 1e6
 
 
 @dataclass(frozen=True)
-class SoftBox:
-    """A box with its top in z = 0, `counts` vertices along x, y and z. Its point masses have no edges."""
+class Flesh:
+    """A box of DART's soft body with its top in z = 0; its point masses have no edges."""
 
     size_m: tuple[float, float, float]
     counts: tuple[int, int, int]
-
-    @property
-    def xml(self) -> str:
-        """Geometry in the SKEL format."""
-        size, counts = " ".join(map(str, self.size_m)), " ".join(map(str, self.counts))
-        return f"<box><size>{size}</size><frags>{counts}</frags></box>"
+    """Vertices along x, y and z."""
+    k_v: float
+    """Stiffness of the spring that ties a vertex to its rest place [N/m]."""
+    damping: float
+    """Damping of a vertex [N s/m]."""
+    mass: float
+    """Mass of a vertex [kg]."""
 
     @property
     def vertices(self) -> int:
         """Number of point masses."""
         x, y, z = self.counts
         return x * y * z - (x - 2) * (y - 2) * (z - 2)
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return self.size_m[2]
-
-
-@dataclass(frozen=True)
-class Ellipsoid:
-    """An ellipsoid with its pole in the origin: rings of `slices` vertices, `stacks` - 1 of them, and two poles."""
-
-    size_m: tuple[float, float, float]
-    slices: int
-    stacks: int
-
-    @property
-    def xml(self) -> str:
-        """Geometry in the SKEL format."""
-        size = " ".join(map(str, self.size_m))
-        counts = f"<num_slices>{self.slices}</num_slices><num_stacks>{self.stacks}</num_stacks>"
-        return f"<ellipsoid><size>{size}</size>{counts}</ellipsoid>"
-
-    @property
-    def vertices(self) -> int:
-        """Number of point masses."""
-        return (self.stacks - 1) * self.slices + 2
-
-    @property
-    def height_m(self) -> float:
-        """Height along z."""
-        return self.size_m[2]
-
-
-@dataclass(frozen=True)
-class Flesh:
-    """Parameters of a DART soft body, equal for all vertices."""
-
-    shape: SoftBox | Ellipsoid
-    k_v: float
-    """Stiffness of the spring that ties a vertex to its rest place [N/m]."""
-    k_e: float
-    """Stiffness against displacement differences along an edge [N/m]."""
-    damping: float
-    """Damping of a vertex [N s/m]."""
-    mass: float
-    """Mass of a vertex [kg]."""
-
-    def at_rest(self, dt: float) -> float:
-        """Return the fraction of a static contact force that DART reports at time step `dt` [s]."""
-        return self.mass / (self.mass + dt * self.damping + dt**2 * self.k_v)
 
 
 _SCENE = """<?xml version="1.0"?>
@@ -108,8 +59,8 @@ _SCENE = """<?xml version="1.0"?>
 </world></skel>"""
 _FLESH = """<skeleton name="flesh">
     <body name="flesh"><transformation>0 0 {centre} 0 0 0</transformation><inertia><mass>{heavy}</mass></inertia>
-      <soft_shape><total_mass>{total}</total_mass><geometry>{geometry}</geometry>
-        <kv>{k_v}</kv><ke>{k_e}</ke><damp>{damping}</damp></soft_shape></body>
+      <soft_shape><total_mass>{total}</total_mass><geometry><box><size>{size}</size><frags>{counts}</frags></box></geometry>
+        <kv>{k_v}</kv><ke>0</ke><damp>{damping}</damp></soft_shape></body>
     <joint type="prismatic" name="anchor"><parent>world</parent><child>flesh</child><axis><xyz>0 0 1</xyz></axis></joint>
   </skeleton>"""
 _GROUND = """<skeleton name="flesh"><mobile>false</mobile>
@@ -122,15 +73,13 @@ _GROUND = """<skeleton name="flesh"><mobile>false</mobile>
 class DartScene:
     """A sphere on a vertical rail over flesh, or over a rigid block without flesh."""
 
-    def __init__(
-        self, flesh: Flesh | None, radius: float, dt: float, *, friction: float = 1.0, mass: float = 1.0, height: float = 0.0
-    ) -> None:
+    def __init__(self, flesh: Flesh | None, radius: float, dt: float, mass: float, height: float) -> None:
         """The sphere of `radius` [m] and `mass` [kg] starts `height` [m] above z = 0, the flesh's top; `dt` [s]."""
         body = _GROUND
         if flesh is not None:
             body = _FLESH.format(
-                centre=-flesh.shape.height_m / 2, heavy=HEAVY_KG, total=flesh.mass * flesh.shape.vertices,
-                geometry=flesh.shape.xml, k_v=flesh.k_v, k_e=flesh.k_e, damping=flesh.damping,
+                centre=-flesh.size_m[2] / 2, heavy=HEAVY_KG, total=flesh.mass * flesh.vertices, k_v=flesh.k_v,
+                size=" ".join(map(str, flesh.size_m)), counts=" ".join(map(str, flesh.counts)), damping=flesh.damping,
             )  # fmt: skip
         xml = _SCENE.format(dt=dt, flesh=body, start=radius + height, mass=mass, d=2 * radius)
         self.world: Any = dart.utils.SkelParser.readWorldXML(xml)
@@ -144,9 +93,8 @@ class DartScene:
         for name in ("flesh", "probe"):
             node = self.world.getSkeleton(name).getBodyNode(0)
             for k in range(node.getNumShapeNodes()):
-                node.getShapeNode(k).getDynamicsAspect().setFrictionCoeff(friction)
+                node.getShapeNode(k).getDynamicsAspect().setFrictionCoeff(1.0)
                 node.getShapeNode(k).getDynamicsAspect().setRestitutionCoeff(0.0)
-        self.radius, self.dt = radius, dt
 
     @property
     def depth(self) -> float:
@@ -157,12 +105,6 @@ class DartScene:
         """Return the upward force on the sphere in the last step [N]."""
         contacts = self.world.getLastCollisionResult().getContacts()
         return abs(float(sum(contact.force[2] for contact in contacts)))
-
-    def move(self, velocity: float) -> None:
-        """Step with a prescribed velocity of the sphere along z [m/s]."""
-        self._probe.getJoint(0).setActuatorType(dart.dynamics.ActuatorType.VELOCITY)
-        self._probe.setCommand(0, velocity)
-        self.world.step()
 
     def fall(self, weight: float) -> None:
         """Step with only `weight` [N] and contact acting on the sphere."""
@@ -187,7 +129,7 @@ SETUP = DropSetup()
 
 SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
 """Surface of Palpate in the figure."""
-FLESH = Flesh(SoftBox((0.03, 0.03, 0.02), (13, 13, 3)), k_v=560.0, k_e=0.0, damping=0.7, mass=1e-3)
+FLESH = Flesh((0.03, 0.03, 0.02), (13, 13, 3), k_v=560.0, damping=0.7, mass=1e-3)
 """Soft body of DART in the figure, vertices 2.5 mm apart."""
 
 
@@ -248,7 +190,7 @@ def drop_in_dart(
     flesh: Flesh | None, mass: float = SETUP.mass_kg, height: float = SETUP.height_m, seconds: float = SETUP.duration_s
 ) -> Drop:
     """Drop the sphere in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
-    scene = DartScene(flesh, SETUP.radius_m, SETUP.step_s, friction=1.0, mass=mass, height=height)
+    scene = DartScene(flesh, SETUP.radius_m, SETUP.step_s, mass, height)
     depth, force = [], []
     for _ in range(round(seconds / SETUP.step_s)):
         scene.fall(mass * GRAVITY)
@@ -292,10 +234,7 @@ def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
         "tool would sink 11 mm into the "
         "default wall."
     )
-    data = {drop.name: {"time_s": drop.time, "depth_m": drop.depth, "force_n": drop.force} for drop in drops}
-    return PageSection(
-        "drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6), data
-    )
+    return PageSection("drop", "The contact test of the paper (figure 3)", text, checks, lambda f: draw(f, drops), (7.0, 3.6))
 
 
 def draw(figure: Figure, drops: tuple[Drop, ...]) -> None:

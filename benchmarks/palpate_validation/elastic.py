@@ -63,11 +63,7 @@ def section(curves: ElasticCurves | None = None) -> PageSection:
         "The elastic tier as a half-space of 10 kPa. Hertz's solution is for a paraboloid. The force of a "
         "sphere is some percent smaller at depths of half a radius, in agreement with Sneddon's solution."
     )
-    data = {"radii_m": RADII_M, "depths_m": DEPTHS_M, "paraboloid_n": c.paraboloid, "sphere_n": c.sphere, "hertz_n": c.hertz,
-            "sneddon_n": c.sneddon}  # fmt: skip
-    return PageSection(
-        "elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8), data
-    )
+    return PageSection("elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8))
 
 
 def draw(figure: Figure, c: ElasticCurves) -> None:

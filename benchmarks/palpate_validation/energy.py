@@ -118,8 +118,7 @@ def section(cycles: list[Cycle] | None = None) -> PageSection:
         "lesion ten times as stiff, lift and return, with friction of 0, 0.3 or 1. At every millisecond the stored energy is at "
         f"most the work done, and every cycle dissipates {100 * min(lost):.0f} to {100 * max(lost):.0f} % of the work done."
     )
-    data = {"gained": [c.gained for c in in_contact], "surplus": [c.surplus for c in in_contact]}
-    return PageSection("energy", "Energy", text, checks, lambda f: draw(f, in_contact), data=data)
+    return PageSection("energy", "Energy", text, checks, lambda f: draw(f, in_contact))
 
 
 def draw(figure: Figure, cycles: list[Cycle]) -> None:

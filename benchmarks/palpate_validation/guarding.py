@@ -157,8 +157,7 @@ def section(found: GuardingFelt | None = None) -> PageSection:
         "Involuntary guarding has a slightly larger effect on strokes, since the wall relaxes under them and the muscle does "
         "not. The time constants of guarding are assumed."
     )
-    data = {"ratio_pressed": {kind: found.pressed_ratio(kind) for kind in KINDS}}
-    return PageSection("guarding", "Guarding", text, checks, lambda f: draw(f, found), (7.0, 3.0), data)
+    return PageSection("guarding", "Guarding", text, checks, lambda f: draw(f, found), (7.0, 3.0))
 
 
 def draw(figure: Figure, found: GuardingFelt) -> None:

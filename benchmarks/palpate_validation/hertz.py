@@ -121,16 +121,7 @@ def section(curves: HertzCurves | None = None) -> PageSection:
         "are too stiff; deep contacts of a small sphere are too soft, and beyond about half a radius Hertz's small strains "
         "do not hold. Outside these ranges use the elastic tier."
     )
-    data = {
-        "radii_m": curves.radii,
-        "depths_m": curves.depths,
-        "force_n": curves.force,
-        "hertz_n": curves.hertz,
-        "within_m": ranges,
-    }
-    return PageSection(
-        "hertz", "Surface tier on a flat half-space: Hertz", text, tuple(checks), lambda f: draw(f, curves), data=data
-    )
+    return PageSection("hertz", "Surface tier on a flat half-space: Hertz", text, tuple(checks), lambda f: draw(f, curves))
 
 
 def draw(figure: Figure, curves: HertzCurves) -> None:

@@ -194,12 +194,7 @@ def section(found: People | None = None) -> PageSection:
         "Tensed muscles are a parallel spring with the measured force ratio at 10 mm."
     )
     checks = (*_errors(found), *_exponents(found.places), _tensed(found.places), *_losses(found.loops))
-    data = {
-        "depth_m": COMPARED_M,
-        "places": [{**vars(p), "fit": _plain(p.fit), "rms_percent": p.rms_percent} for p in found.places],
-        "loops": [{**vars(o), "lost_percent": o.lost_percent} for o in found.loops],
-    }
-    return PageSection("people", "Living people", text, checks, lambda f: draw(f, found), (7.0, 4.4), data)
+    return PageSection("people", "Living people", text, checks, lambda f: draw(f, found), (7.0, 4.4))
 
 
 def _errors(found: People) -> Iterator[Check]:
@@ -245,10 +240,6 @@ def _losses(loops: Sequence[HysteresisLoop]) -> Iterator[Check]:
     for each in loops:
         name = f"work lost in a press of {1e3 * BOUNDS.pressed_m:g} mm and its release at {1e3 * each.speed:g} mm/s"
         yield Check(name, each.lost_percent, "%", *BOUNDS.lost_percent, "excised skin: 46 to 48 %")
-
-
-def _plain(fit: Fit) -> dict[str, float]:
-    return {**fit.wall._asdict(), **{name: value for name, value in vars(fit).items() if name != "wall"}}
 
 
 def draw(figure: Figure, found: People) -> None:

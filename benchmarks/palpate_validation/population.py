@@ -143,9 +143,8 @@ def section(found: PopulationSample | None = None) -> PageSection:
         "Ten people determine an SD between people to a quarter, which is the width of the bounds. The people were young, male "
         "and slim; other builds are not validated."
     )
-    data = {"measured": people.figures(), "sampled": found.figures(), "force_n": found.force, "depth_m": DEPTHS_M}
     return PageSection(
-        "population", "Check of the sampler of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8), data
+        "population", "Check of the sampler of persons", text, checks, lambda f: draw(f, found, people), (7.0, 2.8)
     )
 
 

@@ -83,8 +83,7 @@ def section(found: Relaxation | None = None) -> PageSection:
         "fitted to its force without access to the scenario. Displacements are held, so the force relaxes by the "
         "series of the material."
     )
-    data = {"time_s": found.time, "ratio": found.ratio, "g": found.g, "tau_s": found.tau}
-    return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8), data)
+    return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8))
 
 
 def draw(figure: Figure, found: Relaxation) -> None:

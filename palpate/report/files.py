@@ -1,6 +1,4 @@
-"""Atomic writes of files that other programs read and of marked parts of pages; results that a kill has left elsewhere; the
-fingerprint of the platform.
-"""
+"""Atomic writes of files that other programs read; results that a kill has left elsewhere; the fingerprint of the platform."""
 
 import os
 import platform
@@ -12,7 +10,6 @@ from pathlib import Path
 from typing import Any
 
 import psutil
-import typer
 
 from palpate.console import say
 
@@ -65,40 +62,6 @@ def write_text(path: Path, text: str) -> None:
     """Write a text file atomically. Raises OSError."""
     with drafted(path) as draft:
         draft.write_text(text, encoding="utf-8")
-
-
-def docs_option(name: str) -> Any:
-    """Return the option `--docs` of a command, whose file is checked before anything is measured."""
-
-    def check(path: Path | None) -> Path | None:
-        if path is not None:
-            _around(path, name)
-        return path
-
-    return typer.Option(
-        help="Page in which to replace the marked part; all rows go to a CSV file in the same folder.", callback=check
-    )
-
-
-def write_part(path: Path, name: str, text: str) -> None:
-    """Replace the part `name` of a page. Raises typer.BadParameter if the page has none or cannot be written."""
-    before, after = _around(path, name)
-    try:
-        write_text(path, f"{before}{text}{after}")
-    except OSError as error:
-        raise typer.BadParameter(str(error)) from None
-
-
-def _around(path: Path, name: str) -> tuple[str, str]:
-    begin, end = (f"<!-- palpate {name}: {word} -->\n" for word in ("begin", "end"))
-    try:
-        before, first, rest = path.read_text(encoding="utf-8").partition(begin)
-    except (OSError, UnicodeDecodeError) as error:
-        raise typer.BadParameter(f"{path}: {error}") from None
-    _, last, after = rest.partition(end)
-    if not (first and last):
-        raise typer.BadParameter(f"{path} has no part to replace: it needs the lines {begin.strip()} and {end.strip()}")
-    return before + begin, end + after
 
 
 def bring_back(path: Path) -> None:

@@ -15,7 +15,6 @@ from conductor_messages import collected, result
 
 from palpate_benchmarks.campaign import CaseOver, _conclude, _Watch, cases
 from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
-from palpate_benchmarks.faults import markdown
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
 from palpate_benchmarks.whole_cases import FIXED, _freeze_usage, _judge, drawn, fixed, is_whole
@@ -160,16 +159,6 @@ def found(where: str, detected_ms: float, peak_force_n: float) -> FaultFinding:
     return FaultFinding(
         *("kill", where, "lockstep", 8.0, detected_ms, text, "run ended", 5.0, peak_force_n, CaseOutcome.ENDED, text), named=True
     )
-
-
-def test_the_page_sums_up_and_marks_bad_cases() -> None:
-    fine, slow = found("robot", 20.0, 5.5), found("tissue", 40.0, 26.0)
-    page = markdown([fine, slow])
-    assert "1 of 2 cases passed; the largest force was 26.0 N." in page
-    assert "| lockstep | kill | 2 | 1 | 2 | 30, 40 | 26.0 | run ended 2 |" in page
-    assert "**!** lockstep, kill tissue: tissue lost" in page
-    assert "robot lost" not in page
-    assert [line.rsplit(",", 1)[1] for line in csv_text([fine, slow]).splitlines()] == ["good", "True", "False"]
 
 
 def test_findings_are_read_back_from_their_file() -> None:

@@ -8,10 +8,9 @@ import pytest
 from conductor_messages import collected
 from toy_runs import toy_services
 
-from palpate_benchmarks.fault_cases import LIE, FaultCase, FaultFinding
+from palpate_benchmarks.fault_cases import LIE, FaultCase, FaultFinding, LieVerdict
 from palpate_benchmarks.liar import KINDS, Liar, Lie
 from palpate_benchmarks.lies import Healthy, LieOutcome, _judged, cases, cells, left_out, run_lies
-from palpate_benchmarks.lies_report import LieVerdict, verdict
 from palpate_bus.contract import MS, Edge, contract
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
@@ -90,7 +89,7 @@ def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float
     if failure is not None:
         outcome.failure = Failure(FailureCode.GAVE_UP, "held", topics=(failure,))
     finding = FaultFinding(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
-    assert verdict(_judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), outcome, twin)) is judged
+    assert _judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), outcome, twin).lie_verdict is judged
 
 
 @pytest.mark.slow

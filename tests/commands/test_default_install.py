@@ -20,7 +20,7 @@ CALLS = {
     "study": ["smoke"],
     "validate": ["--only", "drop"],
     "reproduce": ["--quiet"],
-    "bench": ["--only", "runs"],
+    "bench": ["lump"],
     "faults": ["--limit", "1"],
     "fuzz": ["codec:*"],
 }

@@ -15,7 +15,7 @@ from rich.console import Console
 
 from palpate.console import EXIT_FAILED, EXIT_TROUBLE
 from palpate.report.archive import EvidenceError, read_evidence
-from palpate.report.files import write_part, write_text
+from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
@@ -29,8 +29,6 @@ from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Exam, Mode, Scenario
-
-BEGIN, END = "<!-- palpate faults: begin -->\n", "<!-- palpate faults: end -->\n"
 
 
 @pytest.mark.parametrize(
@@ -157,22 +155,6 @@ def test_a_file_is_replaced_whole_or_not_at_all(tmp_path: Path) -> None:
     write_text(path, "new")
     assert path.read_text() == "new"
     assert list(tmp_path.iterdir()) == [path]
-
-
-def test_only_the_part_between_the_marks_is_replaced(tmp_path: Path) -> None:
-    path = tmp_path / "doc.md"
-    path.write_text(f"before\n{BEGIN}old\n{END}after\n")
-    write_part(path, "faults", "new\n")
-    assert path.read_text() == f"before\n{BEGIN}new\n{END}after\n"
-
-
-@pytest.mark.parametrize("text", ["nothing\n", f"{BEGIN}no end\n", f"{END}{BEGIN}wrong order\n"])
-def test_a_document_without_both_marks_is_refused_and_kept(tmp_path: Path, text: str) -> None:
-    path = tmp_path / "doc.md"
-    path.write_text(text)
-    with pytest.raises(typer.BadParameter, match="has no part to replace"):
-        write_part(path, "faults", "new\n")
-    assert path.read_text() == text
 
 
 # --- room on the disk ----------------------------------------------------------------------------------------------------
