@@ -65,7 +65,7 @@ GROUPS = {
     "Maintain": {
         "bench": "palpate_benchmarks.bench:bench",
         "faults": "palpate_benchmarks.faults:faults",
-        "fuzz": "palpate.fuzz.command:fuzz",
+        "fuzz": "palpate.fuzz.fuzz:fuzz",
     },
 }
 """Module and attribute of each command, by group: a function, or a Typer app of several commands."""

@@ -13,7 +13,7 @@ from examination import TINY, palpate_run
 import palpate
 from palpate.interface.examination import ExaminationError
 from palpate.quick.patient import Touch
-from palpate.truth.tissue import true_tissue
+from palpate.truth.pressed import true_tissue
 from palpate_models.scenario import press
 from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario
 

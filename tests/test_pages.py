@@ -19,8 +19,7 @@ from examination import palpate_run
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.report.evidence import samples_of
-from palpate.report.results import sample_columns
+from palpate.report.evidence import sample_columns
 from palpate.run.roles import checked, settings_of
 from palpate.study.statistics.reading import read_tables
 from palpate_bus.contract import MS, contract
@@ -351,5 +350,5 @@ def test_faults_and_validation(pages: dict[str, str]) -> None:
 
 def test_every_column_of_the_samples_is_documented() -> None:
     page = (ROOT / "docs" / "reference" / "results.md").read_text(encoding="utf-8")
-    for column in (*sample_columns(samples_of([])), "force_limited", "run"):
+    for column in (*sample_columns([]), "run"):
         assert f"| `{column}` |" in page, column

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_dashboard import arrays, palette
-from palpate_dashboard.geometry import Carry, VertexNormals, shaded
+from palpate_dashboard.arrays import Carry, VertexNormals, shaded
 from palpate_dashboard.replay import RecordedInbox, messages
 from palpate_models.numerics.frames import apply
 from palpate_models.robot import table

@@ -8,8 +8,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from palpate_dashboard import palette
+from palpate_dashboard.arrays import Floats, Indices
 from palpate_dashboard.columns import TIMELINE
-from palpate_dashboard.geometry import Array, Indices
 
 LAYERS: Final = ("mean", "band")
 
@@ -56,7 +56,7 @@ class MapView:
         self._recording.log(f"map/{layer}/legend/labels", names, static=True)
 
     def update(
-        self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Array, spread: Array, scanned: NDArray[np.bool_]
+        self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Floats, spread: Floats, scanned: NDArray[np.bool_]
     ) -> None:
         """Draw stiffness over background [1] and half width of the 90 % band over the mean [1], at the vertices."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
@@ -72,13 +72,13 @@ class MapView:
             mesh = rr.Mesh3D.from_fields(vertex_colors=np.where(scanned, colors, unknown).astype(np.uint32))
             self._recording.log(f"map/{layer}/surface", mesh)
 
-    def lesions(self, segments: Iterable[Array]) -> None:
+    def lesions(self, segments: Iterable[Floats]) -> None:
         """Draw true lesion outlines, one (k, 2, 3) array of segments each."""
         strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
         self._recording.log("map/mean/truth", shape, static=True)
 
-    def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
+    def findings(self, t: int, centroids: Floats, labels: list[str]) -> None:
         """Draw centroids of the findings, shape (n, 3)."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         places = centroids * (1, 1, 0) + (0, 0, 0.004)

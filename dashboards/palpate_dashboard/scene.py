@@ -9,8 +9,8 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages.geometry import quaternion
 from palpate_dashboard import palette
+from palpate_dashboard.arrays import Carry, Floats, Indices, VertexNormals
 from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
-from palpate_dashboard.geometry import Array, Carry, Indices, VertexNormals
 
 METRES_PER_NEWTON: Final = 0.03
 """Scale of the force arrow: 5 N are 15 cm."""
@@ -43,15 +43,15 @@ class SceneView:
     def __init__(self, recording: rr.RecordingStream, columns: Columns) -> None:
         self._recording = recording
         self._columns = columns
-        self._poses: dict[str, Array] = {}
+        self._poses: dict[str, Floats] = {}
         self._normals: VertexNormals | None = None
         self._rest: NDArray[np.float32] | None = None
         self._drawn: NDArray[np.float32] | None = None
         self._map_vertices: NDArray[np.float32] | None = None
         self._carry: Carry | None = None
         self._force_shown = False
-        self._lifted: Array | None = None
-        self._trail: list[Array] = []
+        self._lifted: Floats | None = None
+        self._trail: list[Floats] = []
         recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
         recording.log("world/tool/force", red, static=True)
@@ -60,7 +60,7 @@ class SceneView:
         """Set the simulated time [ns] of the following rows."""
         self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
 
-    def box(self, name: str, X_WB: Array, size: tuple[float, float, float], color: palette.Rgba) -> None:
+    def box(self, name: str, X_WB: Floats, size: tuple[float, float, float], color: palette.Rgba) -> None:
         """Draw a static box: centre pose, shape (4, 4), and edge lengths [m]."""
         path = f"world/furniture/{name}"
         self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
@@ -78,7 +78,7 @@ class SceneView:
             )
             self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
 
-    def link_poses(self, t: int, poses: Mapping[str, Array]) -> None:
+    def link_poses(self, t: int, poses: Mapping[str, Floats]) -> None:
         """Draw link poses by name: x y z [m] qx qy qz qw, shape (7,). A resting link is not repeated."""
         for link, pose in poses.items():
             before = self._poses.get(link)
@@ -106,7 +106,7 @@ class SceneView:
         normals = np.round(self._normals(rounded) * 64.0) / np.float32(64.0)
         self._columns.add("world/abdomen", deformations, t, (rounded, normals))
 
-    def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Array, scanned: NDArray[np.bool_]) -> None:
+    def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Floats, scanned: NDArray[np.bool_]) -> None:
         """Colours the abdomen by the map: vertices, shape (k, 3), stiffness over background [1], and a mask of assessed ones."""
         if self._rest is None:
             return
@@ -125,7 +125,7 @@ class SceneView:
             self._lifted = lifted
             self._columns.add("world/truth", transforms, t, lifted)
 
-    def lesions(self, segments: Iterable[Array]) -> None:
+    def lesions(self, segments: Iterable[Floats]) -> None:
         """Draw true lesion outlines in A, one (k, 2, 3) array of segments each, and A's axes; initially hidden."""
         axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
         self._recording.log("world/truth/axes", axes, static=True)
@@ -133,13 +133,13 @@ class SceneView:
         shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
         self._recording.log("world/truth/lesions", shape, static=True)
 
-    def findings(self, t: int, centroids: Array, labels: list[str]) -> None:
+    def findings(self, t: int, centroids: Floats, labels: list[str]) -> None:
         """Draw centroids of the findings, shape (n, 3), with labels."""
         self.at(t)
         shape = rr.Points3D(centroids, colors=[palette.FINDING], radii=[0.006], labels=labels, show_labels=True)
         self._recording.log("world/findings", shape)
 
-    def camera(self, X_WC: Array) -> None:
+    def camera(self, X_WC: Floats) -> None:
         """Draw the camera at the calibrated pose of its optical frame, shape (4, 4), with its tripod."""
         pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
         self._recording.log("world/camera", pose, static=True)
@@ -154,7 +154,7 @@ class SceneView:
         legs = rr.LineStrips3D([[top, knee], *([knee, foot] for foot in feet)], colors=[palette.PLINTH], radii=[0.011])
         self._recording.log("world/furniture/tripod", legs, static=True)
 
-    def lens(self, k: Array, width: int, height: int) -> None:
+    def lens(self, k: Floats, width: int, height: int) -> None:
         """Set the camera intrinsics, shape (3, 3) [px]."""
         view = rr.Pinhole(
             image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.2
@@ -189,7 +189,7 @@ class SceneView:
         )
         self._recording.log("world/perception/surface", shape)
 
-    def targets(self, t: int, positions: Array, normals: Array) -> None:
+    def targets(self, t: int, positions: Floats, normals: Floats) -> None:
         """Draw palpation targets and outward normals, shapes (n, 3)."""
         self.at(t)
         points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
@@ -197,13 +197,13 @@ class SceneView:
         needles = rr.Arrows3D(origins=positions, vectors=0.02 * normals, colors=[palette.TARGETS], radii=[0.0004])
         self._recording.log("world/perception/normals", needles)
 
-    def planned(self, t: int, positions: Array) -> None:
+    def planned(self, t: int, positions: Floats) -> None:
         """Draw the planned path of the tool, shape (n, 3)."""
         self.at(t)
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._recording.log("world/plan/path", shape)
 
-    def tool(self, t: int, position: Array, in_contact: bool) -> None:
+    def tool(self, t: int, position: Floats, in_contact: bool) -> None:
         """Extend the travelled path by the tool's position, shape (3,)."""
         if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
             return
@@ -221,7 +221,7 @@ class SceneView:
         self._recording.log("world/tool/travelled", shape)
         del self._trail[:-1]
 
-    def force(self, t: int, position: Array, force: Array) -> None:
+    def force(self, t: int, position: Floats, force: Floats) -> None:
         """Draw the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:

@@ -22,8 +22,8 @@ from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, plots, text
+from palpate_dashboard.arrays import VertexNormals, shaded
 from palpate_dashboard.columns import Columns
-from palpate_dashboard.geometry import VertexNormals, shaded
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots

@@ -23,7 +23,7 @@ from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator import HINT, OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
 from palpate_dashboard import arrays, palette, replay, text
-from palpate_dashboard.geometry import Carry, VertexNormals, shaded
+from palpate_dashboard.arrays import Carry, VertexNormals, shaded
 from palpate_dashboard.sinks import Live
 from palpate_dashboard.text import truth_page
 from palpate_models.numerics.maps import level_lines

@@ -38,9 +38,7 @@ def compare(
     from rich.console import Console
 
     from palpate.comparison import compare as comparing
-    from palpate.comparison.figures import draw, draw_outcomes
-    from palpate.comparison.outcomes import read_outcomes, sim_to_real
-    from palpate.comparison.palpated import read_palpated
+    from palpate.comparison.outcomes import draw_outcomes, read_outcomes, sim_to_real
     from palpate.report.files import write_text
 
     if b is None:
@@ -49,9 +47,9 @@ def compare(
         draw_outcomes(out / "compare.png", *pairs)
         figures = asdict(outcome)
     else:
-        first = read_palpated(a, mapping)
-        compared = comparing.compare(first, read_palpated(b, mapping, first.depth_m), register)
-        draw(out / "compare.png", compared)
+        first = comparing.read_palpated(a, mapping)
+        compared = comparing.compare(first, comparing.read_palpated(b, mapping, first.depth_m), register)
+        comparing.draw(out / "compare.png", compared)
         figures = asdict(compared.figures)
     write_text(out / "compare.json", dumps(figures, indent=2) + "\n")
     if as_json:

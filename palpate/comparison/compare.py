@@ -1,10 +1,15 @@
-"""Two palpations of one body, map against map, at the places where the second one was measured."""
+"""Two palpations of one body, map against map, at the places where the second one was measured, and their figure."""
+
+from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Final
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, Final
 
 import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import least_squares
@@ -12,9 +17,13 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import bootstrap, spearmanr
 
-from palpate.comparison.palpated import ComparedPalpation
+from palpate.recording.assessed import collected
+from palpate.recording.read import read_recording
+from palpate.report.archive import FILE, read_evidence
+from palpate.report.evidence import map_of, sample_columns
+from palpate.report.scoring import Map
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, apply
 
 
 @dataclass(frozen=True)
@@ -33,6 +42,50 @@ class CompareTuning:
 
 TUNING: Final = CompareTuning()
 Interval = tuple[float, float]
+
+
+@dataclass(frozen=True, eq=False)
+class ComparedPalpation:
+    """Map of a body, and the forces that were measured; k places, in the body frame A."""
+
+    name: str
+    map: Map
+    depth_m: float
+    """Depth of the map."""
+    places: Array
+    """[m], shape (k, 3)."""
+    force: Array
+    """Measured there [N], shape (k,): at the depth of the map, or of the comparison if the recording has its curve."""
+
+    def moved(self, X: Array) -> ComparedPalpation:
+        """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
+        return replace(self, map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
+
+
+def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None) -> ComparedPalpation:
+    """Return the palpation of a results folder or a recording; of a recording, the forces at `depth_m` [m] if it is given.
+
+    Raises UserError if there is no map.
+    """
+    at_depth = None
+    table: Any
+    if (path / FILE).is_file():
+        message = read_evidence(path).stiffness_map
+        table = np.genfromtxt(path / "samples.csv", delimiter=",", names=True, encoding="utf-8", ndmin=1)
+    else:
+        recording = read_recording(path, mapping)
+        found = collected(recording)
+        message, table = found.stiffness_map, sample_columns(found.samples)
+        at_depth = None if depth_m is None else recording.samples(depth_m)
+    if at_depth is None:
+        places, force = np.column_stack([table[name] for name in ("x_m", "y_m", "z_m")]), table["normal_force_N"]
+    else:
+        places, force = np.array([sample.position for sample in at_depth]), np.array([sample.force for sample in at_depth])
+    if message is None:
+        raise UserError(f"{path}: there is no map to compare: its samples are too few")
+    return ComparedPalpation(
+        path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force
+    )
 
 
 @dataclass(frozen=True)
@@ -173,3 +226,31 @@ def _dice(a: ComparedPalpation, b: ComparedPalpation) -> float | None:
     mine, other = (a.map.finding >= 0)[both], (b.map.finding[nearest] >= 0)[both]
     total = int(mine.sum() + other.sum())
     return 2 * int((mine & other).sum()) / total if total else None
+
+
+def draw(path: Path, compared: Compared) -> None:
+    """Draw two maps of one body, each over its level, and a Bland-Altman plot of the logarithms."""
+    figure = Figure(figsize=(14, 4.4), layout="constrained")
+    maps = figure.subplots(1, 3)
+    for axes, side in ((maps[0], compared.a), (maps[1], compared.b)):
+        _map(axes, side)
+    mean = np.sqrt(compared.of_a * compared.of_b)
+    ratio = np.log(compared.of_b / compared.of_a)
+    maps[2].plot(mean, 100 * ratio, ".", ms=3)
+    middle, half = 100 * float(ratio.mean()), 196 * float(ratio.std())
+    for at, style in ((middle, "-"), (middle - half, "--"), (middle + half, "--")):
+        maps[2].axhline(at, ls=style, color="tab:red", lw=1)
+    maps[2].set(title="Bland-Altman, 95 % limits", xlabel="geometric mean of both [N]", ylabel="B over A [log %]")
+    figure.savefig(path, dpi=110)
+
+
+def _map(axes: Axes, side: ComparedPalpation) -> None:
+    scanned, (x, y, _) = side.map.scanned, 1e3 * side.map.vertices.T
+    level = float(np.median(side.map.apparent[scanned]))
+    ratio = side.map.apparent[scanned] / level
+    low, high = np.quantile(ratio, (0.01, 0.99))
+    shown = axes.scatter(x[scanned], y[scanned], c=ratio, s=14, marker="s", vmin=low, vmax=high)
+    inside = scanned & (side.map.finding >= 0)
+    axes.plot(x[inside], y[inside], "x", ms=3, color="tab:red")
+    axes.set(title=f"{side.name}, over {level:.3g} N; x: finding", xlabel="x [mm]", ylabel="y [mm]", aspect="equal")
+    axes.figure.colorbar(shown, ax=axes, shrink=0.8)

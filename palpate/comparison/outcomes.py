@@ -12,6 +12,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from matplotlib.figure import Figure
 from scipy.stats import pearsonr, t
 
 from palpate_errors import UserError
@@ -108,3 +109,17 @@ def _weight(real: Array, simulated: Array, more: Array) -> float:
 def _around(middle: float, variance: float, n: int, confidence: float) -> tuple[float, float]:
     half = float(t.ppf(0.5 + confidence / 2, n - 1)) * variance**0.5
     return middle - half, middle + half
+
+
+def draw_outcomes(path: Path, real: Array, simulated: Array, more: Array) -> None:
+    """Draw simulated against real outcomes, and those that were simulated only along the axis."""
+    figure = Figure(figsize=(5, 4.6), layout="constrained")
+    axes = figure.subplots()
+    axes.plot(simulated, real, "o", label="pairs")
+    every = np.concatenate((real, simulated, more))
+    ends = float(every.min()), float(every.max())
+    axes.plot(ends, ends, color="grey", lw=0.8)
+    axes.plot(more, np.full(len(more), ends[0]), "|", color="tab:orange", label="simulated only")
+    axes.set(xlabel="simulated", ylabel="real")
+    axes.legend()
+    figure.savefig(path, dpi=110)

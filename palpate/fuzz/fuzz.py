@@ -1,4 +1,4 @@
-"""Fuzzes everything that reads bytes, text or files from other processes and users.
+"""`palpate fuzz`: fuzzes everything that reads bytes, text or files from other processes and users.
 
     palpate fuzz --inputs 100000     mutations of valid inputs, for each target; equal seeds give equal inputs
 
@@ -7,6 +7,8 @@ exception is a find, which is printed with its input in hexadecimal. Write a tes
 Each target runs in a child process with bounded memory and a temporary working folder. A file that is opened for writing
 elsewhere is a find, and so is the end of the process.
 """
+
+from __future__ import annotations
 
 import os
 import random
@@ -18,11 +20,15 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from pathlib import Path
 from time import perf_counter, process_time, thread_time
-from typing import Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final
+
+import typer
 
 from palpate.apart import ChildLost, TimeLimit, run_apart, shared_numbers
-from palpate.fuzz.bus_readers import FuzzTarget, bus_targets
-from palpate.fuzz.file_readers import file_targets
+from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, refuse, table, wide_console
+
+if TYPE_CHECKING:
+    from palpate.fuzz.bus_readers import FuzzTarget
 
 SLOW_S = 1.0
 """Processor time above which an input is a find, since it would delay a service."""
@@ -210,6 +216,9 @@ def summary(result: TargetResult) -> str:
 
 def all_targets() -> list[FuzzTarget]:
     """Return all targets."""
+    from palpate.fuzz.bus_readers import bus_targets  # noqa: PLC0415 - the help of the command needs no readers
+    from palpate.fuzz.file_readers import file_targets  # noqa: PLC0415
+
     return [*bus_targets(), *file_targets()]
 
 
@@ -220,3 +229,29 @@ def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
         if not any(fnmatch(target.name, pattern) for target in known):
             raise ValueError(f"no target {pattern!r}; targets are {', '.join(target.name for target in known)}")
     return [target for target in known if not patterns or any(fnmatch(target.name, p) for p in patterns)]
+
+
+def fuzz(
+    names: Annotated[list[str] | None, typer.Argument(help="Targets or patterns, e.g. 'codec:*'; all by default.")] = None,
+    inputs: Annotated[int, typer.Option(min=1, help="Greatest number of inputs of each target.")] = 100_000,
+    seconds: Annotated[float, typer.Option(min=1, help="Greatest processor time of each target, in seconds.")] = 3600.0,
+    seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
+) -> None:
+    """Feed invalid bytes to everything that reads from the bus or from files, and check that all are refused."""
+    console = SteadyConsole(stderr=True)
+    try:
+        chosen = choose(names or [])
+    except ValueError as error:
+        refuse(error)
+    with CaseDisplay(console, False, "targets") as display:
+        done = campaign(chosen, FuzzPlan(inputs, seed, seconds), display.show)
+    for find in done.finds:
+        console.print(f"{find.target} {find.error}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
+    figures = table("target", ">inputs", ">refused", ">finds", ">processor s", ">peak MB")
+    for name, result in done.targets.items():
+        rest = (result.inputs, result.refused, result.found, round(result.seconds), result.peak_mb)
+        figures.add_row(name, *map(str, rest))
+    wide_console().print(figures)
+    total = sum(result.inputs for result in done.targets.values())
+    print(f"{total} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} kinds of finds, {done.seconds:.0f} s")
+    raise typer.Exit(EXIT_FAILED if done.finds else 0)

@@ -24,8 +24,8 @@ from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
 from palpate.recording.assessed import collected
 from palpate.recording.recording import PalpationRecording
-from palpate.report.evidence import map_of, samples_of
-from palpate.report.results import finding_row, sample_columns
+from palpate.report.evidence import map_of, sample_columns
+from palpate.report.results import finding_row
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
@@ -231,8 +231,7 @@ def _state(
 
 def samples_frame(messages: list[Any]) -> pd.DataFrame:
     """Return a row per `palpation_msgs/PalpationSample`, with the columns of samples.csv."""
-    samples = samples_of(messages)
-    return pd.DataFrame({**sample_columns(samples), "force_limited": samples.force_limited})
+    return pd.DataFrame(sample_columns(messages))
 
 
 def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:

@@ -20,8 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate.apart import guarded
-from palpate.truth.pressed import TrueBody, TrueSurface
-from palpate.truth.tissue import true_tissue
+from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_errors import UserError

@@ -28,31 +28,6 @@ xyz: Final = attrgetter("x", "y", "z")
 
 
 @dataclass(frozen=True)
-class Samples:
-    """The m samples of a run, in A."""
-
-    time: Array
-    """[s], shape (m,)."""
-    position: Array
-    """[m], shape (m, 3)."""
-    normal: Array
-    """Shape (m, 3)."""
-    depth: Array
-    """[m]"""
-    force: Array
-    """[N]"""
-    speed: Array
-    """[m/s]"""
-    time_in_contact: Array
-    """[s]"""
-    depth_uncertainty: Array
-    """Reported SD of the depth [m]."""
-    stroke: Array
-    """Number of the descent."""
-    force_limited: Mask
-
-
-@dataclass(frozen=True)
 class ContactRecord:
     """Measured and true contact at m equal stamps while the contact is reported steady."""
 
@@ -133,24 +108,23 @@ def found_of(areas: Sequence[Any]) -> list[Found]:
     ]
 
 
-def samples_of(messages: list[Any]) -> Samples:
-    """Return the samples of a list of `palpation_msgs/PalpationSample`."""
+def sample_columns(messages: Iterable[Any]) -> dict[str, NDArray[Any]]:
+    """Return the columns of samples.csv, each of shape (m,), of m `palpation_msgs/PalpationSample`, in the abdomen frame."""
+    return columns_of(
+        (
+            (nanoseconds(m.header.stamp) / NS, *xyz(m.position), *xyz(m.normal), m.depth, m.normal_force, m.tangential_speed,
+             m.time_in_contact, m.depth_uncertainty, m.stroke, m.force_limited)
+            for m in messages
+        ),
+        _SAMPLE,
+    )  # fmt: skip
 
-    def column(values: list[Any], width: int = 0) -> Array:
-        return np.array(values, dtype=np.float64).reshape((-1, width) if width else -1)
 
-    return Samples(
-        time=column([nanoseconds(m.header.stamp) / NS for m in messages]),
-        position=column([(m.position.x, m.position.y, m.position.z) for m in messages], 3),
-        normal=column([(m.normal.x, m.normal.y, m.normal.z) for m in messages], 3),
-        depth=column([m.depth for m in messages]),
-        force=column([m.normal_force for m in messages]),
-        speed=column([m.tangential_speed for m in messages]),
-        time_in_contact=column([m.time_in_contact for m in messages]),
-        depth_uncertainty=column([m.depth_uncertainty for m in messages]),
-        stroke=column([m.stroke for m in messages]),
-        force_limited=np.array([m.force_limited for m in messages], dtype=bool),
-    )
+_SAMPLE: Final = np.dtype([
+    *((name, "f8") for name in ("time_s", "x_m", "y_m", "z_m", "nx", "ny", "nz", "depth_m", "normal_force_N", "speed_mps",
+                                "time_in_contact_s", "depth_uncertainty_m", "stroke")),
+    ("force_limited", "?"),
+])  # fmt: skip
 
 
 def peak_force(message: Any) -> float:

@@ -16,7 +16,7 @@ from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullForm
 from matplotlib.tri import Triangulation
 
 from palpate.report import rows
-from palpate.report.evidence import Samples, map_of
+from palpate.report.evidence import map_of
 from palpate.report.scoring import Map, Truth
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.maps import half_width
@@ -205,7 +205,7 @@ def draw_map(
     path: Path,
     message: Any,
     findings: Any | None,
-    samples: Samples,
+    samples_xy: Array,
     truth: Truth | None,
     title: str,
     run: str = "",
@@ -213,7 +213,8 @@ def draw_map(
 ) -> None:
     """Draw `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
 
-    The file's metadata has the name of the run. Writes nothing for a map that is not `drawable`.
+    `samples_xy`: places of the samples [m], shape (m, 2). The file's metadata has the name of the run. Writes nothing for a map
+    that is not `drawable`.
     """
     if not drawable(message):
         return
@@ -221,18 +222,18 @@ def draw_map(
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")
     figure.set_layout_engine("constrained", w_pad=0.12, h_pad=0.12, wspace=0.02, hspace=0.03)
     grid = figure.add_gridspec(2, 3)
-    _draw_force(figure, grid, drawing, samples)
+    _draw_force(figure, grid, drawing, samples_xy)
     _draw_stiffness(figure, grid, drawing)
     figure.suptitle(f"{title}: {_summary(drawing)}", fontsize=15, weight="bold", color=INK)
     figure.supxlabel("white in the maps: not assessed", fontsize=_SMALL, color=QUIET)
     figure.savefig(path, metadata={"Title": title, "Comment": f"run {run}"})
 
 
-def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples: Samples) -> None:
+def _draw_force(figure: Figure, grid: Any, drawing: Drawing, samples_xy: Array) -> None:
     layer = drawing.force_layer
     flat = figure.add_subplot(grid[0, 0])
-    flat.plot(samples.position[:, 0] * 1e3, samples.position[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
-    depth_mm, count = drawing.depth * 1e3, len(samples.time)
+    flat.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
+    depth_mm, count = drawing.depth * 1e3, len(samples_xy)
     drawing.panel(flat, layer, "a", f"Normal force at {depth_mm:.3g} mm depth", f"{count} samples (dots)")
     solid = figure.add_subplot(grid[0, 1], projection="3d")
     drawing.space(solid, drawing.force, layer, layer.label)

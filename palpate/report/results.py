@@ -2,13 +2,14 @@
 
 import csv
 import logging
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import reduce
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
@@ -22,7 +23,7 @@ from palpate_bus.runs.run_folder import run_of
 from palpate_bus.settings import Settings
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import apply, inverse
 from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -147,48 +148,26 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded:
     known = truth_of_run(scenario, c, result.earlier)
     run = run_of(folder)
     report = assemble(scenario, result, known).model_copy(update={"run": run, "recorded": recorded})
-    samples = evidence.samples_of(c.samples)
+    samples = evidence.sample_columns(c.samples)
     write_samples(folder / "samples.csv", samples, run)
     touched, felt = None if known.contact is None else known.contact.touched, known.felt
     archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     if c.stiffness_map is not None:
         title = f"{scenario.name}, seed {scenario.seed}" if recorded is None else scenario.name
+        xy = np.column_stack((samples["x_m"], samples["y_m"]))
         from palpate.report.figures import draw_map  # noqa: PLC0415 - findings are printed before anything is drawn
 
-        draw_map(folder / "map.png", c.stiffness_map, c.findings, samples, known.felt, title, run, report.abdomen)
+        draw_map(folder / "map.png", c.stiffness_map, c.findings, xy, known.felt, title, run, report.abdomen)
     return report
 
 
-def sample_columns(samples: evidence.Samples) -> dict[str, Array]:
-    """Return the columns of samples.csv by name, in the abdomen frame, each of shape (m,)."""
-    x, y, z = samples.position.T
-    nx, ny, nz = samples.normal.T
-    return {
-        "time_s": samples.time,
-        "x_m": x,
-        "y_m": y,
-        "z_m": z,
-        "nx": nx,
-        "ny": ny,
-        "nz": nz,
-        "depth_m": samples.depth,
-        "normal_force_N": samples.force,
-        "speed_mps": samples.speed,
-        "time_in_contact_s": samples.time_in_contact,
-        "depth_uncertainty_m": samples.depth_uncertainty,
-        "stroke": samples.stroke,
-    }
-
-
-def write_samples(path: Path, samples: evidence.Samples, run: str = "") -> None:
-    """Write samples.csv: one row per sample of the run named `run`, in the abdomen frame."""
-    columns = sample_columns(samples)
+def write_samples(path: Path, columns: Mapping[str, NDArray[Any]], run: str = "") -> None:
+    """Write samples.csv: one row per sample of the run named `run`."""
     with path.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
-        writer.writerow((*columns, "force_limited", "run"))
-        for row, limited in zip(np.column_stack(tuple(columns.values())), samples.force_limited, strict=True):
-            writer.writerow((*(f"{value:.6g}" for value in row), int(limited), run))
+        writer.writerow((*columns, "run"))
+        writer.writerows((*(f"{value:.6g}" for value in map(float, row)), run) for row in zip(*columns.values(), strict=True))
 
 
 REASONS = {

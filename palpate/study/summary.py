@@ -31,43 +31,19 @@ from palpate_models.scenario.schema import Scenario
 
 Record = dict[str, Any]
 
-CASES: Final = pa.schema(
-    {
-        "case_id": pa.string(),
-        "study": pa.string(),
-        "population": pa.string(),
-        "method": pa.string(),
-        "split": pa.string(),
-        "number": pa.int64(),
-        "seed": pa.int64(),
-        "tier": pa.string(),
-        "errors": pa.string(),
-        "status": pa.string(),
-        "attempts": pa.int64(),
-        "why": pa.string(),
-        "run_hash": pa.string(),
-        "completed": pa.bool_(),
-        "palpable": pa.int64(),
-        "not_palpable": pa.int64(),
-        "matched": pa.int64(),
-        "missed": pa.int64(),
-        "false_findings": pa.int64(),
-        "on_guarding": pa.int64(),
-        "on_structure": pa.int64(),
-        "score": pa.float64(),
-        "coverage_area": pa.float64(),
-        "coverage_lumps": pa.float64(),
-        "coverage_ratio": pa.float64(),
-        "depth_rms_m": pa.float64(),
-        "peak_force_n": pa.float64(),
-        "exam_time_s": pa.float64(),
-        "sim_time_s": pa.float64(),
-        "wall_time_s": pa.float64(),
-        "assess_time_s": pa.float64(),
-        "peak_memory_bytes": pa.int64(),
-        "core_s": pa.float64(),
-        "loop_examinations": pa.int64(),
-    }
+
+def _schema(strings: str, integers: str, numbers: str, booleans: str) -> pa.Schema:
+    kinds = ((pa.string(), strings), (pa.int64(), integers), (pa.float64(), numbers), (pa.bool_(), booleans))
+    return pa.schema([(name, kind) for kind, names in kinds for name in names.split()])
+
+
+CASES: Final = _schema(
+    "case_id study population method split tier errors status why run_hash",
+    "number seed attempts palpable not_palpable matched missed false_findings on_guarding on_structure peak_memory_bytes"
+    " loop_examinations",
+    "score coverage_area coverage_lumps coverage_ratio depth_rms_m peak_force_n exam_time_s sim_time_s wall_time_s assess_time_s"
+    " core_s",
+    "completed",
 )
 """One row per case. Counts are null and figures NaN for a case without a report.
 
@@ -75,45 +51,17 @@ CASES: Final = pa.schema(
 the simulation, in whole examinations with the assessment. `assess_time_s`: wall time of the assessment (processor time in quick
 cases). `wall_time_s`: all wall time, including the truth. `core_s`: processor time. `loop_examinations`: number of whole
 examinations that the errors of a quick case were fitted to; null for a whole one."""
-FINDINGS: Final = pa.schema(
-    {
-        "case_id": pa.string(),
-        "index": pa.int64(),
-        "reported": pa.bool_(),
-        "x_m": pa.float64(),
-        "y_m": pa.float64(),
-        "z_m": pa.float64(),
-        "area_m2": pa.float64(),
-        "ratio": pa.float64(),
-        "ratio_lower": pa.float64(),
-        "ratio_upper": pa.float64(),
-        "confidence": pa.float64(),
-        "guarding": pa.float64(),
-        "lump": pa.int64(),
-        "place_error_m": pa.float64(),
-        "area_true_m2": pa.float64(),
-        "ratio_true": pa.float64(),
-        "on_guarding": pa.bool_(),
-        "on_structure": pa.bool_(),
-    }
+FINDINGS: Final = _schema(
+    "case_id",
+    "index lump",
+    "x_m y_m z_m area_m2 ratio ratio_lower ratio_upper confidence guarding place_error_m area_true_m2 ratio_true",
+    "reported on_guarding on_structure",
 )
 """One row per finding and per candidate. `lump`: the matched lump, -1 if none. `guarding`: reported probability of a tensed
 muscle. `on_guarding`: True if it lies on one and is false. `on_structure`: True if it lies on a structure of the wall and
 matches no lump."""
-LUMPS: Final = pa.schema(
-    {
-        "case_id": pa.string(),
-        "lump": pa.int64(),
-        "felt_contrast": pa.float64(),
-        "felt_radius_m": pa.float64(),
-        "depth_m": pa.float64(),
-        "radius_m": pa.float64(),
-        "contrast": pa.float64(),
-        "palpable": pa.bool_(),
-        "found": pa.bool_(),
-        "confidence": pa.float64(),
-        "place_error_m": pa.float64(),
-    }
+LUMPS: Final = _schema(
+    "case_id", "lump", "felt_contrast felt_radius_m depth_m radius_m contrast confidence place_error_m", "palpable found"
 )
 """One row per lump, also of failed cases. `felt_radius_m`, `radius_m`: radius of the circle with the felt area and with the area
 of the outline. `found`: by a reported finding. `confidence`: greatest one of its findings and candidates, 0 without any."""

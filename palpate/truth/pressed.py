@@ -21,6 +21,7 @@ from palpate_models.numerics.cache import content_key, remembered
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
+from palpate_models.patient.motion import Motion
 from palpate_models.patient.schema import Lesion, Phantom, Structure
 from palpate_models.scenario.schema import Exam, Scenario
 
@@ -158,9 +159,24 @@ class Copies:
         return self._copy(self.phantom.model_copy(update={"structures": ()}))
 
     def _copy(self, phantom: Phantom) -> TissueBackend | None:
-        from palpate.truth.tissue import true_tissue  # noqa: PLC0415 - imports a service, which reading results does not need
-
         return true_tissue(self._scenario.model_copy(update={"phantom": phantom}))
+
+
+def true_tissue(scenario: Scenario) -> TissueBackend | None:
+    """Return the tissue of a scenario, of any implementation, at rest, on a body that does not move.
+
+    None if it cannot be copied: a foreign FMU, a custom service, real tissue.
+    """
+    from palpate_bus.implementations import create  # noqa: PLC0415 - imports a service, which reading results does not need
+    from palpate_tissue.service import TissueService  # noqa: PLC0415
+
+    chosen = scenario.services.tissue
+    if chosen == "none" or (chosen == "fmu" and scenario.tissue.fmu is not None):
+        return None
+    still = scenario.phantom.model_copy(update={"motion": Motion()})
+    tier = "winkler" if chosen == "fmu" else chosen  # the tier with the equations of our own FMU
+    service = create("tissue", tier, scenario.model_copy(update={"phantom": still}))
+    return service.backend if isinstance(service, TissueService) else None
 
 
 def press_patient(scenario: Scenario) -> Pressed | None:

@@ -12,7 +12,7 @@ import typer
 from conductor_messages import FOUND, SETTINGS, collected, result
 from rich.console import Console
 
-from palpate.report.evidence import samples_of, steady_contact
+from palpate.report.evidence import sample_columns, steady_contact
 from palpate.report.page import write_page
 from palpate.report.results import Known, assemble, clean_world, print_findings, scores_text, truth_of_run, write_results
 from palpate.report.rows import Report
@@ -76,10 +76,10 @@ def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     assert (tmp_path / "map.png").stat().st_size > 50_000
     rows = list(csv.DictReader((tmp_path / "samples.csv").open(encoding="utf-8")))
     messages = collected()
-    samples = samples_of(messages.samples)
-    assert len(rows) == len(samples.time)
-    assert float(rows[3]["normal_force_N"]) == pytest.approx(samples.force[3])
-    assert float(rows[3]["x_m"]) == pytest.approx(samples.position[3, 0])
+    samples = sample_columns(messages.samples)
+    assert len(rows) == len(samples["time_s"])
+    assert float(rows[3]["normal_force_N"]) == pytest.approx(samples["normal_force_N"][3])
+    assert float(rows[3]["x_m"]) == pytest.approx(samples["x_m"][3])
     assert float(rows[3]["depth_uncertainty_m"]) == pytest.approx(messages.samples[3].depth_uncertainty)
     assert float(rows[3]["stroke"]) == messages.samples[3].stroke
 

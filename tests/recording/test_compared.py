@@ -5,10 +5,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.comparison.compare import compare
-from palpate.comparison.figures import draw
+from palpate.comparison.compare import ComparedPalpation, compare, draw
 from palpate.comparison.outcomes import read_outcomes, sim_to_real
-from palpate.comparison.palpated import ComparedPalpation
 from palpate.report.scoring import Map
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, matrix

@@ -7,8 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from palpate.truth.pressed import TrueBody, TrueSurface
-from palpate.truth.tissue import true_tissue
+from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
