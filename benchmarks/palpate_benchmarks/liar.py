@@ -55,7 +55,7 @@ CHANGES: Final[Mapping[str, Callable[[Array, Array, float, float], Array]]] = {
     "noise": lambda x, first, amount, s: np.asarray(x + amount * _RANDOM.standard_normal(x.shape)),
     "dead": lambda x, first, amount, s: np.asarray(amount * _RANDOM.standard_normal(x.shape)),
     "stuck": lambda x, first, amount, s: np.asarray(first + amount * _RANDOM.standard_normal(x.shape)),
-    "permuted": lambda x, first, amount, s: np.roll(x.reshape(-1, 7), 1, axis=1).ravel(),
+    "permuted": lambda x, first, amount, s: np.roll(x, 1),
     "swapped": lambda x, first, amount, s: np.roll(x.reshape(-1, 4), 1, axis=1).ravel(),
     "unnormalised": lambda x, first, amount, s: amount * x,
 }

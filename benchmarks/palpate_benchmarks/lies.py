@@ -70,7 +70,7 @@ SAME_BACKGROUND: Final = 0.25
 """Relative change of the map's background that counts as harm."""
 LONGEST_NS: Final = 90 * NS
 """Simulated time after which a case has hung."""
-CASE_S: Final = 300.0
+CASE_S: Final = 900.0
 """Wall time of a case at most."""
 HANGS: Final = "the examination did not end"
 BEFORE_S: Final = 0.25
@@ -262,7 +262,11 @@ class Lockstep:
         start = round(start_s(lie) * 1e3) * MS
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
-        return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
+        try:
+            return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
+        except RunError as error:  # one case must not end the campaign
+            finding.hung, finding.outcome, finding.ended = True, CaseOutcome.ENDED, str(error)
+            return finding
 
     def _finished(self, lie: Lie | None) -> LieOutcome:
         """Run to the end, in a child process."""

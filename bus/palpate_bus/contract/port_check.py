@@ -234,12 +234,13 @@ class _Source:
 
     def _varies(self) -> Iterator[str]:
         """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
+        idle = "".join(f"m.{field} != {value} or " for field, value in self._topic.varies_while.items())
         for k, (path, most) in enumerate(self._topic.varies.items()):
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
             none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
-            yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
+            yield f"if {idle}{none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
             yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
             yield "else: return False"
 

@@ -97,6 +97,8 @@ class Topic(_Row):
     """Greatest change per second of each number."""
     varies: dict[str, int] = {}
     """Number of messages in a row whose field may repeat exactly."""
+    varies_while: dict[str, int] = {}
+    """Values of other fields without which a field of `varies` may repeat."""
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0
