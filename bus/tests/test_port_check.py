@@ -13,7 +13,7 @@ from toy_services import TOYS, Robot
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.port_check import Checker, PortCheck, RefusedMessage
-from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
+from palpate_bus.messages import RobotStatus, SurfaceMotion, Vector3, Wrench, codec
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
@@ -158,6 +158,21 @@ def test_a_frozen_value_is_refused_until_it_changes() -> None:
     with pytest.raises(RefusedMessage, match="7 messages in a row"):
         check(status(70 * MS, 5.0), 70 * MS)
     check(status(80 * MS, 5.1), 80 * MS)
+
+
+@pytest.mark.parametrize("state", [SurfaceMotion.QUIET, SurfaceMotion.LOST])
+def test_a_breath_that_repeats_is_refused_while_it_is_followed(state: int) -> None:
+    check = PortCheck(RULES.topics["perception/motion"])
+
+    def follow() -> None:
+        for t in range(0, 3 * NS, 100 * MS):
+            check(SurfaceMotion(header(t, "abdomen"), state, 0.0, np.zeros(11), 0.001, Vector3(0.0, 0.0, 0.0)), t)
+
+    if state == SurfaceMotion.QUIET:
+        with pytest.raises(RefusedMessage, match="22 messages in a row"):
+            follow()
+    else:
+        follow()
 
 
 def test_a_refused_spike_leaves_the_messages_after_it_alone() -> None:
