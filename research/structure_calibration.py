@@ -28,10 +28,11 @@ from palpate_assessment.detection import SOFTER, SURE, Candidate
 from palpate_assessment.findings import Kind, causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
+from palpate_assessment.shapes import ridge
 from palpate_assessment.standard import USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.person import drawn
-from palpate_models.patient.schema import Lesion, Phantom
+from palpate_models.patient.schema import Phantom, Structure, StructureKind
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from research.assessment_calibration import real, scenario
@@ -56,37 +57,41 @@ def nearer_bones(person: Phantom, rng: np.random.Generator) -> Phantom:
     return person.model_copy(update={"anatomy": person.anatomy.model_copy(update={"skeleton": skeleton.model_copy(update=near)})})
 
 
-def oblique_scar(rng: np.random.Generator) -> list[Lesion]:
-    """Return a scar of 50 to 90 mm in any direction, as a row of small lumps."""
+def oblique_scar(rng: np.random.Generator) -> Structure:
+    """Return a scar of 50 to 90 mm in any direction."""
     (x, y), angle = rng.uniform((-0.07, -0.07), (0.07, 0.05)), rng.uniform(0, np.pi)
-    half, radius, contrast = rng.uniform(0.025, 0.045), rng.uniform(0.002, 0.0045), rng.uniform(2, 4)
-    along = np.arange(-half, half + 1e-9, 0.004)
-    places = [(x + a * np.cos(angle), y + a * np.sin(angle)) for a in along.tolist()]
-    return [Lesion(centre_m=place, radii_m=(radius, radius), contrast=contrast) for place in places]
+    half, radius = rng.uniform(0.025, 0.045), rng.uniform(0.002, 0.0045)
+    dx, dy = half * np.cos(angle), half * np.sin(angle)
+    return Structure(
+        kind=StructureKind.SCAR, line_m=((x - dx, y - dy), (x + dx, y + dy)), radii_m=(radius, radius), factor=rng.uniform(2, 4)
+    )
 
 
-def midline_scar(rng: np.random.Generator) -> list[Lesion]:
+def midline_scar(rng: np.random.Generator) -> Structure:
     """Return a scar of 80 to 160 mm along the midline."""
-    centre, radii = (rng.uniform(-0.006, 0.006), rng.uniform(-0.05, 0.05)), (rng.uniform(0.002, 0.004), rng.uniform(0.04, 0.08))
-    return [Lesion(centre_m=centre, radii_m=radii, contrast=rng.uniform(1.8, 3.5))]
+    x, y, half, radius = rng.uniform(-0.006, 0.006), rng.uniform(-0.05, 0.05), rng.uniform(0.04, 0.08), rng.uniform(0.002, 0.004)
+    return Structure(
+        kind=StructureKind.SCAR, line_m=((x, y - half), (x, y + half)), radii_m=(radius, radius), factor=rng.uniform(1.8, 3.5)
+    )
 
 
-def hernia(rng: np.random.Generator) -> list[Lesion]:
+def hernia(rng: np.random.Generator) -> Structure:
     """Return a soft spot at the umbilicus or on the midline."""
     at_umbilicus, radius = rng.random() < 0.5, rng.uniform(0.008, 0.02)
     centre = (0.0, 0.0) if at_umbilicus else (rng.uniform(-0.01, 0.01), rng.uniform(-0.05, 0.09))
-    return [Lesion(centre_m=centre, radii_m=(radius, radius), contrast=rng.uniform(0.15, 0.5))]
+    return Structure(kind=StructureKind.HERNIA, line_m=(centre,), radii_m=(radius, radius), factor=rng.uniform(0.15, 0.5))
 
 
-def wide_linea_alba(rng: np.random.Generator) -> list[Lesion]:
+def wide_linea_alba(rng: np.random.Generator) -> Structure:
     """Return a linea alba that is 24 to 60 mm wide and soft."""
-    radii = (rng.uniform(0.012, 0.03), rng.uniform(0.05, 0.09))
-    return [Lesion(centre_m=(0.0, rng.uniform(0.0, 0.05)), radii_m=radii, contrast=rng.uniform(0.35, 0.65))]
+    half, y, radius = rng.uniform(0.05, 0.09), rng.uniform(0.0, 0.05), rng.uniform(0.012, 0.03)
+    line, factor = ((0.0, y - half), (0.0, y + half)), rng.uniform(0.35, 0.65)
+    return Structure(kind=StructureKind.DIASTASIS, line_m=line, radii_m=(radius, radius), factor=factor)
 
 
-def having(structure: Callable[[np.random.Generator], list[Lesion]]) -> Change:
+def having(structure: Callable[[np.random.Generator], Structure]) -> Change:
     """Return the change that adds a structure."""
-    return lambda person, rng: person.model_copy(update={"lesions": (*person.lesions, *structure(rng))})
+    return lambda person, rng: person.model_copy(update={"structures": (*person.structures, structure(rng))})
 
 
 PERSONS: Final[dict[str, Change]] = {
@@ -137,22 +142,28 @@ def evidence(name: str, seed: int) -> list[Evidence]:
     for one in judged[1]:
         if one.beyond > -SURE:
             is_lump = known is not None and real(one, known)
-            true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.lesions))
+            true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.structures))
             rows.append(Evidence(one.features.tolist(), one.signs.features.tolist(), one.structures().tolist(), true))
     return rows
 
 
-def _other_causes(name: str, one: Candidate, lesions: tuple[Lesion, ...]) -> set[int]:
+def _other_causes(name: str, one: Candidate, structures: tuple[Structure, ...]) -> set[int]:
     """Return what a candidate that is not a lump may truly be."""
     if name in STRUCTURES:
         kind, at = STRUCTURES[name][1], np.array((one.disc.x, one.disc.y))
-        near = any((((at - a.centre_m) / (np.array(a.radii_m) + one.disc.radius)) ** 2).sum() < 1 for a in lesions)
+        near = any(along(a, at) < max(a.radii_m) + one.disc.radius for a in structures)
         if near and (one.log_contrast < 0) == (kind is Kind.SOFT_DEFECT):
             return {int(kind)}
     at_border = one.inside_m < 0.02
     if name == "bones nearer" and at_border and abs(one.t) > 4 and one.log_contrast > np.log(1.5):
         return {int(Kind.BONE)}
     return {int(Kind.MUSCLE), NOTHING} | ({int(Kind.BONE)} if at_border else set())
+
+
+def along(structure: Structure, at: Array) -> float:
+    """Return the distance of a place, shape (2,), from a structure's line [m]."""
+    line = np.array(structure.line_m)
+    return float(np.linalg.norm(at - line[0])) if len(line) == 1 else float(ridge(line, 1e-3, 1e-3).distance(at[None])[0])
 
 
 FIELDS: Final = ("probability", "ridge", "bone", "soft")
