@@ -130,8 +130,8 @@ def causes(calibration: Calibration, features: Array, signs: Array, evidence: Ar
 
     `features`, `signs`, `evidence`: of candidates, of muscles about them and of structures, shapes (k, f), (k, 2), (k, 10).
     The causes compete: a lump has the weight exp(l), a muscle exp(g), a structure s exp(l + s), nothing 1. What is softer is
-    neither a muscle nor a scar nor bone, and what is stiffer is not a soft defect. `shift`: of the log odds of a lump, by its prevalence;
-    the logits that decide what is reported are those of the fit.
+    neither a muscle nor a scar nor bone, and what is stiffer is not a soft defect. `shift`: of the log odds of a lump, by its
+    prevalence; the logits that decide what is reported are those of the fit.
     """
     softer = features[:, SOFTER] > 0
     lump, muscle = calibration.logit(features), np.where(softer, -np.inf, calibration.muscle(signs))
