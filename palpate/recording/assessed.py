@@ -5,7 +5,6 @@ from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
-from scipy.spatial import cKDTree
 
 from palpate.exam_state import exam_state
 from palpate.recording.faults import Remedy
@@ -15,6 +14,7 @@ from palpate.report.results import write_results
 from palpate.report.rows import FaultRow, RecordedRow, Report
 from palpate_assessment.assess import assess
 from palpate_assessment.grid import map_grid
+from palpate_assessment.observations import spacing_of
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
 from palpate_bus.messages import ExamState, SurfaceMesh
@@ -64,9 +64,8 @@ def region(samples: list[ForceSample]) -> tuple[tuple[float, float], tuple[float
     """Return centre and size of the sampled region in A [m], and the usual distance of neighbouring samples [m]."""
     xy = np.array([sample.position[:2] for sample in samples])
     low, high = xy.min(axis=0), xy.max(axis=0)
-    spacing = float(np.median(np.asarray(cKDTree(xy).query(xy, 2)[0])[:, 1])) if len(xy) > 1 else 0.0
     (x, y), (width, height) = (0.5 * (low + high)).tolist(), (high - low).tolist()
-    return (x, y), (width, height), spacing
+    return (x, y), (width, height), spacing_of(xy)
 
 
 def _states(recording: PalpationRecording) -> list[Any]:

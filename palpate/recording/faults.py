@@ -24,6 +24,7 @@ class FaultCode(StrEnum):
     DISAGREE = "disagree"
     SHALLOW = "shallow"
     INVALID = "invalid"
+    MOVES = "moves"
 
 
 _TEXTS = {
@@ -44,6 +45,7 @@ _TEXTS = {
     FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
     FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to be assessed",
     FaultCode.INVALID: "{count} of {of} rows have no number, or a normal of length 0",
+    FaultCode.MOVES: "the skin is {value:.2g} m elsewhere from slide to slide: the body moves, as it does in breathing",
 }
 
 
@@ -54,6 +56,7 @@ class Remedy(StrEnum):
     KEPT = "kept as they are"
     CORRECTED = "corrected"
     NOT_TARED = "the force is taken as it is, without a tare"
+    ONE_DEPTH = "all slides are taken to keep one depth"
     REFUSED = "not assessed until it is mended"
 
 

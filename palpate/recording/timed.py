@@ -6,6 +6,7 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.interpolate import make_interp_spline
 
 from palpate.recording import cutting
 from palpate.recording.cutting import ContactOnset, across
@@ -25,6 +26,8 @@ _DRIFT: Final = 0.05
 """Drift that is reported, as a share of the usual force."""
 _FOLLOWS: Final = 0.1
 """SD of the depth over itself, of a slide that keeps it."""
+_MOVES: Final = 2.0
+"""Distance of slides from one skin, in these SD, from which the body moved."""
 
 
 def normal_force(force: Array, normal: Array) -> Array:
@@ -55,7 +58,7 @@ def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: A
     if mapping.body.surface is not None:
         scale = SCALES[mapping.units.length]
         work.skin = of_mesh(mapping.body.surface, scale, inverse(X_WA), mapping.tool.radius_m, work.stations)
-    return work.palpated()
+    return work.palpated(faults)
 
 
 def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fault]) -> tuple[Readings, float]:
@@ -136,27 +139,42 @@ class _Measured:
         self.skin: RecordedSkin | None = None
         self.power = 1.0
 
-    def palpated(self) -> Palpated:
-        """Return the contacts and the skin."""
+    def palpated(self, faults: list[Fault]) -> Palpated:
+        """Return the contacts and the skin; adds a fault."""
         given = self.skin is not None
         for _ in range(2):  # the second time with the normals of the first
             loads = [self._loading(*one) for one in self.touching]
             self.power = cutting.power_of([load.loaded for load in loads], self.sigma)
             onsets = [cutting.onset(load.loaded, self.power, self.sigma) for load in loads]
-            points, sd = self._skin_points(loads, onsets)
+            kept = self._kept(loads, onsets)
+            points, sd = self._skin_points(loads, onsets, kept)
             if not given:
                 self.skin = fitted(points, sd, self.stations, 2 * self.reach)
         assert self.skin is not None
         if given:
-            self.skin = self.skin.through(points, sd)
+            self.skin, kept = self.skin.through(points, sd), {}
+        begun = sum(begin is not None for begin in onsets)
+        off = (points[:, 2] - self.skin.at(points[:, :2])[0])[begun:]
+        if kept and len(off) and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean()):
+            faults.append(Fault(FaultCode.MOVES, 1, 1, Remedy.ONE_DEPTH, apart))
+            kept = dict.fromkeys(kept, float(np.median(list(kept.values()))))
+            self.skin = fitted(*self._skin_points(loads, onsets, kept), self.stations, 2 * self.reach)
         contacts: list[Contact] = []
-        for (one, motion), load, begin in zip(self.touching, loads, onsets, strict=True):
+        for k, ((one, motion), load, begin) in enumerate(zip(self.touching, loads, onsets, strict=True)):
             if motion is _Motion.SLIDE:
-                contacts += self._slid(one)
+                contacts += self._slid(one, kept.get(k))
             elif begin is not None and self.readings.whole[one].any():
                 contacts.append(self._pressed(one, load, begin))
         centres, normals = self.skin.points()
         return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
+
+    def _kept(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> dict[int, float]:
+        """Return the depth that each slide is taken to keep [m]: with which it began, or the usual one where that is unlike it."""
+        slides = [k for k, (_, motion) in enumerate(self.touching) if motion is _Motion.SLIDE]
+        begun = {k: loads[k].at_inward - begin.at if (begin := onsets[k]) else 0.0 for k in slides}
+        deep = [depth for depth in begun.values() if depth > 0]
+        usual = float(np.median(deep)) if deep else 0.0
+        return {k: depth if 0.5 * usual < depth < 2 * usual else usual for k, depth in begun.items()} if deep else {}
 
     def _loading(self, one: slice, motion: _Motion) -> _Loading:
         p = self.readings.position[one]
@@ -166,37 +184,43 @@ class _Measured:
             middle, along = p.mean(axis=0), cutting.path_length(across(p, normal))
             force = normal_force(self.readings.force[one], normal)
             return _Loading(normal, inward[whole], force[whole], middle, float(inward.mean()), (along - along.mean())[whole])
+        force = normal_force(self.readings.force[one], normal)
         if motion is _Motion.SLIDE:
             still = np.linalg.norm(across(p - p[0], normal), axis=1) < 0.5 * self.reach
             p, inward = p[: max(3, int(np.argmin(still)))], inward[: max(3, int(np.argmin(still)))]
         down = cutting.loading(inward)
+        if motion is _Motion.SLIDE:  # before it slides it may be held, while the force relaxes or the body moves
+            down = slice(0, max(3, min(down.stop, cutting.loading(force[: len(p)]).stop)))
         whole = whole[: len(p)][down]
-        force = normal_force(self.readings.force[one][: len(p)][down], normal)
-        return _Loading(normal, inward[down][whole], force[whole], p[down][-1], float(inward[down][-1]))
+        return _Loading(normal, inward[down][whole], force[: len(p)][down][whole], p[down][-1], float(inward[down][-1]))
 
-    def _skin_points(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> tuple[Array, Array]:
+    def _skin_points(
+        self, loads: list[_Loading], onsets: list[ContactOnset | None], kept: dict[int, float]
+    ) -> tuple[Array, Array]:
         """Return points that the tool's centre has at first contact [m], shape (n, 3), and their SD [m].
 
-        They are of onsets; and, with less weight, of the stretches of slides that do not push in and out, in which the tool is
-        taken to keep the depth that it had when it began to slide.
+        They are of onsets; and after these, with less weight, of the stretches of slides that keep a depth [m].
         """
-        points, sd = [], []
-        for load, begin in zip(loads, onsets, strict=True):
-            if begin is not None:
-                points.append(load.at + (load.at_inward - begin.at) * load.normal)
-                sd.append(begin.sd)
-        begun = [load.at_inward - begin.at if begin else np.nan for load, begin in zip(loads, onsets, strict=True)]
-        slides = [(one, depth) for (one, motion), depth in zip(self.touching, begun, strict=True) if motion is _Motion.SLIDE]
-        sliding = [depth for _, depth in slides if depth > 0]
-        usual = float(np.median(sliding)) if sliding else np.nan
-        for one, depth in slides:
-            p = self.readings.position[one][self.readings.whole[one]]
+        begun = [(load, begin) for load, begin in zip(loads, onsets, strict=True) if begin is not None]
+        points = [load.at + (load.at_inward - begin.at) * load.normal for load, begin in begun]
+        sd = [begin.sd for _, begin in begun]
+        for k, depth in kept.items():
+            p = self._sliding(self.touching[k][0])[0]
             normals = np.tile(self.outward, (len(p), 1)) if self.skin is None else self.skin.at(p[:, :2])[1]
-            for part in cutting.windows(across(p, self.outward), self.reach)[1:-1] if np.isfinite(usual) else []:
-                kept = depth if 0.5 * usual < depth < 2 * usual else usual
-                points.append(p[part].mean(axis=0) + kept * normals[part].mean(axis=0))
-                sd.append(_FOLLOWS * kept)
+            for part in cutting.windows(across(p, self.outward), self.reach):
+                points.append(p[part].mean(axis=0) + depth * normals[part].mean(axis=0))
+                sd.append(_FOLLOWS * depth)
         return np.array(points).reshape(-1, 3), np.array(sd)
+
+    def _sliding(self, one: slice) -> tuple[Array, Array, Array]:
+        """Return position, force and time of a slide without its descent and lift."""
+        p = self.readings.position[one]
+        near = cutting.FOOTPRINT_SHARE * self.reach
+        begun, ended = (np.linalg.norm(across(p - end, self.outward), axis=1) > near for end in (p[0], p[-1]))
+        moving = np.arange(len(p)) >= int(np.argmax(begun))
+        moving[len(p) - int(np.argmax(ended[::-1])) :] = False
+        moving &= self.readings.whole[one]
+        return p[moving], self.readings.force[one][moving], self._time(one)[moving]
 
     def _pressed(self, one: slice, load: _Loading, begin: ContactOnset) -> Contact:
         p = self.readings.position[one]
@@ -216,13 +240,21 @@ class _Measured:
             time=time,
         )
 
-    def _slid(self, one: slice) -> list[Contact]:
-        """Return the part of a slide that is at depth; none if that is too short."""
+    def _slid(self, one: slice, kept: float | None) -> list[Contact]:
+        """Return the part of a slide that is at depth; none if that is too short.
+
+        It keeps the depth `kept` [m] but for what is too short for the body's shape; if that is None its depth is that below the skin.
+        """
         assert self.skin is not None
-        p, F, time = self.readings.position[one], self.readings.force[one], self._time(one)
+        p, F, time = self._sliding(one)
         z, normal, sd = self.skin.at(p[:, :2])
+        parts = cutting.windows(across(p, self.outward), self.reach)
+        if kept is not None and len(parts) > 1:
+            way = cutting.path_length(across(p, self.outward))
+            path = make_interp_spline([way[part].mean() for part in parts], [p[part, 2].mean() for part in parts], k=1)
+            z, sd = path(way) + kept / normal[:, 2], np.full(len(p), _FOLLOWS * kept)
         depth = (z - p[:, 2]) * normal[:, 2]
-        deep = np.flatnonzero(self.readings.whole[one] & (depth > 0.5 * np.median(depth)))
+        deep = np.flatnonzero(depth > 0.5 * np.median(depth))
         if len(deep) < 3:
             return []
         return [

@@ -95,12 +95,8 @@ class Observations:
     @cached_property
     def mesh(self) -> tuple[Delaunay, NDArray[np.bool_]]:
         """Triangles between samples, and which of them are filled: without a gap of many samples, as in a notch of the region."""
-        mesh = Delaunay(self.xy)
-        sides = [self.xy[mesh.simplices[:, k]] - self.xy[mesh.simplices[:, k - 1]] for k in range(3)]
-        doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
-        circumradius = np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30)
-        spacing = float(np.median(np.asarray(cKDTree(self.xy).query(self.xy, 2)[0])[:, 1]))
-        return mesh, circumradius <= USABLE.gap * spacing
+        mesh, radii = circumradii(self.xy)
+        return mesh, radii <= USABLE.gap * spacing_of(self.xy)
 
     def encloses(self, places: Array) -> NDArray[np.bool_]:
         """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
@@ -111,6 +107,23 @@ class Observations:
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Return some of the samples."""
         return replace(self, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "standard"})
+
+
+def circumradii(xy: Array) -> tuple[Delaunay, Array]:
+    """Return the triangles between places [m], shape (m, 2), and their circumradii [m]."""
+    mesh = Delaunay(xy)
+    sides = [xy[mesh.simplices[:, k]] - xy[mesh.simplices[:, k - 1]] for k in range(3)]
+    doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
+    return mesh, np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30)
+
+
+def spacing_of(xy: Array) -> float:
+    """Return the usual distance of neighbours [m], shape (m, 2): of lines that of one from the next, of a raster its pitch."""
+    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), 1e-9) < 2:
+        return float(np.median(np.linalg.norm(np.diff(xy, axis=0), axis=1))) if len(xy) > 1 else 0.0
+    mesh, radii = circumradii(xy)
+    whole = ~(mesh.neighbors < 0).any(axis=1)  # those along the border may be slivers
+    return float(np.sqrt(2) * np.median(radii[whole if whole.any() else slice(None)]))
 
 
 def _slides(sample: ForceSample) -> bool:
