@@ -63,7 +63,8 @@ class Observations:
     log_depth: Array
     """log(depth / press depth), by which an error of the exponent n counts."""
     per_metre: Array
-    """|d y / d depth| = n / depth [1/m], by which an error of the depth counts."""
+    """|d y / d depth| = n / depth [1/m], by which an error of the depth counts. Without an anatomy the depth is that of the stroke:
+    noise of each depth would else be evidence for an error that all depths share, and move the level."""
     per_newton: Array
     """1 / F [1/N], by which an error of the force's zero counts: F is the median force of the stroke, or of a press and
     its neighbours, since a sample's own force must not explain itself."""
@@ -166,11 +167,10 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
     speed = np.linalg.norm(velocity, axis=1)
     slid = (speed > USABLE.slide_mps) & (standard.anatomy is not None)
     xy = (position + calibration.lead_s * velocity)[:, :2]
+    numbers, which = np.unique(stroke, return_inverse=True)
+    usual, usual_depth = (np.array([np.median(of[stroke == k]) for k in numbers])[which] for of in (force, depth))
     if standard.anatomy is None:  # each press is a stroke
         usual = np.median(force[cKDTree(xy).query(xy, USABLE.neighbours)[1]], axis=1)
-    else:
-        medians = {int(number): float(np.median(force[stroke == number])) for number in np.unique(stroke)}
-        usual = np.array([medians[int(number)] for number in stroke])
     return Observations(
         standard=standard,
         xy=xy,
@@ -181,7 +181,7 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
         rate=np.where(slid, np.log(np.maximum(speed, USABLE.slide_mps) / (np.median(speed[slid]) if slid.any() else 1.0)), 0.0),
         touched_for=np.array([s.time_in_contact for s in good]),
         log_depth=log_depth,
-        per_metre=calibration.exponent / depth,
+        per_metre=calibration.exponent / (usual_depth if standard.anatomy is None else depth),
         per_newton=1.0 / usual,
         noise=np.array([s.force_noise for s in good]) / force,
         depth_uncertainty=np.array([s.depth_uncertainty for s in good]),
