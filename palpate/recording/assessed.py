@@ -14,7 +14,7 @@ from palpate.report.results import write_results
 from palpate.report.rows import FaultRow, RecordedRow, Report
 from palpate_assessment.assess import assess
 from palpate_assessment.grid import map_grid
-from palpate_assessment.observations import spacing_of
+from palpate_assessment.places import places_of
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
 from palpate_bus.messages import ExamState, SurfaceMesh
@@ -65,7 +65,7 @@ def region(samples: list[ForceSample]) -> tuple[tuple[float, float], tuple[float
     xy = np.array([sample.position[:2] for sample in samples])
     low, high = xy.min(axis=0), xy.max(axis=0)
     (x, y), (width, height) = (0.5 * (low + high)).tolist(), (high - low).tolist()
-    return (x, y), (width, height), spacing_of(xy)
+    return (x, y), (width, height), places_of(samples).spacing
 
 
 def _states(recording: PalpationRecording) -> list[Any]:

@@ -419,10 +419,10 @@ def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
 def _possible(regression: Regression, bump: Bump) -> bool:
     """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
     o = regression.observations
-    if o.standard.anatomy is None and not (
-        o.encloses(np.array(bump.path or ((bump.x, bump.y),))).all()
+    if (places := o.standard.places) is not None and not (
+        places.encloses(np.array(bump.path or ((bump.x, bump.y),))).all()
         and bump.radius <= SEARCH.narrow * o.width
-        and o.encloses(bump.outline()).mean() >= SEARCH.surrounded
+        and places.encloses(bump.outline()).mean() >= SEARCH.surrounded
     ):
         return False
     return all(bump.apart(one) >= SEARCH.too_near for one in regression.lumps)

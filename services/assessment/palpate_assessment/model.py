@@ -71,9 +71,11 @@ def inverse(triangle: Array) -> Array:
 def natural(a: Array, b: Array, standard: PressStandard) -> list[Array]:
     """Unit covariances of the fields of natural variation between places a (k, 2) and b (l, 2), each of shape (k, l).
 
-    With an anatomy, the last two are of strips and of bone.
+    With an anatomy, the last two are of strips and of bone. Without one, distances count between points of the skin: on a steep
+    side of a body, places are further apart than from above.
     """
-    parts = [smooth(a, b, length) for length in standard.lengths.fields_m]
+    on_a, on_b = (p if standard.places is None else standard.places.lifted(p) for p in (a, b))
+    parts = [smooth(on_a, on_b, length) for length in standard.lengths.fields_m]
     if (anatomy := standard.anatomy) is None:
         return parts
     fold = np.array((1.0, 0.0))

@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, Delaunay, cKDTree
+from scipy.spatial import ConvexHull, cKDTree
 
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import PressStandard
@@ -28,9 +28,6 @@ class Usable:
     adds 6 % to its error. Chosen on `clean`, seeds 1000 to 1019; shallower limits are mostly bone."""
     fewest: int = 10
     """Least number of samples."""
-    gap: float = 3.0
-    """Largest circumradius of a triangle of samples without a gap, over the usual distance of neighbours: 1.5 % of the triangles
-    of samples at random places are larger."""
     neighbours: int = 9
     """Presses, itself among them, whose median is the usual force at a place."""
     slide_mps: float = 0.003
@@ -93,38 +90,9 @@ class Observations:
         sides = self.hull.equations
         return float(-(self.xy[self.hull.vertices] @ sides[:, :2].T + sides[:, 2]).min(axis=0).max())
 
-    @cached_property
-    def mesh(self) -> tuple[Delaunay, NDArray[np.bool_]]:
-        """Triangles between samples, and which of them are filled: without a gap of many samples, as in a notch of the region."""
-        mesh, radii = circumradii(self.xy)
-        return mesh, radii <= USABLE.gap * spacing_of(self.xy)
-
-    def encloses(self, places: Array) -> NDArray[np.bool_]:
-        """Return True for places [m] between samples, shape (k, 2) -> (k,)."""
-        mesh, filled = self.mesh
-        inside = mesh.find_simplex(places)
-        return np.asarray((inside >= 0) & filled[inside])
-
     def part(self, chosen: NDArray[np.intp] | slice) -> Observations:
         """Return some of the samples."""
         return replace(self, **{f.name: getattr(self, f.name)[chosen] for f in fields(self) if f.name != "standard"})
-
-
-def circumradii(xy: Array) -> tuple[Delaunay, Array]:
-    """Return the triangles between places [m], shape (m, 2), and their circumradii [m]."""
-    mesh = Delaunay(xy)
-    sides = [xy[mesh.simplices[:, k]] - xy[mesh.simplices[:, k - 1]] for k in range(3)]
-    doubled = np.abs(np.linalg.det(np.stack(sides[:2], axis=1)))
-    return mesh, np.prod([np.linalg.norm(side, axis=1) for side in sides], axis=0) / np.maximum(2 * doubled, 1e-30)
-
-
-def spacing_of(xy: Array) -> float:
-    """Return the usual distance of neighbours [m], shape (m, 2): of lines that of one from the next, of a raster its pitch."""
-    if len(xy) < 3 or np.linalg.matrix_rank(xy - xy.mean(axis=0), 1e-9) < 2:
-        return float(np.median(np.linalg.norm(np.diff(xy, axis=0), axis=1))) if len(xy) > 1 else 0.0
-    mesh, radii = circumradii(xy)
-    whole = ~(mesh.neighbors < 0).any(axis=1)  # those along the border may be slivers
-    return float(np.sqrt(2) * np.median(radii[whole if whole.any() else slice(None)]))
 
 
 def _slides(sample: ForceSample) -> bool:

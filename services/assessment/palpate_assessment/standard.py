@@ -14,6 +14,7 @@ import numpy as np
 from scipy.special import expit
 
 from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.places import SampledPlaces, places_of
 from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
@@ -135,6 +136,8 @@ class PressStandard:
     """Usual force."""
     anatomy: AnatomyPrior | None = ABDOMEN
     """None for a body of which nothing is known: long shapes are tried too, and probabilities are of a stated prior."""
+    places: SampledPlaces | None = None
+    """Of all samples, without an anatomy."""
     calibration: Calibration = field(default_factory=learned)
     """Exponent and conversion of the tissue."""
     errors: ErrorPrior = ErrorPrior()
@@ -152,7 +155,7 @@ class PressStandard:
             "held": 0.0,
             "lead_s": 0.0,
         }
-        return cls(radius_m, depth_m, force_n, None, learned().model_copy(update=tissue), OWN_ZERO)
+        return cls(radius_m, depth_m, force_n, None, places_of(samples), learned().model_copy(update=tissue), OWN_ZERO)
 
     @property
     def footprint_m(self) -> float:
