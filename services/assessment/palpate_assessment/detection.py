@@ -72,10 +72,11 @@ class ShapeSearch:
     """Index of the usual radius, which is the length of a piece."""
     least_gain: float = 0.0
     """Log Bayes factor, over all places, below which no more lumps are sought where no anatomy is assumed."""
-    surrounded: float = 0.55
-    """Least share of a structure's outline that is within the samples where no anatomy is assumed: the border may be stiff."""
-    narrow: float = 0.35
-    """Largest radius, over the lesser width of the samples, where no anatomy is assumed: a wider lump has no surroundings."""
+    surrounded: float = 0.5
+    """Least share of a structure's outline that is within the samples where no anatomy is assumed: it may be at the border."""
+    narrow: float = 0.354
+    """Largest radius, over the lesser width of the samples, where no anatomy is assumed: within a circle of that width, a disc of
+    1/sqrt(8) of it has as much area as its surroundings."""
     rival_offsets_m: tuple[float, ...] = (-0.012, 0.0, 0.012)
     """Distances of the middles of ridges from the disc that they may be instead, along each axis."""
     rival_tries: int = 80
