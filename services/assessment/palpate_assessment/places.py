@@ -14,8 +14,7 @@ from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 
 _GAP: Final = 2.0
-"""Largest circumradius of a triangle of samples without a gap, over their usual distance: 2 % of the triangles of samples at random
-places are larger."""
+"""Largest circumradius of a triangle of samples without a gap, over their usual distance."""
 
 
 @dataclass(frozen=True)
