@@ -169,7 +169,7 @@ class _Measured:
         return Palpated(contacts, centres - self.radius * normals, normals, self.power, len(self.touching) - len(contacts))
 
     def _kept(self, loads: list[_Loading], onsets: list[ContactOnset | None]) -> dict[int, float]:
-        """Return the depth that each slide is taken to keep [m]: the one with which it began, or the usual one if that is unlike it."""
+        """Return the depth that each slide is taken to keep [m]: as it began, or the usual one if that is unlike it."""
         slides = [k for k, (_, motion) in enumerate(self.touching) if motion is _Motion.SLIDE]
         begun = {k: loads[k].at_inward - begin.at if (begin := onsets[k]) else 0.0 for k in slides}
         deep = [depth for depth in begun.values() if depth > 0]
@@ -243,7 +243,7 @@ class _Measured:
     def _slid(self, one: slice, kept: float | None) -> list[Contact]:
         """Return the part of a slide that is at depth; none if that is too short.
 
-        It keeps the depth `kept` [m] but for what is too short for the body's shape; if that is None, the depth is below the skin.
+        It keeps the depth `kept` [m] but for what is too short for the body's shape; if None, the skin shows the depth.
         """
         assert self.skin is not None
         p, F, time = self._sliding(one)
