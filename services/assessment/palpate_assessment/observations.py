@@ -60,8 +60,8 @@ class Observations:
     log_depth: Array
     """log(depth / press depth), by which an error of the exponent n counts."""
     per_metre: Array
-    """|d y / d depth| = n / depth [1/m], by which an error of the depth counts. Without an anatomy the depth is the stroke's: else
-    noise of each depth is evidence for an error that all depths share, and moves the level."""
+    """|d y / d depth| = n / depth [1/m], by which an error of the depth counts. Without an anatomy the depth is the stroke's:
+    else noise of each depth is evidence for an error that all depths share, and moves the level."""
     per_newton: Array
     """1 / F [1/N], by which an error of the force's zero counts: F is the median force of the stroke, or of a press and
     its neighbours, since a sample's own force must not explain itself."""
