@@ -1,6 +1,6 @@
 """Fits what an area may be instead of a lump (scar, bone, soft defect), on variants of persons that the population does not have.
 
-    python -m research.structure_calibration --persons 20 -o FOLDER
+    python -m research.structure_calibration --persons 20 -o FOLDER --fit
 
 Each variant changes persons of tuning seeds, which the quick tier examines: other relaxation, other equipment, bones 25 to 45 mm
 nearer to the umbilicus, scars, hernias, a wide linea alba. The evidence of each candidate is kept in FOLDER. A candidate has the
@@ -24,7 +24,7 @@ from palpate.quick.case import assess, examined
 from palpate.report.results import truth_of_run
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
-from palpate_assessment.detection import SOFTER, SURE, Candidate
+from palpate_assessment.detection import SURE, Candidate
 from palpate_assessment.findings import Kind, causes
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
@@ -209,28 +209,32 @@ def kept(name: str, seed: int, folder: Path) -> list[Evidence]:
 def main(
     persons: Annotated[int, typer.Option(min=2, help="Persons of each variant, seeds 0 on; ten times as many as drawn.")] = 20,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where evidence is kept.")] = Path("out/structures"),
+    fit: Annotated[bool, typer.Option("--fit", help="Fit the weights and write them to calibration.yaml.")] = False,
 ) -> None:
-    """Fit the weights, write them to calibration.yaml, and print what each variant's candidates are called."""
+    """Print how many persons of each variant have a finding, at 2 % false findings, and what structures are called."""
     out.mkdir(parents=True, exist_ok=True)
-    rows: list[Evidence] = []
-    names: list[str] = []
+    rows: dict[str, list[list[Evidence]]] = {}
     for name in (*PERSONS, *STRUCTURES):
-        for seed in range(10 * persons if name == "as drawn" else persons):
-            found = kept(name, seed, out)
-            rows, names = rows + found, names + [name] * len(found)
-    weight = np.array([SHARE if name in STRUCTURES else 1.0 for name in names])
-    calibration = fitted(rows, weight, learned())
-    path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
-    path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
-    features, signs, evidence = (np.array([getattr(row, name) for row in rows]) for name in ("features", "signs", "structures"))
-    _, kinds = causes(calibration, features, signs, evidence)
-    softer = features[:, SOFTER] > 0
-    for name in (*PERSONS, *STRUCTURES):
-        here = np.array([one == name for one in names])
-        named = {
-            kind.name.lower(): int((kinds[here].argmax(axis=1) == kind)[kinds[here].sum(axis=1) > 0.5].sum()) for kind in Kind
-        }
-        print(f"{name}: {here.sum()} candidates, {softer[here].sum()} softer; {named}")
+        rows[name] = [kept(name, seed, out) for seed in range(10 * persons if name == "as drawn" else persons)]
+    calibration = learned()
+    if fit:
+        every = [(row, SHARE if name in STRUCTURES else 1.0) for name in rows for person in rows[name] for row in person]
+        calibration = fitted([row for row, _ in every], np.array([weight for _, weight in every]), calibration)
+        path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
+        path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
+    for name, examined_persons in rows.items():
+        found, lumps, false, named, structures = 0, 0, 0, 0, 0
+        for person in filter(None, examined_persons):
+            features, signs, evidence = (np.array([getattr(r, f) for r in person]) for f in ("features", "signs", "structures"))
+            logits, kinds = causes(calibration, features, signs, evidence)
+            over, lump = logits > calibration.threshold(0.02), np.array([int(Kind.LUMP) in row.true for row in person])
+            found, lumps, false = found + (over & lump).any(), lumps + lump.any(), false + (over & ~lump).any()
+            if name in STRUCTURES and (true := np.array([int(STRUCTURES[name][1]) in row.true for row in person])).any():
+                best = kinds[true][kinds[true].sum(axis=1).argmax()]
+                structures, named = structures + 1, named + (best.argmax() == STRUCTURES[name][1])
+        print(
+            f"{name}: {false} of {len(examined_persons)} with a false finding, {found} of {lumps} lumps, {named} of {structures} named"
+        )
 
 
 if __name__ == "__main__":
