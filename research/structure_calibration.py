@@ -222,19 +222,17 @@ def main(
         calibration = fitted([row for row, _ in every], np.array([weight for _, weight in every]), calibration)
         path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
         path.write_text(yaml.safe_dump(calibration.model_dump(mode="json"), sort_keys=False, default_flow_style=None), "utf-8")
-    for name, examined_persons in rows.items():
+    for name, group in rows.items():
         found, lumps, false, named, structures = 0, 0, 0, 0, 0
-        for person in filter(None, examined_persons):
+        for person in filter(None, group):
             features, signs, evidence = (np.array([getattr(r, f) for r in person]) for f in ("features", "signs", "structures"))
             logits, kinds = causes(calibration, features, signs, evidence)
             over, lump = logits > calibration.threshold(0.02), np.array([int(Kind.LUMP) in row.true for row in person])
-            found, lumps, false = found + (over & lump).any(), lumps + lump.any(), false + (over & ~lump).any()
+            found, lumps, false = found + bool((over & lump).any()), lumps + bool(lump.any()), false + bool((over & ~lump).any())
             if name in STRUCTURES and (true := np.array([int(STRUCTURES[name][1]) in row.true for row in person])).any():
                 best = kinds[true][kinds[true].sum(axis=1).argmax()]
-                structures, named = structures + 1, named + (best.argmax() == STRUCTURES[name][1])
-        print(
-            f"{name}: {false} of {len(examined_persons)} with a false finding, {found} of {lumps} lumps, {named} of {structures} named"
-        )
+                structures, named = structures + 1, named + bool(best.argmax() == STRUCTURES[name][1])
+        print(f"{name}: {false} of {len(group)} with a false finding, {found} of {lumps} lumps, {named} of {structures} named")
 
 
 if __name__ == "__main__":
