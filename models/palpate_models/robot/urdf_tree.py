@@ -41,7 +41,7 @@ class UrdfTree:
             if count > 1 or not name
         )
         self.faults = [*twice, *self._loose()]
-        """What is wrong with the tree; the rest of the file cannot be read then."""
+        """Faults of the tree. With any, the rest of the file is not read."""
 
     def _loose(self) -> list[str]:
         """Return faults of joints whose links are not there, and of links with two joints or in none of the trees."""
