@@ -43,6 +43,8 @@ class AdmittanceTuning:
     """The same on the posture in the null space."""
     damping: float = 0.02
     """Of the least squares [m or 1]: near a singularity the joints slow down."""
+    speed_share: float = 0.8
+    """Largest commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
 
 
 TUNING = AdmittanceTuning()
@@ -84,7 +86,7 @@ class AdmittanceController:
             rate = motion.qd + TUNING.follow_per_s * (motion.q - self._q)
         else:
             rate = self._cartesian(reference)
-        rate = rate / max(1.0, float(np.max(np.abs(rate) / model.velocity_limit)))
+        rate = rate / max(1.0, float(np.max(np.abs(rate) / (TUNING.speed_share * model.velocity_limit))))
         low, high = np.minimum(self._lower, self._q), np.maximum(self._upper, self._q)
         self._q = np.clip(self._q + self._dt * rate, low, high)
         return self._q

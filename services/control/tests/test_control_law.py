@@ -40,25 +40,6 @@ def offset(arm: ArmModel, q: np.ndarray, twist: np.ndarray) -> Reference:
 
 
 @pytest.mark.parametrize("q", WORKING)
-def test_jacobian_is_the_derivative_of_the_pose(arm: ArmModel, q: np.ndarray) -> None:
-    arm.update(q, REST)
-    J, R, p = arm.J_W.copy(), arm.R_WI.copy(), arm.p_WI.copy()
-    for i, dq in enumerate(1e-6 * np.eye(7)):
-        arm.update(q + dq, REST)
-        np.testing.assert_allclose((arm.p_WI - p) / 1e-6, J[:3, i], atol=1e-5)
-        np.testing.assert_allclose(pin.log3(arm.R_WI @ R.T) / 1e-6, J[3:, i], atol=1e-5)
-
-
-@pytest.mark.parametrize("q", WORKING)
-def test_inertia_is_that_of_inverse_dynamics_and_no_velocity_gives_no_coriolis_torque(arm: ArmModel, q: np.ndarray) -> None:
-    arm.update(q, REST)
-    columns = np.column_stack([arm.inverse_dynamics(q, REST, e) - arm.gravity for e in np.eye(7)])
-    np.testing.assert_allclose(columns, arm.inertia(q), atol=1e-9)
-    np.testing.assert_allclose(arm.inertia(q), arm.inertia(q).T)
-    assert arm.coriolis == pytest.approx(np.zeros(7), abs=1e-12)
-
-
-@pytest.mark.parametrize("q", WORKING)
 def test_no_error_no_torque(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
     for mode in ControlMode:
         assert unlimited.command(q, REST, reference(setpoint(arm, q, mode=mode))) == pytest.approx(np.zeros(7), abs=1e-9)
@@ -201,20 +182,6 @@ def test_model_refuses_another_robot() -> None:
         ArmModel(one)
     with pytest.raises(ValueError, match="'probe'"):
         ArmModel(urdf(ROBOT), frame="probe")
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_the_compiled_law_is_the_one_that_python_reads(arm: ArmModel, seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The same functions interpreted by numpy, from gains to the safe torque, at states in motion and off their set-point."""
-    rng = np.random.default_rng(seed)
-    q, qd = WORKING[seed] + 0.1 * rng.normal(size=7), 0.3 * rng.normal(size=7)
-    twist, wrench = 0.1 * rng.normal(size=6), rng.normal(size=6)
-    ref = reference(setpoint(arm, WORKING[seed], V_WD=twist, F_W=wrench, qd=0.1 * rng.normal(size=7)))
-    compiled = ImpedanceController(arm).command(q, qd, ref)
-    names = ("cartesian_torque", "cartesian_gains", "friction_torque", "to_axes", "clip")
-    for module, function in [(impedance, name) for name in names] + [(safety, "safe_torque")]:
-        monkeypatch.setattr(module, function, getattr(module, function).py_func)
-    np.testing.assert_allclose(ImpedanceController(arm).command(q, qd, ref), compiled, rtol=1e-9, atol=1e-9)
 
 
 def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: ImpedanceController) -> None:

@@ -56,11 +56,6 @@ def test_the_overlay_excludes_gravity(rig: Rig) -> None:
     assert np.abs(rig.plant.q - lbr.HOME).max() < 0.01
 
 
-def test_the_sensor_reads_the_tools_weight(rig: Rig) -> None:
-    wrench = rig.outbox["ft/wrench"].wrench.force
-    assert wrench.z == pytest.approx(0.35 * 9.81, abs=1.5)
-
-
 def hold_cause(rig: Rig) -> tuple[int, str]:
     assert rig.status.mode == RobotStatus.MODE_SAFE_HOLD
     return rig.status.cause, rig.status.reason

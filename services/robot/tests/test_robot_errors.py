@@ -5,6 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 from lbr_bench import Rig
+from scipy.spatial.transform import Rotation
 
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY, Array
@@ -146,24 +147,10 @@ def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None
     drawn = arm(length_m=0.001)
     true, nominal = plant(Robot(), drawn=drawn), plant(Robot())
     moved = true.tool_motion()[:3] - nominal.tool_motion()[:3]
-    turns = [np.eye(3)]
-    for pose in nominal.link_poses()[:7]:
-        x, y, z, w = pose[3:]
-        turns.append(np.array(lbr_rotation(x, y, z, w)))
-    expected = sum(turn @ error for turn, error in zip(turns[1:], drawn.origin_m, strict=True))
+    turns = Rotation.from_quat(nominal.link_poses()[:7, 3:]).as_matrix()
+    expected = sum(turn @ error for turn, error in zip(turns, drawn.origin_m, strict=True))
     np.testing.assert_allclose(moved, expected, atol=1e-9)
     assert 0.5e-3 < np.linalg.norm(moved) < 10e-3
-
-
-def lbr_rotation(x: float, y: float, z: float, w: float) -> Array:
-    """Return the rotation of a unit quaternion."""
-    return np.array(
-        (
-            (1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)),
-            (2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)),
-            (2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)),
-        )
-    )
 
 
 def test_both_plants_have_the_same_true_arm() -> None:

@@ -35,20 +35,6 @@ def _model(robot: Robot) -> tuple[pin.Model, pin.Data]:
     return model, model.createData()
 
 
-def test_forward_kinematics_agrees_with_pinocchio() -> None:
-    robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
-    plant = DartPlant(robot)
-    model, data = _model(robot)
-    for q in _postures(20):
-        plant.reset(q)
-        pin.framesForwardKinematics(model, data, q)
-        for link in LINKS:
-            p_WL, rotation = plant.link_pose(link)
-            X_WL = data.oMf[model.getFrameId(link)]
-            np.testing.assert_allclose(p_WL, X_WL.translation, atol=1e-9, err_msg=link)
-            np.testing.assert_allclose(rotation.to_rotation_matrix(), X_WL.rotation, atol=1e-9, err_msg=link)
-
-
 def test_tool_motion_agrees_with_pinocchio() -> None:
     robot = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
     plant = DartPlant(robot)
@@ -117,32 +103,6 @@ def test_friction_is_implicit() -> None:
             M = np.triu(M) + np.triu(M, 1).T
             expected = np.linalg.solve(M + DT * np.diag(D), torque - h - D * v)
             np.testing.assert_allclose(plant.v, v + DT * expected, rtol=1e-9, atol=1e-9)
-
-
-def test_gravity_torque_holds_the_arm_still() -> None:
-    plant = DartPlant(FREE)
-    for q in _postures(3):
-        plant.reset(q)
-        for _ in range(300):
-            plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
-        np.testing.assert_allclose(plant.q, q, atol=1e-9)
-
-
-def test_without_friction_energy_is_conserved_and_with_it_it_decays() -> None:
-    v = np.array([0.3, -0.2, 0.4, 0.3, -0.5, 0.4, 0.6])
-    energies = {}
-    for robot in (FREE, Robot()):
-        plant = DartPlant(robot)
-        plant.reset(lbr.HOME, v)
-        start = plant.kinetic_energy()
-        history = []
-        for _ in range(200):
-            plant.step(plant.gravity_torque(), NOTHING, NOTHING, NO_DAMPING)
-            history.append(plant.kinetic_energy() / start)
-        energies[robot] = np.array(history)
-    assert np.abs(energies[FREE] - 1).max() < 0.01
-    assert np.all(np.diff(energies[Robot()]) <= 1e-12)
-    assert energies[Robot()][-1] < 0.1
 
 
 @pytest.mark.parametrize("joint", range(7))
@@ -225,26 +185,6 @@ def _settle(plant: DartPlant, force: np.ndarray = NOTHING, moment: np.ndarray = 
     for _ in range(3):
         plant.step(plant.gravity_torque(), force, moment, np.full(7, 1e6))
     return np.array(plant.sensor_wrench())
-
-
-def _centre_of_mass(robot: Robot) -> np.ndarray:
-    """Centre of mass of what is below the sensor, in its frame [m]."""
-    inertias = robot_arm.inertias(robot)
-    standoff, sphere = inertias["ft_sensor"], inertias["indenter"]
-    at = np.array([0.0, 0.0, FT_TO_INDENTER_M])
-    moment = standoff.mass * np.array(standoff.com) + sphere.mass * (np.array(sphere.com) + at)
-    return np.asarray(moment / (standoff.mass + sphere.mass))
-
-
-@pytest.mark.parametrize("seed", range(3))
-def test_static_reading_is_the_tools_weight(seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    plant = DartPlant(ROBOT, lbr.HOME + rng.uniform(-0.3, 0.3, 7))
-    wrench = _settle(plant)
-    R_WS = plant.link_pose("ft_sensor")[1].to_rotation_matrix()
-    weight_S = R_WS.T @ [0.0, 0.0, -ROBOT.tool_mass_kg * GRAVITY]
-    np.testing.assert_allclose(wrench[:3], weight_S, atol=1e-3)
-    np.testing.assert_allclose(wrench[3:], np.cross(_centre_of_mass(ROBOT), weight_S), atol=1e-4)
 
 
 def test_reading_is_right_before_the_first_step() -> None:
@@ -332,27 +272,6 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
         np.testing.assert_array_equal(quick.sensor_wrench(), thorough.sensor_wrench())
     assert touched is touches
     assert free > 100, "the test shall see steps without a search"
-
-
-def test_nothing_is_looked_for_while_nothing_is_near(monkeypatch: pytest.MonkeyPatch) -> None:
-    """An arm that swings far from everything uses its clearance up again and again, and finds new room at each look."""
-    plant = DartPlant(Robot(), lbr.HOME)
-    looks: list[float] = []
-    angle = plant._clearance.angle
-
-    def look(q: np.ndarray) -> float:
-        looks.append(angle(q))
-        return looks[-1]
-
-    monkeypatch.setattr(plant._clearance, "angle", look)
-    searched = 0
-    for k in range(2500):
-        torque = plant.gravity_torque() + 4 * np.sin(0.003 * k + np.arange(7.0))
-        plant.step(torque, None, NOTHING, np.full(7, 3.0))
-        searched += plant._free_travel <= LEAST_CLEARANCE_RAD
-    assert len(looks) > 2
-    assert min(looks) > LEAST_CLEARANCE_RAD
-    assert searched == 0
 
 
 def test_the_clearance_ends_at_a_joint_stop() -> None:

@@ -12,7 +12,7 @@ from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import link_names, urdf
+from palpate_models.robot.arm import link_names
 from palpate_models.scenario.errors import Errors, ForceErrors
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_robot.backends.dart.service import create
@@ -94,22 +94,6 @@ def test_every_topic_comes_at_its_tick_and_keeps_its_ranges(rig: Rig) -> None:
             stamped = back.transforms[0] if name == "sim/link_poses" else back
             assert nanoseconds(stamped.header.stamp) == rig.t
             assert stamped.header.frame_id == (topic.frame or "")
-
-
-def test_description_is_the_urdf(rig: Rig) -> None:
-    assert rig.robot.start()["robot_description"].data == urdf(Robot())
-
-
-def test_link_poses_name_every_link_once(rig: Rig) -> None:
-    rig.tick()
-    children = [transform.child_frame_id for transform in rig.outbox["sim/link_poses"].transforms]
-    assert children == list(LINKS)
-
-
-def test_first_tick_is_the_state_at_the_start(rig: Rig) -> None:
-    rig.tick()
-    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME, atol=1e-5)
-    assert rig.mode == (STATUS.MODE_IDLE, STATUS.CAUSE_NONE)
 
 
 def test_holds_still_without_any_command(rig: Rig) -> None:

@@ -8,17 +8,21 @@ import pytest
 from palpate_bus.messages import JointTorqueCommand, RobotStatus
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.testing import HandInbox
+from palpate_errors import UserError
+from palpate_models.robot.urdf_arm import load_arm
 from palpate_models.scenario.load import load_scenario
 from palpate_robot.backends.ros2_control.checks import FirstContactCheck
+from palpate_robot.backends.ros2_control.rules import FrankaRules, Sensed, UrRules
 from palpate_robot.backends.ros2_control.service import create
-from palpate_robot.driver import DriverMode
+from palpate_robot.driver import DriverMode, HoldCause
 
 MS = 1_000_000
+WALL_NPM = 2000.0
 ARMS = [("panda", "franka"), ("ur5", "ur")]
 
 
 class Ros2Bench:
-    """Driver and emulator; every tick commands zero torque, or that the first joint moves."""
+    """Driver and emulator; every tick commands zero torque, or that the first joint moves, or presses on a wall at the tool."""
 
     def __init__(self, arm: str, profile: str, *changes: str) -> None:
         settings = [f"robot.arm={arm}", f"robot.driver.profile={profile}", "robot.driver.emulated=true", *changes]
@@ -26,14 +30,23 @@ class Ros2Bench:
         self.inbox = HandInbox()
         self.t = -MS
         self.status: Any = None
-        self.speed_radps = 0.0
+        self.emulator = self.driver._port.emulator
+        self.speed_radps, self.torque_nmps, self.press = 0.0, 0.0, False
+        self.peak_n, self.states = 0.0, 0
         self._start: Any = None
+        self._wall_m = self._height_m()
+
+    def _height_m(self) -> float:
+        return float(self.emulator._plant.tool_motion()[2])
 
     def tick(self, ticks: int) -> None:
         for _ in range(ticks):
             self.t += MS
+            self.emulator.force_W[2] = WALL_NPM * max(self._wall_m - self._height_m(), 0.0)
+            self.peak_n = max(self.peak_n, self.emulator.force_W[2])
             outbox = self.driver.step(self.t, self.inbox)
             self.status = outbox.get("robot/status", self.status)
+            self.states = self.driver._states
             if self._start is None and "joint_states" in outbox:
                 self._start, begun = outbox["joint_states"].position.copy(), self.t
                 self._begun = begun
@@ -42,9 +55,16 @@ class Ros2Bench:
 
     def _command(self) -> Any:
         values, none = np.zeros(len(self._start)), np.zeros(0)
+        elapsed_s = (self.t - self._begun) * 1e-9
         if self.driver._positions:
             values = self._start.copy()
-            values[0] += self.speed_radps * (self.t - self._begun) * 1e-9
+            values[0] += self.speed_radps * elapsed_s
+        else:
+            values[0] = self.torque_nmps * elapsed_s
+        if self.press:
+            J = np.array([self.driver._model.external_torque(self._start, axis) for axis in np.eye(6)])
+            down = min(elapsed_s, 0.8) * np.array((0.0, 0.0, -1.0, 0.0, 0.0, 0.0))
+            values = self._start + np.linalg.pinv(J) @ (0.005 * down) if self.driver._positions else J.T @ (10.0 * down)
         torque, position = (none, values) if self.driver._positions else (values, none)
         return JointTorqueCommand(header(self.t), torque, position, duration_message(50 * MS), "", "")
 
@@ -62,12 +82,108 @@ def test_the_emulated_arm_takes_commands(arm: str, profile: str) -> None:
     assert external < 6.0, "the tool's weight is in ft/wrench, whatever the stack reports"
 
 
-def test_commands_without_effect_are_reported() -> None:
-    bench = Ros2Bench("ur5", "ur", 'robot.driver.events=["0.1 controller 0"]')
-    bench.speed_radps = 0.1
-    bench.tick(1200)
-    assert bench.driver._driver.mode is DriverMode.SAFE_HOLD
-    assert "does not follow" in bench.status.reason
+PROVOKED = {
+    "force reflex": ("franka", "collision 5", "no joint states"),
+    "torque reflex": ("franka", "collision_torque 2", "no joint states"),
+    "lost packets": ("franka", "lose 20", "no joint states"),
+    "inactive controller of torques": ("franka", "controller 0", "does not follow"),
+    "protective stop": ("ur", "protective 5", "the external control program does not run"),
+    "pendant": ("ur", "speed 0.5", "speed is scaled to 50 %"),
+    "remote control off": ("ur", "remote 0", "the external control program does not run"),
+    "inactive controller of positions": ("ur", "controller 0", "does not follow"),
+}
+
+
+@pytest.mark.parametrize(("profile", "event", "told"), PROVOKED.values(), ids=PROVOKED)
+def test_a_rule_ends_a_press_and_is_reported(profile: str, event: str, told: str) -> None:
+    bench = Ros2Bench({p: a for a, p in ARMS}[profile], profile, f'robot.driver.events=["0.15 {event}"]')
+    bench.press = "follow" not in told
+    bench.speed_radps, bench.torque_nmps = 0.3, 30.0
+    bench.tick(900)
+    assert (bench.driver._driver.mode, bench.driver._driver.cause) == (DriverMode.SAFE_HOLD, HoldCause.DEVICE)
+    assert told in bench.driver._driver.reason
+    assert bench.peak_n < 15.0
+    assert bench.peak_n > 1.0 or not bench.press
+
+
+@pytest.mark.parametrize(("arm", "profile"), ARMS)
+def test_a_wrong_sign_of_the_wrench_is_reported_at_the_first_contact(arm: str, profile: str) -> None:
+    right, wrong = Ros2Bench(arm, profile), Ros2Bench(arm, profile, "robot.driver.ft_sign=-1", "robot.driver.ft_weight=false")
+    for bench in (right, wrong):
+        bench.press = True
+        bench.tick(600)
+        assert bench.peak_n < 15.0
+    assert right.driver._driver.mode is DriverMode.ACTIVE, right.status.reason
+    assert right.driver.finish()["first_contact_checked"]
+    assert "pulls the tool out" in wrong.driver._driver.reason
+
+
+@pytest.mark.parametrize(("arm", "profile", "rate_hz"), [("panda", "franka", 1000), ("ur5", "ur", 500)])
+def test_states_come_at_the_rate_of_the_arm(arm: str, profile: str, rate_hz: int) -> None:
+    bench = Ros2Bench(arm, profile)
+    bench.tick(200)
+    assert bench.states == pytest.approx(0.2 * rate_hz, abs=1)
+
+
+def test_a_reflex_lasts_until_recovered_and_the_driver_holds_until_released() -> None:
+    bench = Ros2Bench("panda", "franka", 'robot.driver.events=["0.1 lose 20", "0.3 recover 1"]')
+    bench.tick(250)
+    assert bench.emulator.rules.stopped == "communication_constraints_violation"
+    states = bench.states
+    bench.tick(40)
+    assert bench.states == states
+    bench.tick(100)
+    assert bench.states > states
+    assert bench.driver._driver.held
+    bench.driver._driver.release(bench.t)
+    bench.tick(50)
+    assert bench.driver._driver.mode is DriverMode.ACTIVE
+
+
+def still(joints: int, force_n: float = 0.0, speed_radps: float = 0.0) -> Sensed:
+    return Sensed(np.zeros(joints), np.full(joints, speed_radps), force_n, np.zeros(joints))
+
+
+def test_a_franka_limits_the_rate_of_torques_or_ends_in_a_reflex_and_keeps_the_last_torque_of_lost_packets() -> None:
+    rules, arm = FrankaRules(load_arm("panda")), load_arm("panda")
+    applied = np.array([rules.cycle(still(7), np.full(7, 5.0)) for _ in range(8)])
+    assert np.diff(applied, axis=0).max() == pytest.approx(1.0)
+    assert applied[-1] == pytest.approx(5.0)
+    for _ in range(2):  # 20 in a row end it, not 38 of 39
+        rules.event("lose 19")
+        assert all(np.array_equal(rules.cycle(still(7), np.zeros(7)), applied[-1]) for _ in range(19))
+        rules.cycle(still(7), np.full(7, 5.0))
+    rules.event("limiter 0")
+    assert rules.cycle(still(7), np.full(7, 5.9)) is not None
+    assert rules.cycle(still(7), np.full(7, 7.0)) is None
+    assert rules.stopped == "controller_torque_discontinuity"
+    rules.event("recover 1")
+    assert rules.cycle(still(7, speed_radps=float(arm.velocity_radps.max()) + 0.1), np.zeros(7)) is None
+    assert rules.stopped == "joint_velocity_violation"
+
+
+@pytest.mark.parametrize(("settings", "reached_s"), [([], 0.03), (["lookahead 0.2"], 0.2), (["speed 0.5"], 0.06)])
+def test_a_ur_follows_with_its_look_ahead_and_slower_at_less_speed(settings: list[str], reached_s: float) -> None:
+    rules = UrRules(load_arm("ur5"))
+    for event in settings:
+        rules.event(event)
+    rules.cycle(still(6), np.zeros(6))
+    cycles = next(k for k in range(1, 500) if rules.cycle(still(6), np.full(6, 0.01))[0] >= 0.01 * (1 - np.exp(-1)) - 1e-12)
+    assert 0.002 * cycles == pytest.approx(reached_s, abs=0.0021)
+
+
+def test_a_ur_ignores_a_jump_of_the_target_and_is_unlocked_five_seconds_after_a_protective_stop() -> None:
+    rules = UrRules(load_arm("ur5"))
+    assert rules.cycle(still(6), np.full(6, 0.05)) == pytest.approx(0.0)
+    assert rules.cycle(still(6, force_n=60.0), np.zeros(6)) is None
+    for seconds, stopped in ((4.9, True), (0.2, False)):
+        for _ in range(round(seconds * 500)):
+            rules.cycle(still(6), np.zeros(6))
+        rules.event("recover 1")
+        assert bool(rules.stopped) is stopped
+    for event in ("lookahead 0", "speed 1.5", "unknown 1", "speed x"):
+        with pytest.raises(UserError, match="want a name"):
+            rules.event(event)
 
 
 @pytest.mark.parametrize(("push", "wrong"), [((0.0, 0.0, -3.0), False), ((0.0, 0.0, 3.0), True), ((3.0, 0.0, 0.5), False)])

@@ -244,10 +244,6 @@ class DartPlant:
             self._cached_state = self._kinematics.state(self.q, self.v)
         return self._cached_state
 
-    def kinetic_energy(self) -> float:
-        """Return the kinetic energy [J]."""
-        return float(self._arm.computeKineticEnergy())
-
     def sensor_wrench(self) -> Wrench:
         """Return the wrench on the F/T sensor from the tool below it: force [N], then moment [N m].
 

@@ -208,12 +208,6 @@ class MujocoPlant:
             torque -= self._uncompensated * self._jacobian[2]
         return torque
 
-    def kinetic_energy(self) -> float:
-        """Return the kinetic energy [J]."""
-        product = np.zeros_like(self.v)
-        mujoco.mj_mulM(self._model, self._data, product, self.v)
-        return float(self.v @ product / 2)
-
     def sensor_wrench(self) -> Wrench:
         """Return the wrench on the F/T sensor from the tool below it: force [N], then moment [N m].
 

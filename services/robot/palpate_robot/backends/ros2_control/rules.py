@@ -41,6 +41,8 @@ class Rules(ABC):
     """Turns the commands of an arm into what its joints follow, cycle by cycle."""
 
     period_ms: ClassVar[int]
+    ranges: ClassVar[dict[str, tuple[float, float]]] = {}
+    """Allowed numbers of settings."""
     commands: ClassVar[CommandLevel]
 
     def __init__(self, arm: Arm) -> None:
@@ -73,12 +75,19 @@ class Rules(ABC):
             number = float(value)
         except ValueError:
             number = np.nan
-        if not np.isfinite(number) or name not in (*self.settings, "recover"):
-            raise UserError(f"event {text!r}: want a name of {', '.join((*self.settings, 'recover'))} and a number")
+        least, most = self.ranges.get(name, (0.0, np.inf))
+        if not least <= number <= most or name not in (*self.settings, "recover"):
+            raise UserError(
+                f"event {text!r}: want a name of {', '.join((*self.settings, 'recover'))} and a number from {least:g} to {most:g}"
+            )
         if name == "recover":
-            self.stopped = ""
+            self._recover()
         else:
             self.settings[name] = number
+
+    def _recover(self) -> None:
+        """End a stop by hand."""
+        self.stopped = ""
 
     @abstractmethod
     def cycle(self, sensed: Sensed, command: Array | None) -> Array | None:
@@ -141,6 +150,9 @@ class UrRules(Rules):
     """A Universal Robots arm behind ur_robot_driver, commanded by joint positions (`servoj`)."""
 
     period_ms = 2
+    ranges: ClassVar = {"lookahead": (0.03, 0.2), "speed": (0.0, 1.0)}
+    LOCKED_S: Final = 5.0
+    """Time after a protective stop in which it cannot be unlocked."""
     commands = CommandLevel.POSITION
     IGNORE_RADPS: Final = 20.0
 
@@ -149,6 +161,7 @@ class UrRules(Rules):
         self.settings |= {"lookahead": 0.03, "speed": 1.0, "remote": 1.0, "protective": 50.0}
         self._target: Array | None = None
         self._reference: Array | None = None
+        self._stood_s = 0.0
 
     @property
     def program(self) -> bool:
@@ -164,6 +177,7 @@ class UrRules(Rules):
         """See `Rules.cycle`. The reference follows the target with the lag of the look-ahead time [A]."""
         if sensed.force_n > self.settings["protective"]:
             self.stopped = "protective stop"
+        self._stood_s = self._stood_s + self._dt if self.stopped else 0.0
         if not self.runs:
             self._target = self._reference = None
             return None
@@ -177,6 +191,10 @@ class UrRules(Rules):
         most = self._arm.velocity_radps * speed * self._dt
         self._reference = self._reference + np.clip(share * (self._target - self._reference), -most, most)
         return self._reference
+
+    def _recover(self) -> None:
+        if self._stood_s >= self.LOCKED_S:
+            super()._recover()
 
 
 RULES: Final[dict[Stack, type[Rules]]] = {Stack.FRANKA: FrankaRules, Stack.UR: UrRules}
