@@ -94,14 +94,14 @@ PROVOKED = {
 }
 
 
-@pytest.mark.parametrize(("profile", "event", "told"), PROVOKED.values(), ids=PROVOKED)
-def test_a_rule_ends_a_press_and_is_reported(profile: str, event: str, told: str) -> None:
+@pytest.mark.parametrize(("profile", "event", "reported"), PROVOKED.values(), ids=PROVOKED)
+def test_a_rule_ends_a_press_and_is_reported(profile: str, event: str, reported: str) -> None:
     bench = Ros2Bench({p: a for a, p in ARMS}[profile], profile, f'robot.driver.events=["0.15 {event}"]')
-    bench.press = "follow" not in told
+    bench.press = "follow" not in reported
     bench.speed_radps, bench.torque_nmps = 0.3, 30.0
     bench.tick(900)
     assert (bench.driver._driver.mode, bench.driver._driver.cause) == (DriverMode.SAFE_HOLD, HoldCause.DEVICE)
-    assert told in bench.driver._driver.reason
+    assert reported in bench.driver._driver.reason
     assert bench.peak_n < 15.0
     assert bench.peak_n > 1.0 or not bench.press
 
