@@ -84,9 +84,7 @@ NEEDS = {
 """The extra, or the group of an image, that a package or module needs. The longest matching name counts."""
 DISTRIBUTION = {
     "PIL": "pillow",
-    "libusb_package": "libusb-package",
     "markupsafe": "jinja2",
-    "open3d": "open3d-cpu",
     "pinocchio": "pin",
     "pydantic_settings": "pydantic-settings",
     "rerun": "rerun-sdk",

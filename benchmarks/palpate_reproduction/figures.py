@@ -14,8 +14,7 @@ from PIL import Image
 from palpate.report.archive import Evidence
 from palpate.report.figures import INK, QUIET, Drawing, colour_bar, panel_title
 from palpate.report.scoring import Truth
-from palpate_reproduction.render import Viewpoint, picture
-from palpate_reproduction.scene import Moment, Stage
+from palpate_reproduction.scene import Moment, Stage, Viewpoint, draw
 from palpate_validation import drop
 from palpate_validation.check import PageSection
 
@@ -107,7 +106,7 @@ def phases(path: Path, stage: Stage, shown: Sequence[tuple[str, Moment, bool]]) 
     for axes in grid:
         axes.set_axis_off()
     for axes, (title, moment, close) in zip(grid, shown, strict=False):
-        axes.imshow(picture(stage.bodies(moment), CLOSE if close else ROOM, 480, 340))
+        draw(axes, stage.bodies(moment), CLOSE if close else ROOM)
         axes.set_title(f"{title}, {moment.time_s:.1f} s", fontsize=9.5, color=INK)
     _save(figure, path)
 

@@ -13,92 +13,12 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from palpate.report.archive import Evidence, read_evidence
 from palpate.report.page import known_truth, read_report, sample_places
-from palpate.report.rows import Report
 from palpate_bus.messages import ExamState
 from palpate_dashboard.replay import recording_of
 from palpate_models.scenario.load import load_scenario
 from palpate_reproduction import figures
 from palpate_reproduction.runs import GRAPH, SCENARIO, SNAKE, ReproductionCase, ReproductionError
 from palpate_reproduction.scene import Stage, deformation_mm, moments
-
-
-@dataclass(frozen=True)
-class Limit:
-    """One limit of the paper."""
-
-    paper: str
-    """The limit as reported in the paper."""
-    here: str
-    """The solution in Palpate."""
-    shown: str
-    """Evidence: a figure of the runs or a page."""
-
-
-def limits(report: Report, deformation_mm: float, peak_ratio: float) -> list[Limit]:
-    """Return the table of the paper's limits, with figures of the default run.
-
-    `deformation_mm`: largest displacement of the skin in the pictures; `peak_ratio`: largest over median estimated stiffness.
-    """
-    scores, platform = report.scores, report.platform
-    dice = "not known" if scores is None or scores.dice is None else f"{scores.dice:.2f}"
-    off = "not known" if scores is None or scores.place_error_m is None else f"{1e3 * scores.place_error_m:.1f} mm"
-    held = "not known" if scores is None or scores.coverage_90 is None else f"{100 * scores.coverage_90:.0f} %"
-    depth = "not known" if report.depth_rms_error_m is None else f"{1e3 * report.depth_rms_error_m:.2f} mm"
-    force = "not known" if report.max_force_N is None else f"{report.max_force_N:.1f} N"
-    pace = f"{report.real_time_factor:.1f} × real time, {report.runtime} and recorded, {platform.get('cores')} cores"
-    return [
-        Limit(
-            "DART has one stiffness per body: it is switched for the whole body while the tool is in the stiff area",
-            "stiffness is a field over the surface, defined per vertex, with a smooth edge",
-            f"figure 8; the map has stiffnesses up to {peak_ratio:.1f} times its median",
-        ),
-        Limit(
-            "low real-time factor because of a soft body that is not optimal",
-            "explicit integration; contact is solved per vertex, without a linear system",
-            pace,
-        ),
-        Limit(
-            "the rigid part is the body scaled down: protruding parts displace the bone",
-            "nothing is scaled: each vertex has a foundation along its normal; alternatively an elastic layer over a rigid back",
-            "`phantom.kind=mesh` takes any mesh (quick start); `services.tissue=elastic`",
-        ),
-        Limit(
-            "deformation is not shown",
-            "the deformed surface is a topic; dashboard, camera and the pictures above show the same vertices",
-            f"figure 6: the skin moves by up to {deformation_mm:.1f} mm",
-        ),
-        Limit(
-            "accuracy of the result is not reported",
-            "each run is scored against the truth, which only the tissue and the scoring have",
-            f"localised within {off}, Dice {dice}, the 90 % band covers the truth on {held}; `palpate study` over patients",
-        ),
-        Limit(
-            "Gazebo's force sensor does not perceive the changes of stiffness; the force is read from inside the physics engine",
-            "an F/T sensor under the tool, with bias, noise and the tool's weight; the examination has no other force signal",
-            "the contract rejects a reader of `sim/` and `truth/` topics (docs/topics.md)",
-        ),
-        Limit(
-            "the depth is that of the commanded pose: 10 mm along the normal, without regard to compliance",
-            "measured depth is controlled; at the working force limit the depth is reduced, and the sample reports it",
-            f"true depth: RMS error {depth}; largest force {force}",
-        ),
-        Limit(
-            "scattered data, fitted by a script afterwards and projected onto a plane",
-            "a map on the perceived surface in 3-D during the scan, with its uncertainty, and findings with confidence",
-            "figure 7, report.html of every run",
-        ),
-        Limit(
-            "the source code of Gazebo has to be changed and built",
-            "wheels from a package index; `make run` on Python 3.11 to 3.13",
-            "Makefile",
-        ),
-        Limit(
-            "one model, one stiff area, one run",
-            "scenarios, seeds, lesions anywhere, user-defined meshes; equal hashes for equal runs",
-            "`palpate scenarios`, docs/quick-start.md",
-        ),
-    ]
-
 
 WATCHING = ("conductor", "dashboard", "recorder")
 
@@ -217,7 +137,8 @@ def write_page(
         images=Path(os.path.relpath(images, page.parent)).as_posix(),
         transients=transients,
         ways=ways,
-        limits=limits(report, max(deformation_mm(rest, moment) for moment in seen), ratio),
+        deformation=max(deformation_mm(rest, moment) for moment in seen),
+        peak_ratio=ratio,
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")

@@ -1,27 +1,68 @@
-"""Scene of a recorded run at a given time: robot, table and deformed abdomen as bodies to draw."""
+"""Pictures of a recorded run at a given time: robot, table and deformed abdomen, drawn triangle by triangle, the nearest last."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from trimesh.creation import box
 
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_dashboard import arrays, palette
-from palpate_dashboard.arrays import Carry, VertexNormals, shaded
+from palpate_dashboard.arrays import Carry
 from palpate_dashboard.replay import RecordedInbox, messages
-from palpate_models.numerics.frames import apply
+from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
-from palpate_reproduction.render import Body
 
 TOPICS = ("sim/link_poses", "sim/surface", "assessment/map")
+LAMP = np.array((0.45, -0.55, 1.0)) / np.linalg.norm((0.45, -0.55, 1.0))
+"""Direction to the lamp, in world."""
+AMBIENT = 0.45
 CARRY_M = 0.012
 """Distance over which the map colours the vertices of the abdomen."""
+
+
+class Body(NamedTuple):
+    """Triangles in world: corners [m], shape (m, 3, 3), and colours in 0..1, shape (m, 3)."""
+
+    corners: Array
+    colors: Array
+
+
+class Viewpoint(NamedTuple):
+    """Position of the eye and of its target [m], and vertical angle of view [deg]; world's z is up."""
+
+    eye: tuple[float, float, float]
+    target: tuple[float, float, float]
+    angle_deg: float = 40.0
+
+
+def draw(axes: Axes, bodies: Sequence[Body], view: Viewpoint, aspect: float = 480 / 340) -> None:
+    """Draw the scene, lit by one lamp without shadows; `aspect`: width over height."""
+    eye = np.array(view.eye)
+    forward = np.array(view.target) - eye
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    axes_W = np.stack([v / np.linalg.norm(v) for v in (right, np.cross(right, forward), forward)])
+    corners, colors = (np.concatenate(parts) for parts in zip(*bodies, strict=True))
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12)
+    middle = corners.mean(axis=1) - eye
+    normal *= -np.sign(np.einsum("ij,ij->i", normal, middle))[:, None]  # thin surfaces have two sides
+    light = AMBIENT + (1 - AMBIENT) * np.maximum(normal @ LAMP, 0.0)
+    seen = (corners - eye) @ axes_W.T
+    order = np.argsort(-np.linalg.norm(middle, axis=1))
+    order = order[seen[order, :, 2].min(axis=1) > 0]
+    flat = (seen[..., :2] / seen[..., 2:])[order]
+    faces = np.clip(colors * light[:, None], 0, 1)[order]
+    axes.add_collection(PolyCollection(list(flat), facecolors=faces, edgecolors=faces, linewidths=0.3))
+    half = np.tan(np.deg2rad(view.angle_deg) / 2)
+    axes.set(xlim=(-aspect * half, aspect * half), ylim=(-half, half), aspect="equal")
 
 
 @dataclass(frozen=True)
@@ -68,14 +109,10 @@ class Stage:
     def __init__(self, scenario: Scenario, rest: Moment) -> None:
         given = exam_input(scenario)
         self._X_WA = np.array(given.X_WA)
-        self._links = {
-            link: [(*shaded(mesh.vertices, mesh.triangles), mesh.rgba) for mesh in meshes]
-            for link, meshes in visual_meshes(given.robot).items()
-        }
-        self._triangles = arrays.triples(rest.surface.triangles).astype(np.uint32)
-        vertices = arrays.triples(rest.surface.vertices).astype(np.float64)
-        self._rest = vertices
-        self._still = [_box(box) for box in table.boxes(given.robot)]
+        self._links = visual_meshes(given.robot)
+        self._triangles = arrays.triples(rest.surface.triangles)
+        self._rest = arrays.triples(rest.surface.vertices).astype(np.float64)
+        self._still = [_box(part) for part in table.boxes(given.robot)]
 
     def bodies(self, moment: Moment) -> list[Body]:
         """Return all bodies at a moment."""
@@ -83,38 +120,33 @@ class Stage:
 
     def abdomen(self, moment: Moment) -> Body:
         """Return the deformed abdomen, coloured by the estimated stiffness."""
-        vertices = arrays.triples(moment.surface.vertices).astype(np.float32)
-        colors = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
+        skin = palette.packed(palette.SKIN)
+        colors = np.full(len(self._rest), skin, dtype=np.uint32)
         known = moment.stiffness_map
         if known is not None and np.asarray(known.scanned).any():
             scanned, apparent = np.asarray(known.scanned, dtype=bool), np.asarray(known.apparent, dtype=np.float64)
             ratio = apparent / (known.background if known.background > 0 else float(np.median(apparent[scanned])))
             places = apply(self._X_WA, arrays.triples(known.vertices).astype(np.float64))
-            skin = palette.packed(palette.SKIN)
             shades = np.where(scanned, palette.stiffness_colors(ratio), skin)
             colors = Carry(places, self._rest, CARRY_M)(shades, skin).astype(np.uint32)
-        rgb = np.stack([(colors >> shift) & 255 for shift in (24, 16, 8)], axis=1).astype(np.float32)
-        return Body(vertices, self._triangles, VertexNormals(self._triangles, len(vertices))(vertices), rgb)
+        rgb = np.stack([(colors >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
+        vertices = arrays.triples(moment.surface.vertices).astype(np.float64)
+        return Body(vertices[self._triangles], rgb[self._triangles].mean(axis=1))
 
     def _robot(self, moment: Moment) -> list[Body]:
-        bodies = []
-        for item in moment.link_poses.transforms:
-            X = transform_matrix(item.transform)
-            for vertices, triangles, normals, rgba in self._links.get(item.child_frame_id, ()):
-                color = [255.0 * channel for channel in rgba]
-                bodies.append(_body(apply(X, vertices.astype(np.float64)), triangles, normals @ X[:3, :3].T, color))
-        return bodies
+        return [
+            _plain(apply(transform_matrix(item.transform), mesh.vertices)[mesh.triangles], mesh.rgba)
+            for item in moment.link_poses.transforms
+            for mesh in self._links.get(item.child_frame_id, ())
+        ]
 
 
-def _body(vertices: NDArray[Any], triangles: NDArray[Any], normals: NDArray[Any], color: Sequence[float]) -> Body:
-    colors = np.tile(np.array(color[:3], dtype=np.float32), (len(vertices), 1))
-    return Body(vertices.astype(np.float32), triangles.astype(np.uint32), normals.astype(np.float32), colors)
+def _plain(corners: Array, color: Sequence[float]) -> Body:
+    return Body(corners, np.tile(color[:3], (len(corners), 1)))
 
 
-def _box(box: table.Box) -> Body:
-    corner = np.array([(x, y, z) for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]) * box.size
-    sides = ((0, 1, 3, 2), (4, 6, 7, 5), (0, 4, 5, 1), (2, 3, 7, 6), (0, 2, 6, 4), (1, 5, 7, 3))
-    faces = np.array([face for a, b, c, d in sides for face in ((a, b, c), (a, c, d))])
-    vertices, triangles, normals = shaded(corner, faces)
-    color = palette.PLINTH if box.name == "robot_base" else palette.SHEET
-    return _body(apply(box.X_WB, vertices.astype(np.float64)), triangles, normals @ box.X_WB[:3, :3].T, color)
+def _box(part: table.Box) -> Body:
+    """Return a box, in triangles small enough to be drawn in the order of their distances."""
+    mesh = box(extents=part.size, transform=part.X_WB).subdivide_to_size(0.04)
+    color = palette.PLINTH if part.name == "robot_base" else palette.SHEET
+    return _plain(np.asarray(mesh.triangles), [channel / 255 for channel in color])

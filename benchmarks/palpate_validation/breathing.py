@@ -3,6 +3,7 @@
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
@@ -34,35 +35,12 @@ KINDS = {
 
 
 @dataclass(frozen=True)
-class Breaths:
-    """n breaths, measured at the navel."""
-
-    inspiration: Array
-    """Duration of the rise [s], shape (n,)."""
-    expiration: Array
-    """Duration of the fall [s], shape (n,)."""
-    pause: Array
-    """Duration of the rest before the next rise [s], shape (n,)."""
-    depth: Array
-    """[m], shape (n,)."""
-
-    @property
-    def duration(self) -> Array:
-        """Time from one rise to the next [s], shape (n,)."""
-        return self.inspiration + self.expiration + self.pause
-
-    @property
-    def share(self) -> Array:
-        """Inspiration over duration [1], shape (n,)."""
-        return self.inspiration / self.duration
-
-
-@dataclass(frozen=True)
 class Measured:
     """Breaths of several patients, and one curve of each kind."""
 
-    quiet: tuple[Breaths, ...]
-    deep: tuple[Breaths, ...]
+    quiet: pd.DataFrame
+    """A row per breath, as `read` returns it, with the number of the patient."""
+    deep: pd.DataFrame
     time: Array
     """[s], shape (m,)."""
     curves: dict[str, Array]
@@ -85,17 +63,24 @@ def sampled(breathing: Breathing, seed: int, until_s: float = TABLE_S) -> Array:
     return np.array([curve.excursion(t) for t in np.arange(0, until_s, SETUP.step_s)])
 
 
-def read(excursion: Array) -> Breaths:
-    """Return the complete breaths in a curve, each from the start of a rise to the start of the next."""
+def read(excursion: Array) -> pd.DataFrame:
+    """Return the complete breaths in a curve, each from the start of a rise to the start of the next.
+
+    Columns: duration of rise, fall and rest (inspiration, expiration, pause) and of all [s], depth [m], the rise's share.
+    """
     above = excursion > SETUP.at_rest * excursion.mean()
     edges = np.diff(above.astype(int))
     rise, rest = np.flatnonzero(edges > 0), np.flatnonzero(edges < 0)
     rest = rest[rest > rise[0]][: len(rise) - 1]
-    pairs = list(zip(rise[:-1], rest, strict=True))
-    top = np.array([a + int(np.argmax(excursion[a : b + 1])) for a, b in pairs])
-    steps = (top - rise[:-1], rest - top, rise[1:] - rest)
-    up, down, still = (SETUP.step_s * count.astype(np.float64) for count in steps)
-    return Breaths(up, down, still, excursion[top])
+    top = np.array([a + int(np.argmax(excursion[a : b + 1])) for a, b in zip(rise[:-1], rest, strict=True)])
+    steps = {"inspiration": top - rise[:-1], "expiration": rest - top, "pause": rise[1:] - rest, "duration": np.diff(rise)}
+    breaths = SETUP.step_s * pd.DataFrame(steps)
+    return breaths.assign(depth=excursion[top], share=breaths["inspiration"] / breaths["duration"])
+
+
+def _of_patients(kind: str, patients: int) -> pd.DataFrame:
+    """Return the breaths of several patients."""
+    return pd.concat([read(sampled(KINDS[kind], seed)).assign(patient=seed) for seed in range(patients)], ignore_index=True)
 
 
 def measure(patients: int = SETUP.patients) -> Measured:
@@ -111,8 +96,8 @@ def measure(patients: int = SETUP.patients) -> Measured:
         near = near[np.argsort(at[near])]
         lines.append((at[near], body.breathing[near]))
     return Measured(
-        quiet=tuple(read(sampled(KINDS["quiet"], seed)) for seed in range(patients)),
-        deep=tuple(read(sampled(KINDS["deep"], seed)) for seed in range(patients)),
+        quiet=_of_patients("quiet", patients),
+        deep=_of_patients("deep", patients),
         time=np.arange(0, SETUP.shown_s, SETUP.step_s),
         curves=curves,
         jump=float(np.abs(np.diff(speed)).max() / np.abs(speed).max()),
@@ -123,46 +108,38 @@ def measure(patients: int = SETUP.patients) -> Measured:
     )
 
 
-def _pooled(breaths: tuple[Breaths, ...], field: str) -> Array:
-    return np.concatenate([getattr(breath, field) for breath in breaths])
-
-
-def _cv(breaths: tuple[Breaths, ...], field: str) -> float:
-    """Return the mean over patients of the coefficient of variation [%]."""
-    return 100 * float(np.mean([getattr(breath, field).std() / getattr(breath, field).mean() for breath in breaths]))
-
-
-def _memory(breaths: tuple[Breaths, ...], field: str) -> float:
-    """Return the mean over patients of the correlation between successive breaths."""
-    return float(np.mean([np.corrcoef(getattr(breath, field)[:-1], getattr(breath, field)[1:])[0, 1] for breath in breaths]))
-
-
 def section(found: Measured | None = None) -> PageSection:
     """Return the comparison of breathing curves with measurements on people, with bounds."""
     found = found or measure()
-    quiet, deep = found.quiet, found.deep
-    depth_mm = 1e3 * float(_pooled(quiet, "depth").mean())
-    rate, slow = (60 / float(_pooled(breaths, "duration").mean()) for breaths in (quiet, deep))
-    ratio = float(_pooled(quiet, "expiration").mean() / _pooled(quiet, "inspiration").mean())
-    share = depth_mm / (1e3 * float(_pooled(deep, "depth").mean()))
-    pause = 100 * float((_pooled(quiet, "pause") / _pooled(quiet, "duration")).mean())
+    quiet, deep = found.quiet.mean(), found.deep.mean()
+    of_one = found.quiet.groupby("patient")
+    variation = 100 * (of_one.std(ddof=0) / of_one.mean()).mean()
+    memory = float(of_one["depth"].apply(lambda depth: np.corrcoef(depth[:-1], depth[1:])[0, 1]).mean())
+    depth_mm, pause = 1e3 * quiet["depth"], 100 * float((found.quiet["pause"] / found.quiet["duration"]).mean())
     checks = (
-        Check("breaths a minute, quiet", rate, "", 13.5, 14.5, "14, n = 100 (Ragnarsdottir 2006)"),
-        Check("breaths a minute, deep", slow, "", 7.1, 7.7, "7.4 (Ragnarsdottir 2006)"),
-        Check("expiration over inspiration", ratio, "", 1.14, 1.26, "1.21 men, 1.14 women (Ragnarsdottir 2006)"),
+        Check("breaths a minute, quiet", 60 / quiet["duration"], "", 13.5, 14.5, "14, n = 100 (Ragnarsdottir 2006)"),
+        Check("breaths a minute, deep", 60 / deep["duration"], "", 7.1, 7.7, "7.4 (Ragnarsdottir 2006)"),
+        Check(
+            "expiration over inspiration",
+            quiet["expiration"] / quiet["inspiration"],
+            "",
+            1.14,
+            1.26,
+            "1.21 men, 1.14 women (Ragnarsdottir 2006)",
+        ),
         Check("pause, of a breath", pause, "%", against="assumed"),
         Check("depth at the navel, quiet", depth_mm, "mm", 5, 12, "5 to 12 mm, assumed"),
-        Check("quiet over deep", share, "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
-        Check("variation of duration from breath to breath", _cv(quiet, "duration"), "%", 18, 24, "20.8 % (Tobin 1988)"),
-        Check("variation of depth from breath to breath", _cv(quiet, "depth"), "%", 28, 38, "33 % (Tobin 1988)"),
-        Check("variation of inspiration's share of a breath", _cv(quiet, "share"), "%", 15, 21, "17.9 % (Tobin 1988)"),
-        Check("correlation of depth with the breath before", _memory(quiet, "depth"), "", 0.15, 0.45, "0.30 (Tobin 1995)"),
+        Check("quiet over deep", quiet["depth"] / deep["depth"], "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
+        Check("variation of duration from breath to breath", variation["duration"], "%", 18, 24, "20.8 % (Tobin 1988)"),
+        Check("variation of depth from breath to breath", variation["depth"], "%", 28, 38, "33 % (Tobin 1988)"),
+        Check("variation of inspiration's share of a breath", variation["share"], "%", 15, 21, "17.9 % (Tobin 1988)"),
+        Check("correlation of depth with the breath before", memory, "", 0.15, 0.45, "0.30 (Tobin 1995)"),
         Check("change of speed in 10 ms, of the greatest", 100 * found.jump, "%", None, 5, "a curve without corners"),
         Check("share of the excursion at the body's border", found.border, "", None, 0, "none"),
         Check("distance of the largest excursion from the navel", 1e3 * found.largest_at_m, "mm", None, 30, "the navel"),
-    )
+    )  # fmt: skip
     text = (
-        f"{len(quiet)} patients breathe for {TABLE_S:g} s each; their breaths are read from the curve, sampled at "
+        f"{len(of_one)} patients breathe for {TABLE_S:g} s each; their breaths are read from the curve, sampled at "
         f"{1 / SETUP.step_s:g} Hz, without access to the table of breaths. Duration and depth are log-normal and correlated "
         "from breath to breath; pause, depth in millimetres and coughs are assumed. Sighs are not modelled."
     )
@@ -178,7 +155,7 @@ def draw(figure: Figure, found: Measured) -> None:
     axes.set(xlabel="time [s]", ylabel="excursion [mm], 30 mm apart", ylim=(None, 135))
     axes.legend(ncols=4, loc="upper right")
     axes = figure.add_subplot(grid[1, 0])
-    axes.plot(_pooled(found.quiet, "duration"), 1e3 * _pooled(found.quiet, "depth"), ".", color=COLOURS[0], ms=1.5)
+    axes.plot(found.quiet["duration"], 1e3 * found.quiet["depth"], ".", color=COLOURS[0], ms=1.5)
     axes.set(xlabel="duration of a breath [s]", ylabel="depth [mm]")
     axes = figure.add_subplot(grid[1, 1])
     for (at, share), name, colour in ((found.across, "across", COLOURS[1]), (found.along, "along", INK)):

@@ -1,8 +1,10 @@
 """Check of the sampler of persons: the statistics of their forces against those of the living people of Remus et al."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import stats
@@ -30,55 +32,46 @@ class PopulationSetup:
 SETUP = PopulationSetup()
 
 LEFT_OUT = "force at 10 mm of a person left out: places in the 80 % interval of the other nine"
-DEPTHS_M = np.array((0.005, 0.010, 0.020))
-AT_10_MM = 1
+DEPTHS_M = [0.005, 0.010, 0.020]
+AT_10_MM = 0.010
 
 
-@dataclass(frozen=True)
-class PopulationSample:
-    """Forces at positions on several people."""
-
-    person: NDArray[np.int_]
-    """Number of the person, shape (n,)."""
-    force: Array
-    """Force at `DEPTHS_M` [N], shape (n, 3)."""
-
-    def of_people(self, depth: int) -> list[Array]:
-        """Return the logarithms of the forces of each person at a depth."""
-        return [np.log(self.force[self.person == person, depth]) for person in np.unique(self.person)]
-
-    def figures(self) -> dict[str, float]:
-        """Return the compared statistics."""
-        ten = self.of_people(AT_10_MM)
-        scatter = sum(float(((logs - logs.mean()) ** 2).sum()) for logs in ten)
-        exponents = np.log2(self.force[:, 1:] / self.force[:, :-1])
-        return {
-            **{f"median force at {1e3 * d:g} mm [N]": float(np.median(f)) for d, f in zip(DEPTHS_M, self.force.T, strict=True)},
-            "5 % of forces at 10 mm are below [N]": float(np.quantile(self.force[:, AT_10_MM], 0.05)),
-            "95 % are below [N]": float(np.quantile(self.force[:, AT_10_MM], 0.95)),
-            "between people: deviation of the mean ln F at 10 mm": float(np.std([logs.mean() for logs in ten], ddof=1)),
-            "between places of one person: deviation of ln F at 10 mm": float(np.sqrt(scatter / (len(self.person) - len(ten)))),
-            "largest over smallest force at 10 mm on one person, median": float(
-                np.median([np.exp(np.ptp(logs)) for logs in ten])
-            ),
-            "median exponent, 5 to 10 mm": float(np.median(exponents[:, 0])),
-            "median exponent, 10 to 20 mm": float(np.median(exponents[:, 1])),
-            "deviation of the exponent, 10 to 20 mm": float(exponents[:, 1].std(ddof=1)),
-        }
+def figures(sample: pd.DataFrame) -> dict[str, float]:
+    """Return the compared statistics of a sample: a row per place, with `person` and the force at each of `DEPTHS_M` [N]."""
+    logs: pd.DataFrame = sample[DEPTHS_M].apply(np.log)
+    ten = logs[AT_10_MM].groupby(sample["person"])
+    exponents = logs.diff(axis=1) / np.log(2)
+    scatter = float(((logs[AT_10_MM] - ten.transform("mean")) ** 2).sum())
+    return {
+        **{f"median force at {1e3 * depth:g} mm [N]": float(sample[depth].median()) for depth in DEPTHS_M},
+        "5 % of forces at 10 mm are below [N]": float(sample[AT_10_MM].quantile(0.05)),
+        "95 % are below [N]": float(sample[AT_10_MM].quantile(0.95)),
+        "between people: deviation of the mean ln F at 10 mm": float(ten.mean().std()),
+        "between places of one person: deviation of ln F at 10 mm": float(np.sqrt(scatter / (len(sample) - len(ten)))),
+        "largest over smallest force at 10 mm on one person, median": float(_ratios(sample).median()),
+        "median exponent, 5 to 10 mm": float(exponents[DEPTHS_M[1]].median()),
+        "median exponent, 10 to 20 mm": float(exponents[DEPTHS_M[2]].median()),
+        "deviation of the exponent, 10 to 20 mm": float(exponents[DEPTHS_M[2]].std()),
+    }
 
 
 WITHIN = (0.08, 0.08, 0.10, 0.15, 0.15, 0.40, 0.20, 0.12, 0.07, 0.07, 0.40)
 """Relative tolerance of each figure: the uncertainty of a sample of ten people."""
 
 
-def measured() -> PopulationSample:
+def sample_of(person: Sequence[int], force: Array) -> pd.DataFrame:
+    """Return a sample of the numbers of persons, shape (n,), and forces [N], shape (n, 3)."""
+    return pd.DataFrame(force, columns=DEPTHS_M).assign(person=person)
+
+
+def measured() -> pd.DataFrame:
     """Return the 48 relaxed positions of the file."""
     places = remus2024.relaxed_people()
-    force = np.array([remus2024.curve(*place).force(DEPTHS_M) for place in places])
-    return PopulationSample(np.array([remus2024.PEOPLE.index(person) for _, person in places]), force)
+    force = np.array([remus2024.curve(*place).force(np.array(DEPTHS_M)) for place in places])
+    return sample_of([remus2024.PEOPLE.index(person) for _, person in places], force)
 
 
-def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> PopulationSample:
+def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> pd.DataFrame:
     """Return persons of the seeds 0, 1, 2 .., each pressed at `SETUP.places` random positions of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
@@ -95,16 +88,16 @@ def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> Popula
         wall = healthy_wall(at, phantom.size_m, phantom.anatomy, usual.stiffening_per_m, seed)
         for factor, stiffening in zip(wall.stiffness.tolist(), wall.stiffening.tolist(), strict=True):
             here = usual.model_copy(update={"k_w_n_per_m3": usual.k_w_n_per_m3 * factor, "stiffening_per_m": stiffening})
-            force.append([pressed_force(here, 0.0, depth + offset) for depth in DEPTHS_M.tolist()])
-    return PopulationSample(np.repeat(np.arange(persons), SETUP.places), np.array(force))
+            force.append([pressed_force(here, 0.0, depth + offset) for depth in DEPTHS_M])
+    return sample_of(np.repeat(np.arange(persons), SETUP.places).tolist(), np.array(force))
 
 
-def left_out(people: PopulationSample, depth: int = AT_10_MM) -> NDArray[np.bool_]:
+def left_out(people: pd.DataFrame) -> NDArray[np.bool_]:
     """Return for each position whether it is in the 80 % interval that the other people predict for a new person, shape (n,).
 
     ln F is normal between people and between positions of one person; the interval is Student's, for the mean of a few people.
     """
-    logs = people.of_people(depth)
+    logs = [np.log(own.to_numpy()) for _, own in people.groupby("person")[AT_10_MM]]
     inside = []
     for one, own in enumerate(logs):
         others = [each for number, each in enumerate(logs) if number != one]
@@ -126,20 +119,20 @@ def _places(points: Array, rng: np.random.Generator) -> Array:
     raise RuntimeError(f"population: fewer than {SETUP.places} places {SETUP.apart_m} m apart among {len(points)}")
 
 
-def section(found: PopulationSample | None = None) -> PageSection:
+def section(found: pd.DataFrame | None = None) -> PageSection:
     """Return the comparison with its bounds."""
-    found, people = found or sampled(), measured()
+    found, people = sampled() if found is None else found, measured()
     checks = tuple(
         Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
-        for (name, ours), theirs, within in zip(found.figures().items(), people.figures().values(), WITHIN, strict=True)
+        for (name, ours), theirs, within in zip(figures(found).items(), figures(people).values(), WITHIN, strict=True)
     )
     covered = float(left_out(people).mean())
-    checks += (Check(LEFT_OUT, covered, "of all", against=f"{len(people.force)} places of {len(people.of_people(0))} people"),)
+    checks += (Check(LEFT_OUT, covered, "of all", against=f"{len(people)} places of {people['person'].nunique()} people"),)
     text = (
         "This is a check of the sampler, whose moments come from the same ten people, and no validation of other persons. "
-        f"{found.person[-1] + 1} persons of `phantom.kind: person, build: median`, each pressed at {SETUP.places} random places "
-        "of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus et "
-        "al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
+        f"{found['person'].nunique()} persons of `phantom.kind: person, build: median`, each pressed at {SETUP.places} random "
+        "places of the belly away from bone by a sphere of 10 mm at 5 mm/s, against the 48 places of ten relaxed people (Remus "
+        "et al. 2024, CC BY 4.0). Level, stiffening, length and their variation are drawn with the moments of `fitted.csv`. "
         "Ten people determine an SD between people to a quarter, which is the width of the bounds. The people were young, male "
         "and slim; other builds are not validated."
     )
@@ -148,26 +141,23 @@ def section(found: PopulationSample | None = None) -> PageSection:
     )
 
 
-def draw(figure: Figure, found: PopulationSample, people: PopulationSample) -> None:
+def draw(figure: Figure, found: pd.DataFrame, people: pd.DataFrame) -> None:
     """Draw distributions of force, of its ratio within a person and of its exponent, sampled and measured."""
     axes = figure.subplots(1, 3)
     shown = (
-        ("force at 10 mm [N]", found.force[:, AT_10_MM], people.force[:, AT_10_MM]),
+        ("force at 10 mm [N]", found[AT_10_MM], people[AT_10_MM]),
         ("largest over smallest on one person", _ratios(found), _ratios(people)),
-        (
-            "exponent, 10 to 20 mm",
-            np.log2(found.force[:, 2] / found.force[:, 1]),
-            np.log2(people.force[:, 2] / people.force[:, 1]),
-        ),
+        ("exponent, 10 to 20 mm", np.log2(found[0.020] / found[0.010]), np.log2(people[0.020] / people[0.010])),
     )
     for ax, (name, ours, theirs) in zip(axes, shown, strict=True):
         for values, colour, label, style in ((ours, COLOURS[0], "sampled", "-"), (theirs, INK, "measured", ".")):
-            at = np.sort(values)
+            at = np.sort(np.asarray(values))
             ax.plot(at, (np.arange(len(at)) + 0.5) / len(at), style, ms=3, lw=1.2, color=colour, label=label)
         ax.set(xlabel=name, ylim=(0, 1))
     axes[0].set(ylabel="share below")
     axes[0].legend()
 
 
-def _ratios(sample: PopulationSample) -> Array:
-    return np.array([np.exp(np.ptp(logs)) for logs in sample.of_people(AT_10_MM)])
+def _ratios(sample: pd.DataFrame) -> pd.Series:
+    of_one = sample.groupby("person")[AT_10_MM]
+    return of_one.max() / of_one.min()

@@ -165,7 +165,7 @@ class PluginKind:
         return function
 
 
-IMPORTED = {"open3d-cpu": "open3d", "pillow": "PIL", "pin": "pinocchio", "rerun-sdk": "rerun", "scikit-learn": "sklearn"}
+IMPORTED = {"pillow": "PIL", "pin": "pinocchio", "rerun-sdk": "rerun", "scikit-learn": "sklearn"}
 """Modules of distributions, where the name differs by more than a dash: another distribution may provide the module."""
 
 

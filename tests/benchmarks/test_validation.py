@@ -18,7 +18,7 @@ from palpate_validation import buried, drop, elastic, energy, guarding, hertz, m
 from palpate_validation.check import Check, PageSection, failures, number, write
 from palpate_validation.drop import DartScene
 from palpate_validation.meshes import lump, static_force, uniform
-from palpate_validation.population import PopulationSample
+from palpate_validation.population import DEPTHS_M, sample_of
 
 
 def assert_bounds(section: PageSection) -> None:
@@ -135,8 +135,9 @@ def test_checks_know_their_bounds() -> None:
 
 def test_people_all_alike_or_too_stiff_are_detected() -> None:
     people = population.measured()
-    alike = PopulationSample(people.person, np.tile(np.median(people.force, axis=0), (len(people.force), 1)))
-    stiff = PopulationSample(people.person, 1.3 * people.force)
+    force = people[DEPTHS_M].to_numpy()
+    alike = sample_of(people["person"], np.tile(np.median(force, axis=0), (len(people), 1)))
+    stiff = sample_of(people["person"], 1.3 * force)
     for wrong in (alike, stiff):
         assert any(check.passed is False for check in population.section(wrong).checks)
 

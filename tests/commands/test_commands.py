@@ -54,7 +54,7 @@ def test_the_list_of_commands_imports_none_and_describes_each() -> None:
 
 
 SLOW_TO_IMPORT = {
-    "casadi", "coal", "dartpy", "distributed", "fmpy", "jinja2", "matplotlib", "mcap", "mujoco", "numba", "ompl", "open3d",
+    "casadi", "coal", "dartpy", "distributed", "fmpy", "jinja2", "matplotlib", "mcap", "mujoco", "numba", "ompl",
     "pandas", "PIL", "pinocchio", "plotly", "pyarrow", "rerun", "ruckig", "scipy", "sklearn", "statsmodels", "trimesh",
 }  # fmt: skip
 """Modules that take a command's help over half a second to import, one or two of them together."""
