@@ -5,7 +5,7 @@ from typing import Any
 
 import rerun.blueprint as rrb
 
-from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.sinks import TIMELINE
 
 
 def _eye(position: tuple[float, float, float], target: tuple[float, float, float], up: tuple[float, float, float]) -> Any:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from palpate_dashboard import palette
 from palpate_dashboard.arrays import Floats, Indices
-from palpate_dashboard.columns import TIMELINE
+from palpate_dashboard.sinks import TIMELINE
 
 LAYERS: Final = ("mean", "band")
 

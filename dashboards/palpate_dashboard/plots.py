@@ -13,7 +13,7 @@ import rerun as rr
 
 from palpate_bus.contract import contract
 from palpate_dashboard import palette
-from palpate_dashboard.columns import TIMELINE, Columns, scalars
+from palpate_dashboard.sinks import TIMELINE, Columns, scalars
 from palpate_dashboard.text import LEVELS, Health
 from palpate_models.numerics.frames import Array
 

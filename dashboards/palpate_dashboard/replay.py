@@ -1,12 +1,10 @@
 """Draws a run from the recorder's MCAP file, finished or live.
 
-python -m palpate_dashboard.replay DIR            # writes DIR/recording.rrd from DIR/recording_mcap and DIR/scenario.yaml
-
+`main` writes DIR/recording.rrd from DIR/recording_mcap and DIR/scenario.yaml.
 `follow` draws a live run: its past from the recording, then live messages. It is a separate node; no service waits for it.
 """
 
 import os
-import sys
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from heapq import heappop, heappush
@@ -166,15 +164,6 @@ def main(folder: Path, progress: Callable[[int], None] | None = None) -> Path:
         target.unlink(missing_ok=True)  # a partial file would pass for a complete one
         raise
     return target
-
-
-if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit("usage: python -m palpate_dashboard.replay DIR")
-    try:
-        print(main(Path(sys.argv[1])))
-    except (OSError, ValueError) as error:
-        sys.exit(str(error))
 
 
 CHECK_S = 1.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from palpate_bus.messages.geometry import quaternion
 from palpate_dashboard import palette
 from palpate_dashboard.arrays import Carry, Floats, Indices, VertexNormals
-from palpate_dashboard.columns import TIMELINE, Columns, arrows, deformations, transforms
+from palpate_dashboard.sinks import TIMELINE, Columns, arrows, deformations, transforms
 
 METRES_PER_NEWTON: Final = 0.03
 """Scale of the force arrow: 5 N are 15 cm."""

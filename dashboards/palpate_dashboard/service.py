@@ -23,12 +23,11 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, palette, plots, text
 from palpate_dashboard.arrays import VertexNormals, shaded
-from palpate_dashboard.columns import Columns
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.map import MapView
 from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots
 from palpate_dashboard.scene import SceneView, Shaded
-from palpate_dashboard.sinks import Live, open_recording
+from palpate_dashboard.sinks import Columns, Live, open_recording
 from palpate_models.numerics.frames import apply
 from palpate_models.numerics.maps import half_width, level_lines
 from palpate_models.robot import table

@@ -16,11 +16,10 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import KeyValue, codec
 from palpate_bus.recordings import RecordingError
 from palpate_dashboard import replay
-from palpate_dashboard.columns import TIMELINE
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import AWAITED
 from palpate_dashboard.service import FILE, DashboardService, create
-from palpate_dashboard.sinks import Live
+from palpate_dashboard.sinks import TIMELINE, Live
 from palpate_models.robot.arm import link_names
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario

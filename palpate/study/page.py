@@ -2,6 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -14,7 +15,6 @@ from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 
 from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
-from palpate.study import human_line
 from palpate.study.statistics.accuracy import Agreement, FindingCalibration
 from palpate.study.statistics.analysis import Analysis
 from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
@@ -38,6 +38,36 @@ COVARIATES: Final = {
     "contrast": ("stiffness of the lump over its surroundings", 1.0),
     "radius_m": ("radius of the lump [mm]", 1e3),
 }
+
+
+@dataclass(frozen=True)
+class HumanExaminers:
+    """Detection of lumps by hand, for plots of detection: published figures with sources and limits."""
+
+    source: str = (
+        "Fletcher et al., Physicians' abilities to detect lumps in silicone breast models, JAMA 1985;253:2224-2228,"
+        " doi:10.1001/jama.1985.03350390066027"
+    )
+    caveat: str = (
+        "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no breathing."
+        " The line shows what trained hands achieved there; it is not a comparison on equal patients."
+    )
+    found: float = 0.44
+    """Mean share of lumps found by the 80 physicians (range 0.17 to 0.83)."""
+    by_hardness: Mapping[str, float] = field(default_factory=lambda: {"hard": 0.56, "soft": 0.40})
+    by_size: tuple[tuple[float, float], ...] = ((0.003, 0.14), (0.010, 0.87))
+    """Size of the lumps [m] and share found; taken as their diameter, by which lumps of models are sold."""
+    residents: str = (
+        "How do women compare with internal medicine residents in breast lump detection?, J Gen Intern Med,"
+        " doi:10.1007/BF02597396"
+    )
+    residents_sensitivity: float = 0.58
+    """Share of 18 lumps in six silicone models that 62 residents found."""
+    residents_specificity: float = 0.52
+    """Share of the models that they examined without a false finding."""
+
+
+HUMANS: Final = HumanExaminers()
 MANY: Final = 400
 """Points from which a cloud is drawn as an image."""
 
@@ -75,8 +105,8 @@ def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "b
 
 def _human(axes: Axes) -> None:
     """Draw the detection rate of human examiners."""
-    label = f"80 physicians, breast models: {human_line.FOUND:.0%} (Fletcher 1985)"
-    axes.axhline(human_line.FOUND, color=HUMAN, ls="--", lw=1.2, label=label)
+    label = f"80 physicians, breast models: {HUMANS.found:.0%} (Fletcher 1985)"
+    axes.axhline(HUMANS.found, color=HUMAN, ls="--", lw=1.2, label=label)
 
 
 def _title(axes: Axes, words: str) -> None:
@@ -104,8 +134,8 @@ def roc(analyses: Sequence[Analysis]) -> str | None:
         axes.fill_between(ROC_GRID, curve.low, curve.high, color=color, alpha=0.13, lw=0)
     axes.plot([0, 1], [0, 1], color=QUIET, lw=0.8, ls=":")
     _human(axes)
-    at = 1 - human_line.RESIDENTS_SPECIFICITY
-    axes.plot(at, human_line.RESIDENTS_SENSITIVITY, "D", color=HUMAN, ms=6, label="62 residents, breast models: 58 % of lumps")
+    at = 1 - HUMANS.residents_specificity
+    axes.plot(at, HUMANS.residents_sensitivity, "D", color=HUMAN, ms=6, label="62 residents, breast models: 58 % of lumps")
     plain(axes, "patients with a lump above the threshold", "persons without a lump above it")
     _percent(axes, both=True)
     axes.set_xlim(-0.01, 1)
@@ -156,10 +186,9 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
         _errorbar(axes, [scale * at for at in x], rows, INK, "found, in bins of equal number")
         _human(axes)
         if name == "radius_m":
-            sizes = [point.size_m / 2 * scale for point in human_line.BY_SIZE]
-            axes.plot(
-                sizes, [point.found for point in human_line.BY_SIZE], "D", color=HUMAN, ms=6, label="physicians, by size of lump"
-            )
+            sizes, shares = zip(*HUMANS.by_size, strict=True)
+            radii = [scale * size / 2 for size in sizes]
+            axes.plot(radii, shares, "D", color=HUMAN, ms=6, label="physicians, by size of lump")
         plain(axes, "probability of detection" if name == names[0] else "", words)
         if name in LOGARITHMIC:
             axes.set_xscale("log")
@@ -321,7 +350,7 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
         s=summary,
         shown=[a.name for a in shown],
         methods=[summary["methods"][a.name] for a in shown],
-        human=human_line,
+        human=HUMANS,
         quantities=QUANTITIES,
         roc=_safe(roc(analyses)),
         froc=_safe(froc(analyses)),

@@ -1,7 +1,7 @@
 """Results of a study: its tables as Parquet (one row per case, per finding and per lump), study.json and study.html."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict
 from importlib.metadata import version
 from math import nan, pi, sqrt
 from pathlib import Path
@@ -9,23 +9,21 @@ from typing import Any, Final
 
 import pyarrow as pa
 from pyarrow import parquet
-from pydantic import ValidationError
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
 from palpate.report.rows import FindingRow
 from palpate.report.scoring import FindingScore
-from palpate.study import human_line
 from palpate.study.folder import RUN, Folder, Manifest, Outcome, RunRecord, record
-from palpate.study.page import render
+from palpate.study.page import HUMANS, render
 from palpate.study.real_time import write_real_time
-from palpate.study.statistics.accuracy import CalibrationRow, ErrorsRow, Spread
+from palpate.study.statistics.accuracy import COVERED, MEASURED, CalibrationRow, ErrorsRow, Spread, coverage, spread
 from palpate.study.statistics.analysis import Analysis, analyse
 from palpate.study.statistics.comparison import Comparison, compare
 from palpate.study.statistics.detectability import Surface
-from palpate.study.statistics.detection import ContrastRow, Rates
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Estimate, Row
-from palpate.study.statistics.reading import Tables, read_tables
+from palpate.study.statistics.detection import ContrastRow, Rates, by_contrast, by_population, rates
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Bootstrap, Estimate, Row
+from palpate.study.statistics.reading import Tables, Variant, read_tables
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Scenario
 
@@ -260,14 +258,6 @@ class StudySummary(Row):
     """Detection by human examiners, with sources."""
 
 
-@dataclass(frozen=True)
-class Analysed:
-    """A study's figures and the curves for its plots."""
-
-    summary: StudySummary
-    analyses: tuple[Analysis, ...]
-
-
 def conclude(folder: Folder, manifest: Manifest) -> tuple[RunRecord, list[Outcome]]:
     """Write tables, run.json, study.json and study.html. Raises UserError if a case has no outcome yet."""
     outcomes = folder.outcomes(manifest)
@@ -290,41 +280,29 @@ def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
         command: command that runs the study again.
         folds: resamplings of the bootstrap.
     """
-    analysed = analysed_tables(read_tables(folder, folds), command)
-    write_text(folder / JSON, analysed.summary.model_dump_json(indent=1) + "\n")
-    write_text(folder / PAGE, render(analysed.summary.model_dump(), analysed.analyses, analysed.summary.comparisons))
-
-
-def read_summary(path: Path) -> StudySummary:
-    """Return a study.json. Raises UserError."""
-    try:
-        return StudySummary.model_validate_json(path.read_text(encoding="utf-8"))
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"{path} cannot be read: {error}") from error
-    except ValidationError as error:
-        wrong = (f"{'.'.join(map(str, item['loc']))}: {item['msg']}" for item in error.errors())
-        raise UserError(f"{path} is not a study.json of this version: {'; '.join(wrong)}") from error
-
-
-def analysed_tables(tables: Tables, command: str) -> Analysed:
-    """Return all statistics of a study."""
+    tables = read_tables(folder, folds)
     analyses = tuple(analyse(variant, tables.bootstrap) for variant in tables.variants)
+    summary = _summary(tables, analyses, command)
+    write_text(folder / JSON, summary.model_dump_json(indent=1) + "\n")
+    write_text(folder / PAGE, render(summary.model_dump(), analyses, summary.comparisons))
+
+
+def _summary(tables: Tables, analyses: Sequence[Analysis], command: str) -> StudySummary:
     reference, *others = tables.variants
-    summary = StudySummary(
+    return StudySummary(
         study=tables.study,
         splits=tables.splits,
         version=version("palpate"),
         command=command,
         patients=_patients(tables),
         reference=reference.name,
-        methods={analysis.name: _method(analysis) for analysis in analyses},
+        methods={own.name: _method(own, a, tables.bootstrap) for own, a in zip(tables.variants, analyses, strict=True)},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
         assumed=any((variant.cases["loop_examinations"] < LEAST_EXAMINATIONS).any() for variant in tables.variants),
         level=LEVEL,
         bootstrap_folds=tables.folds,
-        human=human_line.as_json(),
+        human=asdict(HUMANS),
     )
-    return Analysed(summary, analyses)
 
 
 def _patients(tables: Tables) -> dict[str, int]:
@@ -332,11 +310,11 @@ def _patients(tables: Tables) -> dict[str, int]:
     return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
 
 
-def _method(a: Analysis) -> MethodRow:
+def _method(variant: Variant, a: Analysis, bootstrap: Bootstrap) -> MethodRow:
     return MethodRow(
-        rates=a.rates,
-        populations=a.populations,
-        contrasts=a.contrasts,
+        rates=rates(variant, bootstrap),
+        populations=by_population(variant, bootstrap),
+        contrasts=by_contrast(variant, bootstrap),
         auc=None if a.roc is None else a.roc.auc,
         froc_mean=None if a.froc is None else a.froc.mean,
         froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},
@@ -346,8 +324,8 @@ def _method(a: Analysis) -> MethodRow:
         errors=a.errors.figures,
         calibration=None if a.calibration is None else a.calibration.figures,
         guarding=None if a.guarding is None else a.guarding.figures,
-        effort=a.effort,
-        coverage=a.coverage,
+        effort={name: spread(variant, name, bootstrap) for name in MEASURED},
+        coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
     )
 
 

@@ -14,7 +14,7 @@ from palpate.study.statistics.accuracy import calibration, finding_errors, guard
 from palpate.study.statistics.detection import by_population, rates, roc
 from palpate.study.statistics.estimate import Bootstrap
 from palpate.study.statistics.reading import Tables, read_tables, tables_of
-from palpate.study.summary import read_summary, summarise
+from palpate.study.summary import StudySummary, summarise
 from palpate_errors import UserError
 
 FOLDS = 30
@@ -76,7 +76,7 @@ def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_figure_has_its_sample_size_and_interval(study: Path) -> None:
-    summary = read_summary(study / "study.json")
+    summary = StudySummary.model_validate_json((study / "study.json").read_bytes())
     assert summary.patients == {"healthy": 30, "lumps": 40}
     assert summary.reference == "palpate"
     for row in summary.methods.values():
@@ -118,7 +118,7 @@ def test_a_quick_study_of_healthy_people_has_a_page_and_may_be_quoted_if_its_loo
     cases = [synthetic.case(i, "healthy", tier="quick", loop_examinations=behind) for i in range(3)]
     synthetic.write(tmp_path, synthetic.frames(cases, [], []))
     summarise(tmp_path, COMMAND, FOLDS)
-    row = read_summary(tmp_path / "study.json").methods["palpate"]
+    row = StudySummary.model_validate_json((tmp_path / "study.json").read_bytes()).methods["palpate"]
     assert row.auc is None
     assert row.rates.specificity.value == 1.0
     assert ("Not to be quoted" in (tmp_path / "study.html").read_text(encoding="utf-8")) == (behind < LEAST_EXAMINATIONS)
