@@ -91,14 +91,9 @@ def on_surface_tier(lump: Buried) -> float:
     return lumpy / plain
 
 
-def measure(lumps: tuple[Buried, ...] = FINITE_ELEMENTS) -> Array:
-    """Return the force ratios on the surface tier, shape (n,)."""
-    return np.array([on_surface_tier(lump) for lump in lumps])
-
-
-def section(found: Array | None = None) -> PageSection:
+def section() -> PageSection:
     """Return the comparison with its bounds."""
-    found = measure() if found is None else found
+    found = np.array([on_surface_tier(lump) for lump in FINITE_ELEMENTS])
     reference = {lump.lesion.model_dump_json(): lump.ratio for lump in FINITE_ELEMENTS}
     both = [(lump.ratio, reference[name]) for lump in ELASTIC_TIER if (name := lump.lesion.model_dump_json()) in reference]
     surface = np.log(found / [lump.ratio for lump in FINITE_ELEMENTS])

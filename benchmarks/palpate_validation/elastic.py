@@ -1,6 +1,6 @@
 """Validation of the elastic tier against Hertz and Sneddon: paraboloids and spheres pressed into a flat half-space."""
 
-from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -15,41 +15,19 @@ DEPTHS_M = np.array((2, 3, 5, 7, 10)) * 1e-3
 BOUND_PERCENT = 2.0
 
 
-@dataclass(frozen=True)
-class ElasticCurves:
-    """Forces [N] of the elastic tier, shapes (radii, depths)."""
-
-    paraboloid: Array
-    sphere: Array
-    hertz: Array
-    sneddon: Array
-
-
-def measure() -> ElasticCurves:
-    """Press the half-space at rest, between its vertices."""
+def section() -> PageSection:
+    """Press a half-space at rest, between its vertices; return the comparison with its bounds."""
     slab = FlatSlab(young_pa=HERTZ.young_pa)
-    between = (0.0004, 0.00025)
 
-    def press(profile: str) -> Array:
-        return np.array(
-            [[slab.press(r, float(d), between, profile).force_n for d in DEPTHS_M] for r in RADII_M]  # type: ignore[arg-type]
-        )
+    def press(profile: Literal["paraboloid", "sphere"]) -> Array:
+        return np.array([[slab.press(r, float(d), (0.0004, 0.00025), profile).force_n for d in DEPTHS_M] for r in RADII_M])
 
-    return ElasticCurves(
-        press("paraboloid"),
-        press("sphere"),
-        np.array([hertz_force(DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in RADII_M]),
-        np.array([[sneddon_force(float(d), r, HERTZ.young_pa, slab.poisson) for d in DEPTHS_M] for r in RADII_M]),
-    )
-
-
-def section(curves: ElasticCurves | None = None) -> PageSection:
-    """Return the comparison with its bounds."""
-    c = curves or measure()
-    by_hertz, by_sneddon = 100 * (c.paraboloid / c.hertz - 1), 100 * (c.sphere / c.sneddon - 1)
+    paraboloid, sphere = press("paraboloid"), press("sphere")
+    hertz = np.array([hertz_force(DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in RADII_M])
+    sneddon = np.array([[sneddon_force(float(d), r, HERTZ.young_pa, slab.poisson) for d in DEPTHS_M] for r in RADII_M])
+    by_hertz, by_sneddon = 100 * (paraboloid / hertz - 1), 100 * (sphere / sneddon - 1)
     at = int(np.argmin(np.abs(DEPTHS_M - 0.005)))
-    force = c.paraboloid[:, at]
-    power = float(np.polyfit(np.log(RADII_M), np.log(force), 1)[0])
+    power = float(np.polyfit(np.log(RADII_M), np.log(paraboloid[:, at]), 1)[0])
     checks = (
         Check("paraboloid, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_hertz).max()), "%", high=BOUND_PERCENT,
               against="Hertz"),
@@ -57,22 +35,29 @@ def section(curves: ElasticCurves | None = None) -> PageSection:
               against="Sneddon"),
         Check("exponent of the force in the radius", power, "", 0.48, 0.52, "Hertz: 0.5"),
         Check("sphere at 10 mm depth, R = 20 mm, against the paraboloid's law",
-              100 * float(c.sphere[2, -1] / c.hertz[2, -1] - 1), "%", against="Hertz"),
+              100 * float(sphere[2, -1] / hertz[2, -1] - 1), "%", against="Hertz"),
     )  # fmt: skip
     text = (
         "The elastic tier as a half-space of 10 kPa. Hertz's solution is for a paraboloid. The force of a "
         "sphere is some percent smaller at depths of half a radius, in agreement with Sneddon's solution."
     )
-    return PageSection("elastic", "Elastic tier on a flat half-space: Hertz", text, checks, lambda f: draw(f, c), (4.5, 2.8))
+    return PageSection(
+        "elastic",
+        "Elastic tier on a flat half-space: Hertz",
+        text,
+        checks,
+        lambda f: draw(f, paraboloid / hertz, sphere / sneddon),
+        (4.5, 2.8),
+    )
 
 
-def draw(figure: Figure, c: ElasticCurves) -> None:
+def draw(figure: Figure, paraboloid: Array, sphere: Array) -> None:
     """Draw force relative to theory against depth, for each radius."""
     axes = figure.subplots()
     mm = DEPTHS_M * 1e3
     for k, radius in enumerate(RADII_M):
-        axes.plot(mm, c.paraboloid[k] / c.hertz[k], "o-", color=COLOURS[k], ms=3, lw=1, label=f"R = {radius * 1e3:g} mm")
-        axes.plot(mm, c.sphere[k] / c.sneddon[k], "x--", color=COLOURS[k], ms=4, lw=0.7)
+        axes.plot(mm, paraboloid[k], "o-", color=COLOURS[k], ms=3, lw=1, label=f"R = {radius * 1e3:g} mm")
+        axes.plot(mm, sphere[k], "x--", color=COLOURS[k], ms=4, lw=0.7)
     axes.plot([], [], "o-", color=INK, ms=3, lw=1, label="paraboloid over Hertz")
     axes.plot([], [], "x--", color=INK, ms=4, lw=0.7, label="sphere over Sneddon")
     axes.axhspan(0.98, 1.02, color=QUIET, alpha=0.15, lw=0)

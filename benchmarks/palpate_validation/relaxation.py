@@ -33,64 +33,49 @@ WALL = Stiffness(length_m=ELASTIC.length_m, stiffening_per_m=0.0, friction=0.0)
 """The linear wall of `ELASTIC` with the default's relaxation."""
 
 
-@dataclass(frozen=True)
-class Relaxation:
-    """Force of a held contact over time, and the fitted series."""
-
-    time: Array
-    """[s], shape (n,)"""
-    ratio: Array
-    """Force relative to the instantaneous force, shape (n,)."""
-    g: Array
-    """Fitted relaxing fractions, shape (2,)."""
-    tau: Array
-    """Fitted time constants [s], shape (2,)."""
-
-
 def series(t: Array, g1: float, tau1: float, g2: float, tau2: float) -> Array:
     """Return F(t) / F0 = 1 - sum g (1 - exp(-t / tau)) of two branches."""
     return np.asarray(1 - g1 * (1 - np.exp(-t / tau1)) - g2 * (1 - np.exp(-t / tau2)))
 
 
-def measure(hold_s: float = SETUP.hold_s) -> Relaxation:
-    """Hold the sphere for `hold_s` [s] and fit the series to the force by least squares, starting from 1 s and 20 s."""
+def measure() -> tuple[Array, Array]:
+    """Hold the sphere; return times [s] and the force relative to the instantaneous one, shapes (n,)."""
     model = flat_phantom(SETUP.half_m)
     instantaneous = hold(WinklerTissue(model, ELASTIC), SETUP.depth_m, SETUP.radius_m)
     tissue = WinklerTissue(model, WALL)
     p = np.array((0.0, 0.0, SETUP.radius_m - SETUP.depth_m))
-    force = np.array([tissue.step(0.0, p, STILL, SETUP.radius_m)[0][2] for _ in range(round(hold_s / tissue.dt))])
+    force = np.array([tissue.step(0.0, p, STILL, SETUP.radius_m)[0][2] for _ in range(round(SETUP.hold_s / tissue.dt))])
     time = tissue.dt * np.arange(1, len(force) + 1)
-    keep = np.unique(np.geomspace(SETUP.from_s, hold_s, 400) / tissue.dt).astype(int) - 1
-    time, ratio = time[keep], force[keep] / instantaneous
-    (g1, tau1, g2, tau2), _ = curve_fit(series, time, ratio, p0=(0.2, 1.0, 0.2, 20.0))
-    order = np.argsort((tau1, tau2))
-    return Relaxation(time, ratio, np.array((g1, g2))[order], np.array((tau1, tau2))[order])
+    keep = np.unique(np.geomspace(SETUP.from_s, SETUP.hold_s, 400) / tissue.dt).astype(int) - 1
+    return time[keep], force[keep] / instantaneous
 
 
-def section(found: Relaxation | None = None) -> PageSection:
-    """Return the estimated series with its bounds."""
-    found = found or measure()
+def section() -> PageSection:
+    """Fit the series to the force by least squares, starting from 1 s and 20 s; return it with its bounds."""
+    time, ratio = measure()
+    fitted, _ = curve_fit(series, time, ratio, p0=(0.2, 1.0, 0.2, 20.0))
+    fractions, constants = fitted.reshape(2, 2)[np.argsort(fitted[1::2])].T
     checks = []
     for k, (g, tau) in enumerate(zip(WALL.prony_g, WALL.prony_tau_s, strict=True)):
-        checks.append(Check(f"relaxing fraction g{k + 1} read from the force", found.g[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
+        checks.append(Check(f"relaxing fraction g{k + 1} read from the force", fractions[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
         checks.append(
-            Check(f"time constant tau{k + 1} read from the force", found.tau[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
+            Check(f"time constant tau{k + 1} read from the force", constants[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
         )
     left = 1 - sum(WALL.prony_g)
-    checks.append(Check("remaining ratio", float(1 - found.g.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
+    checks.append(Check("remaining ratio", float(1 - fractions.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
     text = (
         f"A sphere of {SETUP.radius_m * 1e3:g} mm held {SETUP.depth_m * 1e3:g} mm deep for {SETUP.hold_s:g} s; two exponentials "
         "fitted to its force without access to the scenario. Displacements are held, so the force relaxes by the "
         "series of the material."
     )
-    return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, found), (4.5, 2.8))
+    return PageSection("relaxation", "Relaxation", text, tuple(checks), lambda f: draw(f, time, ratio), (4.5, 2.8))
 
 
-def draw(figure: Figure, found: Relaxation) -> None:
+def draw(figure: Figure, time: Array, ratio: Array) -> None:
     """Draw the force ratio over the logarithm of time, with the series of the scenario."""
     axes = figure.subplots()
-    axes.plot(found.time, found.ratio, ".", color=COLOURS[0], ms=3, label="tissue")
-    expected = series(found.time, WALL.prony_g[0], WALL.prony_tau_s[0], WALL.prony_g[1], WALL.prony_tau_s[1])
-    axes.plot(found.time, expected, color=INK, lw=0.8, label="Prony series of the scenario")
+    axes.plot(time, ratio, ".", color=COLOURS[0], ms=3, label="tissue")
+    expected = series(time, WALL.prony_g[0], WALL.prony_tau_s[0], WALL.prony_g[1], WALL.prony_tau_s[1])
+    axes.plot(time, expected, color=INK, lw=0.8, label="Prony series of the scenario")
     axes.set(xlabel="time [s]", ylabel="force over the instantaneous", xscale="log")
     axes.legend()
