@@ -25,11 +25,9 @@ from palpate_plugins import PluginError
 SCENARIO = load_scenario("clean", ["services.tissue=mine.py"])
 LOST, FAILED, BLOCKED = FailureCode.ROLE_LOST, FailureCode.ROLE_FAILED, FailureCode.BLOCKED
 ENDS = [
-    ("exit0", LOST, "left with status 0"),
     ("exit3", LOST, "left with status 3"),
     ("leave", FAILED, "SystemExit: 0"),
     ("crash", LOST, "killed by signal 11 (SIGSEGV)"),
-    ("kill", LOST, "killed by signal 9 (SIGKILL)"),
     ("hang", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
     ("spin", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
 ]
@@ -131,14 +129,14 @@ def test_an_interruption_is_that_of_the_child(tmp_path: Path, monkeypatch: pytes
     assert result.failure.code is FailureCode.INTERRUPTED
 
 
-@pytest.mark.parametrize("how", [how for how, *_ in ENDS])
+@pytest.mark.parametrize("how", ["exit0", "leave", "hang"])
 def test_separate_processes_name_it_too(how: str) -> None:
     rest = ("planning", *(role for role in ROLES if role not in ("tissue", "planning")))
     patience = Patience(foreign=frozenset({"tissue"}), foreign_step=2.0)
     outcome = run_toys(environment={"TOY_TISSUE_DOES": how}, patience=patience, groups=(("tissue",), rest))
     assert outcome.failure is not None
     assert "tissue" in outcome.failure.roles
-    assert outcome.failure.code in ((BLOCKED,) if how in ("hang", "spin") else (LOST, FAILED))
+    assert outcome.failure.code in ((BLOCKED,) if how == "hang" else (LOST, FAILED))
 
 
 EXITING = {

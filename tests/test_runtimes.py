@@ -262,21 +262,6 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
         close_session(session)
 
 
-def test_a_wall_clock_run_ends_at_the_announced_time() -> None:
-    outcome = run_toys(wallclock=True)
-    assert outcome.failure is None
-    assert outcome.sim_time_s * NS >= toy_services.END
-    steps = outcome.blame["control"]["steps"]
-    assert 0.1 * toy_services.END / MS < steps <= outcome.sim_time_s * NS / MS + 1, "a late service continues at the present tick"
-
-
-def test_a_wall_clock_run_without_exam_states_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("palpate_conductor.grants.EXAM_SILENT_S", 1.0)
-    monkeypatch.setattr("palpate_conductor.watchdog.RECENT_S", 0.0)  # a loaded machine may delay the conductor, too
-    outcome = run_toys(environment={"TOY_END_S": "30"}, wallclock=True, faults={"planning": ("exam/state", "drop", "0.5")})
-    assert_failed(outcome, FailureCode.EXAM_SILENT, "planning")
-
-
 def test_a_peer_with_another_definition_of_a_message_is_named_within_a_second() -> None:
     done: list[bool] = []
     tokens: list[NodeTokens] = []

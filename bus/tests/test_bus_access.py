@@ -82,13 +82,9 @@ def bus(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Bus]:
     [
         ("control", "robot", "control/joint_torque", True),
         ("robot", "control", "joint_states", True),
-        ("tissue", "dashboard", "truth/phantom", True),
         ("robot", VIEWER, "joint_states", True),
-        ("camera", "robot", "control/joint_torque", False),
         ("planning", "robot", "control/joint_torque", False),
         ("tissue", "planning", "truth/phantom", False),
-        ("tissue", "planning", "sim/contact_wrench", False),
-        ("robot", "assessment", "sim/tool_state", False),
         ("robot", VIEWER, "sim/tool_state", False),
     ],
 )

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import Annotated, NamedTuple
+from typing import Annotated
 
 import typer
 import zenoh
@@ -26,14 +26,6 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LINK_TIMEOUT_S = 1.0
 
 
-class ChosenBus(NamedTuple):
-    """The bus to join: endpoints, or a run, or by default the only run on this machine."""
-
-    connect: Sequence[str] | None = None
-    run: str | None = None
-    domain: int | None = None
-
-
 @dataclass(frozen=True)
 class Joined:
     """A zenoh session on the bus of a run."""
@@ -52,12 +44,12 @@ class Joined:
 
 
 @contextmanager
-def joined(chosen: ChosenBus) -> Iterator[Joined]:
-    """Join a bus for a `with` block. Ctrl-C ends the command with status 0.
+def joined(connect: Sequence[str] | None, run: str | None, domain: int | None) -> Iterator[Joined]:
+    """Join a bus for a `with` block: by endpoints, or of a run, by default the only one on this machine.
 
-    Raises UserError if there is no such bus.
+    Ctrl-C ends the command with status 0. Raises UserError if there is no such bus.
     """
-    target = find(*chosen)
+    target = find(connect, run, domain)
     try:
         with session(target.options) as bus:
             _wait_for_links(bus, target.options)

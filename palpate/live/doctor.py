@@ -13,7 +13,7 @@ from rich.text import Text
 
 from palpate.console import EXIT_TROUBLE, SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
 from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import Contract, contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.monitor import LiveMonitor
@@ -64,11 +64,7 @@ class Diagnosis:
 
     def as_json(self) -> dict[str, Any]:
         """Return the output of `--json`."""
-        topics = []
-        for row in self.topics:
-            facts = asdict(row)
-            facts["topic"] = row.topic.name
-            topics.append(facts)
+        topics = [{**asdict(row), "topic": row.topic.name} for row in self.topics]
         violations = [{**asdict(violation), "count": count} for violation, count in self.violations]
         findings = [asdict(finding) for finding in self.findings]
         return {"healthy": self.healthy, "findings": findings, "topics": topics, "violations": violations}
@@ -189,16 +185,16 @@ def _waiting(live: LiveMonitor) -> list[Remark]:
     """Report which service waits for which, from the services' own reports."""
     findings = []
     now = monotonic()
-    for role, report in sorted(live.reports.items()):
-        if now - report.received > SILENT_S:
-            findings.append(Remark("progress", Severity.WARN, f"{role} has not reported for {now - report.received:.0f} s"))
+    for role, (_, received) in sorted(live.reports.items()):
+        if now - received > SILENT_S:
+            findings.append(Remark("progress", Severity.WARN, f"{role} has not reported for {now - received:.0f} s"))
     if live.reports and live.monitor.time.progress == 0:
-        for role, report in sorted(live.reports.items()):
+        for role, (report, _) in sorted(live.reports.items()):
             wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for no service"
             findings.append(Remark("progress", Severity.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))
     elif live.reports:
-        slowest = min(live.reports, key=lambda role: live.reports[role].tick)
-        text = f"{len(live.reports)} services report; the last of them, {slowest}, is at {live.reports[slowest].tick / 1e9:.2f} s"
+        slowest = min((report for report, _ in live.reports.values()), key=lambda report: report.tick)
+        text = f"{len(live.reports)} services report; the last of them, {slowest.role}, is at {slowest.tick / 1e9:.2f} s"
         findings.append(Remark("progress", Severity.OK, text))
     return findings
 
@@ -224,7 +220,7 @@ def doctor(
         live_runs()
         wide_console().print("\n".join(f"removed {path}" for path in left) or "nothing left of killed runs", highlight=False)
         return
-    with joined(ChosenBus(connect, run, domain)) as bus:
+    with joined(connect, run, domain) as bus:
         if watch:
             _watch(_monitor(bus), as_json)
         with SteadyConsole(stderr=True).status(f"listening for {seconds:g} s"):
@@ -249,20 +245,13 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
             for violation in live.poll():
                 after_s = monotonic() - began
                 if as_json:
-                    print_line({"after_s": round(after_s, 3), **_facts(violation)})
+                    print_line({"after_s": round(after_s, 3), **asdict(violation)})
                 else:
                     line = Text.assemble((f"{after_s:8.2f} s", "dim"), "  ", (str(violation), "red"))
                     wide_console().print(line, soft_wrap=True)
             sleep(POLL_S)
     finally:
         live.close()
-
-
-def _facts(violation: Violation) -> dict[str, str]:
-    return {
-        "topic": violation.topic, "sender": violation.sender, "kind": str(violation.kind), "field": violation.field,
-        "expected": violation.expected, "got": violation.got,
-    }  # fmt: skip
 
 
 def _print(diagnosis: Diagnosis) -> None:

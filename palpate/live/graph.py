@@ -8,7 +8,7 @@ import typer
 from rich.text import Text
 
 from palpate.console import print_json, table, wide_console
-from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, Joined, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import Contract, contract
 from palpate_bus.runs.announcement import Run
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
@@ -23,7 +23,6 @@ class LiveTopic:
     """(type, hash) of its endpoints; more than one is a mismatch."""
     publishers: list[str] = field(default_factory=list)
     subscribers: list[str] = field(default_factory=list)
-    qos: set[str] = field(default_factory=set)
 
 
 @dataclass
@@ -68,11 +67,7 @@ def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:
             continue
         topic = by_name.setdefault(end.topic, LiveTopic(end.topic))
         topic.types.add((end.type, end.type_hash))
-        if entity.kind is EntityKind.PUBLISHER:
-            topic.publishers.append(entity.node)
-            topic.qos.add(end.qos)
-        else:
-            topic.subscribers.append(entity.node)
+        (topic.publishers if entity.kind is EntityKind.PUBLISHER else topic.subscribers).append(entity.node)
     return dict(sorted(by_name.items()))
 
 
@@ -123,7 +118,7 @@ def _group() -> None:
 @app.command("list")
 def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
-    with joined(ChosenBus(connect, run, domain)) as bus:
+    with joined(connect, run, domain) as bus:
         found = present(bus)
         rules = contract()
         absent = missing(rules, found, bus.target.run)

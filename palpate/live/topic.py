@@ -17,7 +17,7 @@ from rich.text import Text
 
 from palpate.console import SteadyConsole, bandwidth, print_json, print_line, say, table, wide_console
 from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenBus, ChosenRun, Connect, Domain, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
@@ -43,7 +43,7 @@ Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop af
 @app.command("list")
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
-    with joined(ChosenBus(connect, run, domain)) as bus:
+    with joined(connect, run, domain) as bus:
         found = graph.topics(graph.present(bus))
     if as_json:
         print_json([_topic_row(topic) for topic in found.values()])
@@ -65,7 +65,7 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
 def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
     name = name.strip("/")
-    with joined(ChosenBus(connect, run, domain)) as bus:
+    with joined(connect, run, domain) as bus:
         found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
     row = contract().topics.get(name)
     if not found and row is None:
@@ -106,7 +106,7 @@ def echo(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Print the messages of a topic as they arrive."""
     left = 1 if once else count
-    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
+    with _subscribed(name, connect, run, domain) as (topic, reader):
         for received in _until(reader, seconds):
             value = plain(_message(received, topic), full=full or as_json, path=field)
             if as_json:
@@ -128,7 +128,7 @@ def hz(
     seconds: Seconds = None,
 ) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
-    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
+    with _subscribed(name, connect, run, domain) as (topic, reader):
         spacing = Spacing()
         for received in _each_period(reader, seconds):
             for message in received:
@@ -148,7 +148,7 @@ def bw(
     seconds: Seconds = None,
 ) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
-    with _subscribed(name, ChosenBus(connect, run, domain)) as (topic, reader):
+    with _subscribed(name, connect, run, domain) as (topic, reader):
         window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
         for received in _each_period(reader, seconds):
             window.append([len(message.payload) for message in received])
@@ -234,9 +234,9 @@ class Spacing:
 
 
 @contextmanager
-def _subscribed(name: str, chosen: ChosenBus) -> Iterator[tuple[Topic, TopicReader]]:
+def _subscribed(name: str, connect: list[str] | None, run: str | None, domain: int | None) -> Iterator[tuple[Topic, TopicReader]]:
     """Join the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
-    with joined(chosen) as bus:
+    with joined(connect, run, domain) as bus:
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:

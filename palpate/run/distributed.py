@@ -7,7 +7,7 @@ from time import perf_counter
 from palpate.run.group import Groups, one_per_process
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
-from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, override_files, read_processes
+from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, write_scenario_files
 from palpate_bus import implementations
 from palpate_bus.settings import Settings
@@ -43,7 +43,7 @@ def run_distributed(
     absent = absent or Absent((), 0.0, lambda _: None)
     roles = (*workers(scenario), *observers)
     absent.check(roles)
-    processes = read_processes(compose_file(), roles, override_files())
+    processes = read_processes(compose_file(), roles)
     started = [process for role, process in processes.items() if role not in absent.roles]
     groups = groups or one_per_process(roles)
     for process in started:

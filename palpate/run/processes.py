@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from contextlib import AbstractContextManager, suppress
+from contextlib import AbstractContextManager, ExitStack, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import monotonic
@@ -60,24 +60,17 @@ class SecureBus:
 
     def __enter__(self) -> Self:
         """Start the router. Raises BusConfigError."""
-        try:
+        with ExitStack() as stack:
             if self._own is not None:
+                stack.callback(self._own.remove)
                 init(self.keys, days=2)
             options = BusOptions(mode="router", listen=(self.endpoint,), tls=self.keys / ROUTER)
-            self._router = open_session(options, access_control(contract()))
-        except BaseException:
-            self._remove_own_keys()
-            raise
+            stack.callback(close_session, open_session(options, access_control(contract())))
+            self._close = stack.pop_all().close
         return self
 
     def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
-        close_session(self._router)
-        self._remove_own_keys()
-
-    def _remove_own_keys(self) -> None:
-        """Remove keys that were made for this run alone."""
-        if self._own is not None:
-            self._own.remove()
+        self._close()
 
 
 COMPOSE = "docker-compose.yml"
@@ -108,11 +101,6 @@ class ServiceProcess:
         return self.words
 
 
-def override_files() -> tuple[Path, ...]:
-    """Return the overrides that PALPATE_COMPOSE names after the compose file, separated as in a PATH."""
-    return Settings.read().compose[1:]
-
-
 def compose_file() -> Path:
     """Return the compose file: PALPATE_COMPOSE, else that of the checkout or of the installed package. Raises UserError."""
     package = Path(__file__).resolve().parents[1]
@@ -123,14 +111,15 @@ def compose_file() -> Path:
     raise UserError(f"no {COMPOSE} found; looked for {', '.join(map(str, candidates))}. Set PALPATE_COMPOSE")
 
 
-def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] = ()) -> dict[str, ServiceProcess]:
+def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path] | None = None) -> dict[str, ServiceProcess]:
     """Return the processes of `roles`, in that order, from a compose file and overrides, merged as by `docker compose -f -f`:
-    a later file replaces the command and adds to the environment.
+    a later file replaces the command and adds to the environment. By default the overrides are the files that PALPATE_COMPOSE
+    names after the first.
 
     Raises UserError naming what is missing or malformed.
     """
     found: dict[str, ServiceProcess] = {}
-    for file in (path, *overrides):
+    for file in (path, *(Settings.read().compose[1:] if overrides is None else overrides)):
         services = _services(file)
         for role in roles:
             service = services.get(role)

@@ -15,7 +15,7 @@ Samples wait in channels until `poll`, which the owner calls often. Each produce
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from time import monotonic, time_ns
 from typing import Any
 
@@ -253,18 +253,6 @@ WALL_CLOCK_TICK = 10**17
 """A grant beyond this [ns] is a wall time: the common start of a wall-clock run."""
 
 
-@dataclass(frozen=True)
-class RoleReport:
-    """The last report of a service."""
-
-    state: int
-    tick: int
-    """Last finished tick [ns]."""
-    waiting_for: str
-    received: float
-    """By the monotonic clock [s]."""
-
-
 class LiveMonitor:
     """A `Monitor` on a bus, for all topics or for `topics` only; see `listen`."""
 
@@ -273,7 +261,8 @@ class LiveMonitor:
     ) -> None:
         self.monitor = Monitor(rules, rate)
         self.graph = GraphWatch(session, domain)
-        self.reports: dict[str, RoleReport] = {}
+        self.reports: dict[str, tuple[ServiceReport, float]] = {}
+        """By role, its last report and when it was received, by the monotonic clock [s]."""
         self.offsets: dict[str, float] = {}
         """Smallest age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
@@ -335,7 +324,7 @@ class LiveMonitor:
             except codec.CodecError:
                 continue
             if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
-                self.reports[message.role] = RoleReport(message.state, int(message.tick), message.waiting_for, now)
+                self.reports[message.role] = message, now
 
 
 class _Listener:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import hashlib
 import struct
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from time import perf_counter_ns
 
@@ -234,10 +234,6 @@ class TickInbox:
             return []
         return [self._decode(buffer, one) if one.message is None else one.message for one in buffer.new]
 
-    def raw(self, topic: str) -> Sequence[Packet]:
-        """Return the messages since the step before, undecoded."""
-        return self._buffers[topic].new
-
     def stamp(self, topic: str) -> int | None:
         """Return the simulated time [ns] of the newest message."""
         latest = self._buffers[topic].latest
@@ -340,16 +336,7 @@ class Stepper:
 
         Raises LockstepError if a periodic message is missing or is sent off its tick.
         """
-        blame = self.blame
-        begin, decoded, encoded = perf_counter_ns(), blame.decode, blame.encode
-        sent: list[Sent] = []
-        for outbox in self._outboxes(t):
-            stepped = perf_counter_ns()
-            sent += self._pack(outbox, t)
-            blame.encode += perf_counter_ns() - stepped
-        self._close(t)
-        blame.compute += perf_counter_ns() - begin - (blame.decode - decoded) - (blame.encode - encoded)
-        return sent
+        return [one for part in self.parts(t) for one in part]
 
     def parts(self, t: int) -> Iterator[list[Sent]]:
         """As `step`, but yields the messages of each part of the step before the next is computed."""
