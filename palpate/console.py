@@ -234,21 +234,20 @@ class CaseDisplay(Progress):
 
 
 class TimeLeft(Progress):
-    """A bar from `begin` to `end`, in any unit, for a `with` block; nothing if standard error is not a terminal."""
+    """A bar from `begin` to `end`, in any unit, for a `with` block; nothing if standard error is not a terminal.
 
-    def __init__(self, description: str, begin: float, end: float) -> None:
+    `where` gives the position and `doing` the text at each refresh, ten times per second.
+    """
+
+    def __init__(self, doing: Callable[[], str], where: Callable[[], float], begin: float, end: float) -> None:
         console = SteadyConsole(stderr=True)
-        columns = (TextColumn(description), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
+        columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=10.0)
-        self._begin = self._reached = begin
-        self._shown = self.add_task(description, total=end - begin)
-
-    def reach(self, where: float) -> None:
-        """Set the position. Cheap: the bar is drawn ten times per second only."""
-        self._reached = where
+        self._doing, self._where, self._begin = doing, where, begin
+        self._shown = self.add_task(doing(), total=end - begin)
 
     def get_renderables(self) -> Iterable[RenderableType]:
         """Update the bar; rich calls this at each refresh."""
         if self.task_ids:  # rich draws before the task exists, too
-            self.update(self._shown, completed=self._reached - self._begin)
+            self.update(self._shown, completed=self._where() - self._begin, description=self._doing())
         yield from super().get_renderables()

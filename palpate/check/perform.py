@@ -5,20 +5,18 @@ import shlex
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from pathlib import Path
 
 import typer
-from rich.console import RenderableType
-from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.text import Text
 
 from palpate.apart import guarded, shared_numbers
 from palpate.check.live_rig import LiveRig
 from palpate.check.rig import ConformanceReport, Rig, RigSettings, ServiceRig, Verdict
 from palpate.check.suites import SUITES, check
-from palpate.console import SteadyConsole, table, wide_console
+from palpate.console import TimeLeft, table, wide_console
 from palpate_bus import implementations
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.announcement import NoBus
@@ -59,25 +57,10 @@ def started(command: str | None, role: str, settings: RigSettings, endpoint: str
                         child.wait(timeout=5)
 
 
-class CheckDisplay(Progress):
-    """A bar that follows the clock of a rig, for a `with` block; nothing without a terminal."""
-
-    def __init__(self, rig: Rig) -> None:
-        """Read the rig about ten times a second while the suite runs."""
-        console = SteadyConsole(stderr=True)
-        text = TextColumn("{task.description}, {task.fields[checks]} checks")
-        columns = (SpinnerColumn(), text, BarColumn(bar_width=30), TimeRemainingColumn())
-        super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal)
-        self._rig = rig
-        self._shown = self.add_task(rig.role.name, total=SUITES[rig.role.name][1], checks=0)
-
-    def get_renderables(self) -> Iterable[RenderableType]:
-        """Update the task and return what to draw; rich calls it at each refresh."""
-        if self.task_ids:  # rich also draws before there is a task
-            about = f"{self._rig.role.name}: {self._rig.report.group}"
-            checks = len(self._rig.report.results)
-            self.update(self._shown, completed=self._rig.t / NS, description=about, checks=checks)
-        yield from super().get_renderables()
+def _shown(rig: Rig) -> TimeLeft:
+    """Return a bar that follows the clock of a rig."""
+    role, report = rig.role.name, rig.report
+    return TimeLeft(lambda: f"{role}: {report.group}, {len(report.results)} checks", lambda: rig.t / NS, 0.0, SUITES[role][1])
 
 
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED: "dim"}
@@ -91,7 +74,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
 
     def perform() -> ConformanceReport:
         rig = ServiceRig(implementations.create(role, choice, settings.scenario), settings, steps)
-        with CheckDisplay(rig):
+        with _shown(rig):
             return check(rig)
 
     limits = Settings.read()
@@ -110,7 +93,7 @@ def check_live(
         try:
             with started(start, role, settings, where, domain):
                 rig.await_implementation(wait)
-                with CheckDisplay(rig):
+                with _shown(rig):
                     check(rig)
                     rig.finish()
         finally:

@@ -8,7 +8,7 @@ outputs are those for the rounded inputs, so on one platform a reference differs
 import logging
 import math
 import tempfile
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, MutableSequence
 from dataclasses import dataclass, fields, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
@@ -220,14 +220,13 @@ def _scenario_near(path: Path, role: str) -> str:
     raise RecordingError(f"{path}: no {name} in it or next to it; {role} needs the scenario of the run: --scenario FILE")
 
 
-def replay_service(
-    case: GoldenCase, tolerance: Tolerance, progress: Callable[[int], None] = lambda _: None
-) -> dict[str, TopicResult]:
-    """Re-runs the service and compares all its messages; calls `progress` with the stamp of each [ns]."""
+def replay_service(case: GoldenCase, tolerance: Tolerance, reached: MutableSequence[int] | None = None) -> dict[str, TopicResult]:
+    """Re-runs the service and compares all its messages; the stamp of each [ns] is written into `reached`."""
 
     def sent() -> Iterator[RecordedMessage]:
         for message in rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end):
-            progress(message.stamp)
+            if reached is not None:
+                reached[0] = message.stamp
             yield message
 
     expected = case.recording.messages(case.outputs, end=case.end)
@@ -271,13 +270,8 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
 
     def perform() -> dict[str, TopicResult]:
         case = prepare(file, service, scenario)
-        with TimeLeft(f"running {role} again", 0, case.end) as bar:
-
-            def progress(t: int) -> None:
-                reached[0] = t
-                bar.reach(t)
-
-            return replay_service(case, allowed, progress)
+        with TimeLeft(lambda: f"running {role} again", lambda: reached[0], 0, case.end):
+            return replay_service(case, allowed, reached)
 
     results = guarded(f"--service {service}", perform, Settings.read().start_limit_s, place=lambda: (reached[0],))
     if as_json:

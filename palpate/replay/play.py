@@ -105,18 +105,12 @@ class Player:
             if acting and not self._drive:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
-    def play(
-        self,
-        start: int = 0,
-        until: int | None = None,
-        progress: Callable[[int], None] = lambda _: None,
-        gap: Callable[[float], None] = lambda _: None,
-    ) -> None:
+    def play(self, start: int = 0, until: int | None = None, gap: Callable[[float], None] = lambda _: None) -> None:
         """Play from `start` to `until` [ns after the origin].
 
         It begins with the last earlier message of each topic that is not periodic.
 
-        Calls `progress` with the stamp of each message [ns], and `gap` with the time [s] until the next one if that is long.
+        Calls `gap` with the time [s] until the next message if that is long.
 
         Raises UserError if a service appears that sends a topic that is played, or would act on it.
         """
@@ -136,7 +130,6 @@ class Player:
                 self._tick()
             self._wait(epoch + round((message.stamp - start) / self._rate))
             self.now = message.stamp - self.origin
-            progress(self.now)
             self._publishers[message.topic].put(message.payload, max(message.sequence, 1))
             self.sent += 1
 
@@ -226,8 +219,8 @@ def play(
         if start > last:
             raise UserError(f"--from {start / NS:g}: {file} ends at {last / NS:.3f} s")
         try:
-            with TimeLeft("playing", start, last if end is None else min(end, last)) as bar:
-                player.play(start, end, bar.reach, lambda s: console.print(f"no message for the next {s:.0f} s", highlight=False))
+            with TimeLeft(lambda: "playing", lambda: player.now, start, last if end is None else min(end, last)):
+                player.play(start, end, lambda s: console.print(f"no message for the next {s:.0f} s", highlight=False))
             if not player.sent:
                 raise RunError(f"{file}: played no message: it has none in the part that was chosen")
             console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, at most {player.lag_ms:.1f} ms late")

@@ -251,8 +251,7 @@ def test_only_roles_that_the_run_has_are_missed() -> None:
 
 
 def test_the_bar_follows_the_position_and_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with TimeLeft("playing", 10.0, 30.0) as bar:
-        bar.reach(15.0)
+    with TimeLeft(lambda: "playing", lambda: 15.0, 10.0, 30.0) as bar:
         list(bar.get_renderables())
         assert bar.tasks[0].percentage == pytest.approx(25.0)
     assert capsys.readouterr().err == ""
