@@ -51,10 +51,8 @@ def test_wall_clock_neither_waits_long_nor_uses_the_low_latency_transport() -> N
 @pytest.mark.parametrize(
     ("environment", "message"),
     [
-        ({"PALPATE_MODE": "boss"}, "PALPATE_MODE is 'boss'; allowed: peer, client, router"),
         ({"PALPATE_MODE": "client"}, "neither PALPATE_ROUTER nor PALPATE_CONNECT"),
         ({"PALPATE_LISTEN": "7447"}, "endpoint '7447' is not <protocol>/<address>"),
-        ({"PALPATE_LOWLATENCY": "maybe"}, "PALPATE_LOWLATENCY is 'maybe'; allowed: 0, 1"),
         ({"PALPATE_CONNECT": "unixsock-stream/" + "x" * 120}, "at most 107 bytes; choose a shorter folder"),
     ],
 )
@@ -97,9 +95,9 @@ def test_a_port_in_use_has_a_message_of_one_line() -> None:
 @pytest.mark.parametrize(
     ("lowlatency", "size"),
     [
-        *((ends, size) for ends in ((), ("a",)) for size in (1, 60_000, 1_300_000)),
+        *((ends, 1_300_000) for ends in ((), ("a",))),
         # The low-latency transport has no fragments: only what fits into one message is sure to arrive.
-        *((("a", "b"), size) for size in (1, 60_000)),
+        (("a", "b"), 60_000),
     ],
 )
 def test_a_mesh_carries_messages_of_every_size(tmp_path: Path, lowlatency: tuple[str, ...], size: int) -> None:
@@ -181,12 +179,6 @@ def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:
     assert "panic" not in error
 
 
-def test_closing_twice_is_harmless() -> None:
-    opened = open_session(BusOptions())
-    assert close_session(opened)
-    assert close_session(opened)
-
-
 @pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")
 def test_a_closed_session_keeps_no_shared_memory(tmp_path: Path) -> None:
     """Otherwise each examination in a process would leak 17 MB."""
@@ -265,6 +257,7 @@ def test_process_reads_its_own_environment_and_a_child_gets_changes(monkeypatch:
     ("name", "value", "allowed"),
     [
         ("PALPATE_MODE", "star", "peer, client, router"),
+        ("PALPATE_LOWLATENCY", "maybe", "0, 1"),
         ("PALPATE_RUNTIME", "fast", "lockstep, wallclock"),
         ("PALPATE_RECORD", "maybe", "none, normal, full"),
         ("PALPATE_RECORD_FILE_MB", "0", "a whole number from 1"),

@@ -18,6 +18,7 @@ from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.announcement import NoBus
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
 from palpate_bus.runtime.member import Member
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch, gid
 from palpate_bus.wire.rmw import AttachmentWriter, topic_key
@@ -40,7 +41,6 @@ class ProtocolTiming:
 
 
 TIMING = ProtocolTiming()
-CONTROL, REPORT = "palpation_msgs/msg/RunControl", "palpation_msgs/msg/ServiceReport"
 
 
 class LiveRig(Rig):
@@ -57,8 +57,8 @@ class LiveRig(Rig):
         transport = Transport(session)
         self._members = {name: Member(session, name, self.rules, domain, transport) for name in sorted(producers)}
         self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.rules.inputs(role)}
-        self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL, "event")
-        self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT)
+        self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL_TYPE, "event")
+        self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
         self._readers = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
@@ -176,7 +176,7 @@ class LiveRig(Rig):
         received = []
         while (sample := self._reports.get(0)) is not None:
             try:
-                message = codec.decode(sample.payload, REPORT)
+                message = codec.decode(sample.payload, REPORT_TYPE)
             except codec.CodecError as error:
                 self.undecodable.append(f"palpate/report: {error}")
                 continue
@@ -192,7 +192,7 @@ class LiveRig(Rig):
         self._last_control = monotonic()
         self._sequences["control"] += 1
         message = RunControl(command, tick, last, role, reason)
-        self._control.put(codec.encode(message, CONTROL), self._sequences["control"])
+        self._control.put(codec.encode(message, CONTROL_TYPE), self._sequences["control"])
 
     # -- the rig
 

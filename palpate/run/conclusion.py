@@ -44,8 +44,10 @@ def conclude(
         print_line({"folder": str(folder), **report.model_dump(mode="json")})
     else:
         print_findings(SteadyConsole(), report)
-    for sentence in _contract_violations(result):
-        say(f"{sentence}; see docs/topics.md, and palpate check assessment")
+    last = {"assessment/map": result.collected.stiffness_map, "assessment/findings": result.collected.findings}
+    for name, message in last.items():  # such as a confidence of 80
+        for sentence in [] if message is None else violations(contract().topics[name], message):
+            say(f"{sentence}; see docs/topics.md, and palpate check assessment")
     if page is not None and (trouble or not quiet):
         megabytes = megabytes_of(page.parent)
         size = f"{megabytes:.0f} MB" if megabytes >= 1 else "under 1 MB"
@@ -69,13 +71,6 @@ def _hold_text(result: RunResult) -> str:
     if failure is not None and failure.code is FailureCode.GAVE_UP and exam is not None and exam.reason in HOLD_REASONS:
         return ""
     return f"; the arm has been held since {nanoseconds(changes[-1].header.stamp) / NS:.3f} s: {changes[-1].reason}"
-
-
-def _contract_violations(result: RunResult) -> list[str]:
-    """Return a sentence for each violation of the contract in the last map and findings, such as a confidence of 80."""
-    topics, collected = contract().topics, result.collected
-    last = {"assessment/map": collected.stiffness_map, "assessment/findings": collected.findings}
-    return [fault for name, message in last.items() if message is not None for fault in violations(topics[name], message)]
 
 
 def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:

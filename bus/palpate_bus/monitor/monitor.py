@@ -95,7 +95,8 @@ class Monitor:
             if publishes:
                 self._publishers.setdefault(topic.name, set()).add(entity.node)
                 self._since.setdefault((topic.name, entity.node), now)
-                self._check_sender(topic, entity.node, now)
+                if entity.node != topic.producer and not topic.open:
+                    self._note(topic, entity.node, Kind.SENDER, f"{topic.producer} only", f"a publisher of {entity.node}", now)
             if (described.type, described.type_hash) != (topic.type, topic.type_hash):
                 self._note(topic, entity.node, Kind.TYPE, _type(topic.type, topic.type_hash),
                            f"{_type(described.type, described.type_hash)}{'' if publishes else ' wanted'}", now)  # fmt: skip
@@ -163,8 +164,9 @@ class Monitor:
         passed = [stream.passed() for stream in streams]
         seconds = max((p.seconds for p in passed), default=0.0)
         kept = self._kept.get(topic.name)
-        if kept is not None and seconds < TUNING.grace_s:
-            return self._kept_health(kept)
+        if kept is not None and seconds < TUNING.grace_s:  # as of its last subscription, with its present senders
+            senders = sorted(self._publishers.get(topic.name, set()))
+            return replace(kept, senders=tuple(senders), violations=self._violations(topic))
         messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
         own = [p.messages * 1e9 / p.stamps for p in passed if p.stamps]
         senders = sorted({stream.sender for stream in streams} | self._publishers.get(topic.name, set()))
@@ -182,11 +184,6 @@ class Monitor:
             topic.name in self.listening,
         )  # fmt: skip
 
-    def _kept_health(self, kept: TopicHealth) -> TopicHealth:
-        """Return a topic as of its last subscription, with its present senders and violations."""
-        senders = tuple(sorted(self._publishers.get(kept.topic.name, set())))
-        return replace(kept, senders=senders, violations=self._violations(kept.topic))
-
     def _violations(self, topic: Topic) -> int:
         return sum(seen.count for key, seen in self.active.items() if key[0] == topic.name)
 
@@ -196,20 +193,13 @@ class Monitor:
         return self._nodes.get(gid, f"unknown sender {gid.hex()[:8]}")
 
     def _note(self, topic: Topic, sender: str, kind: Kind, expected: str, got: str, now: float, path: str = "") -> None:
-        key = (topic.name, sender, kind, path)
-        seen = self.active.get(key)
-        if seen is not None:
-            seen.last = now
-            seen.count += 1
-            seen.violation = Violation(topic.name, sender, kind, expected, got, path)
-            return
-        violation = Violation(topic.name, sender, kind, expected, got, path)
-        self.active[key] = SeenViolation(violation, now, now)
-        self._news.append(violation)
-
-    def _check_sender(self, topic: Topic, sender: str, now: float) -> None:
-        if sender != topic.producer and not topic.open:
-            self._note(topic, sender, Kind.SENDER, f"{topic.producer} only", f"a publisher of {sender}", now)
+        key, violation = (topic.name, sender, kind, path), Violation(topic.name, sender, kind, expected, got, path)
+        if key in self.active:
+            seen = self.active[key]
+            seen.violation, seen.last, seen.count = violation, now, seen.count + 1
+        else:
+            self.active[key] = SeenViolation(violation, now, now)
+            self._news.append(violation)
 
     def _check_sequence(self, topic: Topic, stream: Stream, sequence: int, now: float) -> None:
         missing = sequence - stream.sequence - 1

@@ -116,16 +116,13 @@ def matching(chosen: str | None) -> list[Run]:
     return [run for run in live() if chosen is None or chosen == str(run.pid) or chosen in run.name]
 
 
-def _is_announcement(path: Path) -> bool:
-    """Return True if the name is that of an announcement: a folder of PALPATE_RUNS may contain other files."""
-    return re.fullmatch(r"\d+-\d+\.json", path.name) is not None
-
-
 def live() -> list[Run]:
     """Return the active runs of this user on this machine, oldest first. Removes files of killed runs."""
     remove_leftovers()
     runs = []
-    for path in filter(_is_announcement, folder().iterdir()):
+    for path in folder().iterdir():
+        if not re.fullmatch(r"\d+-\d+\.json", path.name):  # a folder of PALPATE_RUNS may contain other files
+            continue
         with suppress(OSError, ValueError, TypeError), path.open(encoding="utf-8") as file:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)

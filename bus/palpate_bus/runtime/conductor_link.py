@@ -24,6 +24,7 @@ log = logging.getLogger(__name__)
 CONDUCTOR: Final = "conductor"
 HEARTBEAT: Final = "palpate/heartbeat"
 CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
+REPORT_TYPE: Final = "palpation_msgs/msg/ServiceReport"
 
 
 @dataclass(frozen=True)
@@ -182,8 +183,8 @@ class Reports:
 
     def __init__(self, member: Member) -> None:
         self._member = member
-        self._publisher = member.internal_publisher(f"palpate/report/{member.role}", "palpation_msgs/msg/ServiceReport", "event")
-        self._encode = codec.encoder("palpation_msgs/msg/ServiceReport")
+        self._publisher = member.internal_publisher(f"palpate/report/{member.role}", REPORT_TYPE, "event")
+        self._encode = codec.encoder(REPORT_TYPE)
         self._sequence = 0
         self._last = 0.0
 

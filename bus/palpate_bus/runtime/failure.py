@@ -110,12 +110,9 @@ class Failure:
 
 
 def _own_line(error: BaseException) -> str:
-    lines = [(frame.f_code.co_filename, line) for frame, line in walk_tb(error.__traceback__) if _is_own(frame.f_globals)]
-    return f"{lines[-1][0]}, line {lines[-1][1]}: " if lines else ""
-
-
-def _is_own(names: Mapping[str, Any]) -> bool:
-    return str(names.get("__name__", "")).startswith(USER_MODULE)
+    frames = [(frame, line) for frame, line in walk_tb(error.__traceback__)]
+    own = [(f.f_code.co_filename, line) for f, line in frames if str(f.f_globals.get("__name__", "")).startswith(USER_MODULE)]
+    return f"{own[-1][0]}, line {own[-1][1]}: " if own else ""
 
 
 def invalid_inputs(buffers: Iterable[InputBuffer]) -> dict[str, str]:

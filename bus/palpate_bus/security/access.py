@@ -17,7 +17,7 @@ import sys
 from collections.abc import Sequence
 from typing import Any
 
-from palpate_bus.contract import Contract, Internal, Visibility, contract
+from palpate_bus.contract import Contract, Visibility, contract
 from palpate_bus.wire.liveliness import ADMIN_SPACE
 from palpate_bus.wire.rmw import hello_key
 
@@ -72,14 +72,16 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     access = _Rules()
     presence = (_TOKEN, _WATCH)
     data = (_PUT + _TOKEN, _GET + _WATCH)  # an advanced publisher has a token below its key
+    internal = list(rules.internal.values())
     for role in rules.roles:
         sends = [key for topic in rules.outputs(role) for key in _keys(topic.name)]
-        sends += [key for row in rules.internal.values() for key in _internal_sent(row, role)]
+        sends += [key for row in internal if row.producer in ("any", role) for key in _keys(row.name.replace("<role>", role))]
         gets = [key for topic, _ in rules.inputs(role) for key in _keys(topic.name)]
-        gets += [key for row in rules.internal.values() for key in _internal_got(row, role)]
+        gets += [key for row in internal if row.readers in ("any", role) for key in _keys(row.name.replace("<role>", "*"))]
         access.allow(role, "sends", sends, True, data)
         access.allow(role, "gets", gets, False, data)
-        access.allow(role, "lives", _tokens(role), True, presence)
+        tokens = [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]  # of its node, publishers and subscriptions, see `liveliness`
+        access.allow(role, "lives", tokens, True, presence)
     shown = public(rules)
     access.allow(WATCHER, "watches", [key for name in shown for key in _keys(name)], False, data)
     for guest in (VIEWER, OPERATOR):
@@ -115,29 +117,6 @@ def _keys(topic: str) -> list[str]:
     return [key, hello_key(key), f"{key}/@adv/**"]
 
 
-def _internal_sent(row: Internal, role: str) -> list[str]:
-    """Return the keys of a runtime message that `role` may send."""
-    if row.producer not in ("any", role):
-        return []
-    return _keys(row.name.replace("<role>", role))
-
-
-def _internal_got(row: Internal, role: str) -> list[str]:
-    """Return the keys of a runtime message that `role` may receive, from any sender."""
-    if row.readers not in ("any", role):
-        return []
-    return _keys(row.name.replace("<role>", "*"))
-
-
-def _tokens(role: str) -> list[str]:
-    """Return the liveliness tokens of a role's node, publishers and subscriptions (see `liveliness`)."""
-    return [f"{ADMIN_SPACE}/*/*/*/*/*/*/*/{role}/**"]
-
-
 if __name__ == "__main__":
-    json.dump(
-        {"access_control": access_control(contract(), "usernames" if "--users" in sys.argv[1:] else "cert_common_names")},
-        sys.stdout,
-        indent=2,
-    )
-    print()
+    by = "usernames" if "--users" in sys.argv[1:] else "cert_common_names"
+    print(json.dumps({"access_control": access_control(contract(), by)}, indent=2))

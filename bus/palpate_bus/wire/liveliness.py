@@ -234,16 +234,3 @@ def mismatches(entities: Iterable[Entity]) -> list[str]:
                     f"wants {wanted.type} {wanted.type_hash}; both need the same message definitions"
                 )
     return sorted(found)
-
-
-def entities(session: zenoh.Session, domain: int, timeout: float = 1.0) -> list[Entity]:
-    """Return the present entities, sorted by token; waits up to `timeout` [s] for the answers."""
-    found = {}
-    for reply in session.liveliness().get(f"{ADMIN_SPACE}/{domain}/**", timeout=timeout):
-        if reply.ok is not None:
-            token = str(reply.ok.key_expr)
-            try:
-                found[token] = parse_token(token)
-            except WireError:
-                continue
-    return [found[token] for token in sorted(found)]

@@ -261,18 +261,14 @@ class Transport:
 
     def tagger(self, key: str) -> Tagger | None:
         """Return the tagger for the messages of a key; None if they carry no tags."""
-        name = parse_key(key).topic
-        tagged = contract().tagged(name) and (self._tags or _is_open(name))
+        name, topics = parse_key(key).topic, contract().topics
+        tagged = contract().tagged(name) and (self._tags or (name in topics and topics[name].open))
         return Tagger(self.key, key) if self.key is not None and tagged else None
 
     def tag_check(self, key: str) -> TagCheck | None:
         """Return the check of received messages of a key; None if they carry no tags."""
         tagger = self.tagger(key)
         return None if tagger is None else TagCheck(tagger, contract().topics.get(parse_key(key).topic))
-
-
-def _is_open(name: str) -> bool:
-    return name in contract().topics and contract().topics[name].open
 
 
 def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:

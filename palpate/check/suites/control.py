@@ -86,7 +86,8 @@ def suite(rig: Rig) -> None:
     rig.section("garbage")
     _garbage(rig, arm)
     rig.section("silence")
-    _silence(rig, arm)
+    received = rig.run(0.4 + rig.slack_s, {"planning/setpoint": arm.joint_target(arm.home, 100.0)})[COMMAND]
+    _ceases(rig, arm, "no joint states", received)
 
 
 def _ceased(received: list[ReceivedMessage]) -> bool:
@@ -180,11 +181,6 @@ def _garbage(rig: Rig, arm: Played) -> None:
     _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
     received = rig.log[COMMAND]
     rig.expect("and recovers with good ones", not _ceased(received), "valid commands", _last(arm, received))
-
-
-def _silence(rig: Rig, arm: Played) -> None:
-    received = rig.run(0.4 + rig.slack_s, {"planning/setpoint": arm.joint_target(arm.home, 100.0)})[COMMAND]
-    _ceases(rig, arm, "no joint states", received)
 
 
 def _ceases(rig: Rig, arm: Played, when: str, received: list[ReceivedMessage], finite: bool = True) -> None:

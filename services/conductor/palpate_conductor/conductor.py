@@ -13,7 +13,7 @@ import zenoh
 from palpate_bus.contract import MS, Contract, contract
 from palpate_bus.messages import OperatorRequest, RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import NS, header
-from palpate_bus.runtime.conductor_link import CONDUCTOR, TRANSPORT_LOST
+from palpate_bus.runtime.conductor_link import CONDUCTOR, CONTROL_TYPE, REPORT_TYPE, TRANSPORT_LOST
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.runtime.member import Member
@@ -74,12 +74,9 @@ class Conductor:
         self._patience = patience or Patience()
         self._wallclock = timing.wallclock
         self._slots = Slots(timing.handover_s if timing.wallclock else 0.0)
-        self._control = member.internal_publisher("palpate/control", "palpation_msgs/msg/RunControl", "event")
-        self._encode = codec.encoder("palpation_msgs/msg/RunControl")
-        self._decode = codec.decoder("palpation_msgs/msg/ServiceReport")
-        self._subscriptions = {
-            role: member.internal_subscription(f"palpate/report/{role}", "palpation_msgs/msg/ServiceReport") for role in roles
-        }
+        self._control = member.internal_publisher("palpate/control", CONTROL_TYPE, "event")
+        self._encode, self._decode = codec.encoder(CONTROL_TYPE), codec.decoder(REPORT_TYPE)
+        self._subscriptions = {role: member.internal_subscription(f"palpate/report/{role}", REPORT_TYPE) for role in roles}
         self._process_roles = {role: (role,) for role in roles}
         """By role, all roles of its process."""
         self._sequence = 0
@@ -237,13 +234,11 @@ class Conductor:
                 tell(self)
                 warned = True
             if monotonic() - since > limit_s:
-                raise self._start_timeout(missing_inputs, limit_s)
+                self.abort("start timed out")
+                silent = [role for role in self._roles if role not in missing_inputs]
+                text = f"not ready after {limit_s:.0f} s: {self._unready(missing_inputs)}"
+                raise RunFailed(FailureCode.NO_ANSWER, text, *silent)
         self._contract.poll(force=True)  # so that the first diagnostics include the service that joined last
-
-    def _start_timeout(self, missing_inputs: Mapping[str, list[str]], limit_s: float) -> RunFailed:
-        self.abort("start timed out")
-        silent = [role for role in self._roles if role not in missing_inputs]
-        return RunFailed(FailureCode.NO_ANSWER, f"not ready after {limit_s:.0f} s: {self._unready(missing_inputs)}", *silent)
 
     def _unready(self, missing_inputs: Mapping[str, list[str]]) -> str:
         """Return a text for the services that have not answered or have an input without a sender."""
