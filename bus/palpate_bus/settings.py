@@ -8,7 +8,6 @@ No other module reads PALPATE_ variables. The scenario, not the settings, says w
 """
 
 import os
-import sys
 import types
 import typing
 from collections.abc import Callable, Mapping
@@ -271,18 +270,3 @@ def allowed(name: str) -> str:
     most = "".join(f", up to {rule.le:g}" for rule in field.metadata if hasattr(rule, "le"))
     words: dict[Any, str] = {bool: "0, 1", Path: "a path", float: f"a number above 0{most}"}
     return "NAME=NUMBER, ..." if name == "bounds" else words.get(kinds[0], "text")
-
-
-def main() -> int:
-    """Print the settings of this environment; return the exit status."""
-    try:
-        for name, value in Settings.read().to_env().items():
-            print(f"{name}={value}")
-    except BusConfigError as error:
-        print(error, file=sys.stderr)
-        return 2
-    return 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from palpate_bus.contract import MS, Contract, contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import RobotStatus, Vector3, Wrench, codec
 from palpate_bus.messages.codec import Message
@@ -112,8 +112,8 @@ class Rig(ABC):
     live = False
     """True for a separate process in real time."""
 
-    def __init__(self, role: str, settings: RigSettings, rules: Contract | None = None) -> None:
-        self.rules = rules or contract()
+    def __init__(self, role: str, settings: RigSettings) -> None:
+        self.rules = contract()
         self.role = self.rules.roles[role]
         self.settings = settings
         self.log: dict[str, list[ReceivedMessage]] = {topic.name: [] for topic in self.rules.outputs(role)}

@@ -6,8 +6,8 @@ import os
 import subprocess
 import tempfile
 import webbrowser
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
+from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
 from time import sleep
@@ -15,9 +15,8 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
-from rich.progress import BarColumn, Progress, TaskProgressColumn, TextColumn, TimeRemainingColumn
 
-from palpate.console import SteadyConsole
+from palpate.console import SteadyConsole, TimeLeft
 from palpate.live.bus import ChosenRun
 from palpate_errors import UserError
 from palpate_plugins import needs
@@ -70,7 +69,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
             _follow(run, port, native, show, leave, console)
         else:
             with tempfile.TemporaryDirectory(prefix="palpate-dashboard-") as place:
-                _view(_drawn(Path(source), Path(place), console), port, native, show, console)
+                _view(_drawn(Path(source), Path(place)), port, native, show, console)
     except KeyboardInterrupt:
         raise typer.Exit from None
 
@@ -106,7 +105,7 @@ def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console:
             viewer.terminate()
 
 
-def _drawn(source: Path, place: Path, console: Console) -> Path:
+def _drawn(source: Path, place: Path) -> Path:
     """Return the .rrd of a source, drawn from the MCAP recording if there is none (into `place` for a single file)."""
     from palpate_dashboard import replay
     from palpate_dashboard.service import FILE, DashboardService
@@ -122,27 +121,20 @@ def _drawn(source: Path, place: Path, console: Console) -> Path:
         if not scenario.is_file():
             raise UserError(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
         drawn = DashboardService(load_scenario(str(scenario)), place / FILE, Live(), paced=False)
-        with _progress(console, (source,)) as advance:
-            replay.replay((source,), drawn, advance)
+        with _drawing((source,), reached := [0]):
+            replay.replay((source,), drawn, partial(reached.__setitem__, 0))
         return place / FILE
     if files := replay.recording_of(source):
-        with _progress(console, files) as advance:
-            return replay.main(source, advance)
+        with _drawing(files, reached := [0]):
+            return replay.main(source, partial(reached.__setitem__, 0))
     raise UserError(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
 
 
-@contextmanager
-def _progress(console: Console, files: Sequence[Path]) -> Iterator[Callable[[int], None] | None]:
-    """Show a bar with the remaining time, on a terminal; yields the function that takes the time drawn so far [ns]."""
+def _drawing(files: Sequence[Path], reached: list[int]) -> TimeLeft:
+    """Return a bar with the remaining time; `reached`: the time drawn so far [ns]."""
     from palpate_dashboard import replay
 
-    if not console.is_terminal:
-        yield None
-        return
-    columns = (TextColumn("drawing"), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True) as bar:
-        task = bar.add_task("drawing", total=replay.end_of(files))
-        yield lambda t: bar.update(task, completed=t)
+    return TimeLeft(lambda: "drawing", lambda: reached[0], 0, replay.end_of(files) or 0)
 
 
 def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:

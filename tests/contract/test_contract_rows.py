@@ -205,14 +205,13 @@ def test_a_broken_row_is_refused(change: str, message: str) -> None:
 def test_violations_of_a_row_are_described() -> None:
     topic = RULES.topics["ft/wrench"]
     good = WrenchStamped(header(5, "ft_sensor"), Wrench(Vector3(0.0, 0.0, 3.0), Vector3(0.0, 0.0, 0.0)))
-    assert violations(topic, good, 5) == []
+    assert violations(topic, good) == []
     assert numbers(good, "wrench.force").tolist() == [0, 0, 3]
     bad = WrenchStamped(header(6, "world"), Wrench(Vector3(0.0, float("nan"), 0.0), Vector3(41.0, 0.0, 0.0)))
-    assert violations(topic, bad, 5) == [
+    assert violations(topic, bad) == [
         "ft/wrench: header.frame_id: expected 'ft_sensor', got 'world'",
         "ft/wrench: wrench.force: expected -200..200 [N], got nan",
         "ft/wrench: wrench.torque: expected -40..40 [N m], got 41",
-        "ft/wrench: header.stamp: expected 5 ns, got 6 ns",
     ]
     assert violations(topic, Vector3(0.0, 0.0, 0.0)) == [
         "ft/wrench: message: expected geometry_msgs/msg/WrenchStamped, got geometry_msgs/msg/Vector3"

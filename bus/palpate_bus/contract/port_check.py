@@ -97,13 +97,9 @@ class Checker:
         ranged = {path for paths in self._ranges.values() for path in paths}
         self._finite = [leaf.path for leaf in self._all if leaf.base.startswith("float") and leaf.path not in ranged]
 
-    def __call__(self, message: Message, t: int | None = None) -> list[MessageViolation]:
-        """Return the violations of a message. `t`: expected stamp of its headers [ns]; None: not checked."""
-        found = [] if self._conforms(message, _NO_PAST, 0) else list(self._violations(message))
-        stamps = [nanoseconds(header.stamp) for header in _headers(message)] if t is not None else []
-        if wrong := [stamp for stamp in stamps if stamp != t]:
-            found.append(MessageViolation(ViolationKind.STAMP, "header.stamp", f"{t} ns", f"{wrong[0]} ns"))
-        return found
+    def __call__(self, message: Message) -> list[MessageViolation]:
+        """Return the violations of a message."""
+        return [] if self._conforms(message, _NO_PAST, 0) else list(self._violations(message))
 
     def _violations(self, message: Message) -> Iterator[MessageViolation]:
         topic, kind = self._topic, message_type(self._topic.type)
@@ -144,9 +140,9 @@ def _headers(message: Message) -> list[Any]:
     return [transform.header for transform in getattr(message, "transforms", ())]
 
 
-def violations(topic: Topic, message: Message, t: int | None = None) -> list[str]:
-    """Return the violations of a message as text. `t` as for `Checker`."""
-    return [f"{topic.name}: {violation}" for violation in Checker(topic)(message, t)]
+def violations(topic: Topic, message: Message) -> list[str]:
+    """Return the violations of a message as text."""
+    return [f"{topic.name}: {violation}" for violation in Checker(topic)(message)]
 
 
 def _out_of_range(path: str, values: np.ndarray[Any, Any], least: float, most: float, unit: str) -> MessageViolation:

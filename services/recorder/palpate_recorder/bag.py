@@ -17,6 +17,8 @@ from palpate_bus.settings import KEPT_EVERY
 
 CHUNK_BYTES = 4 * 1024 * 1024
 """Largest size of a chunk, which bounds the memory."""
+FLUSH_NS = 1_000_000_000
+"""Simulated time after which a chunk goes to disk [ns]."""
 FILE_BYTES = 1 << 30
 """Size at which a file is completed and the next one begun; a crash does not affect a completed file."""
 
@@ -108,7 +110,7 @@ def _extent(first: int | None, last: int, messages: int) -> dict[str, Any]:
 class BagWriter:
     """Writes CDR messages into a rosbag2 folder. An old recording in the folder is replaced.
 
-    Messages are collected in a chunk, which goes to disk when it spans `flush_every` nanoseconds or has `CHUNK_BYTES`,
+    Messages are collected in a chunk, which goes to disk when it spans `FLUSH_NS` or has `CHUNK_BYTES`,
     so that a crash loses at most that span: an MCAP file is readable up to its last complete chunk.
     Not safe for use from several threads at once.
     """
@@ -119,7 +121,6 @@ class BagWriter:
         channels: Iterable[Channel],
         *,
         run: str = "",
-        flush_every: int = 1_000_000_000,
         file_bytes: int = FILE_BYTES,
         compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
@@ -137,7 +138,6 @@ class BagWriter:
         self.channels = {channel.topic: channel for channel in channels}
         self.counts = {topic: Count() for topic in self.channels}
         self._files: list[_File] = []
-        self._flush_every = flush_every
         self._flush_at: int | None = None
         self._file_bytes = file_bytes
         self._compression = compression
@@ -189,10 +189,10 @@ class BagWriter:
         count.bytes += len(payload)
         self._file.take(stamp)
         if self._flush_at is None:
-            self._flush_at = stamp + self._flush_every
+            self._flush_at = stamp + FLUSH_NS
         elif stamp >= self._flush_at:
             self.flush()
-            self._flush_at = stamp + self._flush_every
+            self._flush_at = stamp + FLUSH_NS
             if self._stream.tell() >= self._file_bytes:
                 self._end_file()
                 self._begin_file()
