@@ -22,9 +22,8 @@ from palpate_bus.implementations import create
 from palpate_bus.runtime.conductor_link import RunAborted
 from palpate_bus.runtime.distributed import LockstepNode
 from palpate_bus.runtime.member import Member
-from palpate_bus.runtime.observer import ObserverNode
+from palpate_bus.runtime.observer import ObserverNode, RawRecorder, RecorderNode
 from palpate_bus.runtime.process import rare_collections, run_in_background
-from palpate_bus.runtime.recording import RawRecorder, RecorderNode
 from palpate_bus.runtime.wallclock import WallClockNode
 from palpate_bus.service import Service
 from palpate_bus.settings import BusConfigError, Settings

@@ -16,8 +16,8 @@ from palpate_bus.messages import JointState, RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import CodecError
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
+from palpate_bus.runtime.observer import RecorderNode
 from palpate_bus.runtime.output import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
-from palpate_bus.runtime.recording import RecorderNode
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import ReceivedSample
 

@@ -19,8 +19,8 @@ from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import BETWEEN, Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
+from palpate_bus.runtime.observer import RawRecorder
 from palpate_bus.runtime.process import rare_collections
-from palpate_bus.runtime.recording import RawRecorder
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collected, CollectedNews, Collector, FrameTree, collect

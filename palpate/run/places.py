@@ -8,7 +8,7 @@ A debugger, or a program in another language, can do the same.
 import json
 import os
 import sys
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Annotated, NamedTuple, NoReturn
@@ -128,16 +128,12 @@ def command_for(role: str, place: ServicePlace, service: str | None) -> tuple[st
     return service_command(role, word)
 
 
-def become(command: Sequence[str], environment: Mapping[str, str]) -> NoReturn:
-    """Replace this process by another program; `environment` is added to that of this process."""
-    program = sys.executable if command[0] == "python" else command[0]
-    os.execvpe(program, [program, *command[1:]], {**os.environ, **environment})
-
-
 def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | None, run: str | None) -> NoReturn:
-    """Become the process of the place that `find` returns for the run."""
+    """Replace this process by that of the place that `find` returns for the run."""
     place = find(role, named_runs(run)[-1])
-    become(command_for(role, place, service), place.environment)
+    first, *words = command_for(role, place, service)
+    program = sys.executable if first == "python" else first
+    os.execvpe(program, [program, *words], {**os.environ, **place.environment})
 
 
 NameOrFile = Annotated[
