@@ -43,6 +43,7 @@ def test_processes_find_the_lesion(composed: Finished, tmp_path: Path) -> None:
     assert finished.report["run_hash"] == composed.report["run_hash"]
 
 
+@pytest.mark.slow  # test_fmu_equivalence.py compares the two step by step
 def test_the_fmu_gives_the_same_examination(composed: Finished, tmp_path: Path) -> None:
     """Sums in another order differ by 1e-13 of a force, which stick and slip amplify; the scores do not differ."""
     finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=(*GATE, "services.tissue=fmu"))

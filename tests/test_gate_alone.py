@@ -6,14 +6,8 @@ from examination import SHORT, assert_held_and_no_harder, kill_in_contact, palpa
 
 
 def test_healthy_has_no_finding(tmp_path: Path) -> None:
-    finished = palpate_run(
-        "clean",
-        tmp_path,
-        "--composed",
-        "--record",
-        "none",
-        settings=(*SHORT, "camera.frames=4", "phantom.edge_m=0.01", "phantom.lesions=[]"),
-    )
+    settings = (*SHORT, "camera.frames=4", "phantom.edge_m=0.01", "phantom.lesions=[]")
+    finished = palpate_run("clean", tmp_path, "--composed", "--record", "none", settings=settings)
     assert finished.status == 0, finished.output
     assert finished.report["samples"] > 30
     assert finished.report["findings"] == []

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, example, given, settings
+from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from message_strategies import messages
 
@@ -60,25 +60,10 @@ def test_broken_messages_raise_codec_error_at_most(name: str, data: st.DataObjec
     broken = bytes(payload) + data.draw(st.binary(max_size=9))
     try:
         message = codec.decode(broken, name)
-    except codec.CodecError:
+    except codec.CodecError as error:
+        assert name in str(error)
         return
     assert codec.decode(codec.encode(message, name), name) is not None
-
-
-@pytest.mark.parametrize("name", TYPES)
-@FAST
-@given(payload=st.binary(max_size=200))
-@example(payload=b"")
-@example(payload=b"\x00\x01\x00\x00")
-@example(payload=b"\x00\x01\x00\x00" + b"\xff" * 64)
-@example(payload=b"\x00\x00\x00\x00" + b"\xff" * 64)
-@example(payload=b"\x00\x01\x00\x00" + b"\x00" * 400)
-def test_garbage_raises_codec_error_at_most(name: str, payload: bytes) -> None:
-    for data in (payload, b"\x00\x01\x00\x00" + payload, memoryview(payload)):
-        try:
-            codec.decode(data, name)
-        except codec.CodecError as error:
-            assert name in str(error)
 
 
 @pytest.mark.parametrize("length", [2**31, 2**32 - 1])

@@ -14,7 +14,7 @@ from rich.text import Text
 from palpate.console import EXIT_TROUBLE, SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
-from palpate_bus.contract import Contract, contract
+from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.monitor import LiveMonitor
 from palpate_bus.runs.announcement import live as live_runs
@@ -79,19 +79,18 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
             live.poll()
             sleep(POLL_S)
         live.poll()
-        return diagnose(bus, contract(), live)
+        return diagnose(bus, live)
     finally:
         live.close()
 
 
-def diagnose(bus: Joined, rules: Contract, live: LiveMonitor) -> Diagnosis:
+def diagnose(bus: Joined, live: LiveMonitor) -> Diagnosis:
     """Return the diagnosis from what the monitor has received so far."""
-    found = list(live.graph.alive.values())
     findings = [
-        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(bus, rules, live), *_processes(live),
+        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(bus, live), *_processes(live),
         *_waiting(live),
     ]  # fmt: skip
-    differing = mismatches(found)
+    differing = mismatches(live.graph.alive.values())
     findings += [Remark("types", Severity.BAD, sentence) for sentence in differing]
     if not differing:
         findings.append(Remark("types", Severity.OK, "all nodes have the same message definitions"))
@@ -158,7 +157,8 @@ def _clock(live: LiveMonitor) -> list[Remark]:
     return findings
 
 
-def _who(bus: Joined, rules: Contract, live: LiveMonitor) -> list[Remark]:
+def _who(bus: Joined, live: LiveMonitor) -> list[Remark]:
+    rules = contract()
     absent = graph.missing(rules, live.graph.alive.values(), bus.target.run)
     workers = [role for role in absent if not rules.roles[role].observer]
     others = [role for role in absent if rules.roles[role].observer]
