@@ -14,8 +14,8 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
+from palpate_conductor.handover import REPLACEABLE
 from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, Timing
-from palpate_conductor.watchdog import REPLACEABLE
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario

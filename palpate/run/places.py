@@ -21,7 +21,7 @@ from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run, named_runs
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_conductor.watchdog import REPLACEABLE
+from palpate_conductor.handover import REPLACEABLE
 from palpate_errors import UserError
 from palpate_inputs import read_json
 from palpate_plugins import is_file

@@ -134,7 +134,7 @@ def test_a_name_that_is_used_twice_is_found(tmp_path: Path) -> None:
 
 # --- no code outside an arm's data and its driver knows a robot by name; quotations in docstrings and comments may --------
 
-FOLDERS = ("bus", "models", "services", "palpate", "dashboards", "fmus", "benchmarks", "research", "asv")
+ROBOT_FREE = ("bus", "models", "services", "palpate", "dashboards", "fmus", "benchmarks", "research", "asv")
 NAME = re.compile(r"(?<![a-z])(lbr|kuka|iiwa|franka|panda|ur5|ur10|xarm\d*|kinova)(?![a-z])", re.IGNORECASE)
 DATA_AND_DRIVERS = (
     "models/palpate_models/robot/lbr.py",
@@ -160,7 +160,7 @@ def code_texts(tree: ast.AST) -> Iterator[tuple[int, str]]:
 
 
 def product_files() -> list[str]:
-    files = (path.relative_to(ROOT).as_posix() for folder in FOLDERS for path in (ROOT / folder).rglob("*.py"))
+    files = (path.relative_to(ROOT).as_posix() for folder in ROBOT_FREE for path in (ROOT / folder).rglob("*.py"))
     return sorted(file for file in files if "/tests/" not in file and not file.startswith(DATA_AND_DRIVERS))
 
 

@@ -23,9 +23,10 @@ from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
 from palpate_conductor.grants import EXAM_SILENT_S, Grants
+from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
-from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog, Slots
+from palpate_conductor.watchdog import FreezeWatch, Heartbeat, RunWatchdog
 from palpate_inputs import InputError, parse_json
 
 log = logging.getLogger(__name__)

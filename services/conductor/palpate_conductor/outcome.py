@@ -30,7 +30,7 @@ class Timing:
     limit: int = SIM_LIMIT
     """Simulated time [ns] at which the run ends at the latest."""
     handover_s: float = 0.0
-    """Wall-clock mode: time for which the slot of a service that left is kept [s], see `watchdog.Slots`; 0 keeps none."""
+    """Wall-clock mode: time for which the slot of a service that left is kept [s], see `handover`; 0 keeps none."""
 
     @property
     def wallclock_rate(self) -> float | None:

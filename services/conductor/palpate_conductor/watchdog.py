@@ -1,4 +1,4 @@
-"""The conductor's heartbeat, and the progress of the services: which one blocks the others, which is frozen, which is replaced.
+"""The conductor's heartbeat, and the progress of the services: which one blocks the others, and which process is frozen.
 
 Frozen processes are found only where the conductor can inspect them: on the same machine, in the same namespace of process ids.
 """
@@ -230,47 +230,3 @@ class RunWatchdog:
         blocked = ", ".join(f"{name} (for {self.progress[name].waiting_for})" for name in sorted(set(waiting) - {culprit}))
         tick_s = self.progress[culprit].tick / 1e9
         return culprit, f"{culprit} is at {tick_s:.3f} s and does not wait; blocked: {blocked}"
-
-
-REPLACEABLE: Final = frozenset({"camera", "assessment"})
-"""Roles whose absence is safe and whose work another process can continue, in wall-clock mode. A run ends without the roles that
-move the arm, measure or supervise, and a perception that did not process the first scan has no surface to continue with."""
-
-
-@dataclass
-class Slots:
-    """Roles whose process left, and roles that a replacement has."""
-
-    patience_s: float = 0.0
-    """Time for which a slot is kept; 0 keeps none."""
-    empty: dict[str, tuple[float, str]] = field(default_factory=dict)
-    """Roles without a process: time [s] at which it left, and how."""
-    replaced: set[str] = field(default_factory=set)
-    """Roles of a replacement. The end of their first process is ignored."""
-
-    def keeps(self, role: str) -> bool:
-        """Return True if the slot of `role` is kept when its process leaves."""
-        return self.patience_s > 0 and role in REPLACEABLE
-
-    def leave(self, role: str, how: str) -> bool:
-        """Mark a slot empty; return False if it was empty."""
-        if role in self.empty:
-            return False
-        self.empty[role] = (monotonic(), how)
-        return True
-
-    def fill(self, role: str) -> bool:
-        """Mark a slot filled after a report of `role`; return False if it was not empty."""
-        if role not in self.empty:
-            return False
-        del self.empty[role]
-        self.replaced.add(role)
-        return True
-
-    def expired(self) -> dict[str, str]:
-        """Remove and return the slots that were not filled in time, with how each process left."""
-        now = monotonic()
-        late = {role: how for role, (since, how) in self.empty.items() if now - since > self.patience_s}
-        for role in late:
-            del self.empty[role]
-        return late
