@@ -41,6 +41,8 @@ class AdmittanceTuning:
     """Gain of the inverse kinematics on the error of pose and of joint positions."""
     posture_per_s: float = 2.0
     """The same on the posture in the null space."""
+    posture_radps: float = 0.5
+    """Largest speed of that: at a singular wrist two joints would turn against each other at their limits."""
     damping: float = 0.02
     """Of the least squares [m or 1]: near a singularity the joints slow down."""
     speed_share: float = 0.8
@@ -107,7 +109,8 @@ class AdmittanceController:
         J = model.J_W
         rate: Array = J.T @ np.linalg.solve(J @ J.T + TUNING.damping**2 * np.eye(6), twist)
         if model.joints > len(J):
-            posture = motion.qd + TUNING.posture_per_s * (motion.q - self._q)
+            back = TUNING.posture_per_s * (motion.q - self._q)
+            posture = motion.qd + back / max(1.0, float(np.linalg.norm(back)) / TUNING.posture_radps)
             rate += posture - np.linalg.pinv(J) @ (J @ posture)
         return rate
 

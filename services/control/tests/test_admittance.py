@@ -75,6 +75,14 @@ def test_no_set_point_turns_a_joint_faster_or_further_than_it_may(mode: ControlM
     assert (np.abs(contact.q) <= contact.model.position_upper).all()
 
 
+def test_a_far_posture_is_approached_slowly() -> None:
+    contact = Contact()
+    contact.follow(ControlMode.JOINT, np.zeros(3), 20)
+    before, self_motion = contact.q, np.linalg.svd(contact.model.J_W)[2][-1]
+    contact.follow(ControlMode.CARTESIAN, np.zeros(3), 100, q=contact.asked + 2.0 * self_motion)
+    assert 0.01 < np.linalg.norm(contact.q - before) < 0.105 * TUNING.posture_radps
+
+
 def test_after_a_reset_it_starts_where_the_arm_is() -> None:
     contact = Contact()
     contact.follow(ControlMode.CARTESIAN, PUSH, 50)
