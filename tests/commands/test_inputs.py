@@ -90,15 +90,12 @@ def test_a_run_that_cannot_be_is_refused(words: str, said: tuple[str, ...], tmp_
         ("study smoke --out file", "file: cannot be made a folder"),
         ("reproduce --out file", "file: cannot be made a folder"),
         ("reproduce --docs file/page.md", "file: cannot be made a folder"),
-        ("validate --docs file/page.md", "file: cannot be made a folder"),
         ("bench --out .", "is not a writable file"),
-        ("faults --docs page.md", "needs the lines"),
         ("faults", "faults.csv: holds no findings"),
     ],
 )
 def test_other_commands_refuse_bad_input(words: str, said: str, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
-    (tmp_path / "page.md").write_text("no marks\n")
     if words == "faults":
         (tmp_path / "faults.csv").write_text("[1, 2")
     assert said in refused(*words.split())
