@@ -1,12 +1,17 @@
-"""Validation of the surface tier against Hertz: the range in which a Winkler-Pasternak wall behaves as a half-space."""
+"""Validation of spheres and paraboloids on a flat wall against Hertz and Sneddon.
+
+Surface tier: the range in which a Winkler-Pasternak wall behaves as a half-space. Elastic tier: a half-space.
+"""
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
+from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 from palpate_validation.probing import static_curve
 
@@ -23,10 +28,13 @@ class HertzSetup:
     tolerance: float = 0.10
     range_m: tuple[float, float] = (0.005, 0.015)
     radii_m: tuple[float, ...] = (0.010, 0.015, 0.020, 0.030)
+    elastic_percent: float = 2.0
+    """Largest error of the elastic tier."""
 
 
 HERTZ = HertzSetup()
 
+ELASTIC_DEPTHS_M = np.array((2, 3, 5, 7, 10)) * 1e-3
 DEPTHS_M = np.array((1, 1.5, 2, 3, 4, 5, 6, 8, 10, 12, 15, 17, 20, 25)) * 1e-3
 
 
@@ -140,3 +148,57 @@ def draw(figure: Figure, curves: HertzCurves) -> None:
     right.axhline(1, color=INK, lw=0.6)
     right.axvspan(HERTZ.range_m[0] * 1e3, HERTZ.range_m[1] * 1e3, color=QUIET, alpha=0.08, lw=0)
     right.set(xlabel="depth [mm]", ylabel="force over Hertz", ylim=(0.7, 1.4))
+
+
+def elastic_section() -> PageSection:
+    """Press a half-space at rest, between its vertices; return the comparison with its bounds."""
+    slab = FlatSlab(young_pa=HERTZ.young_pa)
+
+    def press(profile: Literal["paraboloid", "sphere"]) -> Array:
+        return np.array(
+            [[slab.press(r, float(d), (0.0004, 0.00025), profile).force_n for d in ELASTIC_DEPTHS_M] for r in HERTZ.radii_m]
+        )
+
+    paraboloid, sphere = press("paraboloid"), press("sphere")
+    hertz = np.array([hertz_force(ELASTIC_DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in HERTZ.radii_m])
+    sneddon = np.array(
+        [[sneddon_force(float(d), r, HERTZ.young_pa, slab.poisson) for d in ELASTIC_DEPTHS_M] for r in HERTZ.radii_m]
+    )
+    by_hertz, by_sneddon = 100 * (paraboloid / hertz - 1), 100 * (sphere / sneddon - 1)
+    at, most = int(np.argmin(np.abs(ELASTIC_DEPTHS_M - 0.005))), HERTZ.elastic_percent
+    power = float(np.polyfit(np.log(HERTZ.radii_m), np.log(paraboloid[:, at]), 1)[0])
+    checks = (
+        Check("paraboloid, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_hertz).max()), "%", high=most,
+              against="Hertz"),
+        Check("sphere, 2 to 10 mm, R = 10 to 30 mm: largest error", float(np.abs(by_sneddon).max()), "%", high=most,
+              against="Sneddon"),
+        Check("exponent of the force in the radius", power, "", 0.48, 0.52, "Hertz: 0.5"),
+        Check("sphere at 10 mm depth, R = 20 mm, against the paraboloid's law",
+              100 * float(sphere[2, -1] / hertz[2, -1] - 1), "%", against="Hertz"),
+    )  # fmt: skip
+    text = (
+        "The elastic tier as a half-space of 10 kPa. Hertz's solution is for a paraboloid. The force of a "
+        "sphere is some percent smaller at depths of half a radius, in agreement with Sneddon's solution."
+    )
+    return PageSection(
+        "elastic",
+        "Elastic tier on a flat half-space: Hertz",
+        text,
+        checks,
+        lambda f: draw_elastic(f, paraboloid / hertz, sphere / sneddon),
+        (4.5, 2.8),
+    )
+
+
+def draw_elastic(figure: Figure, paraboloid: Array, sphere: Array) -> None:
+    """Draw force relative to theory against depth, for each radius."""
+    axes = figure.subplots()
+    mm = ELASTIC_DEPTHS_M * 1e3
+    for k, radius in enumerate(HERTZ.radii_m):
+        axes.plot(mm, paraboloid[k], "o-", color=COLOURS[k], ms=3, lw=1, label=f"R = {radius * 1e3:g} mm")
+        axes.plot(mm, sphere[k], "x--", color=COLOURS[k], ms=4, lw=0.7)
+    axes.plot([], [], "o-", color=INK, ms=3, lw=1, label="paraboloid over Hertz")
+    axes.plot([], [], "x--", color=INK, ms=4, lw=0.7, label="sphere over Sneddon")
+    axes.axhspan(0.98, 1.02, color=QUIET, alpha=0.15, lw=0)
+    axes.set(xlabel="depth [mm]", ylabel="force over theory", ylim=(0.95, 1.05))
+    axes.legend(ncols=2)
