@@ -25,6 +25,7 @@ class FaultCode(StrEnum):
     SHALLOW = "shallow"
     INVALID = "invalid"
     MOVES = "moves"
+    ZERO = "zero"
 
 
 _TEXTS = {
@@ -45,6 +46,7 @@ _TEXTS = {
     FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
     FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to be assessed",
     FaultCode.INVALID: "{count} of {of} rows have no number, or a normal of length 0",
+    FaultCode.ZERO: "the force is {value:.2g} N where probes begin: it was not tared",
     FaultCode.MOVES: "the skin is {value:.2g} m elsewhere from slide to slide: the body moves, as it does in breathing",
 }
 

@@ -13,7 +13,18 @@ from matplotlib.figure import Figure
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
 from palpate.recording.probes import probes
-from palpate.recording.readings import KINDS, TABLES, ReadingError, Readings, from_bag, from_table, moved, opened, read_table
+from palpate.recording.readings import (
+    KINDS,
+    TABLES,
+    ReadingError,
+    Readings,
+    from_bag,
+    from_table,
+    moved,
+    numbers_of,
+    opened,
+    read_table,
+)
 from palpate.report.files import write_text
 from palpate_models.numerics.frames import GRAVITY
 
@@ -24,7 +35,7 @@ _NORMAL: Final = re.compile(r"n(ormal)?", re.I)
 _TOUCH: Final = re.compile(r"(p|pos|tip|ee)?_?(0|touch|contact|start)", re.I)
 _TIME: Final = re.compile(r"(t|time|stamp|timestamp|sec|secs|seconds)(_?(s|ms|us|ns|sec))?", re.I)
 _PROBE: Final = re.compile(r"(probe|press|point|touch|contact|trial|id|number)(_?(id|nr|no|number|index))?", re.I)
-_UNIT: Final = re.compile(r"[_\[( ]*(mm|mN|m|N|s|ms|us|ns)[\])]*$")
+_UNIT: Final = re.compile(r"[_\[( ]*(mm|cm|mN|kgf|gf|m|N|s|ms|us|ns)[\])]*$")
 
 
 def propose(path: Path, out: Path) -> list[str]:
@@ -98,14 +109,16 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
     if quaternion:
         lines.append(f"not sure: quaternion {', '.join(quaternion)} in the order {order}")
     span = float(np.nanmax(np.ptp(table[list(position)].apply(pd.to_numeric, errors="coerce").dropna().to_numpy(), axis=0)))
-    length = "mm" if position[0].endswith("mm") or span > 3 else "m"
+    named = [unit[1] if (unit := _UNIT.search(one)) else None for one in (position[0], columns.force[0])]
+    length = named[0] if named[0] in ("m", "cm", "mm") else "mm" if span > 3 else "m"
     lines.append(f"{'sure' if span > 10 or span < 1 else 'not sure'}: lengths in {length}: the positions span {span:.3g}")
     unit = "s"
     if time:
-        step = float(np.nanmedian(np.diff(pd.to_numeric(table[time], errors="coerce"))))
+        step = float(np.nanmedian(np.diff(numbers_of(table[time]))))
         unit = "ns" if step > 1e5 else "us" if step > 500 else "ms" if step > 0.5 else "s"
         lines.append(f"sure: time in {unit}: a row every {step:.3g}")
-    units = Units.model_validate({"length": length, "time": unit})
+    force_unit = named[1] if named[1] in ("N", "mN", "gf", "kgf") else "N"
+    units = Units.model_validate({"length": length, "force": force_unit, "time": unit})
     return Mapping(table=columns, units=units, tool=MappedTool(radius_m=_UNKNOWN_RADIUS_M))
 
 

@@ -16,7 +16,11 @@ from palpate_models.section import Pose, Section, Vec3
 Triple = tuple[str, str, str]
 Turn = Annotated[float, Field(ge=-2 * pi, le=2 * pi)]
 """[rad]; larger numbers are degrees."""
-SCALES: Final = {"m": 1.0, "mm": 1e-3, "N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
+SCALES: Final = {
+    **{"m": 1.0, "cm": 1e-2, "mm": 1e-3},
+    **{"N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "kgf": 9.80665},
+    **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
+}
 """Metres, newtons and seconds in a unit."""
 
 
@@ -32,7 +36,7 @@ class MappedColumns(Section):
     force: Triple | tuple[str]
     """x, y, z of the force; or one column with the force along the normal."""
     time: str | None = None
-    """Time. A table without it needs `probe`."""
+    """Time, in numbers or as a date. A table without it needs `probe`."""
     probe: str | None = None
     """Number of the probe: rows of equal number are one contact, in order, and time is not used."""
     orientation: tuple[str, str, str, str] | None = None
@@ -83,8 +87,8 @@ class Topics(Section):
 class Units(Section):
     """Units of the table. Messages are in SI units."""
 
-    length: Literal["m", "mm"] = "m"
-    force: Literal["N", "mN", "gf"] = "N"
+    length: Literal["m", "cm", "mm"] = "m"
+    force: Literal["N", "mN", "gf", "kgf"] = "N"
     time: Literal["s", "ms", "us", "ns"] = "s"
 
 

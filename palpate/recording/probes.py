@@ -17,6 +17,8 @@ _AWAY: Final = 3.0
 """A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
 _TOUCHED: Final = 3.0
 """Least force of a contact, in SD of the force."""
+_UNTARED: Final = 0.3
+"""Force at first contact, over that of the probe, that light contact does not have."""
 
 
 def probes(readings: Readings) -> list[slice]:
@@ -46,15 +48,21 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     if not kept:
         return Palpated.nothing()
     inward = [-(p[one] @ n[one][0]) for one in kept]
+    begin_at = [-(start[one][0] @ n[one][0]) for one in kept]
+    given = readings.touch is not None
+    light = [force[one][0] for one, s, at in zip(kept, inward, begin_at, strict=True) if s[0] - at < 0.1 * (s.max() - at)]
+    if given and len(light) > 0.5 * len(kept):
+        zero, greatest = float(np.median(light)), float(np.median([force[one].max() for one in kept]))
+        if abs(zero) > _UNTARED * (greatest - zero):
+            faults.append(Fault(FaultCode.ZERO, len(kept), len(rows), Remedy.CORRECTED, zero))
+            force = force - zero
     loads = [(s[d], force[one][d]) for s, one in zip(inward, kept, strict=True) if (d := cutting.loading(s))]
     power = cutting.power_of(loads, sigma)
     onsets = [cutting.onset(load, power, sigma) for load in loads]
-    given = readings.touch is not None
-    zero = [-(start[one][0] @ n[one][0]) for one in kept]
-    off = np.array([begin.at - at if begin else np.nan for begin, at in zip(onsets, zero, strict=True)])
+    off = np.array([begin.at - at if begin else np.nan for begin, at in zip(onsets, begin_at, strict=True)])
     scatter = 1.4826 * float(np.nanmedian(np.abs(off - np.nanmedian(off)))) if np.isfinite(off).any() else 0.0
     contacts = []
-    for one, s, at, begin in zip(kept, inward, zero, onsets, strict=True):
+    for one, s, at, begin in zip(kept, inward, begin_at, onsets, strict=True):
         if begin is None and not given:
             continue
         sd = scatter if given or begin is None else begin.sd

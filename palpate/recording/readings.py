@@ -80,12 +80,14 @@ def read_table(path: Path) -> pd.DataFrame:
         if path.suffix == ".parquet":
             _check_parquet(file, path)
             return pd.read_parquet(file)
-        first = file.readline()
+        first = next((line for line in file if not line.startswith(b"#")), b"")
         file.seek(0)
         separator = max(",;\t", key=lambda one: first.count(one.encode()))
         decimal = "," if separator == ";" and b"," in file.read(_SNIFFED) else "."
         file.seek(0)
-        return pd.read_csv(file, sep=separator, decimal=decimal, skipinitialspace=True, low_memory=False)
+        return pd.read_csv(file, sep=separator, decimal=decimal, comment="#", skipinitialspace=True, low_memory=False).rename(
+            columns=str.strip
+        )
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
     except UserError:
@@ -103,6 +105,21 @@ def _check_parquet(file: io.BytesIO, path: Path) -> None:
         raise over(path, f"{size / MB:.0f} MB unpacked", "unpacked_mb", ReadingError)
 
 
+def numbers_of(column: pd.Series) -> pd.Series:
+    """Return the numbers of a column, of dates the seconds since the first; NaN where there is none."""
+    if not pd.api.types.is_datetime64_any_dtype(column):
+        found = pd.to_numeric(column, errors="coerce")
+        if found.notna().any():
+            return found
+    dates = pd.to_datetime(column, errors="coerce", utc=True, format="mixed")
+    return (dates - dates.min()).dt.total_seconds()
+
+
+def is_date(column: pd.Series) -> bool:
+    """Return True for a column of dates."""
+    return not pd.api.types.is_numeric_dtype(column) and not pd.to_numeric(column.astype(str), errors="coerce").notna().any()
+
+
 def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
     """Return the readings of a table. Raises ReadingError for a missing column or one that has no numbers."""
     columns, units = mapping.table, mapping.units
@@ -113,12 +130,14 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
             return None
         if missing := [one for one in names if one not in table]:
             raise ReadingError(f"{name}: no column {missing[0]!r}; it has {', '.join(map(str, table.columns[:20]))}")
-        numbers = table[list(names)].apply(pd.to_numeric, errors="coerce").to_numpy(float)
+        numbers = table[list(names)].apply(numbers_of).to_numpy(float)
         if not np.isfinite(numbers).any():
             raise ReadingError(f"{name}: columns {', '.join(names)} have no numbers")
         return numbers * SCALES.get(unit, 1.0)
 
-    times = values((columns.time,) if columns.time else None, units.time)
+    times = values(
+        (columns.time,) if columns.time else None, "s" if columns.time in table and is_date(table[columns.time]) else units.time
+    )
     quaternion = values(columns.orientation)
     if quaternion is not None:
         quaternion = np.roll(quaternion, -1, axis=1) if columns.quaternion == "wxyz" else quaternion

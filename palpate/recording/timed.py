@@ -155,7 +155,8 @@ class _Measured:
             self.skin, kept = self.skin.through(points, sd), {}
         begun = sum(begin is not None for begin in onsets)
         off = (points[:, 2] - self.skin.at(points[:, :2])[0])[begun:]
-        if kept and len(off) and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean()):
+        refused = any(fault.remedy is Remedy.REFUSED for fault in faults)
+        if kept and len(off) and not refused and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean()):
             faults.append(Fault(FaultCode.MOVES, 1, 1, Remedy.ONE_DEPTH, apart))
             kept = dict.fromkeys(kept, float(np.median(list(kept.values()))))
             self.skin = fitted(*self._skin_points(loads, onsets, kept), self.stations, 2 * self.reach)

@@ -15,8 +15,8 @@ from palpate.recording.read import read_recording
 FOLDER = Path(os.environ.get("PALPATE_RECORDINGS", "missing"))
 EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
 KNOWN = {
-    "vessel-at-2-mm": ("probingRAL2018_T1.csv", "probes", (-6, 45), 8, 3),
-    "vessel-at-3-mm": ("probingRAL2018_T2.csv", "probes", (-6, 45), 8, 3),
+    "vessel-at-2-mm": ("probingRAL2018_T1.csv", "probes", (-6, 45), 8, 1),
+    "vessel-at-3-mm": ("probingRAL2018_T2.csv", "probes", (-6, 45), 8, 1),
     "ball": ("region_small_balls.csv", "probes", (-30.5, 65), 3, 1),
     "vessel-in-a-slide": ("ContPalpRAL18T1.csv", "slide", (1, -13), 6, 1),
     "liver": ("pig_liver_20150826_region1.csv", "probes", None, 0, 0),

@@ -152,6 +152,11 @@ MAPPED = {
     "20-hz": (lambda t: resampled(t, 20), OVER_TIME),
     "500-hz": (lambda t: resampled(t, 500), OVER_TIME),
     "millimetres": (in_mm, mapped(OVER_TIME, units=Units(length="mm"))),
+    "centimetres-kgf": (
+        lambda t: t.assign(**{name: 100 * t[name] for name in P}, **{name: t[name] / 9.80665 for name in F}),
+        mapped(OVER_TIME, units=Units(length="cm", force="kgf")),
+    ),
+    "dates": (lambda t: t.assign(t=(pd.Timestamp("2026-01-01") + pd.to_timedelta(t.t, unit="s")).astype(str)), OVER_TIME),
     "on-the-body": (flipped, mapped(OVER_TIME, force=ForceSource(on="body"))),
     "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=MappedTool(radius_m=0.015, point="tip"))),
     "late": (late, mapped(OVER_TIME, force=ForceSource(delay_s=0.2))),
