@@ -109,7 +109,7 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
     if quaternion:
         lines.append(f"not sure: quaternion {', '.join(quaternion)} in the order {order}")
     span = float(np.nanmax(np.ptp(table[list(position)].apply(pd.to_numeric, errors="coerce").dropna().to_numpy(), axis=0)))
-    named = [unit[1] if (unit := _UNIT.search(one)) else None for one in (position[0], columns.force[0])]
+    named = [suffix[1] if (suffix := _UNIT.search(one)) else None for one in (position[0], columns.force[0])]
     length = named[0] if named[0] in ("m", "cm", "mm") else "mm" if span > 3 else "m"
     lines.append(f"{'sure' if span > 10 or span < 1 else 'not sure'}: lengths in {length}: the positions span {span:.3g}")
     unit = "s"

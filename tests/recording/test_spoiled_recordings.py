@@ -11,8 +11,9 @@ from palpate.interface.assessment import assess
 from palpate.recording.faults import FaultCode
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Units
 from palpate.recording.read import recording_of
-from palpate.recording.readings import from_table
+from palpate.recording.readings import Readings, from_table
 from palpate.recording.recording import PalpationRecording
+from palpate_assessment.places import places_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))
@@ -223,3 +224,23 @@ def test_a_fault_is_named_and_adds_no_finding(pressed: pd.DataFrame, spoil, mapp
     assert fault.text
     places = assess(recording).findings[["x_m", "y_m"]].to_numpy()
     assert np.all(np.linalg.norm(places - (-0.055, -0.055), axis=1) < 0.015)
+
+
+def test_slides_over_a_body_that_breathes_keep_one_depth() -> None:
+    """The tool follows the skin, which rises and falls by 4 mm, 10 mm deep along lines that are 12 mm apart."""
+    rows = []
+    for line in range(6):
+        depth = np.concatenate((np.linspace(-15, 10, 60), np.full(450, 10.0), np.linspace(10, -15, 40)))
+        along = np.concatenate((np.zeros(110), np.linspace(0, 90, 360), np.full(80, 90.0)))
+        rows.append(np.column_stack((along, np.full(550, 12.0 * line), -depth)))
+    x, y, z = 1e-3 * np.concatenate(rows).T
+    time = 0.01 * np.arange(len(x))
+    depth = np.maximum(-z, 0)
+    rng = np.random.default_rng(0)
+    position = np.column_stack((x, y, z + 0.015 + 0.004 * np.sin(2 * np.pi * time / 4.3)))
+    force = np.column_stack((0 * x, 0 * x, 3e3 * depth**1.5)) + rng.normal(0, 0.02, (len(x), 3))
+    recording = recording_of(Readings(position, force, time), OVER_TIME, "breathing")
+    assert [fault.code for fault in recording.faults] == [FaultCode.MOVES]
+    assert abs(recording.depth_m - 0.010) < 0.002
+    assert all(abs(np.median(touch.depth) - recording.depth_m) < 0.001 for touch in recording.touches)
+    assert 0.007 < places_of(recording.samples()).spacing < 0.012  # that of the lines

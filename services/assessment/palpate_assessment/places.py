@@ -16,6 +16,9 @@ from palpate_models.numerics.frames import Array
 _GAP: Final = 2.0
 """Largest circumradius of a triangle of samples without a gap, over their usual distance."""
 
+_NEIGHBOURS: Final = 9
+"""Samples, itself among them, whose median is the height of the skin at a place."""
+
 
 @dataclass(frozen=True)
 class SampledPlaces:
@@ -67,6 +70,7 @@ class SampledPlaces:
 
 
 def places_of(samples: Sequence[ForceSample]) -> SampledPlaces:
-    """Return the places of samples."""
+    """Return the places of samples; each is as high as its neighbours, for an error of its own depth is not the body's shape."""
     position = np.array([sample.position for sample in samples])
-    return SampledPlaces(position[:, :2], position[:, 2])
+    near = cKDTree(position[:, :2]).query(position[:, :2], min(_NEIGHBOURS, len(position)))[1].reshape(len(position), -1)
+    return SampledPlaces(position[:, :2], np.median(position[near, 2], axis=1))
