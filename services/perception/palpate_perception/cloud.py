@@ -232,6 +232,8 @@ class FusedDepth:
     """Standard deviation of the mean [m], NaN where no frame was valid."""
     frames: int
     """Number of fused frames."""
+    agreeing: float
+    """Share of the valid depths that are within the gate."""
 
 
 class DepthFusion:
@@ -290,4 +292,5 @@ class DepthFusion:
         mean = offset.sum(axis=0) / n
         variance = np.where(kept, (offset - mean) ** 2, 0).sum(axis=0) / np.maximum(n - 1, 1)
         sigma = np.sqrt(np.maximum(variance, frame_sigma(median) ** 2) / n)
-        return FusedDepth((median + mean).astype(np.float32), sigma.astype(np.float32), len(self._frames))
+        agreeing = float(kept.sum() / valid.sum()) if valid.any() else 1.0
+        return FusedDepth((median + mean).astype(np.float32), sigma.astype(np.float32), len(self._frames), agreeing)

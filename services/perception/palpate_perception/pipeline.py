@@ -32,6 +32,8 @@ class PipelineTuning:
     """SD of the surface over the frames above which a remark is added; noise causes less than a tenth of it."""
     least_coverage: float = 0.95
     """Least part of the region in view; below it no targets are returned."""
+    least_agreeing: float = 0.5
+    """Least share of depths near their median over the frames; a live camera has nearly all of them there."""
 
 
 PIPELINE: Final = PipelineTuning()
@@ -127,6 +129,11 @@ class Pipeline:
 
         seen = visibility.seen(p_A, self._exam)
         coverage = float(np.mean(seen))
+        if fused.agreeing < PIPELINE.least_agreeing:
+            differing = f"{100 * (1 - fused.agreeing):.0f} % of the depths"
+            message = f"{differing} differ from frame to frame by more than {cloud.GATE:g} times the camera's noise"
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, ViewReason.BAD_FRAMES, message)
+
         if coverage < PIPELINE.least_coverage:
             gaps = self._gaps(seen, p_A, depth, origin, camera)
             message = (

@@ -8,6 +8,7 @@ from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, visibility
 from palpate_perception.cloud import DepthFusion, frame_sigma
+from palpate_perception.pipeline import PIPELINE
 from palpate_perception.visibility import Gaps, ViewReason
 
 SHAPE = (40, 50)
@@ -49,6 +50,13 @@ def test_frames_that_looked_past_an_edge_are_left_out() -> None:
     fused = fuse(images).fused()
     assert np.mean(np.abs(fused.depth - 1.1) < 3e-3) > 0.97
     assert fused.depth.mean() == pytest.approx(1.1, abs=3e-3)
+
+
+@pytest.mark.parametrize(("noise_m", "usable"), [(0.0, True), (0.005, True), (0.04, False)])
+def test_frames_of_a_camera_that_only_sends_noise_do_not_agree(noise_m: float, usable: bool) -> None:
+    rng = np.random.default_rng(2)
+    images = [image + np.float32(noise_m) * rng.standard_normal(SHAPE, np.float32) for image in frames(np.full(SHAPE, 1.1), 10)]
+    assert (fuse(images).fused().agreeing > PIPELINE.least_agreeing) == usable
 
 
 def test_invalid_pixels_do_not_count_and_never_valid_ones_stay_invalid() -> None:

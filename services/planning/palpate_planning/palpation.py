@@ -56,8 +56,8 @@ class PalpationTuning:
 
 TUNING = PalpationTuning()
 
-HIDDEN = Cause(Reason.WALL_HIDDEN, "the arm hides the wall from the camera")
-NOT_TRACKED = Cause(Reason.WALL_NOT_TRACKED, "the wall could not be tracked")
+HIDDEN = Cause(Reason.WALL_HIDDEN, "the arm hides the wall from the camera", "camera/follow/depth")
+NOT_TRACKED = Cause(Reason.WALL_NOT_TRACKED, "the wall could not be tracked", "camera/follow/depth")
 REPLANNED = frozenset({Reason.ARM_STRETCHED, Reason.WALL_HIDDEN})
 """Reasons after which the rest of the targets is planned again."""
 

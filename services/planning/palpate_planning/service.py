@@ -44,13 +44,10 @@ NEEDED_BEFORE_TARGETS = (*NEEDED, "camera", "perception")
 """Roles whose loss ends the examination before there are targets."""
 CULPRITS = {
     PalpationTargets.NONE: "perception",
-    PalpationTargets.NO_DEPTH: "camera/depth/image_raw",
-    PalpationTargets.NO_FRAMES: "camera/depth/image_raw",
     PalpationTargets.NO_CAMERA: "camera",
     PalpationTargets.NO_CALIBRATION: "camera/depth/camera_info",
-    PalpationTargets.BAD_FRAMES: "camera/depth/image_raw",
 }
-"""Role or topic at fault, by the reason why perception has no targets."""
+"""Role or topic behind the reason why perception has no targets; any other reason is seen in the images."""
 FINAL = frozenset({SupervisorState.CAUSE_SENSOR})
 """Causes of a stop that no release ends."""
 BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
@@ -147,7 +144,7 @@ class PlanningService(Service):
             text = targets.message or "perception found no targets, or no usable surface"
             blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
             reason = Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED
-            return PerceptionFailure(Cause(reason, text, CULPRITS.get(targets.reason, "")))
+            return PerceptionFailure(Cause(reason, text, CULPRITS.get(targets.reason, "camera/depth/image_raw")))
         try:
             return abdomen_of(self._mesh, targets, self._X_WA)
         except ValueError as error:

@@ -38,12 +38,14 @@ FOR_WALL: Final = _wait(
     "waiting above the skin: the wall is not tracked",
     Reason.WALL_NOT_TRACKED,
     "the wall could not be tracked",
+    "camera/follow/depth",
 )
 FOR_BREATH: Final = _wait(
     Reason.WAITS_FOR_BREATH,
     "waiting for the end of expiration: the breath's gate is closed",
     Reason.WALL_NOT_TRACKED,
     "the breath did not reach the end of expiration for long enough",
+    "camera/follow/depth",
 )
 FOR_ARM: Final = _wait(
     Reason.WAITS_FOR_ARM,
