@@ -6,7 +6,7 @@ from typing import Any
 import numpy as np
 
 from palpate.check import shapes
-from palpate.check.rig import Rig
+from palpate.check.rig import Rig, sensed
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState
@@ -62,7 +62,7 @@ class PlayedScan:
         p_A = np.array([[x, y, shapes.height(np.array(x), np.array(y))]])
         n_A = shapes.normals(np.array([x]), np.array([y]))
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
-        depth = self._depth if scanning else -0.01
+        depth = float(sensed(self._depth, t)) if scanning else -0.01
         force = BELLY.force_n * self.stiffness(x, y) if scanning else 0.0
         return exam_state(
             t,

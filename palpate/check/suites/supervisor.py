@@ -11,7 +11,7 @@ from palpate.check.shapes import level
 from palpate.exam_state import exam_state
 from palpate_bus.contract import MS
 from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import NS, header
 from palpate_models.numerics.frames import GRAVITY, Array, apply, inverse
 from palpate_models.robot.arm import arm_of, urdf
 from palpate_models.robot.kinematics import tool_jacobian, tool_pose
@@ -54,6 +54,7 @@ class PlayedArm:
         self.robot = exam_input(rig.settings.scenario).robot
         self._model = pin.buildModelFromXML(urdf(self.robot, geometry=False))
         self._data = self._model.createData()
+        self._t = rig.t
         self.calm()
 
     def calm(self) -> None:
@@ -63,12 +64,17 @@ class PlayedArm:
         self.push_N = 0.0
         """Upward force on the tool [N]."""
         self.mode, self.reason = RobotStatus.MODE_ACTIVE, ""
+        self.turns = False
+        """True if the positions follow the velocities."""
 
     def feed(self, *without: str) -> Feed:
         """Return the periodic inputs of the supervisor without some topics."""
         return {name: source for name, source in ((STATUS, self._status), (EXAM, self._exam)) if name not in without}
 
     def _status(self, t: int) -> Any:
+        if self.turns:
+            self.q = self.q + self.qd * (t - self._t) / NS
+        self._t = t
         q, push_W = np.nan_to_num(self.q), np.array((0.0, 0.0, self.push_N))
         force = tool_pose(q, self.robot)[:3, :3].T @ (push_W - np.array((0.0, 0.0, self.robot.tool_mass_kg * GRAVITY)))
         torque = pin.rnea(self._model, self._data, q, self.qd, np.zeros_like(q)) - tool_jacobian(q, self.robot)[:3].T @ push_W
@@ -143,7 +149,7 @@ def suite(rig: Rig) -> None:
 def _measures(rig: Rig, arm: PlayedArm) -> None:
     """Check the reported force, speed and depth."""
     rig.section("measures")
-    arm.qd = _turning(arm, 0.05)
+    arm.qd, arm.turns = _turning(arm, 0.05), True
     rig.send(SURFACE, arm.surface(rig.t, 0.004))
     received = _press(rig, arm, 10.0)
     state = received[-1].message

@@ -32,6 +32,8 @@ class Problem(NamedTuple):
     text: str
 
 
+FARTHEST_M: Final = 0.1
+"""A Cartesian set-point that is farther from the tool does not come from planning, which starts where the arm is."""
 NO_PROBLEM: Final = Problem("", "")
 _NONE: Final = np.zeros(0)
 
@@ -130,11 +132,16 @@ class ControlService(Service):
             return self._stop_commands(t, Problem("joint_states", wrong))
         if self._admittance is not None and (stale := self._sense(self._admittance, t, inbox)):
             return self._repeat(t, stale)
-        command = self._controller.command(q, qd, self._reference.at(followed))
+        reference = self._reference.at(followed)
+        command = self._controller.command(q, qd, reference)
+        far = ""
         if self._admittance is None:
+            gap = reference.setpoint.p_WD - self.model.p_WI
+            if reference.setpoint.mode is ControlMode.CARTESIAN and gap.dot(gap) > FARTHEST_M**2:
+                far = f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m"
             np.maximum(self._peak, np.abs(command), out=self._peak)
         self._last, self._last_expires = command, t + self._command_expiry
-        return self._command(t, command, self._full_validity)
+        return self._stop_commands(t, Problem(TOPIC, far)) if far else self._command(t, command, self._full_validity)
 
     def finish(self) -> Mapping[str, Any]:
         """Return counts of set-points and rejections, the last problem, and the largest torque per joint [N m]."""

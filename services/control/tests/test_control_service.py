@@ -116,6 +116,14 @@ def test_a_setpoint_for_another_arm_is_refused(rig: Rig) -> None:
     assert rig.service.finish()["setpoints_rejected"] == 1
 
 
+def test_a_cartesian_setpoint_far_from_the_tool_ends_commanding(rig: Rig) -> None:
+    rig.send(setpoint(0, mode=ImpedanceSetpoint.MODE_CARTESIAN))
+    command = rig.tick(20)
+    assert valid_for(command) == 0
+    assert command.culprit == "planning/setpoint"
+    assert "m from the tool, limit 0.1 m" in command.problem
+
+
 def test_no_setpoint_outlives_the_contract(rig: Rig) -> None:
     rig.send(setpoint(0, valid=10_000 * MS))
     assert valid_for(rig.tick(251)) == EXPIRY

@@ -50,6 +50,14 @@ def test_a_new_forecast_is_joined_without_a_step() -> None:
     assert breath.displacement(200 * MS + round(TUNING.join_s * SECOND)) == pytest.approx(0.004 - 0.002 / np.e)
 
 
+@pytest.mark.parametrize(("wall_m", "left_m"), [(-0.030, 0.026), (0.030, 0.030 * float(np.exp(-4 / 3)))])
+def test_a_wall_that_leaps_inward_is_followed_slowly_and_outward_at_once(wall_m: float, left_m: float) -> None:
+    breath = Breath()
+    breath.receive(motion(0, 0.0, 0.0), 0)
+    breath.receive(motion(100 * MS, wall_m, wall_m), 100 * MS)
+    assert abs(breath.displacement(140 * MS) - wall_m) == pytest.approx(left_m)
+
+
 def test_a_forecast_that_is_too_old_is_not_relied_on() -> None:
     breath = Breath()
     breath.receive(motion(0, 0.0, 0.0), 0)

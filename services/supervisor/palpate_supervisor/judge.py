@@ -1,11 +1,14 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
 from dataclasses import dataclass
+from typing import Final
 
-from palpate_supervisor.senses import ForceComparison
+import numpy as np
+
+from palpate_supervisor.senses import ForceComparison, Measurement
 from palpate_supervisor.watch import Breach, Level, StopCause
 
-FT, JOINTS = "ft/wrench", "joint_states"
+FT, JOINTS, STATUS = "ft/wrench", "joint_states", "robot/status"
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,35 @@ class SensorJudge:
         elif not self._tested and depth is not None and depth > -TUNING.tested_above_m:
             return _ft("self-test incomplete before the first touch: the tool was not moved enough to weigh it")
         return []
+
+
+class MotionAgreement:
+    """Compares the measured positions with the integral of the measured velocities, over about half a second."""
+
+    WINDOW_S: Final = 0.5
+    LIMIT_RAD: Final = 0.03
+    """Three times the error of a velocity that lags by 10 ms while it changes by 1 rad/s."""
+    JUMP_RADPS: Final = 4.0
+    """Faster than any joint: a jump, which other checks name."""
+
+    def __init__(self) -> None:
+        self._before: Measurement | None = None
+        self._gap = np.zeros(0)
+
+    def judge(self, measured: Measurement, since_s: float) -> list[Breach]:
+        """Return the breaches at a measurement, `since_s` [s] after the one before."""
+        before, self._before = self._before, measured
+        moved = measured.q - (measured.q if before is None else before.q)
+        if before is None or not 0 < since_s < self.WINDOW_S or np.abs(moved).max() > self.JUMP_RADPS * since_s:
+            self._gap = np.zeros_like(measured.q)
+            return []
+        turned = 0.5 * (measured.qd + before.qd) * since_s
+        gap = (self._gap + moved - turned) * np.exp(-since_s / self.WINDOW_S)
+        self._gap = np.clip(gap, -2 * self.LIMIT_RAD, 2 * self.LIMIT_RAD)  # it is over within the window when they agree again
+        if (gap := float(np.abs(self._gap).max())) <= self.LIMIT_RAD:
+            return []
+        reason = f"joint sensors: positions and velocities disagree by {gap:.2f} rad, limit {self.LIMIT_RAD:g} rad"
+        return [Breach(Level.EMERGENCY, StopCause.SENSOR, reason, culprit=STATUS)]
 
 
 def _ft(reason: str) -> list[Breach]:

@@ -15,7 +15,7 @@ from palpate_models.numerics.frames import inverse
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_supervisor.judge import SensorJudge
+from palpate_supervisor.judge import MotionAgreement, SensorJudge
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
@@ -63,7 +63,8 @@ class SupervisorService(Service):
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it before the first deadline
         self._max_age = contract().topics["planning/setpoint"].expiry
         """Age limit of watched topics [ns]: the expiry of set-points. Control and driver check their own inputs faster."""
-        self._judge = SensorJudge()
+        self._judge, self._agreement = SensorJudge(), MotionAgreement()
+        self._disagreeing: list[Breach] = []
         self._latch = Latch()
         self._began: int | None = None
         self._tool = Tool(np.zeros(3), 0.0, 0.0)
@@ -157,6 +158,7 @@ class SupervisorService(Service):
             self._stamp, self._stamped = stamp, t
             clear = self._surface is not None and self._depth < -TUNING.clear_m
             self._tool = self._sense.sense(measured, since_s, clear)
+            self._disagreeing = self._agreement.judge(measured, since_s)
         tool = self._tool
         self._peak_force = max(self._peak_force, tool.force)
         self._peak_speed = max(self._peak_speed, tool.speed)
@@ -164,6 +166,7 @@ class SupervisorService(Service):
         self._depth = min(max(depth, TUNING.no_depth_m), TUNING.deepest_m)
         known = depth if above else None
         found = self._watch.judge(tool, known, stamp, t) + self._judge.judge(self._sense.comparison, known)
+        found += self._disagreeing
         if t - self._stamped > self._max_age:
             age = f"{(t - self._stamped) / 1e6:.0f} ms, limit {self._max_age / 1e6:.0f} ms"
             reason = f"robot/status repeats a measurement of age {age}"

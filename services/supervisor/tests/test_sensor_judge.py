@@ -11,7 +11,7 @@ from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
-from palpate_supervisor.judge import FT, JOINTS, SensorJudge
+from palpate_supervisor.judge import FT, JOINTS, MotionAgreement, SensorJudge
 from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement
 from palpate_supervisor.tool import ToolSense
 
@@ -125,3 +125,14 @@ def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_l
         sd.append(senses.compare(reading, np.zeros(6), J, np.zeros(3), np.eye(3), 0.0, DT, (t < 1.0, True)).joint_sd)
     assert sd[310] > 2 * sd[-1]
     assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
+
+
+@pytest.mark.parametrize(("lie", "seen"), [("", False), ("stuck", True), ("gain", True)])
+def test_positions_agree_with_velocities(lie: str, seen: bool) -> None:
+    agreement, rng = MotionAgreement(), np.random.default_rng(2)
+    found = []
+    for measured in measurements():
+        q = measured.q + rng.normal(0.0, 1e-5, 7)
+        q = {"": q, "stuck": measurements()[0].q + rng.normal(0.0, 1e-5, 7), "gain": 0.8 * q}[lie]
+        found += agreement.judge(measured._replace(q=q), DT)
+    assert bool(found) == seen

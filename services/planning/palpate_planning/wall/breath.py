@@ -24,8 +24,9 @@ class ForecastTuning:
     """Age above which a motion is not followed: the length of the forecast."""
     join_s: float = 0.03
     """Time constant of the blend from one forecast to the next. During the blend the older forecast still adds its error (0.69 mm
-    with
-    0.1 s, 0.53 mm with this; tuning seeds 1 and 2, 8 mm deep)."""
+    with 0.1 s, 0.53 mm with this; tuning seeds 1 and 2, 8 mm deep)."""
+    inward_mps: float = 0.1
+    """Greatest speed at which a receding wall is joined: four times that of a deep breath. A camera may be wrong."""
     steps_kept: float = 0.98
     """Forgetting factor of the mean square step per message: an average over 50 messages, about a breath."""
     exposures: int = 60
@@ -88,7 +89,8 @@ class Breath:
             return 0.0
         k = (t - motion.stamp) / FORECAST_STEP
         forecast = float(np.interp(k, np.arange(len(motion.forecast)), motion.forecast))
-        return forecast + self._gap * exp(-(t - self._since) / SECOND / TUNING.join_s)
+        since_s = (t - self._since) / SECOND
+        return forecast + max(self._gap * exp(-since_s / TUNING.join_s), self._gap - TUNING.inward_mps * since_s)
 
     def seen(self, times: Array) -> Array | None:
         """Return measured displacements [m] at past times [ns], shape (n,), or None if not measured yet."""
