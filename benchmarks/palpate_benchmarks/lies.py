@@ -68,7 +68,7 @@ LEAST_SHARE: Final = 0.9
 """Share of the twin's targets that a complete examination has felt."""
 SAME_BACKGROUND: Final = 0.25
 """Relative change of the map's background that counts as harm."""
-LONGEST_NS: Final = 120 * NS
+LONGEST_NS: Final = 180 * NS
 """Simulated time after which a case has hung."""
 CASE_S: Final = 900.0
 """Wall time of a case at most."""
