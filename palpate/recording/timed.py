@@ -258,10 +258,12 @@ class _Measured:
         deep = np.flatnonzero(depth > 0.5 * np.median(depth))
         if len(deep) < 3:
             return []
+        first = p + depth[:, None] * normal
+        first[:, 2] = self.skin.at(first[:, :2])[0]  # its own heights would be those of a body that moves
         return [
             Contact(
                 kind=ContactKind.SLIDE,
-                position=(p + (depth - self.radius)[:, None] * normal)[deep],
+                position=(first - self.radius * normal)[deep],
                 normal=normal[deep],
                 depth=depth[deep],
                 force=normal_force(F, normal)[deep],
