@@ -111,10 +111,10 @@ def examined(seed: int) -> tuple[object, ...]:
         report = json.loads((Path(folder) / "report.json").read_text(encoding="utf-8"))
         run = list(samples(Path(folder)))
         found = list(judged(load_scenario(f"{folder}/scenario.yaml").robot, run))
-    stops = "; ".join(stop["reason"] for stop in report["services"]["supervisor"]["stops"])
+    stops = "; ".join(stop["reason"] for stop in report["services"]["supervisor"]["facts"]["stops"])
     alarms = " ".join(sorted({culprit for _, culprit in found} - {""}))
     largest = (f"{max(getattr(c, field) for c, _ in found):.2f}" for field in ForceComparison._fields)
-    return seed, f"{len(run) * PERIOD_S:.1f}", report["services"]["planning"]["message"], stops, alarms, *largest
+    return seed, f"{len(run) * PERIOD_S:.1f}", report["services"]["planning"]["facts"]["message"], stops, alarms, *largest
 
 
 def collect(seeds: range, out: Path) -> None:
