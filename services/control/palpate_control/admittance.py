@@ -12,7 +12,8 @@ G(s) after a delay d, the loop is L = Z G e^(-d s) / (K (T s + 1)) (Colgate and 
 10.1080/00207178808906161; Keemink et al., IJRR 2018, doi 10.1177/0278364918768950). Where |L| < 1 at all frequencies, no delay
 makes it unstable (small gain).
 
-The joints follow by inverse kinematics on commanded positions, with damped least squares and the posture in the null space.
+The joints follow the planned posture, corrected by inverse kinematics on commanded positions. The least squares are damped: near
+a singular wrist the tool tilts, where two joints would otherwise turn fast against each other and leave the plan.
 """
 
 from dataclasses import dataclass
@@ -40,11 +41,13 @@ class AdmittanceTuning:
     follow_per_s: float = 50.0
     """Gain of the inverse kinematics on the error of pose and of joint positions."""
     posture_per_s: float = 2.0
-    """The same on the posture in the null space."""
+    """The same on the posture."""
     posture_radps: float = 0.5
-    """Largest speed of that: at a singular wrist two joints would turn against each other at their limits."""
-    damping: float = 0.02
-    """Of the least squares [m or 1]: near a singularity the joints slow down."""
+    """Largest speed of that."""
+    damping_m: float = 0.02
+    """Of the least squares: a motion that moves the tool by less per rad follows the posture instead of the pose."""
+    damping_rad: float = 0.3
+    """The same for turns of the tool [1]: near a singularity it tilts by a few degrees, and its place stays."""
     speed_share: float = 0.8
     """Largest commanded speed over a joint's limit: the arm's position loop overshoots, and its driver holds beyond the limit."""
 
@@ -63,6 +66,7 @@ class AdmittanceController:
         self.model, self._dt = model, period_s
         self._lower, self._upper = model.position_lower + limit_zone, model.position_upper - limit_zone
         self._weight_W = np.array((0.0, 0.0, -tool_mass_kg * GRAVITY))
+        self._damping = np.diag(np.repeat((TUNING.damping_m, TUNING.damping_rad), 3) ** 2)
         self._bias: Array | None = None
         self._reading: Array | None = None
         self._fresh = False
@@ -94,7 +98,7 @@ class AdmittanceController:
         return self._q
 
     def _cartesian(self, reference: Reference) -> Array:
-        """Return joint velocities [rad/s] that follow the pose less what the force makes it yield."""
+        """Return joint velocities [rad/s] that follow pose and posture, less what the force makes the tool yield."""
         assert self._q is not None
         model, (setpoint, motion) = self.model, reference
         R_WD = motion.R_WD
@@ -106,13 +110,10 @@ class AdmittanceController:
         error = np.concatenate((motion.p_WD + R_WD @ self._yield - model.p_WI, pin.log3(R_WD @ model.R_WI.T)))
         twist = motion.V_WD + TUNING.follow_per_s * error
         twist[:3] += R_WD @ step / self._dt
+        back = TUNING.posture_per_s * (motion.q - self._q)
+        posture = motion.qd + back / max(1.0, float(np.linalg.norm(back)) / TUNING.posture_radps)
         J = model.J_W
-        rate: Array = J.T @ np.linalg.solve(J @ J.T + TUNING.damping**2 * np.eye(6), twist)
-        if model.joints > len(J):
-            back = TUNING.posture_per_s * (motion.q - self._q)
-            posture = motion.qd + back / max(1.0, float(np.linalg.norm(back)) / TUNING.posture_radps)
-            rate += posture - np.linalg.pinv(J) @ (J @ posture)
-        return rate
+        return np.asarray(posture + J.T @ np.linalg.solve(J @ J.T + self._damping, twist - J @ posture))
 
     def _force(self, R_WS: Array) -> Array:
         """Return the force of the environment on the tool [N], world axes, shape (3,); zero before the first tare."""

@@ -71,7 +71,8 @@ def setpoint(
     arm: ArmModel, at: np.ndarray, stamp: int = 0, mode: ControlMode = ControlMode.CARTESIAN, **changes: object
 ) -> Setpoint:
     """Return a set-point that holds posture `at`, with `changes`."""
-    arm.update(np.asarray(at, dtype=float), np.zeros(7))
+    rest = np.zeros(arm.joints)
+    arm.update(np.asarray(at, dtype=float), rest)
     fields: dict[str, object] = {
         "mode": mode,
         "stamp": stamp,
@@ -82,12 +83,12 @@ def setpoint(
         "stiffness": np.array([2000.0, 2000.0, 5000.0, 200.0, 200.0, 200.0]),
         "damping_ratio": np.full(6, 0.8),
         "q": np.array(at, dtype=float),
-        "qd": np.zeros(7),
-        "joint_stiffness": np.full(7, 20.0) if mode is ControlMode.CARTESIAN else np.full(7, 500.0),
+        "qd": rest,
+        "joint_stiffness": np.full_like(rest, 20.0 if mode is ControlMode.CARTESIAN else 500.0),
     }
     return Setpoint(**(fields | changes))  # type: ignore[arg-type]
 
 
 def reference(setpoint_: Setpoint) -> Reference:
     """Return a set-point as the law follows it, without extrapolation."""
-    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros(7))))
+    return Reference(setpoint_, ReferenceMotion(setpoint_.R_WD, coordinates(setpoint_, np.zeros_like(setpoint_.q))))

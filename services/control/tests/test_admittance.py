@@ -1,5 +1,8 @@
 """Admittance control: the static law, the tare, and the limits of what it commands."""
 
+from dataclasses import replace
+from math import acos
+
 import numpy as np
 import pytest
 from control_plant import WORKING, reference, setpoint
@@ -81,6 +84,30 @@ def test_a_far_posture_is_approached_slowly() -> None:
     before, self_motion = contact.q, np.linalg.svd(contact.model.J_W)[2][-1]
     contact.follow(ControlMode.CARTESIAN, np.zeros(3), 100, q=contact.asked + 2.0 * self_motion)
     assert 0.01 < np.linalg.norm(contact.q - before) < 0.105 * TUNING.posture_radps
+
+
+@pytest.mark.parametrize("beside_m", [-0.01, 0.01])
+def test_beside_a_path_through_a_singular_wrist_the_tool_tilts_and_stays_in_place(beside_m: float) -> None:
+    """Two axes of the wrist align: 10 mm beside the planned path they turned at their limits, and the tool was 12 mm off."""
+    pytest.importorskip("coal")
+    model = ArmModel(urdf(Robot(arm="ur5")))
+    law, beside = AdmittanceController(model, MASS), np.array((0.0, beside_m, 0.0))
+    start, travel = np.array((0.3, -1.2, 1.9, -2.2, 0.25, 0.0)), np.array((0.0, 0.0, 0.0, 0.0, -0.5, 0.0))
+    q, off, fastest = start, np.zeros(3), 0.0
+    for ms in range(2000):
+        x = ms / 2000
+        planned, rate = start + travel * x * x * (3 - 2 * x), travel * 3 * x * (1 - x)
+        asked = setpoint(model, planned, qd=rate)
+        asked = replace(asked, p_WD=asked.p_WD + beside, V_WD=model.J_W @ rate)
+        before = q
+        q = law.command(q, rate, reference(asked))
+        fastest = max(fastest, float(np.abs(q - before).max()) * 1e3)
+        model.update_kinematics(q)
+        off = np.maximum(off, (np.abs(q - planned).max(), acos(asked.R_WD[:, 2] @ model.R_WI[:, 2]), 0.0))
+        if ms > 300:
+            off[2] = max(off[2], np.linalg.norm(asked.p_WD - model.p_WI))
+    assert (off < (0.2, 0.04, 5e-4)).all()
+    assert fastest < 0.5 * model.velocity_limit.min()
 
 
 def test_after_a_reset_it_starts_where_the_arm_is() -> None:
