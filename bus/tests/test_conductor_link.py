@@ -143,7 +143,7 @@ def test_a_conductor_that_returns_is_not_lost(wallclock: Bus) -> None:
 def test_in_lockstep_the_silence_may_be_longer(monkeypatch: pytest.MonkeyPatch) -> None:
     bus = Bus(monkeypatch, "lockstep")
     link = bus.link(grace_s=9.0)
-    assert TIMES.lockstep_silent_s < bus.silence(link, 10.0) < TIMES.lockstep_silent_s + 0.1
+    assert TIMES.lockstep_heartbeat_s < bus.silence(link, 10.0) < TIMES.lockstep_heartbeat_s + 0.1
 
 
 def test_in_lockstep_a_conductor_without_a_core_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:

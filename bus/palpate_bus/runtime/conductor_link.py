@@ -1,8 +1,8 @@
 """Communication of a service with the conductor: control messages and heartbeats in, reports out.
 
-The conductor counts as lost when its token is gone or its heartbeat is late by the contract's deadline. In wall-clock mode the
-services then continue for a grace period in which planning lifts the arm; in lockstep they leave at once, since no time passes
-without grants.
+The conductor counts as lost when its token is gone or its heartbeat is late: by the contract's deadline in wall-clock mode, by
+`LinkTimes.lockstep_heartbeat_s` in lockstep. In wall-clock mode the services then continue for a grace period in which planning
+lifts the arm; in lockstep they leave at once, since no time passes without grants.
 """
 
 import json
@@ -36,13 +36,13 @@ class LinkTimes:
     progress_s: float = 0.2
     """Period of progress reports, wall clock."""
     silent_s: float = 10.0
-    """Time without a message after which the conductor is lost before the run starts, or if it has no heartbeat."""
-    awaited_s: float = 120.0
-    """As `silent_s`, before the first message: containers on a busy machine start tens of seconds apart."""
-    quiet_s: float = 5.0
-    """Part of it after which the wait is said."""
-    lockstep_silent_s: float = 3.0
-    """As `silent_s`, in lockstep, where time does not advance without grants."""
+    """Timeout for any message before the first grant and heartbeat."""
+    first_message_s: float = 120.0
+    """Timeout for the first message: containers on a busy machine start tens of seconds apart."""
+    wait_warning_s: float = 5.0
+    """Time after which a warning reports that wait."""
+    lockstep_heartbeat_s: float = 3.0
+    """Timeout for the heartbeat in lockstep, where time does not advance without grants."""
     longest_poll_s: float = 0.1
     """Longest silence counted between two polls: a node that polls later was itself starved of CPU, and perhaps others too."""
     token_gone_s: float = 0.01
@@ -63,7 +63,7 @@ TRANSPORT_LOST: Final = "the router of the bus does not answer"
 
 def longest_silence_s(rules: Contract, wallclock: bool) -> float:
     """Return the silence [s] after which a conductor that has sent a heartbeat counts as lost."""
-    return rules.internal[HEARTBEAT].deadline / NS if wallclock else TIMES.lockstep_silent_s
+    return rules.internal[HEARTBEAT].deadline / NS if wallclock else TIMES.lockstep_heartbeat_s
 
 
 class RunAborted(RunError):
@@ -83,15 +83,15 @@ class ConductorLink:
         self._deadline_s = longest_silence_s(member.rules, wallclock)
         self._busy_s = TIMES.busy_s if wallclock else TIMES.lockstep_busy_s
         self._grace_s = grace_s / (Settings.read().rate or 1.0)
-        self._patience_s = TIMES.awaited_s
+        self._patience_s = TIMES.first_message_s
         self._granted = self._beating = False
         self._control_sequence = self._beat_sequence = 0
         """Last sequence numbers of control and heartbeat; duplicates are ignored."""
         self._silent_s = 0.0
         self._polled = self._checked = self._lost_at = monotonic()
-        self._missed = False
+        self._token_missing = False
         """True if the conductor's token was missing at the last check."""
-        self._waits = False
+        self._wait_reported = False
         """True if it has been said that the conductor is awaited."""
         self._pid = 0
         """The conductor's process id if we can inspect that process; else 0."""
@@ -145,14 +145,14 @@ class ConductorLink:
             self._on_heartbeat(beat.payload)
             return
         self._silent_s += since
-        if self._silent_s > TIMES.quiet_s and self._patience_s == TIMES.awaited_s and not self._waits:
-            self._waits = True
-            log.warning("waiting for the conductor, %g s at most", TIMES.awaited_s)
+        if self._silent_s > TIMES.wait_warning_s and self._patience_s == TIMES.first_message_s and not self._wait_reported:
+            self._wait_reported = True
+            log.warning("waiting for the conductor, %g s at most", TIMES.first_message_s)
         if self.lost or now - self._checked < TIMES.token_gone_s:
             return
         self._checked = now
-        before, self._missed = self._missed, CONDUCTOR in self._member.gone()
-        if before and self._missed:
+        before, self._token_missing = self._token_missing, CONDUCTOR in self._member.gone()
+        if before and self._token_missing:
             self._lose(TRANSPORT_LOST if self._member.transport_lost() else "the conductor's token is gone")
         elif self._silent_s > self._patience_s and (self._silent_s > self._busy_s or not (self._pid and is_running(self._pid))):
             self._lose(f"no heartbeat for {self._silent_s:.2f} s")

@@ -179,7 +179,7 @@ def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed:
     weight = grid.area[nodes] / grid.area[nodes].sum()
     inside = nodes[near]
     middle = float(weight @ mean[inside])
-    sd = float(np.hypot(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight), standard.errors.unlike * middle))
+    sd = float(np.hypot(np.sqrt(weight @ covariance[np.ix_(inside, inside)] @ weight), standard.errors.lump_press_sd * middle))
     return Area(
         nodes=nodes,
         centroid=weight @ grid.nodes[nodes],

@@ -235,8 +235,8 @@ class Regression:
         for lump in self.lumps:
             prior = prior + (PRIOR.lump_sd * lump(xy)) ** 2 + (PRIOR.free(o.standard) * lump(xy, 2 * lump.edge)) ** 2
         variance = np.maximum(prior - (seen**2).sum(axis=0), 1e-8) + self.transfer_variance
-        if self.lumps and e.unlike:
-            variance += (e.unlike * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
+        if self.lumps and e.lump_press_sd:
+            variance += (e.lump_press_sd * (self.whitened @ self.whiten(self.lump_covariance(o.xy, xy)))) ** 2
         return self.level + self.whitened @ seen, np.sqrt(variance)
 
     def smooth(self, xy: Array) -> Array:

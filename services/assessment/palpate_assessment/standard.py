@@ -1,7 +1,7 @@
-"""The standard press that a map is of, and what is assumed before anything was pressed.
+"""The standard press and the priors of a stiffness map.
 
-A press feels over the radius of its footprint, sqrt(2 R d - d^2) for a sphere of radius R at depth d, so all lengths scale with
-it. Forces scale with the force of the press.
+A press averages over the radius of its footprint, sqrt(2 R d - d^2) for a sphere of radius R at depth d, so all lengths scale
+with it. Forces scale with the force of the press.
 """
 
 from collections.abc import Sequence
@@ -52,7 +52,7 @@ class Lengths:
     """Lengths [m] for the footprint of the abdomen's standard press."""
 
     fields_m: tuple[float, ...] = (0.012, 0.022, 0.045, 0.09, 0.18)
-    """Of the fields that natural variation is made of."""
+    """Length scales of the fields of natural variation."""
     smooth_m: float = 0.045
     """Fields of this length and more are smooth: alike over a hand's breadth."""
     edge_m: float = 0.007
@@ -62,7 +62,7 @@ class Lengths:
     free_m: float = 0.012
     """Length over which a lump differs from the ideal shape."""
     radii_m: tuple[float, ...] = (0.008, 0.012, 0.018, 0.026, 0.036)
-    """Of the lumps that are tried first."""
+    """Initial radii of the search for lumps."""
     pitch_m: float = 0.01
     """Distance between their centres, and how far these may be outside the samples."""
     refined_m: float = 0.004
@@ -86,8 +86,9 @@ class ErrorPrior:
     surface_share: float = 0.8
     """Its share of the depth uncertainty. A scan cannot separate it from stiffness."""
     wide_m: float = 0.15
-    """The same of the offset and tilt that remain after touches."""
+    """Correlation length of the offset and tilt that remain after touches."""
     wide_share: float = 0.7
+    """Their share of the depth uncertainty."""
     onset_m: float = 0.00015
     """Error common to all touches: 0.11 mm with typical equipment, RMS over twelve examinations, 0.29 mm with poor, over ten
     (tuning seeds) [C]. The contact model does not fit every wall exactly, and skin that was pressed before is lower."""
@@ -104,11 +105,11 @@ class ErrorPrior:
     """SD of the exponent with which slides depend on their speed: strokes are slower at their ends."""
     slide_sd: float = 0.015
     """SD of the log difference of slide and press from place to place, besides the common one."""
-    unlike: float = 0.1
+    lump_press_sd: float = 0.1
     """SD of the difference of press and slide over a lump, as a share of its log-contrast."""
 
 
-OWN_ZERO = ErrorPrior(
+ONSET_REFERENCED_ERRORS = ErrorPrior(
     least_depth_m=0.00003,
     surface_share=0.0,
     wide_share=0.0,
@@ -117,7 +118,7 @@ OWN_ZERO = ErrorPrior(
     press_sd=0.0,
     rate_sd=0.0,
     slide_sd=0.0,
-    unlike=0.0,
+    lump_press_sd=0.0,
 )
 """Errors of presses whose depth counts from their own onset, and which are themselves what the map is of."""
 ABDOMEN = AnatomyPrior()
@@ -137,7 +138,7 @@ class PressStandard:
     anatomy: AnatomyPrior | None = ABDOMEN
     """None for a body of which nothing is known: long shapes are tried too, and probabilities are of a stated prior."""
     places: SampledPlaces | None = None
-    """Of all samples, without an anatomy."""
+    """Sampled places; None with an anatomy."""
     calibration: Calibration = field(default_factory=learned)
     """Exponent and conversion of the tissue."""
     errors: ErrorPrior = ErrorPrior()
@@ -155,7 +156,9 @@ class PressStandard:
             "held": 0.0,
             "lead_s": 0.0,
         }
-        return cls(radius_m, depth_m, force_n, None, places_of(samples), learned().model_copy(update=tissue), OWN_ZERO)
+        return cls(
+            radius_m, depth_m, force_n, None, places_of(samples), learned().model_copy(update=tissue), ONSET_REFERENCED_ERRORS
+        )
 
     @property
     def footprint_m(self) -> float:

@@ -58,7 +58,7 @@ class ToolWeight:
     def contact(self, R_WS: Array, wrench_S: Array, a_W: Array) -> Array:
         """Return the force of the environment on the tool [N], world axes, shape (3,).
 
-        `a_W`: acceleration of the tool [m/s^2], shape (3,): 0.5 m/s^2 at 0.35 kg would look like a touch.
+        `a_W`: acceleration of the tool [m/s^2], shape (3,). Without it 0.5 m/s^2 at 0.35 kg would read as 0.18 N, above `off_n`.
         """
         return np.asarray(R_WS @ (wrench_S[:3] - self.bias) - self.weight_W + self.mass * a_W)
 

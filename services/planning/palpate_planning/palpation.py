@@ -163,7 +163,7 @@ class Palpation:
 
     @property
     def free_goal(self) -> Array | None:
-        """Goal of the present free motion [rad], shape (7,); None on a path."""
+        """Goal of the present free motion [rad], shape (n,); None on a path."""
         free = self._motion.segment.free
         return None if free is None or self.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
 

@@ -33,7 +33,7 @@ from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import abdomen_of, correction_message, motion_of, path_message, state_message, touch_message
 from palpate_planning.periods import Periods
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
-from palpate_planning.status import Observation, PerceptionFailure, Phase
+from palpate_planning.status import NO_STOP, ArmStop, Observation, PerceptionFailure, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation
@@ -48,7 +48,7 @@ CULPRITS = {
     PalpationTargets.NO_CALIBRATION: "camera/depth/camera_info",
 }
 """Role or topic behind the reason why perception has no targets; any other reason is seen in the images."""
-FINAL = frozenset({SupervisorState.CAUSE_SENSOR})
+NOT_RELEASABLE = frozenset({SupervisorState.CAUSE_SENSOR})
 """Causes of a stop that no release ends."""
 BEFORE_TARGETS = frozenset({Phase.HOME, Phase.LOOK})
 """Phases before there are targets."""
@@ -84,7 +84,6 @@ class PlanningService(Service):
             self._commanded = self._commanded or status.mode == RobotStatus.MODE_ACTIVE
         requests = tuple(inbox.new("operator/request"))
         state = inbox.latest("supervisor/state")
-        stop, soft = _stop(status, state, requests, self._commanded)
         step = self._exam.step(
             Observation(
                 t=t,
@@ -93,9 +92,7 @@ class PlanningService(Service):
                 motion=self._motion(inbox),
                 averaged=self._averaged(inbox),
                 findings_final=any(message.final for message in inbox.new("assessment/findings")),
-                stop=stop,
-                soft=soft,
-                final=state is not None and state.level != SupervisorState.LEVEL_OK and state.cause in FINAL,
+                stop=_stop(status, state, requests, self._commanded),
                 end=_end(requests),
                 lost=self._lost(t, inbox),
                 request=self._request(inbox),
@@ -158,21 +155,22 @@ class PlanningService(Service):
 
     def _averaged(self, inbox: Inbox) -> Array | None:
         """Return the height of the wall averaged over all images, if it arrived and belongs to the present surface."""
+        heights = None
         for message in inbox.new("perception/correction"):
             if self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
-                return np.asarray(message.outward, dtype=float)
-        return None
+                heights = np.asarray(message.outward, dtype=float)
+        return heights
 
     def _request(self, inbox: Inbox) -> PressRequest | None:
-        """Return the request of the search, if one arrived."""
-        if not self._known.exam.searched:
+        """Return the newest request of the search, if one arrived: the search waits for its execution before the next."""
+        received = inbox.new("exam/request")
+        if not received or not self._known.exam.searched:
             return None
-        for message in inbox.new("exam/request"):
-            over = message.request == SearchRequest.DONE
-            xy = None if over else np.array((message.place.x, message.place.y))
-            depth = min(float(message.depth), self._known.limits.depth_m)  # a policy may request more
-            return PressRequest(int(message.number), xy, depth, message.reason)
-        return None
+        message = received[-1]
+        over = message.request == SearchRequest.DONE
+        xy = None if over else np.array((message.place.x, message.place.y))
+        depth = min(float(message.depth), self._known.limits.depth_m)  # a policy may request more
+        return PressRequest(int(message.number), xy, depth, message.reason)
 
     def _lost(self, t: int, inbox: Inbox) -> Cause:
         """Return the cause if needed roles are disconnected, or the supervisor is silent for longer than a set-point is valid."""
@@ -186,26 +184,29 @@ class PlanningService(Service):
         return Cause(Reason.SERVICE_LOST, f"lost {', '.join(gone)}", culprit) if gone else NO_CAUSE
 
 
-def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...], commanded: bool) -> tuple[Cause, bool]:
-    """Return the cause of a stop, if any, and True for a soft stop, after which planning retreats (else the driver holds).
+def _stop(status: Message | None, state: Message | None, requests: tuple[Message, ...], commanded: bool) -> ArmStop:
+    """Return the stop, if any.
 
     `status` is the latest `robot/status`, `state` the latest `supervisor/state`. `commanded`: the driver has accepted a command;
     one that is idle again, after a release, awaits the next.
     """
+    wrong = None if state is None or state.level == SupervisorState.LEVEL_OK else state
+    final = wrong is not None and wrong.cause in NOT_RELEASABLE
     for request in requests:
         if request.request == OperatorRequest.STOP:
-            return Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), False
+            return ArmStop(Cause(Reason.OPERATOR_STOP, f"stopped by the operator: {request.reason}"), final=final)
     if status is not None and status.mode == RobotStatus.MODE_SAFE_HOLD:
-        wrong = state is not None and state.level != SupervisorState.LEVEL_OK and state.cause in FINAL
-        source = state if state is not None and wrong else status
-        return Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {source.reason}", source.culprit), False
+        source = wrong if wrong is not None and final else status
+        return ArmStop(Cause(Reason.ROBOT_HOLD, f"the driver is in safe hold: {source.reason}", source.culprit), final=final)
     if status is not None and status.mode == RobotStatus.MODE_IDLE and (commanded or status.cause != RobotStatus.CAUSE_NONE):
-        return Cause(Reason.ROBOT_NOT_READY, f"the robot is not ready: {status.reason or 'no command yet'}", "robot"), False
-    if state is None or state.level == SupervisorState.LEVEL_OK:
-        return NO_CAUSE, False
-    if state.level == SupervisorState.LEVEL_SOFT_STOP:
-        return Cause(Reason.SOFT_STOP, f"soft stop of the supervisor: {state.reason}", state.culprit), True
-    return Cause(Reason.EMERGENCY_STOP, f"emergency stop of the supervisor: {state.reason}", state.culprit), False
+        text = f"the robot is not ready: {status.reason or 'no command yet'}"
+        return ArmStop(Cause(Reason.ROBOT_NOT_READY, text, "robot"), final=final)
+    if wrong is None:
+        return NO_STOP
+    if wrong.level == SupervisorState.LEVEL_SOFT_STOP:
+        cause = Cause(Reason.SOFT_STOP, f"soft stop of the supervisor: {wrong.reason}", wrong.culprit)
+        return ArmStop(cause, planning_retreats=True, final=final)
+    return ArmStop(Cause(Reason.EMERGENCY_STOP, f"emergency stop of the supervisor: {wrong.reason}", wrong.culprit), final=final)
 
 
 def _end(requests: tuple[Message, ...]) -> Cause:

@@ -57,25 +57,36 @@ class PerceptionFailure(NamedTuple):
     cause: Cause
 
 
+class ArmStop(NamedTuple):
+    """A stop of the arm. False if there is none."""
+
+    cause: Cause = NO_CAUSE
+    planning_retreats: bool = False
+    """True if planning moves the arm, back along the normal; else the driver holds it."""
+    final: bool = False
+    """True if no release ends it."""
+
+    def __bool__(self) -> bool:
+        return bool(self.cause)
+
+
+NO_STOP: Final = ArmStop()
+
+
 class Observation(NamedTuple):
-    """Inputs of one step. What arrived is given at one step only."""
+    """Inputs of one step. A message appears only in the step in which it arrived."""
 
     t: int
     """[ns]"""
     reading: SensorReading | None
-    """None before the first joint states."""
+    """None before the first `robot/status`."""
     perceived: PerceivedAbdomen | PerceptionFailure | None = None
     """Perception's answer, if it arrived."""
     motion: BreathObservation | None = None
     """The newest motion of the wall, if it arrived."""
     findings_final: bool = False
     """True if the final findings of the assessment arrived."""
-    stop: Cause = NO_CAUSE
-    """Cause for which the arm must rest, if any."""
-    soft: bool = False
-    """True if the stop leaves the arm to planning, which retreats along the normal; else the driver holds."""
-    final: bool = False
-    """True if no release can end the cause of the stop."""
+    stop: ArmStop = NO_STOP
     end: Cause = NO_CAUSE
     """Cause for which the examination is to go home and end, if that was just requested."""
     lost: Cause = NO_CAUSE

@@ -91,8 +91,8 @@ class Stops:
         if now.stop and course.phase is not Phase.HELD:
             course.interrupted = course.phase
             self._hold(now)
-        if now.lost or (now.stop and now.final):
-            self._end_after_loss(now, now.lost or now.stop)
+        if now.lost or now.stop.final:
+            self._end_after_loss(now, now.lost or now.stop.cause)
         elif now.end:
             self._end_at_home(now, now.end)
 
@@ -105,11 +105,11 @@ class Stops:
             return None
         if self._resuming:
             self._hold(now)
-        self._soft = self._soft and now.soft
+        self._soft = self._soft and now.stop.planning_retreats
         self._stopped_ns += passed
         if self._stopped_ns > self._patience_s * SECOND:
-            text = f"the stop was not released within {self._patience_s:g} s of waiting: {now.stop.text}"
-            course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.culprit))
+            text = f"the stop was not released within {self._patience_s:g} s of waiting: {now.stop.cause.text}"
+            course.abort(now, Cause(Reason.NOT_RELEASED, text, now.stop.cause.culprit))
         elif not self._soft:
             assert now.reading is not None
             course.arm.hold(now.reading.q)
@@ -121,12 +121,13 @@ class Stops:
         """Let the strokes retreat, or leave the arm to the driver."""
         assert now.reading is not None
         course = self._course
-        self._soft, self._resuming = now.soft, False
+        self._soft, self._resuming = now.stop.planning_retreats, False
         place = (course.status.stroke, None if course.interrupted in PALPATING else course.interrupted)
         self._stopped_ns = self._stopped_ns if place == self._place else 0
         self._place, self._counted = place, now.t
         course.arm.hold(now.reading.q)
-        course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {now.stop.text}", now.stop)
+        cause = now.stop.cause
+        course.enter(Phase.HELD, now.t, f"held in phase {course.interrupted.name}: {cause.text}", cause)
         if (palpation := self._palpation) is not None:
             palpation.pause()
 
@@ -151,7 +152,7 @@ class Stops:
             palpation.skip_free_motion()
 
     def _free_goal(self, palpation: Palpation | None) -> Array | None:
-        """Return the goal of the interrupted free motion of the plan [rad], shape (7,); None if there was none."""
+        """Return the goal of the interrupted free motion of the plan [rad], shape (n,); None if there was none."""
         if palpation is not None:
             return palpation.free_goal
         plan = self._course.plan

@@ -12,7 +12,7 @@ class Views:
     """The views of the abdomen: postures, tried in turn, and the bursts of the camera."""
 
     def __init__(self, postures: list[Array]) -> None:
-        """`postures` [rad], shape (7,) each."""
+        """`postures` [rad], shape (n,) each."""
         self.postures = postures
         self.failed = 0
         """Number of views that failed."""
@@ -21,7 +21,7 @@ class Views:
 
     @property
     def posture(self) -> Array:
-        """The posture to look from [rad], shape (7,)."""
+        """The posture to look from [rad], shape (n,)."""
         return self.postures[self.failed]
 
     def fail(self) -> bool:

@@ -19,7 +19,7 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
 from palpate_planning.reasons import NO_CAUSE
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
-from palpate_planning.status import ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.status import ArmStop, ExamStep, Observation, PerceptionFailure, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
@@ -157,7 +157,7 @@ class World:
         reading = SensorReading(self.q.copy(), wrench, qd)
         motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
         outcome = self.exam.step(
-            Observation(self.t, reading, answer, motion, final, self.stop, self.soft, self.final, self.end, self.lost)
+            Observation(self.t, reading, answer, motion, final, ArmStop(self.stop, self.soft, self.final), self.end, self.lost)
         )
         self.end = NO_CAUSE
         if outcome.trigger:

@@ -164,7 +164,7 @@ class ExamPlanner:
 
 
 def look_postures(known: ExamInput) -> list[Array]:
-    """Return collision-free postures to look from [rad], shape (7,) each: those that leave the view free first, by their turn.
+    """Return collision-free postures to look from [rad], shape (n,) each: those that leave the view free first, by their turn.
 
     They are the home posture, turned about the vertical.
     """

@@ -138,7 +138,7 @@ class SegmentPlanner:
         return () if transit is None else (transit, Segment(path, contact=True, depth_m=depth))
 
     def hover(self, piece: Stroke, end: int) -> Array | None:
-        """Return the posture above the first (0) or last (-1) target [rad], shape (7,); None if out of reach or in collision."""
+        """Return the posture above the first (0) or last (-1) target [rad], shape (n,); None if out of reach or in collision."""
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
@@ -196,7 +196,7 @@ class SegmentPlanner:
 
 
 def collision(scene: CollisionScene, q: Array) -> Cause:
-    """Return the cause that names what the arm collides with at `q` [rad], shape (7,)."""
+    """Return the cause that names what the arm collides with at `q` [rad], shape (n,)."""
     return Cause(Reason.COLLISION, f"the arm would collide: {', '.join(scene.collisions(q))}")
 
 
