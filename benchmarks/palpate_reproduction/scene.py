@@ -76,9 +76,9 @@ class Moment:
 
 
 def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]:
-    """Return the scene at each of `times_s` from the files of a recording. Raises OSError, ValueError if it ends before."""
+    """Return the scene at each of `times_s` from the files of a recording. Raises OSError, ValueError if it ends earlier."""
     inbox = RecordedInbox()
-    wanted = sorted(set(times_s))
+    wanted, stamp = sorted(set(times_s)), 0
     found: dict[float, Moment] = {}
 
     def take(time: float) -> None:
@@ -90,6 +90,8 @@ def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]
             take(wanted.pop(0))
         if topic in TOPICS:
             inbox.put(topic, payload, stamp)
+    if wanted and wanted[-1] > stamp / 1e9:
+        raise ValueError(f"{recording}: ends at {stamp / 1e9:.1f} s, before {wanted[-1]:.1f} s")
     for time in wanted:
         take(time)
     if any(moment.link_poses is None or moment.surface is None for moment in found.values()):

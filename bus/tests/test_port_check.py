@@ -55,7 +55,7 @@ LIES: dict[str, tuple[str, Callable[[Any], Any], tuple[str, ...]]] = {
     "force is infinite": ("ft/wrench", force(-INF), ("wrench.force = -inf", "-200..200 [N]")),
     "force is too large": ("ft/wrench", force(201.0), ("wrench.force = 201", "-200..200 [N]")),
     "one joint is NaN": ("joint_states", lambda m: joints(m, "velocity", NAN), ("velocity = nan", "-4..4 [rad/s]")),
-    "one joint is infinite": ("joint_states", lambda m: joints(m, "effort", INF), ("effort = inf", "-200..200 [N m]")),
+    "one joint is infinite": ("joint_states", lambda m: joints(m, "effort", INF), ("effort = inf", "-400..400 [N m]")),
     "one joint is in degrees": ("joint_states", lambda m: joints(m, "position", 90.0), ("position = 90", "deg")),
     "another frame": ("ft/wrench", lambda m: dataclasses.replace(m, header=header(0, "moon")), ("'moon'", "ft_sensor")),
     "another type": ("ft/wrench", lambda _: Vector3(0.0, 0.0, 0.0), ("geometry_msgs/msg/WrenchStamped",)),

@@ -34,6 +34,8 @@ class Threshold(Service):
 
     def findings(self):
         """Return one finding: all places with more than twice the force of the softest tenth."""
+        if not self.forces:
+            return []
         places = apply(self.X_AW, np.array(self.places))
         ratio = np.array(self.forces) / np.quantile(self.forces, 0.1)
         stiff = places[ratio > 2.0]
@@ -42,7 +44,10 @@ class Threshold(Service):
         x, y, z = map(float, stiff.mean(axis=0))
         level = float(np.median(ratio[ratio > 2.0]))
         area = self.spacing**2 * len(np.unique(np.round(stiff[:, :2] / self.spacing), axis=0))
-        return [Finding(Point(x, y, z), quadrant(x, y), area, level, 2.0, level, 0.5, *[0.0] * 4, Finding.KIND_LUMP)]
+        others = {"guarding": 0.0, "ridge": 0.0, "bone": 0.0, "soft": 0.0}
+        ratio = {"ratio": level, "ratio_lower": 2.0, "ratio_upper": float(ratio.max())}
+        place = {"centroid": Point(x, y, z), "quadrant": quadrant(x, y), "area": area}
+        return [Finding(**place, **ratio, confidence=0.5, **others, kind=Finding.KIND_LUMP)]
 
 
 def create(scenario):

@@ -58,12 +58,16 @@ TUNING = AdmittanceTuning()
 class AdmittanceController:
     """The law for one arm; it keeps the commanded joint positions."""
 
-    def __init__(self, model: ArmModel, tool_mass_kg: float, limit_zone: float = 0.05, period_s: float = 1e-3) -> None:
-        """Create a controller called every `period_s` that stays `limit_zone` [rad] away from joint limits where it starts there.
+    def __init__(
+        self, model: ArmModel, tool_mass_kg: float, limit_zone: float = 0.05, period_s: float = 1e-3, reading_s: float = 0.01
+    ) -> None:
+        """Create a controller called every `period_s`, with an F/T reading every `reading_s`.
+
+        It stays `limit_zone` [rad] away from joint limits where it starts there.
 
         `tool_mass_kg`: mass below the F/T sensor.
         """
-        self.model, self._dt = model, period_s
+        self.model, self._dt, self._tare_share = model, period_s, min(reading_s / TUNING.tare_s, 1.0)
         self._lower, self._upper = model.position_lower + limit_zone, model.position_upper - limit_zone
         self._weight_W = np.array((0.0, 0.0, -tool_mass_kg * GRAVITY))
         self._damping = np.diag(np.repeat((TUNING.damping_m, TUNING.damping_rad), 3) ** 2)
@@ -77,9 +81,12 @@ class AdmittanceController:
         self._q: Array | None = None
         self._yield = np.zeros(3)
 
-    def sense(self, force_S: Array) -> None:
-        """Take an F/T reading: force in the sensor's axes, not tared [N], shape (3,)."""
-        self._reading, self._fresh = force_S, True
+    def sense(self, force_S: Array, *, commanded: bool = True) -> None:
+        """Take an F/T reading: force in the sensor's axes, not tared [N], shape (3,).
+
+        `commanded`: the driver executes the commands. One that holds the arm may hold it in contact, which is no bias.
+        """
+        self._reading, self._fresh = force_S, commanded
 
     def command(self, q: Array, qd: Array, reference: Reference) -> Array:
         """Return the joint positions to command [rad], shape (n,), at measured positions `q` [rad]; `qd` is not used."""
@@ -122,9 +129,9 @@ class AdmittanceController:
         return np.asarray(R_WS @ (self._reading - self._bias) - self._weight_W)
 
     def _tare(self, R_WS: Array) -> None:
-        """Learn the bias: in free motion nothing but the tool loads the sensor."""
+        """Learn the bias: in free motion nothing but the tool loads the sensor, whose axes are those of the indenter."""
         if self._reading is None or not self._fresh:
             return
         self._fresh = False
         bias = self._reading - R_WS.T @ self._weight_W
-        self._bias = bias if self._bias is None else self._bias + (bias - self._bias) * min(self._dt * 10 / TUNING.tare_s, 1.0)
+        self._bias = bias if self._bias is None else self._bias + (bias - self._bias) * self._tare_share

@@ -62,8 +62,7 @@ class ControllerTuning:
     joint_clip_rad: float = 0.25
     """Largest joint error that loads the spring in mode JOINT."""
     dead_ticks: int = 2
-    """Delay from measurement to torque: one tick of transport, one of zero-order hold, half a tick of velocity age, rounded
-    up."""
+    """Delay from measurement to torque: one tick of transport, half a tick of zero-order hold, half a tick of velocity age."""
     design_ticks: int = 10
     """Gains are designed for each set-point and after this many ticks, in which the arm moves by milliradians."""
 

@@ -8,7 +8,18 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import ImpedanceSetpoint, JointTorqueCommand, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
+from palpate_bus.messages import (
+    ImpedanceSetpoint,
+    JointTorqueCommand,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    Twist,
+    Vector3,
+    Wrench,
+    codec,
+)
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -20,6 +31,7 @@ from palpate_control.model import ArmModel
 from palpate_control.reference import Extrapolator
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, urdf
+from palpate_models.robot.kinematics import tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Limits, Robot, Scenario
@@ -56,8 +68,10 @@ class ControlService(Service):
         self._names, self._home, self._still = list(arm.joint_names), arm.home_rad, np.zeros(self.model.joints)
         topics = contract().topics
         zone, period_s = limits.joint_margin_rad, contract().roles[self.role].period / NS
-        self._positions = robot.level is CommandLevel.POSITION
-        self._admittance = AdmittanceController(self.model, robot.tool_mass_kg, zone, period_s) if self._positions else None
+        self._robot, self._positions = robot, robot.level is CommandLevel.POSITION
+        reading_s = topics["robot/status"].period / NS
+        law = AdmittanceController(self.model, robot.tool_mass_kg, zone, period_s, reading_s) if self._positions else None
+        self._admittance = law
         self._controller = self._admittance or ImpedanceController(self.model, zone, period_s)
         self._reference = Extrapolator(topics[TOPIC].period)
         self._setpoint_expiry = topics[TOPIC].expiry
@@ -134,18 +148,16 @@ class ControlService(Service):
             return self._repeat(t, stale)
         reference = self._reference.at(followed)
         command = self._controller.command(q, qd, reference)
-        far = ""
-        if self._admittance is None:
-            gap = reference.setpoint.p_WD - self.model.p_WI
-            if reference.setpoint.mode is ControlMode.CARTESIAN and gap.dot(gap) > FARTHEST_M**2:
-                far = f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m"
+        if not self._positions:
             np.maximum(self._peak, np.abs(command), out=self._peak)
         self._last, self._last_expires = command, t + self._command_expiry
+        far = self._too_far(reference.setpoint, q)
         return self._stop_commands(t, Problem(TOPIC, far)) if far else self._command(t, command, self._full_validity)
 
     def finish(self) -> Mapping[str, Any]:
-        """Return counts of set-points and rejections, the last problem, and the largest torque per joint [N m]."""
-        return {**self._facts, "problem": self._problem, "peak_torque_nm": [round(float(x), 3) for x in self._peak]}
+        """Return counts of set-points and rejections, the last problem, and the largest torques [N m] if it commands torques."""
+        peak = {} if self._positions else {"peak_torque_nm": [round(float(x), 3) for x in self._peak]}
+        return {**self._facts, "problem": self._problem, **peak}
 
     def _accept(self, message: Message, t: int) -> None:
         """Check a set-point and queue it until joint states as late as its stamp arrive; the first one is applied at once."""
@@ -178,6 +190,15 @@ class ControlService(Service):
         self._refused = Problem(TOPIC, f"{TOPIC} refused: {why}")
         self._problem = f"at {t} ns: {self._refused.text}"
 
+    def _too_far(self, setpoint: Setpoint, q: Array) -> str:
+        """Return a text for a Cartesian set-point that is too far from the tool to come from planning; empty for others."""
+        if setpoint.mode is not ControlMode.CARTESIAN:
+            return ""
+        gap = setpoint.p_WD - (tool_pose(q, self._robot)[:3, 3] if self._positions else self.model.p_WI)
+        return (
+            f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m" if gap.dot(gap) > FARTHEST_M**2 else ""
+        )
+
     def _wait(self, t: int, joints: Message | None) -> Outbox:
         """Return the command before the first set-point: zero torque, or the positions measured first."""
         if self._admittance is not None and self._last is self._still:
@@ -189,7 +210,7 @@ class ControlService(Service):
     def _sense(self, admittance: AdmittanceController, t: int, inbox: Inbox) -> Problem | None:
         """Hand the newest F/T reading on; return a problem if it is stale."""
         for message in inbox.new("robot/status"):
-            admittance.sense(wrench(message.wrench)[:3])
+            admittance.sense(wrench(message.wrench)[:3], commanded=message.mode == RobotStatus.MODE_ACTIVE)
         received = inbox.stamp("robot/status")
         if received is None or t - received > self._status_age:
             age = "none yet" if received is None else f"{(t - received) / MS:.0f} ms old"

@@ -53,6 +53,16 @@ def test_at_rest_the_tool_yields_by_force_over_stiffness(posture: int) -> None:
     np.testing.assert_allclose(fed - start, 0.1 * PUSH / K[0], atol=2e-5)
 
 
+def test_an_arm_that_its_driver_holds_in_contact_takes_no_bias() -> None:
+    contact = Contact()
+    start = contact.follow(ControlMode.JOINT, np.zeros(3), 20)
+    asked = reference(setpoint(contact.model, contact.asked, mode=ControlMode.JOINT))
+    for _ in range(SETTLED):
+        contact.law.sense(contact.tool()[1].T @ (PUSH - (0, 0, MASS * GRAVITY)) + BIAS, commanded=False)
+        contact.law.command(contact.q, REST, asked)
+    np.testing.assert_allclose(contact.follow(ControlMode.CARTESIAN, np.zeros(3)), start, atol=2e-5)
+
+
 def test_without_a_tare_no_force_moves_the_tool() -> None:
     contact = Contact()
     start = contact.tool()[0]

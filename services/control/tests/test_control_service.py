@@ -6,13 +6,25 @@ import numpy as np
 import pytest
 
 from palpate_bus.contract import MS, contract
-from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench, codec
+from palpate_bus.messages import (
+    ImpedanceSetpoint,
+    JointState,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    Twist,
+    Vector3,
+    Wrench,
+    codec,
+)
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create
 from palpate_models.robot.lbr import HOME, JOINT_NAMES
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.arm_file import CommandLevel
+from palpate_models.scenario.schema import Robot, Scenario
 
 EXPIRY = 50 * MS
 
@@ -39,17 +51,25 @@ def setpoint(t: int, valid: int = 250 * MS, mode: int = ImpedanceSetpoint.MODE_J
     return ImpedanceSetpoint(**(fields | changes))
 
 
+def status(t: int) -> Any:
+    none, zero = Vector3(0.0, 0.0, 0.0), np.zeros(7)
+    return RobotStatus(header(t), RobotStatus.MODE_ACTIVE, 0, "", np.array(HOME), zero, Wrench(none, none), zero, 0, "", zero)
+
+
 class Rig:
     """A service with its inbox, ticked by the millisecond with fresh joint states."""
 
-    def __init__(self) -> None:
-        self.service: ControlService = create(Scenario())
+    def __init__(self, level: CommandLevel = CommandLevel.TORQUE) -> None:
+        self.service: ControlService = create(Scenario(robot=Robot(level=level)))
+        self.positions = level is CommandLevel.POSITION
         self.inbox = HandInbox()
         self.t = 0
 
     def tick(self, count: int = 1, message: Any = None, **state: Any) -> Any:
         for _ in range(count):
             self.inbox.put("joint_states", message or joints(self.t, **state), self.t)
+            if self.positions:
+                self.inbox.put("robot/status", status(self.t), self.t)
             outbox = self.service.step(self.t, self.inbox)
             self.t += MS
         assert set(outbox) == {"control/joint_torque"}
@@ -116,7 +136,9 @@ def test_a_setpoint_for_another_arm_is_refused(rig: Rig) -> None:
     assert rig.service.finish()["setpoints_rejected"] == 1
 
 
-def test_a_cartesian_setpoint_far_from_the_tool_ends_commanding(rig: Rig) -> None:
+@pytest.mark.parametrize("level", [CommandLevel.TORQUE, CommandLevel.POSITION])
+def test_a_cartesian_setpoint_far_from_the_tool_ends_commanding(level: CommandLevel) -> None:
+    rig = Rig(level)
     rig.send(setpoint(0, mode=ImpedanceSetpoint.MODE_CARTESIAN))
     command = rig.tick(20)
     assert valid_for(command) == 0

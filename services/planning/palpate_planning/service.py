@@ -163,8 +163,8 @@ class PlanningService(Service):
 
     def _request(self, inbox: Inbox) -> PressRequest | None:
         """Return the newest request of the search, if one arrived: the search waits for its execution before the next."""
-        received = inbox.new("exam/request")
-        if not received or not self._known.exam.searched:
+        received = inbox.new("exam/request") if self._known.exam.searched else []
+        if not received:
             return None
         message = received[-1]
         over = message.request == SearchRequest.DONE

@@ -44,7 +44,7 @@ AT_REST: Final = Setpoint(
 def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array, stiffness: Array) -> Setpoint:
     """Return the set-point of free motion at `t` [ns]: positions [rad], velocities [rad/s], stiffness [N m/rad], shapes (n,).
 
-    X_WI, shape (4, 4): pose of the indenter, for other readers of the message; the controller does not use it.
+    X_WI, shape (4, 4): desired pose of the indenter, at `q`; drivers that take Cartesian set-points follow it.
     """
     return replace(AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
 

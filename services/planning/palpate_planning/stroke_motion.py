@@ -8,6 +8,7 @@ import numpy as np
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
+from palpate_models.robot.kinematics import tool_pose
 from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
@@ -69,6 +70,7 @@ class StrokeMotion:
     def __init__(self, exam: Exam, limits: Limits, robot: Robot, period_s: float, wall: Wall) -> None:
         """Depth is measured from the present `wall`."""
         self._exam, self._limits, self._radius, self._arm = exam, limits, robot.indenter_radius_m, arm_of(robot)
+        self._robot = robot
         self.period_s, self.speed_mps, self.wall = period_s, exam.speed_mps, wall
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
@@ -250,4 +252,4 @@ class StrokeMotion:
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
         q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
         self._behind_rad = float(np.abs(q_now - contact.q).max())
-        return joint_setpoint(t, contact.X_WI, q_now, qd_now, self._arm.stiffness_nmprad)
+        return joint_setpoint(t, tool_pose(q_now, self._robot), q_now, qd_now, self._arm.stiffness_nmprad)
