@@ -23,7 +23,7 @@ BORDER_M = 0.005
 RAISED_M = 0.035
 """Rise of the indenter from its depth along the normal that is served too: 25 mm above the surface."""
 CLEARANCE_M = 0.05
-"""Between base and table [A]."""
+"""Between base and table (assumed)."""
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
 """Least and largest x, y and height [m] and yaw [rad] of the base."""
 STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))

@@ -42,7 +42,7 @@ _NO_TRIANGLES = np.empty(0, np.uint32)
 _NO_SHARES = np.empty(0, np.float32)
 
 DEPTH_SD_M = 0.0003
-"""Published SD of depth [m]: indenter and skin are known exactly except between the points of the mesh [A]."""
+"""Published SD of depth [m]: indenter and skin are known exactly except between the points of the mesh (assumed)."""
 
 
 @dataclass(frozen=True, eq=False)

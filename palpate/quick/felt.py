@@ -27,9 +27,9 @@ HALF_M: Final = 0.148
 _RADIUS_M: Final = 0.015
 """Radius of the indenter."""
 CONTACT_M: Final = 0.009
-"""Radius of its contact at the depth of the standard press, from the obstacle problem of the foundation [C]."""
+"""Radius of its contact at the depth of the standard press, from the obstacle problem of the foundation (computed)."""
 POWER: Final = 0.8
-"""Exponent of the power mean over the footprint: the wall yields next to a stiff place [C]."""
+"""Exponent of the power mean over the footprint: the wall yields next to a stiff place (computed)."""
 _TENSION_GAIN: Final = 0.4
 """Increase of the force by muscle tension, relative to tension over k_w."""
 _TABLE: Final = np.linspace(0.0, 600.0, 25)

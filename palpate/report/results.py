@@ -183,8 +183,8 @@ REASONS = {
     "yielded": "where the force limit was reached before the depth, as over bone",
 }
 USUAL_N = (1.2, 4.8)
-"""Usual range of a person's apparent stiffness: the measured median of 2.4 N, plus and minus two SD of 0.35 in the logarithm. The
-SD has 0.12 between the measured people, who are similar [V], 0.2 between places of one person [V], and a margin [A]."""
+"""Usual range of a person's apparent stiffness: the measured median of 2.4 N, plus or minus two SD of 0.35 in the logarithm: 0.12
+between the measured people, who are similar, 0.2 between places of one person (Remus et al. 2024), and an assumed margin."""
 
 
 def unassessed(report: Report) -> str:

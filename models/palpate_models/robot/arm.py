@@ -19,13 +19,13 @@ from palpate_models.scenario.schema import Robot
 FLANGE_TO_FT_M: Final = 0.030
 """Thickness of the F/T sensor: flange to measuring face [A: like an ATI Gamma, 75 mm x 33 mm, 0.255 kg]."""
 FT_TO_INDENTER_M: Final = 0.100
-"""Measuring face to the sphere's centre: the stand-off [A]."""
+"""Measuring face to the sphere's centre: the stand-off (assumed)."""
 FT_SENSOR_MASS_KG: Final = 0.25
-"""The sensor's own mass, on the flange's side of its measuring face [A]."""
+"""The sensor's own mass, on the flange's side of its measuring face (assumed)."""
 FT_SENSOR_RADIUS_M: Final = 0.0375
 STANDOFF_RADIUS_M: Final = 0.0125
 STANDOFF_MASS_FRACTION: Final = 0.6
-"""Part of the tool's mass that is in the stand-off; the rest is in the sphere [A]."""
+"""Part of the tool's mass that is in the stand-off; the rest is in the sphere (assumed)."""
 
 
 def arm_of(robot: Robot) -> Arm:

@@ -10,12 +10,12 @@ from palpate_models.scenario.schema import Robot
 from palpate_models.section import Pose, Vec3
 
 TABLE_TOP_M: Final = 0.73
-"""Height of the table's top face [A]."""
+"""Height of the table's top face (assumed)."""
 TABLE_X_M: Final = (0.285, 0.835)
 TABLE_Y_M: Final = (-1.0, 1.0)
 TABLE_THICKNESS_M: Final = 0.10
 COLUMN_M: Final = (0.30, 0.60)
-"""Footprint of the table's column, x and y [A]."""
+"""Footprint of the table's column, x and y (assumed)."""
 BASE_SIDE_M: Final = 0.40
 
 

@@ -91,12 +91,12 @@ class ErrorPrior:
     """Their share of the depth uncertainty."""
     onset_m: float = 0.00015
     """Error common to all touches: 0.11 mm with typical equipment, RMS over twelve examinations, 0.29 mm with poor, over ten
-    (tuning seeds) [C]. The contact model does not fit every wall exactly, and skin that was pressed before is lower."""
+    (tuning seeds) (computed). The contact model does not fit every wall exactly, and skin that was pressed before is lower."""
     tare: float = 0.012
     """Prior median of the zero of a stroke's force, over the force of the press: 0.06 N with typical equipment, 0.12 N with poor
-    (tuning seeds 0 to 9) [C]."""
+    (tuning seeds 0 to 9) (computed)."""
     shared_tare: float = 1.0
-    """Variance of the zero of the force that all strokes share, over that of a single one: with poor equipment 0.08 N [C]."""
+    """Variance of the zero of the force that all strokes share, over that of a single one (0.08 N with poor equipment)."""
     white_sd: float = 0.01
     """Prior median of the independent error of a sample, over its force."""
     press_sd: float = 0.02

@@ -84,7 +84,7 @@ class AdmittanceController:
     def sense(self, force_S: Array, *, commanded: bool = True) -> None:
         """Take an F/T reading: force in the sensor's axes, not tared [N], shape (3,).
 
-        `commanded`: the driver executes the commands. One that holds the arm may hold it in contact, which is no bias.
+        `commanded`: the driver executes the commands. While it holds the arm, the arm may be in contact.
         """
         self._reading, self._fresh = force_S, commanded
 

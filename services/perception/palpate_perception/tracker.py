@@ -93,7 +93,7 @@ class AverageTuning:
     least_pixels: int = 12
     """Fewer pixels over the surface correct nothing."""
     pixel_error_m: float = 2e-4
-    """Error of a pixel's mean [m] [A]; uniform, so it does not change weights."""
+    """Error of a pixel's mean [m] (assumed); uniform, so it does not change weights."""
 
 
 AVERAGE: Final = AverageTuning()

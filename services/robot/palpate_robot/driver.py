@@ -22,7 +22,7 @@ class DriverTuning:
     """Limits on commands, and the braking phase of a hold."""
 
     brake_factor: float = 5.0
-    """Factor on the damping at the start of a hold [A]: a scan at 30 mm/s stops in 0.2 mm, before stiffening tissue adds
+    """Factor on the damping at the start of a hold (assumed): a scan at 30 mm/s stops in 0.2 mm, before stiffening tissue adds
     force."""
     brake_ticks: int = 100
     """Duration of that phase [ms]: much longer than stopping takes, and a small part of a breath."""
@@ -31,9 +31,9 @@ class DriverTuning:
     passes."""
     position_jump_rad: float = 0.02
     """Largest change of a joint position command beyond that at the speed limit, and largest distance of the first one from the
-    measured position [A]."""
+    measured position (assumed)."""
     first_torque_nm: float = 20.0
-    """Largest first command per joint [A]: the arm is at rest, and a set-point at its position needs almost no torque."""
+    """Largest first command per joint (assumed): the arm is at rest, and a set-point at its position needs almost no torque."""
     validity_ns: int = 50_000_000
     """Longest validity of a command, as in the contract, and longest interval counted since the previous one."""
     ahead_ns: int = 500_000_000

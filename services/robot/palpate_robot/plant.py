@@ -13,9 +13,9 @@ from palpate_models.scenario.schema import Robot
 DT: Final = 1e-3
 """Step [s]."""
 END_STOP_MARGIN_RAD: Final = 0.03
-"""Distance of the mechanical end stop behind the position limit [A]; the driver acts at the limit."""
+"""Distance of the mechanical end stop behind the position limit (assumed); the driver acts at the limit."""
 STICK_RADPS: Final = 1e-3
-"""Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this [A]."""
+"""Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this (assumed)."""
 
 
 def nominal(robot: Robot) -> DrawnArm:

@@ -20,7 +20,7 @@ from palpate_robot.plant import DT
 
 @dataclass(frozen=True)
 class PositionLoopTuning:
-    """Constants of the loop [A]: those of a geared arm with a servo at 500 Hz."""
+    """Constants of the loop (assumed): those of a geared arm with a servo at 500 Hz."""
 
     stiffness_per_torque: float = 100.0
     """k over the torque limit [1/rad]: 15 N on an outstretched arm turn its shoulder by 0.7 mrad."""

@@ -29,9 +29,9 @@ from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, STICK_RADPS
 
 RIPPLES: Final = 320
-"""Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear [A]."""
+"""Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear (assumed)."""
 SETTLING_S: Final = 0.02
-"""Time constant of the joint deflection [A]: motor inertia of 4 kg m^2 (at the joint) on a spring of 10 kN m/rad."""
+"""Time constant of the joint deflection (assumed): motor inertia of 4 kg m^2 (at the joint) on a spring of 10 kN m/rad."""
 _NOISE_BLOCK: Final = 1024
 
 
@@ -87,7 +87,7 @@ class TorqueSensors:
         self._missing = Kinematics(robot, mass_scale=drawn.link_mass - 1.0)  # gravity is linear in the masses
 
     def read(self, q: Array, v: Array, torque: Array, readings: int) -> Array:
-        """Return the mean of some readings [N m], shape (n,): of the torque on the links, at joints `q` [rad] and `v` [rad/s]."""
+        """Return the mean measured torque on the links [N m], shape (n,), of `readings` readings at `q` [rad] and `v` [rad/s]."""
         given, drawn = self._drawn.given, self._drawn
         loaded = torque + self._missing.state(q, np.zeros_like(v))[13:]
         friction = (given.friction_nm + given.load_friction * np.abs(loaded)) * (v / (np.abs(v) + STICK_RADPS))
@@ -109,8 +109,8 @@ class FtSensor:
         self._drawn = drawn
         self._sensitivity = np.ascontiguousarray(drawn.sensitivity)
         self._lag = exp(-period_s / drawn.lag_s) if drawn.lag_s else 0.0
-        self._felt: Array | None = None
-        """The lagging wrench; None before the first reading."""
+        self._filtered: Array | None = None
+        """Reading after the lag; None before the first reading."""
         self._deviation = np.repeat((given.noise_n, given.noise_nm), 3)
         self._scale = np.repeat((1.0, MOMENT_PER_FORCE_M), 3)
         self._rng = rng
@@ -130,8 +130,8 @@ class FtSensor:
             self._errors = list(self.block()[::-1])
         if self._lag:
             true = np.asarray(wrench)
-            self._felt = true if self._felt is None else true + self._lag * (self._felt - true)
-            wrench = self._felt.tolist()
+            self._filtered = true if self._filtered is None else true + self._lag * (self._filtered - true)
+            wrench = self._filtered.tolist()
         reading: list[float] = (self._sensitivity.dot(wrench) + self._errors.pop()).tolist()
         return reading
 

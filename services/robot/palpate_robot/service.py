@@ -75,12 +75,14 @@ class RobotService(Service):
         self._moment_W = np.zeros(3)
         self._pressed = False
         self._applied: Array = np.zeros(arm.joints)  # never written to: messages keep it
-        self._recent: list[Array] = []
-        self._readings: list[list[float]] = []
-        """Positions and velocities, and F/T readings, since the last status."""
-        self._driven: list[Array] = [self._plant.gravity_torque()]
-        self._friction: list[Array] = [np.zeros(arm.joints)]
-        """Torques of the drives and of friction since the last status [N m]."""
+        self._joint_readings: list[Array] = []
+        """Positions and velocities since the last status [rad, rad/s], one after the other."""
+        self._ft_readings: list[list[float]] = []
+        """F/T readings since the last status [N, N m]."""
+        self._drive_torques: list[Array] = [self._plant.gravity_torque()]
+        """Torques of the drives since the last status [N m]."""
+        self._friction_torques: list[Array] = [np.zeros(arm.joints)]
+        """Torques of friction since the last status [N m]."""
         self._external_force = 0.0
         self._peak_force = 0.0
 
@@ -134,8 +136,8 @@ class RobotService(Service):
             driven = gravity + torque
             plant.step(driven, self._force_W if self._pressed else None, self._moment_W, damping)
             joints.update(plant.q, plant.v, driven)
-            self._driven.append(driven)
-            self._friction.append(plant.friction)
+            self._drive_torques.append(driven)
+            self._friction_torques.append(plant.friction)
             damped = -damping * joints.v
             if self._loop is not None:
                 self._applied = torque + damped
@@ -182,13 +184,13 @@ class RobotService(Service):
 
     def _joint_state(self, stamp: Message) -> Message:
         q, v = self._joints.read()
-        self._recent += (q, v)
+        self._joint_readings += (q, v)
         return JointState(Header(stamp, ""), self._names, q, v, self._applied)
 
     def _wrench(self, stamp: Message, up_S: tuple[float, float, float]) -> Message:
         """Return the sensor reading. `up_S`: world z axis in sensor axes, for subtracting the tool weight."""
         reading = self._sensor.read(self._plant.sensor_wrench())
-        self._readings.append(reading)
+        self._ft_readings.append(reading)
         fx, fy, fz, mx, my, mz = reading
         weight = self._weight
         external = (fx + weight * up_S[0]) ** 2 + (fy + weight * up_S[1]) ** 2 + (fz + weight * up_S[2]) ** 2
@@ -198,16 +200,16 @@ class RobotService(Service):
 
     def _status(self, stamp: Message) -> Message:
         driver = self._driver
-        ticks = len(self._readings)
-        mean = np.add.reduce(np.concatenate(self._recent).reshape(ticks, -1)) / ticks
-        fx, fy, fz, mx, my, mz = (np.add.reduce(self._readings) / ticks).tolist()
-        if self._driven:
-            torque = (np.add.reduce(self._driven) - np.add.reduce(self._friction)) / len(self._driven)
-            self._measured_torque = self._torque_sensors.read(self._plant.q, self._plant.v, torque, len(self._driven))
-        self._driven.clear()
-        self._friction.clear()
-        self._recent.clear()
-        self._readings.clear()
+        ticks = len(self._ft_readings)
+        mean = np.add.reduce(np.concatenate(self._joint_readings).reshape(ticks, -1)) / ticks
+        fx, fy, fz, mx, my, mz = (np.add.reduce(self._ft_readings) / ticks).tolist()
+        if self._drive_torques:
+            torque = (np.add.reduce(self._drive_torques) - np.add.reduce(self._friction_torques)) / len(self._drive_torques)
+            self._measured_torque = self._torque_sensors.read(self._plant.q, self._plant.v, torque, len(self._drive_torques))
+        self._drive_torques.clear()
+        self._friction_torques.clear()
+        self._joint_readings.clear()
+        self._ft_readings.clear()
         return RobotStatus(
             Header(stamp, ""),
             int(driver.mode),

@@ -25,7 +25,7 @@ class TimingTuning:
     braked_ns: int = 30 * MS
     """Time without a set-point after which control has stopped the arm (`ReferenceTuning.bridged_periods`)."""
     restart_ns: int = 300 * MS
-    """Time in which an interrupted motion returns to its speed [A]."""
+    """Time in which an interrupted motion returns to its speed (assumed)."""
 
 
 TIMING: Final = TimingTuning()

@@ -127,7 +127,7 @@ class PostureTuning:
     knots: int = 32
     """Largest number of optimised targets; postures in between are interpolated and projected onto their targets."""
     smoothness: float = 2.0
-    """Weight of squared joint travel [1/rad^2] between knots of mean spacing [A]."""
+    """Weight of squared joint travel [1/rad^2] between knots of mean spacing (assumed)."""
     pressing_force_n: float = 15.0
     """Normal force in the cost of postures: the working force limit."""
 

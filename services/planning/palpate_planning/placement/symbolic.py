@@ -22,7 +22,7 @@ REACH_LENGTH_M = 0.4
 _RIDGE = 1e-12
 """Added to the Gram matrix of the Jacobian [1], so that no pivot is zero at a singularity."""
 WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
-"""Weights of the cost terms, each term of order one [A]."""
+"""Weights of the cost terms, each term of order one (assumed)."""
 
 
 def casadi() -> Any:

@@ -73,11 +73,11 @@ class PathLimits:
     """Limits of the motion along a path."""
 
     lateral_acceleration_mps2: float = 0.3
-    """Largest v^2/r in curves in contact [m/s^2] [A]."""
+    """Largest v^2/r in curves in contact [m/s^2] (assumed)."""
     turn_rate_radps: float = 0.6
-    """Largest rate at which the tool axis turns in contact [rad/s] [A]."""
+    """Largest rate at which the tool axis turns in contact [rad/s] (assumed)."""
     acceleration_mps2: float = 0.2
-    """Tangential acceleration in contact [m/s^2] [A]."""
+    """Tangential acceleration in contact [m/s^2] (assumed)."""
 
 
 LIMITS = PathLimits()

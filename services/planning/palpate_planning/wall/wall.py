@@ -46,7 +46,7 @@ class CorrectionPrior:
     """Prior of the correction."""
 
     offset_m: float = 0.012
-    """SD of the offset before any touch: camera and its calibration, arm and warm-up together [C]."""
+    """SD of the offset before any touch: camera and its calibration, arm and warm-up together (computed)."""
     tilt_rad: float = 0.025
     """SD of the tilt about two axes: a laterally displaced camera sees a curved wall tilted, by 18 mrad on 12 tuning patients."""
     field_m: float = 0.0006
@@ -54,7 +54,7 @@ class CorrectionPrior:
     field_length_m: float = 0.020
     """Correlation length of that field, from the variogram of these patients."""
     log_roughness_sd: float = 0.5
-    """SD of log a about its expected value [A]."""
+    """SD of log a about its expected value (assumed)."""
     persistence_s: float = 10.0
     """Time constant of depth errors shared by neighbouring pixels."""
     mean_image_roughness: float = 0.35

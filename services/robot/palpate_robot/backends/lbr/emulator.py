@@ -50,13 +50,13 @@ from palpate_robot.backends.lbr.port import (
 
 PERIODS_MS: Final = range(1, 101)
 MONITORING_S: Final = 0.2
-"""Time in each monitoring state [A]; on the arm it lasts until the Sunrise application continues."""
+"""Time in each monitoring state (assumed); on the arm it lasts until the Sunrise application continues."""
 SYNC_S: Final = 0.1
-"""Time in COMMANDING_WAIT [A]."""
+"""Time in COMMANDING_WAIT (assumed)."""
 QUALITY_WINDOW: Final = 100
 """Answers over which connection quality is computed."""
 QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.GOOD), (0.30, ConnectionQuality.FAIR))
-"""Largest fraction of lost answers per quality [A]; above the last it is POOR."""
+"""Largest fraction of lost answers per quality (assumed); above the last it is POOR."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,7 +12,7 @@ from palpate_models.numerics.frames import Array
 
 @dataclass(frozen=True)
 class CheckTuning:
-    """Constants of the checks [A]."""
+    """Constants of the checks (assumed)."""
 
     window_s: float = 0.3
     """Commands of this time count, and a deviation lasts as long before it is reported: an arm at level position lags by less."""

@@ -174,7 +174,7 @@ class UrRules(Rules):
         return super().runs and self.program
 
     def cycle(self, sensed: Sensed, command: Array | None) -> Array | None:
-        """See `Rules.cycle`. The reference follows the target with the lag of the look-ahead time [A]."""
+        """See `Rules.cycle`. The reference follows the target with the lag of the look-ahead time (assumed)."""
         if sensed.force_n > self.settings["protective"]:
             self.stopped = "protective stop"
         self._stood_s = self._stood_s + self._dt if self.stopped else 0.0
