@@ -19,8 +19,8 @@ from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import Wall, WallEstimate
 
 
-class ToolWeight:
-    """The tool below the sensor, and the sensor's bias."""
+class ForceCompensation:
+    """Removes the sensor's bias and the tool's weight and inertia from its readings."""
 
     def __init__(self, mass: float) -> None:
         """`mass` [kg] below the sensor."""
@@ -35,27 +35,26 @@ class ToolWeight:
         self._count = 0
 
     @staticmethod
-    def of(robot: Robot) -> ToolWeight:
+    def of(robot: Robot) -> ForceCompensation:
         """Return the tool of a robot: stand-off and sphere."""
         inertia = inertias(robot)
-        return ToolWeight(inertia["ft_sensor"].mass + inertia["indenter"].mass)
+        return ForceCompensation(inertia["ft_sensor"].mass + inertia["indenter"].mass)
 
-    def force(self, R_WS: Array) -> Array:
+    def weight_S(self, R_WS: Array) -> Array:
         """Return the weight in the sensor's axes [N], shape (3,)."""
         return np.asarray(R_WS.T @ self.weight_W)
 
-    def start_tare(self) -> None:
-        """Drop earlier readings; the bias is kept until the first new one."""
-        self._sum, self._count = np.zeros(3), 0
-
-    def tare(self, R_WS: Array, wrench_S: Array) -> None:
-        """Include a reading in free air, force and torque, shape (6,), in the bias."""
-        self._sum += wrench_S[:3] - self.force(R_WS)
+    def update(self, R_WS: Array, wrench_S: Array, *, taring: bool) -> None:
+        """Include a reading in free air, force and torque, shape (6,), in the bias. A tare ends with a call without `taring`."""
+        if not taring:
+            self._sum, self._count = np.zeros(3), 0
+            return
+        self._sum += wrench_S[:3] - self.weight_S(R_WS)
         self._count += 1
         self.tared = True
         self.bias = self._sum / self._count
 
-    def contact(self, R_WS: Array, wrench_S: Array, a_W: Array) -> Array:
+    def contact_force_W(self, R_WS: Array, wrench_S: Array, a_W: Array) -> Array:
         """Return the force of the environment on the tool [N], world axes, shape (3,).
 
         `a_W`: acceleration of the tool [m/s^2], shape (3,). Without it 0.5 m/s^2 at 0.35 kg would read as 0.18 N, above `off_n`.
@@ -119,10 +118,12 @@ class ContactMeasurement(NamedTuple):
 class ContactSensing:
     """Computes the contact with the estimated wall from sensor readings."""
 
-    def __init__(self, kinematics: ArmKinematics, weight: ToolWeight, wall: Wall, radius: float, period_s: float) -> None:
+    def __init__(
+        self, kinematics: ArmKinematics, compensation: ForceCompensation, wall: Wall, radius: float, period_s: float
+    ) -> None:
         """`radius` of the sphere [m]; a reading comes every `period_s`."""
         self.wall = wall
-        self.weight = weight
+        self.compensation = compensation
         self._kinematics, self._radius, self._period_s = kinematics, radius, period_s
         self._touching = False
         self._velocity: Array | None = None
@@ -136,9 +137,9 @@ class ContactSensing:
         velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
         acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
         self._velocity = velocity
-        force_W = self.weight.contact(R_WS, reading.wrench_S, acceleration)
+        force_W = self.compensation.contact_force_W(R_WS, reading.wrench_S, acceleration)
         force = float(force_W @ foot.n_W)
-        self._touching = self.weight.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
+        self._touching = self.compensation.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         load, by_joints = float(np.linalg.norm(force_W)), joint_force - THRESHOLDS.joints_n
         return ContactMeasurement(
             reading.q,

@@ -10,7 +10,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.contact import ContactSensing, ToolWeight
+from palpate_planning.contact import ContactSensing, ForceCompensation
 from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, TrajectoryFollower
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError
@@ -71,7 +71,7 @@ class ExaminationSequence:
         self._kinematics = ArmKinematics(known.robot, known.limits)
         compile_ahead()
         wall, radius = plane(np.array(known.X_WA)), known.robot.indenter_radius_m
-        self._sense = ContactSensing(self._kinematics, ToolWeight.of(known.robot), wall, radius, periods.step_s)
+        self._sense = ContactSensing(self._kinematics, ForceCompensation.of(known.robot), wall, radius, periods.step_s)
         self._planner = ExamPlanner(known, periods.step_s)
         WORKER.submit(self._planner.prepare)
         follower = TrajectoryFollower(self._kinematics, self._kinematics.arm.home_rad)
@@ -308,10 +308,7 @@ class ExaminationSequence:
         step = palpation.step(now.t, course.contact, course.rate)
         self._report(step, palpation, now.t)
         out.touched = step.touched
-        if step.taring:
-            sense.weight.tare(course.contact.R_WS, now.reading.wrench_S)
-        else:
-            sense.weight.start_tare()
+        sense.compensation.update(course.contact.R_WS, now.reading.wrench_S, taring=step.taring)
         if step.stage is StrokeStage.DONE:
             self._end_strokes(now, out, palpation)
             if palpation.failed:

@@ -13,7 +13,7 @@ from palpate_models.robot.arm import FT_TO_INDENTER_M
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
-from palpate_planning.contact import SensorReading, ToolWeight
+from palpate_planning.contact import ForceCompensation, SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS, SECOND, Periods
@@ -98,7 +98,7 @@ class World:
         self.settings, self.force = settings, force or hertz(2.4)
         self.exam = ExaminationSequence(settings, PERIODS)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
-        self.weight = ToolWeight.of(settings.robot)
+        self.weight = ForceCompensation.of(settings.robot)
         self.bias = np.array([0.7, -0.4, 1.1])
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
@@ -148,7 +148,7 @@ class World:
         qd = (self.q - self._q_before) / PERIOD_S
         velocity = (self.kinematics.jacobian(self.q) @ qd)[:3]
         inertia = R_WS.T @ (self.weight.mass * (velocity - self._velocity) / PERIOD_S)
-        wrench = np.concatenate((contact - inertia + self.weight.force(R_WS) + self.bias, np.cross(arm, contact)))
+        wrench = np.concatenate((contact - inertia + self.weight.weight_S(R_WS) + self.bias, np.cross(arm, contact)))
         self._q_before, self._velocity = self.q, velocity
         answer = None
         if self._answer_at is not None and self.t >= self._answer_at:

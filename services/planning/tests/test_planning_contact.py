@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.scenario.schema import Robot
-from palpate_planning.contact import ToolWeight
+from palpate_planning.contact import ForceCompensation
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
 from palpate_planning.setpoints import NORMAL_STIFFNESS
 
@@ -28,45 +28,43 @@ def reading(R_WS: np.ndarray, force_W: np.ndarray, bias: np.ndarray, mass: float
 def test_contact_force_is_found_at_any_orientation(seed: int) -> None:
     rng = np.random.default_rng(seed)
     mass, com = rng.uniform(0.1, 1.5), rng.uniform(-0.05, 0.1, 3)
-    tool = ToolWeight(mass)
+    tool = ForceCompensation(mass)
     bias = rng.normal(0, 1, 6)
-    tool.start_tare()
     for R in Rotation.random(3, random_state=rng).as_matrix():
-        tool.tare(R, reading(R, np.zeros(3), bias, mass, com))
+        tool.update(R, reading(R, np.zeros(3), bias, mass, com), taring=True)
     assert tool.bias == pytest.approx(bias[:3], abs=1e-9)
     force = rng.normal(0, 5, 3)
     R = Rotation.random(random_state=rng).as_matrix()
-    assert tool.contact(R, reading(R, force, bias, mass, com), np.zeros(3)) == pytest.approx(force, abs=1e-9)
+    assert tool.contact_force_W(R, reading(R, force, bias, mass, com), np.zeros(3)) == pytest.approx(force, abs=1e-9)
 
 
 def test_acceleration_of_the_tool_is_no_contact() -> None:
-    tool = ToolWeight(0.4)
+    tool = ForceCompensation(0.4)
     R = Rotation.from_rotvec((0.3, -0.2, 0.1)).as_matrix()
     a = np.array((0.1, -0.2, 0.5))
     seen = reading(R, -0.4 * a, np.zeros(6), 0.4, np.array((0.0, 0.0, 0.06)))
-    assert tool.contact(R, seen, a) == pytest.approx(np.zeros(3), abs=1e-12)
-    assert np.linalg.norm(tool.contact(R, seen, np.zeros(3))) > 0.2
+    assert tool.contact_force_W(R, seen, a) == pytest.approx(np.zeros(3), abs=1e-12)
+    assert np.linalg.norm(tool.contact_force_W(R, seen, np.zeros(3))) > 0.2
 
 
 def test_taring_averages_noise_out() -> None:
     rng = np.random.default_rng(1)
-    tool, com = ToolWeight(0.35), np.array((0.0, 0.0, 0.07))
-    tool.start_tare()
+    tool, com = ForceCompensation(0.35), np.array((0.0, 0.0, 0.07))
     R = np.diag((-1.0, 1.0, -1.0))
     for _ in range(300):
-        tool.tare(R, reading(R, np.zeros(3), np.full(6, 0.5), 0.35, com) + rng.normal(0, 0.05, 6))
+        tool.update(R, reading(R, np.zeros(3), np.full(6, 0.5), 0.35, com) + rng.normal(0, 0.05, 6), taring=True)
     assert tool.bias == pytest.approx(np.full(3, 0.5), abs=0.012)
 
 
 def test_the_mass_comes_from_the_robots_tables() -> None:
-    assert ToolWeight.of(Robot(tool_mass_kg=0.5)).mass == pytest.approx(0.5)
+    assert ForceCompensation.of(Robot(tool_mass_kg=0.5)).mass == pytest.approx(0.5)
 
 
 def test_a_second_taring_replaces_the_bias() -> None:
-    tool = ToolWeight(0.35)
+    tool = ForceCompensation(0.35)
     for value in (1.0, 2.0):
-        tool.start_tare()
-        tool.tare(np.eye(3), reading(np.eye(3), np.zeros(3), np.full(6, value), 0.35, np.zeros(3)))
+        tool.update(np.eye(3), np.zeros(6), taring=False)
+        tool.update(np.eye(3), reading(np.eye(3), np.zeros(3), np.full(6, value), 0.35, np.zeros(3)), taring=True)
     assert tool.bias == pytest.approx(np.full(3, 2.0))
 
 

@@ -84,7 +84,7 @@ class BusWorld(World):
         inbox.events = {}
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
-        w = np.concatenate((contact + self.weight.force(R_WS) + self.bias, np.zeros(3)))
+        w = np.concatenate((contact + self.weight.weight_S(R_WS) + self.bias, np.zeros(3)))
         inbox.put("robot/status", status(t, self.q, w))
         if self._answer_at is not None and t >= self._answer_at:
             self._answer_at = None
