@@ -16,7 +16,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FUSED = (*TINY, "phantom.edge_m=0.005", "camera.frames=10")
 """A tiny examination on a fine mesh, whose surface is perceived to a millimetre."""
-LONG_FILES = ("test_gate_alone.py", "test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
+LONG_FILES = ("test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
 
@@ -38,7 +38,7 @@ def composed(tmp_path_factory: pytest.TempPathFactory) -> Finished:
     return palpate_run("clean", tmp_path_factory.mktemp("composed"), "--composed", "--record", "none", settings=GATE)
 
 
-GATE_FILES = ("test_gate.py", "test_gate_alone.py")
+GATE_FILE = "test_gate.py"
 EXAMINATION_FILES = ("test_gate.py", "test_examination.py", "test_contract_ros_tools.py")
 """Files that share examinations. One worker runs them all, so that each examination runs once."""
 LONG_S = 1200
@@ -71,5 +71,5 @@ def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
     for outcome in ("passed", "failed", "error"):
         for report in terminalreporter.stats.get(outcome, ()):
             file, _, name = report.nodeid.partition("::test_")
-            if Path(file).name in GATE_FILES and (report.when == "call" or outcome == "error"):
+            if Path(file).name == GATE_FILE and (report.when == "call" or outcome == "error"):
                 terminalreporter.write_line(f"gate: {name.replace('_', ' ')}: {outcome}  {report.capstdout.strip()}".rstrip())

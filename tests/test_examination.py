@@ -1,10 +1,8 @@
 """A short examination through the command, in real processes, and its results."""
 
 import csv
-from pathlib import Path
 
-import pytest
-from examination import TINY, Finished, palpate_run
+from examination import Finished
 
 import palpate
 
@@ -27,18 +25,6 @@ def test_the_results_folder_is_complete(distributed: Finished) -> None:
         assert (folder / "logs" / f"{role}.log").exists(), role
     with (folder / "samples.csv").open() as file:
         assert len(list(csv.DictReader(file))) == distributed.report["samples"]
-
-
-@pytest.mark.parametrize(
-    "runtime",
-    ["--composed", pytest.param("--realtime", marks=pytest.mark.slow), pytest.param("--wallclock", marks=pytest.mark.slow)],
-)
-def test_an_examination_that_planning_aborted_ends_with_status_3_and_its_cause(tmp_path: Path, runtime: str) -> None:
-    own = ("--service", f"planning={Path(__file__).with_name('quitting_planning.py')}")
-    finished = palpate_run("clean", tmp_path, runtime, "--record", "none", *own, settings=TINY)
-    assert finished.status == 3, finished.output
-    assert "the run failed: aborted in phase HOME: enough" in finished.output
-    assert finished.report["failure"] == "aborted in phase HOME: enough"
 
 
 def test_the_library_reads_the_folder(composed: Finished) -> None:

@@ -1,7 +1,7 @@
 """The gate: whole examinations, through the command that users run.
 
 The world is clean: a patient who lies still, and equipment whose only error is white noise. The region holds the lesion and
-tissue around it, to take minutes. Tests that share no examination are in test_gate_alone.py, for the other worker.
+tissue around it, to take minutes.
 """
 
 from pathlib import Path

@@ -19,8 +19,9 @@ from palpate_bus.runtime.failure import FailureCode
 pytestmark = pytest.mark.slow
 
 
-def test_without_planning_the_arm_holds_safely_and_the_force_does_not_rise(tmp_path: Path) -> None:
-    killed = kill_in_contact("planning", tmp_path)
+@pytest.mark.parametrize("role", ["planning", "control"])
+def test_without_planning_or_control_the_arm_holds_safely_and_the_force_does_not_rise(role: str, tmp_path: Path) -> None:
+    killed = kill_in_contact(role, tmp_path)
     assert killed.named_after_s < 2.0
     assert_held_and_no_harder(killed)
 

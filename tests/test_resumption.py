@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from examination import SHORT, Finished, command, palpate_run, service_process
+from examination import SHORT, TINY, Finished, command, palpate_run, service_process
 from scipy.spatial import KDTree
 
 from palpate.report.recovery import FOLDER
@@ -27,6 +27,8 @@ from palpate_models.scenario.load import load_scenario
 from palpate_recorder.recover import recover
 
 SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
+TINY_SCAN = (*TINY, "exam.spacing_m=0.01")
+"""Four short lines on a coarse mesh."""
 Blow = Callable[[psutil.Process], None]
 
 
@@ -42,9 +44,9 @@ def interrupt(run: psutil.Process) -> None:
     run.send_signal(signal.SIGINT)
 
 
-def interrupted(folder: Path, blow: Blow, *options: str) -> None:
+def interrupted(folder: Path, blow: Blow, *options: str, settings: tuple[str, ...] = SMALL) -> None:
     """Run an examination and strike it while its indenter slides along its second line."""
-    run = subprocess.Popen(command("clean", folder, *options, settings=SMALL), stderr=subprocess.PIPE, text=True)
+    run = subprocess.Popen(command("clean", folder, *options, settings=settings), stderr=subprocess.PIPE, text=True)
     scans = 0
     for line in run.stderr:
         scans += " scan " in line
@@ -101,7 +103,7 @@ def check(folder: Path, resumed: Finished) -> None:
 def test_a_killed_examination_is_resumed_once(tmp_path: Path) -> None:
     """The whole command is killed, with its recorder."""
     folder = tmp_path / "broken"
-    interrupted(folder, kill, "--composed")
+    interrupted(folder, kill, "--composed", settings=TINY_SCAN)
     check(folder, resume(folder, "--composed"))
     again = resume(folder, "--composed")
     assert again.status == 2

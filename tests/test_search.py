@@ -112,21 +112,6 @@ def test_a_trajectory_is_reproduced() -> None:
     assert observation["left"] == 0.0
 
 
-def test_vectorised_environments() -> None:
-    envs = gymnasium.make_vec(ID, num_envs=3, presses=4, patients=2)
-    observation, _ = envs.reset(seed=1)
-    assert observation["history"].shape == (3, 4, 5)
-    for _ in range(4):
-        observation, reward, over, _, _ = envs.step(envs.action_space.sample())
-    assert over.all()
-    assert reward.shape == (3,)
-
-
-def test_the_true_tissue_gives_the_same_kind_of_forces() -> None:
-    forces = [played(SearchEnv(hand, presses=6), 3)[1]["history"][:, 3] for hand in ("surrogate", "patient")]
-    assert np.abs(forces[0] - forces[1]).max() < 0.5
-
-
 def test_unusable_options_are_refused() -> None:
     with pytest.raises(ValueError, match="hand = 'foot': want surrogate or patient"):
         SearchEnv("foot")

@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 from palpate_bus.contract import contract
 from palpate_bus.messages import Image, Quaternion
 from palpate_bus.messages.geometry import (
-    cloud_message,
     depth_in_metres,
     depth_message,
     mesh_arrays,
@@ -65,13 +64,6 @@ def test_meshes_survive_a_round_trip_and_missing_arrays_are_empty() -> None:
     assert found.breathing.tolist() == [0.0, 0.5, 1.0]
     bare = mesh_arrays(mesh_message(header(5), vertices))
     assert [array.shape for array in bare] == [(3, 3), (0, 3), (0, 3), (0,)]
-
-
-def test_clouds_are_packed_points() -> None:
-    points = np.arange(6.0).reshape(2, 3)
-    cloud = cloud_message(header(0, "world"), points)
-    assert (cloud.height, cloud.width, cloud.point_step, [field.offset for field in cloud.fields]) == (1, 2, 12, [0, 4, 8])
-    assert np.array_equal(np.frombuffer(cloud.data, "<f4").reshape(-1, 3), points)
 
 
 @pytest.mark.parametrize("orientation", [(0.0, 0.0, 0.0, 0.0), (0.0, 0.0, 0.0, 1.02), (float("nan"), 0.0, 0.0, 1.0)])

@@ -40,11 +40,6 @@ def test_a_tag_depends_on_key_and_topic() -> None:
     assert not Tagger(KEY, "0/a").holds(ATTACHMENT, b"x")
 
 
-def test_a_tag_leaves_the_fields_that_ros_2_reads_unchanged() -> None:
-    tagged = ATTACHMENT + Tagger(KEY, "0/a").tag(ATTACHMENT, b"x")
-    assert rmw.unpack(tagged) == rmw.unpack(ATTACHMENT)
-
-
 def test_a_key_is_readable_to_its_owner_only(tmp_path: Path) -> None:
     file = make_key(tmp_path / "run.key")
     assert file.stat().st_mode & 0o777 == 0o600

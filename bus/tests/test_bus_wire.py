@@ -1,6 +1,5 @@
 """rmw_zenoh's wire format: keys, attachments, liveliness tokens."""
 
-import struct
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -45,13 +44,6 @@ def test_garbage_attachments_raise_wire_error_at_most(data: bytes) -> None:
     except wire.WireError:
         return
     assert wire.AttachmentWriter(gid).pack(sequence, stamp) == data[: wire.ATTACHMENT_SIZE]
-
-
-def test_attachment_of_older_rmw_zenoh_is_refused() -> None:
-    """Before 0.2.4 the fields were named."""
-    old = b"\x0fsequence_number" + struct.pack("<q", 1) + b"\x10source_timestamp" + struct.pack("<q", 2)
-    with pytest.raises(wire.WireError, match="33 bytes"):
-        wire.unpack(old + b"\x0asource_gid\x10" + bytes(16))
 
 
 def test_a_gid_of_another_length_is_refused() -> None:
@@ -142,16 +134,6 @@ def test_gid_is_xxh3_of_the_token_low_half_first() -> None:
     # XXH3-128 of the empty string is 99aa06d3014798d86001c324468d497f (high half first), xxHash's own sanity value.
     assert gid("") == bytes.fromhex("99aa06d3014798d86001c324468d497f")[::-1]
     assert parse_token(TALKER).gid == gid(TALKER) != parse_token(LISTENER).gid
-
-
-@pytest.mark.parametrize("name", sorted(RULES.qos))
-def test_qos_of_our_classes(name: str) -> None:
-    qos = RULES.qos[name]
-    reliability, durability, history, *rest = qos_token(qos).split(":")
-    assert reliability == ("" if qos.reliability == "RELIABLE" else "2")
-    assert durability == ("1" if qos.transient_local else "")
-    assert history == f",{'' if qos.depth == 42 else qos.depth}"
-    assert rest == [",", ",", ",,"]
 
 
 @given(st.one_of(st.text(max_size=60), st.lists(st.sampled_from([*TALKER.split("/"), "", "x", "SS"]), max_size=14).map("/".join)))

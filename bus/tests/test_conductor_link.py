@@ -92,10 +92,21 @@ def wallclock(monkeypatch: pytest.MonkeyPatch) -> Bus:
     return Bus(monkeypatch, "wallclock")
 
 
-def test_silence_is_noticed_at_the_contracts_deadline(wallclock: Bus) -> None:
-    lost = wallclock.silence(wallclock.link(grace_s=9.0), 1.0)
-    assert DEADLINE_S < lost <= DEADLINE_S + 3 * STEP_S
-    assert lost < 0.3
+@pytest.mark.parametrize(
+    ("runtime", "runs", "limit_s"),
+    [
+        ("wallclock", False, DEADLINE_S),
+        ("wallclock", True, TIMES.busy_s),
+        ("lockstep", False, TIMES.lockstep_heartbeat_s),
+        ("lockstep", True, TIMES.lockstep_busy_s),
+    ],
+)
+def test_silence_is_noticed_later_in_lockstep_and_while_the_process_runs_without_a_core(
+    runtime: str, runs: bool, limit_s: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    bus = Bus(monkeypatch, runtime)
+    bus.runs = runs
+    assert limit_s < bus.silence(bus.link(grace_s=9.0), 60.0) <= limit_s + 0.1
 
 
 def test_a_conductor_with_a_heartbeat_is_not_lost(wallclock: Bus) -> None:
@@ -103,11 +114,6 @@ def test_a_conductor_with_a_heartbeat_is_not_lost(wallclock: Bus) -> None:
     for _ in range(1000):
         wallclock.say(RunControl.HEARTBEAT)
         assert wallclock.silence(link, 0.2) == float("inf")
-
-
-def test_a_conductor_that_runs_but_gets_no_core_is_waited_for(wallclock: Bus) -> None:
-    wallclock.runs = True
-    assert TIMES.busy_s < wallclock.silence(wallclock.link(grace_s=9.0), 10.0) < TIMES.busy_s + 0.1
 
 
 def test_a_service_that_was_itself_kept_from_a_core_does_not_blame_the_conductor(wallclock: Bus) -> None:
@@ -138,18 +144,6 @@ def test_a_conductor_that_returns_is_not_lost(wallclock: Bus) -> None:
     wallclock.say(RunControl.HEARTBEAT)
     link.poll()
     assert not link.lost
-
-
-def test_in_lockstep_the_silence_may_be_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = Bus(monkeypatch, "lockstep")
-    link = bus.link(grace_s=9.0)
-    assert TIMES.lockstep_heartbeat_s < bus.silence(link, 10.0) < TIMES.lockstep_heartbeat_s + 0.1
-
-
-def test_in_lockstep_a_conductor_without_a_core_is_waited_for_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    bus = Bus(monkeypatch, "lockstep")
-    bus.runs = True
-    assert TIMES.lockstep_busy_s < bus.silence(bus.link(grace_s=9.0), 60.0) < TIMES.lockstep_busy_s + 0.1
 
 
 def test_a_conductor_without_a_heartbeat_has_the_limit_of_a_start(wallclock: Bus) -> None:

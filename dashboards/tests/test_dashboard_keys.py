@@ -22,8 +22,8 @@ from palpate_bus.messages import StiffnessMap
 from palpate_bus.runs.announcement import Run
 from palpate_bus.runs.operator import HINT, OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
-from palpate_dashboard import arrays, palette, replay, text
-from palpate_dashboard.arrays import Carry, VertexNormals, shaded
+from palpate_dashboard import arrays, replay, text
+from palpate_dashboard.arrays import shaded
 from palpate_dashboard.sinks import Live
 from palpate_dashboard.text import truth_page
 from palpate_models.numerics.maps import level_lines
@@ -32,14 +32,6 @@ from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.patient.schema import Phantom
 from palpate_models.scenario.errors import Errors, draw_errors
 from palpate_models.scenario.schema import Scenario
-
-
-def test_normals_of_a_sphere_point_out() -> None:
-    trimesh = pytest.importorskip("trimesh")
-    sphere = trimesh.creation.icosphere(subdivisions=3)
-    normals = VertexNormals(sphere.faces, len(sphere.vertices))(sphere.vertices)
-    assert np.einsum("ij,ij->i", normals, sphere.vertices).min() > 0.999
-    assert np.linalg.norm(normals, axis=1) == pytest.approx(1.0, abs=1e-5)
 
 
 @pytest.mark.parametrize("level", [0.03, 0.05, 0.071])
@@ -51,26 +43,6 @@ def test_level_lines_of_the_distance_are_circles(level: float) -> None:
     assert radius == pytest.approx(level, abs=1e-3)  # a chord of a 7 mm edge is that far inside
     steps = np.diff(segments[..., :2], axis=1)[:, 0]
     assert np.linalg.norm(steps, axis=1).sum() == pytest.approx(2 * np.pi * level, rel=0.02)
-
-
-def test_no_level_no_lines() -> None:
-    vertices, triangles = dome()
-    assert level_lines(vertices, triangles, np.ones(len(vertices)), 2.0).shape == (0, 2, 3)
-
-
-def test_carry_takes_the_nearest_within_reach() -> None:
-    source = np.array([[0.0, 0, 0], [1.0, 0, 0]])
-    target = np.array([[0.1, 0, 0], [0.9, 0, 0], [0.5, 9, 0]])
-    assert Carry(source, target, 0.2)(np.array([7, 8]), -1).tolist() == [7, 8, -1]
-
-
-def test_colours_rise_from_blue_over_pale_to_red() -> None:
-    soft, normal, stiff, beyond = palette.stiffness_colors(np.array([0.4, 1.0, 5.0, 50.0]))
-    assert soft & 0xFF00 > soft >> 24 << 8  # more blue than red
-    assert stiff >> 24 > 4 * (stiff >> 16 & 0xFF)
-    assert min(normal >> 24, normal >> 16 & 0xFF, normal >> 8 & 0xFF) > 200
-    assert beyond == stiff
-    assert normal & 0xFF == 255
 
 
 def test_a_cloud_with_padding_and_invalid_points() -> None:

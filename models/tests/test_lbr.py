@@ -13,7 +13,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_MASS_KG, FT_TO_INDENTER_M, link_names, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.kinematics import link_transforms, tool_pose
-from palpate_models.robot.solids import cone, mesh
+from palpate_models.robot.solids import cone
 from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot
@@ -181,19 +181,3 @@ def _outside(points: np.ndarray, capsules: tuple[Capsule, ...]) -> float:
 def test_collision_capsules_enclose_the_housing(link: str, meshes: dict[str, list[VisualMesh]]) -> None:
     points = np.concatenate([part.vertices for part in meshes[link]])
     assert _outside(points, robot_arm.capsules(Robot())[link]) < 0.005
-
-
-def test_indenter_has_the_radius_of_the_scenario() -> None:
-    for radius in (0.01, 0.02):
-        (sphere,) = visual_meshes(Robot(indenter_radius_m=radius))["indenter"]
-        np.testing.assert_allclose(np.linalg.norm(sphere.vertices, axis=1), radius, atol=1e-9)
-
-
-def test_surface_net_lies_on_the_field() -> None:
-    field = cone((0.0, 0.0, -0.05), (0.0, 0.0, 0.05), 0.03, 0.03)
-    vertices, triangles = mesh(field, (-0.04, -0.04, -0.09), (0.04, 0.04, 0.09), 0.006)
-    assert np.abs(field(vertices)).max() < 1e-6
-    body = trimesh.Trimesh(vertices, triangles)
-    assert body.is_watertight
-    exact = np.pi * 0.03**2 * 0.1 + 4 / 3 * np.pi * 0.03**3
-    assert body.volume == pytest.approx(exact, rel=0.02)

@@ -70,9 +70,7 @@ def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-@pytest.mark.parametrize(
-    ("kind", "damage"), [("nbi", flipped), ("nbi", cut), ("nbc", flipped), ("nbc", cut), ("stamp", lambda whole: b"\xff")]
-)
+@pytest.mark.parametrize(("kind", "damage"), [("nbi", cut), ("nbc", flipped), ("stamp", lambda whole: b"\xff")])
 def test_damaged_compiled_code_is_made_again(compiled_once: Path, kind: str, damage: Callable[[bytes], bytes]) -> None:
     for path in (compiled_once / "kept").rglob(f"*.{kind}"):
         path.write_bytes(damage(path.read_bytes()))

@@ -10,7 +10,7 @@ from palpate_models.patient.breathing import MOST_M, STILL, TABLE_S, Breathing, 
 from palpate_models.patient.mesh_file import MeshError
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.patient.phantom import build_phantom
-from palpate_models.patient.schema import Background, Phantom, Stiffness
+from palpate_models.patient.schema import Phantom, Stiffness
 from palpate_models.patient.tension import pressed_force, tension_of_ratio
 from palpate_models.patient.wall import Activation, Guarding
 
@@ -194,12 +194,6 @@ def test_the_seed_decides_moment_and_direction():
     assert sides == {-1, 1}
 
 
-def test_patients_lie_still_by_default():
-    body = BodyMotion(Motion(), 3)
-    assert not body.moves
-    np.testing.assert_array_equal(body.pose(1e3), np.eye(4))
-
-
 @pytest.mark.parametrize("fields", [{"kind": "jump"}, {"shift_m": 10}, {"turn_rad": 3}, {"over_s": 0}, {"at_s": -1}])
 def test_bad_motions_are_refused_by_name(fields):
     with pytest.raises(ValidationError, match=next(iter(fields))):
@@ -279,10 +273,6 @@ def test_tension_makes_the_ratio_of_forces(stiffness):
         assert tension > ratio - 1  # the neighbours are not contracted
 
 
-def test_involuntary_guarding_stays():
-    assert level_after(Activation(voluntary=False, dt=1e-3), 20, 0.010) == 1
-
-
 def test_voluntary_guarding_fades_under_a_slow_gentle_press():
     activation = Activation(voluntary=True, dt=1e-3)
     assert level_after(activation, 3.0, 0.010, 0.005) == pytest.approx(np.exp(-1), rel=1e-6)
@@ -292,13 +282,3 @@ def test_voluntary_guarding_fades_under_a_slow_gentle_press():
 @pytest.mark.parametrize(("depth_m", "speed_mps"), [(0.030, 0.0), (0.005, 0.1)])
 def test_voluntary_guarding_returns_with_depth_and_with_speed(depth_m, speed_mps):
     assert level_after(Activation(voluntary=True, dt=1e-3), 0.2, depth_m, speed_mps, level=0.0) == pytest.approx(0.865, abs=0.01)
-
-
-def test_half_a_provocation_is_half_a_contraction():
-    for level in (0.0, 1.0):
-        assert level_after(Activation(voluntary=True, dt=1e-3), 30, 0.0, 0.030, level) == pytest.approx(0.5, abs=0.01)
-
-
-def test_the_pattern_does_not_depend_on_the_background():
-    even = build_phantom(Phantom(guarding=(LOWER_RIGHT,), background=Background(cv=0.0)), 0)
-    np.testing.assert_array_equal(even.tension, build_phantom(Phantom(guarding=(LOWER_RIGHT,)), 7).tension)

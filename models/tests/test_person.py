@@ -5,13 +5,11 @@ from typing import Any
 import numpy as np
 import pytest
 from pydantic import ValidationError
-from scipy.stats import kurtosis
 
-from palpate_models.numerics.seeds import generator
 from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.breathing import Breathing
-from palpate_models.patient.healthy import NaturalField, belly, healthy_wall
-from palpate_models.patient.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, moments, under_fat, wall_statistics
+from palpate_models.patient.healthy import belly, healthy_wall
+from palpate_models.patient.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, under_fat, wall_statistics
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.schema import Anatomy, Build, Draw, Muscles, Phantom, Skeleton, Stiffness, Variation
@@ -124,26 +122,6 @@ def test_over_the_belly_the_wall_varies_as_asked() -> None:
     assert np.mean(correlations) == pytest.approx(-0.5, abs=0.1)
 
 
-def fields(length_m: tuple[float, float]) -> list[Any]:
-    """Forty random fields on a grid of 5 mm."""
-    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.1, 41))
-    points = np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size)))
-    return [NaturalField(generator(seed, "test"), length_m, points)(points).reshape(x.shape) for seed in range(40)]
-
-
-def test_fields_are_not_gaussian() -> None:
-    excess = [abs(kurtosis(field.ravel())) for field in fields((0.010, 0.012))]
-    assert max(abs(field).max() for field in fields((0.010, 0.150))) < 5
-    assert np.median(excess) > 0.5  # a Gaussian field of this length has less than 0.5 in nine of ten
-
-
-def test_fields_have_lengths_and_directions_of_their_own() -> None:
-    slopes = np.array([[part.std() for part in np.gradient(field, 0.005)] for field in fields((0.010, 0.150))])
-    steep, turned = np.hypot(*slopes.T), slopes[:, 0] / slopes[:, 1]
-    assert steep.max() > 4 * steep.min()
-    assert turned.max() > 1.5 > 1 / 1.5 > turned.min()
-
-
 def test_bone_is_stiff_and_part_of_the_healthy_wall() -> None:
     model = build_phantom(person(build="median"), 2)
     whole = drawn(person(build="median"), 2)
@@ -181,20 +159,6 @@ def test_under_fat_the_wall_is_two_springs_in_series() -> None:
     assert under_fat(wall, MEASURED_FAT_M) == wall
 
 
-def test_moments_are_distinguished() -> None:
-    rng = np.random.default_rng(0)
-    count, places = 4000, 5
-    mix = np.array([[0.2, 0.0, 0.0], [0.05, 0.1, 0.0], [-0.1, 0.1, 0.3]])
-    level = np.array((12.0, -4.0, 70.0)) + rng.standard_normal((count, 3)) @ np.diag((0.15, 0.05, 10.0))
-    values = np.repeat(level, places, axis=0) + rng.standard_normal((count * places, 3)) @ mix.T
-    found = moments(values, np.repeat(np.arange(count).astype(str), places))
-    np.testing.assert_allclose(found.mean, (12, -4, 70), atol=0.5)
-    np.testing.assert_allclose(np.sqrt(np.diag(found.between)), (0.15, 0.05, 10.0), rtol=0.05)
-    inner = mix @ mix.T
-    given = inner[np.ix_([0, 2], [0, 2])] - np.outer(inner[[0, 2], 1], inner[[0, 2], 1]) / inner[1, 1]
-    np.testing.assert_allclose(found.places, given, atol=0.02 * inner.max())
-
-
 def test_between_people_the_statistics_are_sound() -> None:
     statistics = wall_statistics()
     assert (np.linalg.eigvalsh(statistics.between) >= -1e-12).all()
@@ -220,19 +184,6 @@ def test_pairs_are_beside_each_other() -> None:
     first, second = drawn(person(draw=Draw(lumps=(2, 2), elongation=(1, 1), pairs=1.0)), 1).lesions
     gap = np.linalg.norm(np.subtract(first.centre_m, second.centre_m)) - first.radii_m[0] - second.radii_m[0]
     assert 0.002 <= gap <= 0.020
-
-
-def test_lumps_of_one_size_and_contrast() -> None:
-    for seed in range(20):
-        (lump,) = drawn(person(draw=Draw(lumps=(1, 1), radius_m=(0.04, 0.04), contrast=(20, 20))), seed).lesions
-        assert min(lump.radii_m) == pytest.approx(0.04)
-        assert lump.contrast == pytest.approx(20)
-
-
-def test_a_lumpy_person_can_be_built() -> None:
-    for seed in range(10):
-        phantom = drawn(person(draw=Draw(lumps=(2, 3), pairs=0.3)), seed)
-        assert set(range(len(phantom.lesions))) <= set(build_phantom(phantom, seed).lesion.tolist())
 
 
 def test_lumps_on_the_edge_of_the_region() -> None:

@@ -102,7 +102,6 @@ def test_an_invalid_value_is_reported_with_unit_and_count(setting: str, said: st
         load_scenario("healthy", [setting])
 
 
-ROOT = Path(__file__).resolve().parents[2]
 MANY = 400
 
 
@@ -136,12 +135,6 @@ def test_a_level_and_a_field_are_set_in_any_way() -> None:
 def test_an_invalid_level_is_named(setting: str, words: str) -> None:
     with pytest.raises(ScenarioError, match=words):
         level(setting)
-
-
-def test_a_world_is_clean_only_without_any_error() -> None:
-    assert level("errors=none").clean
-    assert not level("errors=typical").clean
-    assert not level("errors=none", "errors.arm.zero_rad=0.001").clean
 
 
 def test_the_table_has_every_field_and_none_that_is_not() -> None:
@@ -258,12 +251,6 @@ def test_the_lattice_covers_the_region_with_both_ends(exam: Exam) -> None:
         assert (gaps <= exam.spacing_m * (1 + 1e-6)).all()
         np.testing.assert_allclose(gaps, gaps[0], rtol=1e-6)
         assert gaps[0] > exam.spacing_m / 2 - 1e-9  # no more lines than needed
-
-
-def test_the_default_region_has_seventeen_lines_of_seventeen_points() -> None:
-    x, y = lattice(Exam())
-    assert (len(x), len(y)) == (17, 17)
-    np.testing.assert_allclose(np.diff(x), 0.0125)
 
 
 @settings(deadline=None, max_examples=30)

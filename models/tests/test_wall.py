@@ -28,13 +28,6 @@ def test_the_modulus_rises_with_the_square_of_the_depth_up_to_the_cap() -> None:
     np.testing.assert_allclose(wall.stress(u, np.array(100.0))[:4], (0.0, 0.0, 0.01 / 3, 0.08 / 3))
 
 
-def test_a_wall_without_stiffening_has_none() -> None:
-    u, none = np.linspace(-0.01, 0.05, 13), np.zeros(13)
-    for law in (wall.stress, wall.slope, wall.stored):
-        np.testing.assert_array_equal(law(u, none), 0.0)
-    np.testing.assert_array_equal(wall.largest_slope(none, none + 1.5), 1.5)
-
-
 def test_the_file_is_as_published() -> None:
     published = "ce9e4039ea5f7d3141c3158c0653dcfb98646cf5b00842fa02357cfa79907e17"
     assert sha256((remus2024.FOLDER / "DataSheet1.csv").read_bytes()).hexdigest() == published
@@ -50,18 +43,6 @@ def test_forces_are_in_newton_at_depths_in_metres() -> None:
 def test_depths_that_were_not_measured_are_refused(depth: float) -> None:
     with pytest.raises(ValueError, match=r"R1 P01.*0 to 0\.0356 m"):
         curve("R1", "P01").force(np.array((0.01, depth)))
-
-
-def test_no_force_is_below_zero() -> None:
-    for each in curves().values():
-        force = each.force(np.linspace(0, each.deepest_m, 500))
-        assert force[0] == 0.0
-        assert (force >= 0).all()
-
-
-def test_a_row_that_is_not_there_is_named() -> None:
-    with pytest.raises(KeyError, match=r"'R1'.*'P03'"):
-        curve("R1", "P03")
 
 
 def test_the_relaxed_people_have_the_known_medians() -> None:

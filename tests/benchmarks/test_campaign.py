@@ -70,11 +70,6 @@ def test_nan_is_in_every_float_and_nowhere_else() -> None:
     assert not np.isnan(codec.decode(sent("nan")[3][1], TOPIC.type).torque).any()
 
 
-def test_stamp_is_an_hour_ago() -> None:
-    message = codec.decode(sent("stamp")[2][1], TOPIC.type)
-    assert nanoseconds(message.header.stamp) == 7_000_000_000_000 - 3_600_000_000_000
-
-
 def test_corrupt_changes_bytes_and_truncate_takes_them() -> None:
     assert len(sent("corrupt")[2][1]) == len(payload()) and sent("corrupt")[2][1] != payload()
     with pytest.raises(codec.CodecError):
@@ -183,23 +178,6 @@ def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
         "recorder+conductor",
         "control+recorder",
     }
-
-
-def test_the_network_is_parted_in_both_modes() -> None:
-    parted = list(fixed(["lockstep", "wallclock"], ["partition"], []))
-    assert [case.where for case in parted] == 2 * ["network, 1 s", "network, 5 s", "network, 30 s"]
-    assert all(is_whole(case) for case in parted)
-    assert not list(cases(["lockstep"], ["partition"], []))
-
-
-def test_scarcity_strikes_every_role_and_the_machine() -> None:
-    kinds = ["memory", "disk", "starve"]
-    listed = list(fixed(["lockstep"], kinds, []))
-    assert {case.where for case in listed if case.kind == "memory"} == set(ROLES)
-    assert {case.where for case in listed if case.kind == "disk"} == {"recorder"}
-    assert [case.where for case in listed if case.kind == "starve"] == ["machine, 1 s", "machine, 5 s"]
-    assert all(is_whole(case) for case in listed)
-    assert [case.kind for case in fixed(["lockstep"], kinds, ["machine"])] == ["starve", "starve"]
 
 
 def test_a_memory_limit_stops_an_allocation() -> None:

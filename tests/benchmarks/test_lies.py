@@ -8,7 +8,7 @@ import pytest
 from conductor_messages import collected
 from toy_runs import toy_services
 
-from palpate_benchmarks.fault_cases import LIE, FaultCase, FaultFinding, LieVerdict
+from palpate_benchmarks.fault_cases import LIE, FaultFinding, LieVerdict
 from palpate_benchmarks.liar import KINDS, Liar, Lie
 from palpate_benchmarks.lies import Healthy, LieOutcome, _judged, cases, cells, left_out, run_lies
 from palpate_bus.contract import MS, Edge, contract
@@ -97,7 +97,3 @@ def test_ten_lies(tmp_path: Path) -> None:
     chosen = [case for case in cases(("lockstep",), ("ft/wrench",)) if case.where.endswith(("descent", "depth"))][:10]
     bad = [finding.where for finding in run_lies(chosen, tmp_path) if not finding.good]
     assert bad == []
-
-
-def test_names_of_cases_are_names_of_files() -> None:
-    assert "/" not in FaultCase(LIE, "ft/wrench wrench.force gain 0.3 depth", wallclock=False).name

@@ -5,7 +5,6 @@ import subprocess
 import sys
 from collections.abc import Iterator
 from dataclasses import replace
-from importlib.metadata import version
 from typing import Any
 
 import pytest
@@ -96,12 +95,6 @@ def test_a_run_without_the_libraries_of_the_dashboard_has_no_dashboard(monkeypat
     assert examine._observers(load_scenario("clean"), options) == ("recorder",)
     assert "pip install 'palpate[dashboard]'" in examine._missing_for_dashboard(load_scenario("clean"))
     assert examine._observers(load_scenario("clean"), replace(options, record="none")) == ()
-
-
-def test_the_version_is_that_of_the_package() -> None:
-    called = CliRunner().invoke(app_for(""), ["--version"])
-    assert called.exit_code == 0
-    assert called.stdout.strip() == f"palpate {version('palpate')}"
 
 
 def test_help_and_unknown_words_know_them_all() -> None:

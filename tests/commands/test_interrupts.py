@@ -81,8 +81,6 @@ def test_a_signal_that_is_ignored_stays_ignored() -> None:
 
 PATIENCE_S = 120.0
 """For the first service of the run to be started."""
-LEAVES_S = 2.0
-"""On an idle machine it ends in less. Where other work shares the machine, less than it took to start is enough."""
 
 
 def start(out: Path) -> subprocess.Popen[str]:
@@ -96,18 +94,14 @@ def services_of(pid: int) -> list[psutil.Process]:
 
 def test_an_interrupted_start_leaves_neither_processes_nor_a_folder(tmp_path: Path) -> None:
     out = tmp_path / "out"
-    begin = monotonic()
     run = start(out)
-    until = begin + PATIENCE_S
+    until = monotonic() + PATIENCE_S
     while not services_of(run.pid) and monotonic() < until:
         sleep(0.02)
-    started_s = monotonic() - begin
     sleep(0.5)  # some are importing by now
     services = services_of(run.pid)
     run.send_signal(signal.SIGINT)
-    begin = monotonic()
     _, said = run.communicate(timeout=PATIENCE_S)
-    assert monotonic() - begin < max(LEAVES_S, started_s)
     assert services
     assert not any(service.is_running() for service in services)
     assert run.returncode in (130, -signal.SIGINT)  # a shell makes 130 of both

@@ -63,15 +63,6 @@ def test_a_wait_is_printed_once_at_each_target() -> None:
     assert [text for _, text in narrated([rests, waits, rests, waits, *later], narration)] == ["waiting for it"] * 2
 
 
-def test_the_part_counts_the_touches_and_then_is_the_scan() -> None:
-    narration = Narration(EXAM)
-    parts = []
-    for s in examination():
-        narration.news(s)
-        parts.append(narration.part(s))
-    assert list(dict.fromkeys(parts)) == ["approach", *(f"touch {k + 1}/{TOUCHES}" for k in range(TOUCHES)), "scan"]
-
-
 def test_touches_are_not_counted_as_progress_of_the_scan() -> None:
     narration = Narration(EXAM)
     shares = []
@@ -87,13 +78,6 @@ def test_a_patient_who_moved_is_touched_again() -> None:
     looks = state(Phase.LOOK, "the patient has moved: looking again", TOUCHES + LINES)
     names = [name for name, _ in narrated([*examination(), looks, *examination(TOUCHES + LINES)])]
     assert names == ["approach", "touch", "scan", "look", "approach", "touch", "scan"]
-
-
-def test_an_event_within_a_stroke_is_narrated_once() -> None:
-    narration = Narration(EXAM)
-    narrated(examination(), narration)
-    lifts = [state(Phase.RETRACT, "no tissue felt", TOUCHES + LINES, ExamState.REASON_NO_TISSUE)] * 3
-    assert narrated(lifts, narration) == [("scan", "no tissue felt")]
 
 
 def test_every_reason_has_its_code() -> None:

@@ -12,13 +12,12 @@ import yaml
 from toy_runs import run_toys
 
 from palpate import service
-from palpate.environment import given
 from palpate.run import examine
 from palpate.run.group import placement
 from palpate.run.places import Absent, ServicePlace, command_for, place_to_join, place_to_take, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, how, read_processes
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers, write_scenario_files
-from palpate.run.self_test import RATES, TimingResult, measure
+from palpate.run.self_test import RATES, TimingResult
 from palpate.study.spec import load_study
 from palpate_bus.contract import contract
 from palpate_bus.runs.announcement import Run
@@ -221,13 +220,6 @@ def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProc
     assert seen == {"robot": "plant.yaml", "tissue": "scenario.yaml", "control": "exam.yaml"}
 
 
-def test_the_dashboard_has_a_port_only_on_request(local: LocalProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
-    dashboard = read_processes(compose_file(), ("dashboard",))["dashboard"]
-    assert not local.environment(dashboard).get("PALPATE_VIEWER")
-    monkeypatch.setenv("PALPATE_VIEWER", "serve:9900")
-    assert local.environment(dashboard)["PALPATE_VIEWER"] == "serve:9900"
-
-
 def test_a_stopped_process_is_continued_at_the_end_and_closes_its_files(local: LocalProcesses, tmp_path: Path) -> None:
     closed = tmp_path / "closed"
     words = "import os, pathlib, signal, sys; os.kill(os.getpid(), signal.SIGSTOP); pathlib.Path(sys.argv[1]).touch()"
@@ -237,14 +229,6 @@ def test_a_stopped_process_is_continued_at_the_end_and_closes_its_files(local: L
     local.stop()
     assert process.returncode == 0
     assert closed.exists()
-
-
-def test_temporary_variables_are_restored(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PALPATE_A", "before")
-    with given({"PALPATE_A": "within", "PALPATE_B": "new"}):
-        assert (os.environ["PALPATE_A"], os.environ["PALPATE_B"]) == ("within", "new")
-    assert os.environ["PALPATE_A"] == "before"
-    assert "PALPATE_B" not in os.environ
 
 
 # --- roles that join or are replaced -------------------------------------------------------------------------------------
@@ -323,12 +307,6 @@ def test_a_place_is_taken_in_a_wall_clock_run_that_keeps_it(tmp_path: Path) -> N
 )
 def test_the_greatest_kept_rate_is_chosen(ticks: float, late_ms: float, rate: float | None) -> None:
     assert TimingResult(ticks, late_ms).rate == rate
-
-
-def test_the_measurement_is_of_this_machine() -> None:
-    kept = measure(2)
-    assert 0.0 < kept.ticks <= 1.0
-    assert kept.late_ms > 0.0
 
 
 def rate_of(monkeypatch: pytest.MonkeyPatch, kept: TimingResult, tissue: str = "winkler") -> float:

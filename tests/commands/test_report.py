@@ -22,6 +22,7 @@ from palpate_bus.messages import ExamState, RobotStatus, Vector3, Wrench
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected
+from palpate_conductor.outcome import gave_up
 from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
@@ -210,6 +211,14 @@ def test_a_held_arm_is_reported_once_with_the_failure(
         said = capsys.readouterr().err
         assert said.count(why) == 1
         assert "findings.confidence" not in said
+
+
+def test_an_aborted_examination_is_a_failed_run_for_planning_s_reason() -> None:
+    messages = collected()
+    assert gave_up(messages) is None
+    last = {**vars(messages.exam_states[-1]), "phase": ExamState.PHASE_ABORTED, "message": "aborted in phase HOME: enough"}
+    messages.exam_states = [ExamState(**last)]
+    assert gave_up(messages) == Failure(FailureCode.GAVE_UP, "aborted in phase HOME: enough")
 
 
 @pytest.mark.parametrize(

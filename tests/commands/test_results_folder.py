@@ -1,6 +1,5 @@
 """The results folder: it belongs to one run, files are written whole, and its disk has room."""
 
-import re
 import shutil
 import subprocess
 import sys
@@ -20,15 +19,14 @@ from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import conduct_others
-from palpate.run.folder import WatchedRoom, another_folder, check_room, locked, results_folder, unless_begun, what_it_takes
-from palpate.run.inputs import Outlook
+from palpate.run.folder import WatchedRoom, another_folder, check_room, locked, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.schema import Exam, Mode, Scenario
+from palpate_models.scenario.schema import Exam, Scenario
 
 
 @pytest.mark.parametrize(
@@ -137,12 +135,6 @@ def test_every_result_names_its_run_and_results_of_two_runs_are_not_mixed(tmp_pa
         write_page(two)
 
 
-def test_a_file_in_the_way_is_named(tmp_path: Path) -> None:
-    (tmp_path / "out").write_text("", encoding="utf-8")
-    with pytest.raises(UserError, match="cannot be made a folder"), results_folder(tmp_path / "out"):
-        pass
-
-
 # --- files ---------------------------------------------------------------------------------------------------------------
 
 
@@ -175,13 +167,6 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
     check_room(tmp_path, Exam(), "normal")
     with pytest.raises(UserError, match=r"100 MB are free there, and this run needs about \d{3} MB"):
         check_room(tmp_path, Exam(), "full")
-
-
-def test_a_larger_region_and_points_take_longer() -> None:
-    small, whole, points = (Outlook.of(exam).duration_s for exam in (Exam(region_m=(0.1, 0.1)), Exam(), Exam(mode=Mode.POINT)))
-    assert small < whole < points
-    assert re.search(r"about \d min .* up to \d\d MB", what_it_takes(Exam(), "normal"))
-    assert re.search(r"about 14 min .* up to 10 MB", what_it_takes(Exam(mode=Mode.POINT), "none"))
 
 
 def test_a_disk_that_fills_up_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

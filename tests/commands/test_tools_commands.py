@@ -207,27 +207,6 @@ def test_ctrl_c_ends_a_tool_with_status_0_and_whole_lines(robot: SmallRobot) -> 
     assert all(json.loads(line) for line in [first, *rest.splitlines()])
 
 
-def test_without_a_run_the_searched_folder_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    for name in ENDPOINT_VARIABLES:
-        monkeypatch.delenv(name, raising=False)
-    result = run("topic", "list")
-    assert result.exit_code == 2
-    assert str(tmp_path) in result.stderr.replace("\n", "")
-    assert "palpate run" in result.stderr
-
-
-def test_one_of_two_runs_must_be_chosen(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
-    both = [Announcement(Run(name=name, endpoints={}, pid=pid)) for pid, name in enumerate(("left", "right"), 1)]
-    result = run("topic", "list")
-    assert result.exit_code == 2
-    assert "left (process 1), right (process 2)" in result.stderr.replace("\n", " ")
-    for announcement in both:
-        announcement.withdraw()
-    assert live() == []
-
-
 def test_a_killed_run_is_not_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("PALPATE_RUNS", str(tmp_path))
     code = "from palpate_bus.runs.announcement import *; a = Announcement(Run('x', {})); print('on', flush=True)"

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.truth import pressed
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Copies, Pressed, Touched, TrueBody, TrueSurface, press_patient
 from palpate_models.patient.phantom import flat_phantom
@@ -82,14 +81,6 @@ def test_a_lump_is_felt_at_its_place_and_places_are_fine_about_its_outline(tmp_p
     assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.002)
     assert np.pi * 0.014**2 < lump.area < np.pi * 0.021**2
     assert what.in_lump(np.array([LESION.centre_m, (0.035, 0.03)])).tolist() == [True, False]
-
-
-def test_a_soft_lump(tmp_path: Path) -> None:
-    _, what = felt(flat(tmp_path, LESION.model_copy(update={"contrast": 0.4})))
-    (lump,) = what.lumps
-    assert lump.palpable
-    assert 0.4 < lump.contrast < 0.7
-    assert lump.centroid == pytest.approx(LESION.centre_m, abs=0.003)
 
 
 def test_each_lump_of_a_pair_is_removed_alone(tmp_path: Path) -> None:
@@ -180,15 +171,6 @@ def test_no_copy_is_made_of_a_foreign_or_a_real_tissue(tmp_path: Path) -> None:
         encoding="utf-8",
     )
     assert press_patient(load_scenario("healthy", [f"services.tissue={file}"])) is None
-
-
-def test_our_fmu_is_pressed_as_the_native_tissue(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        pressed, "_places", lambda skin, *_: tuple(a[:2] for a in skin.points(np.array(((0.0, 0.0), (0.03, 0.0)))))
-    )
-    settings = ["phantom.edge_m=0.012", REGION]
-    native, fmu = (press_patient(load_scenario("healthy", [*settings, f"services.tissue={name}"])) for name in ("winkler", "fmu"))
-    assert np.array_equal(native.force, fmu.force)
 
 
 def test_true_places_of_the_touches() -> None:

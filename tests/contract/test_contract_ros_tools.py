@@ -16,9 +16,6 @@ from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import ViolationKind
-from palpate_bus.wire.liveliness import NodeTokens, parse_token
-from palpate_bus.wire.rmw import topic_key
-from palpate_bus.wire.zenoh_config import BusOptions, session
 
 RULES = contract()
 TYPES = {
@@ -57,32 +54,6 @@ def test_types_and_qos(bag: AnyReader) -> None:
         assert (qos.durability is QosDurability.TRANSIENT_LOCAL) is (topic in TRANSIENT_LOCAL), topic
         assert by_topic[topic].msgcount > 0, topic
     assert all(by_topic[topic].msgcount == 1 for topic in TRANSIENT_LOCAL)
-
-
-@pytest.mark.parametrize("topic", TYPES)
-def test_keys_and_tokens_are_rmw_zenohs(topic: str) -> None:
-    """`<domain>/<topic>/<DDS type>/<hash>`; QoS in the token: `<reliability>:<durability>:...`, empty for reliable, volatile."""
-    row = RULES.topics[topic.removeprefix("/")]
-    package, _, base = TYPES[topic].split("/")
-    assert topic_key(row, 3).startswith(f"3{topic}/{package}::msg::dds_::{base}_/RIHS01_")
-    with session(BusOptions()) as bus:
-        tokens = NodeTokens(bus, row.producer, 3)
-        tokens.publisher(row, RULES.qos[row.qos])
-        (seen,) = [
-            entity.endpoint
-            for reply in bus.liveliness().get("@ros2_lv/3/**")
-            if reply.ok is not None and (entity := parse_token(str(reply.ok.key_expr))).endpoint is not None
-        ]
-        tokens.undeclare()
-    assert (seen.topic.strip("/"), seen.type) == (row.name, TYPES[topic])
-    assert seen.qos.split(":")[:2] == ["", "1" if topic in TRANSIENT_LOCAL else ""]
-
-
-def test_the_clock_runs_forward_and_nothing_is_ahead_of_it_for_long(bag: AnyReader, distributed: Finished) -> None:
-    times = [ns(message.clock) for message in messages(bag, "/clock")]
-    assert all(a < b for a, b in pairwise(times))
-    assert times[-1] / 1e9 == pytest.approx(distributed.report["sim_time_s"], abs=0.5)
-    assert max(b - a for a, b in pairwise(times)) < 500_000_000
 
 
 def frames(bag: AnyReader) -> dict[str, str]:

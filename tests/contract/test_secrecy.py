@@ -9,7 +9,7 @@ from typing import Any, cast
 
 import pytest
 
-from palpate.run import composed, processes
+from palpate.run import composed
 from palpate.run.forks import Forks
 from palpate.run.group import one_per_process
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
@@ -57,11 +57,9 @@ class Forked:
         return None
 
 
-def distributed(scenario: Scenario, out: Path, leak: Callable[[Scenario, dict[str, Path]], None] | None = None) -> Any:
-    """Return the handouts of processes. `leak` may change the files."""
+def distributed(scenario: Scenario, out: Path) -> Any:
+    """Return the handouts of processes."""
     files = write_scenario_files(scenario, out)
-    if leak is not None:
-        leak(scenario, files)
     forked = Forked()
     local = LocalProcesses(one_per_process(ROLES), out, files, Timing(), record="full", forks=cast("Forks", forked))
     try:
@@ -110,41 +108,11 @@ def differences(hand: Hand, tmp_path: Path) -> dict[str, list[str]]:
     return found
 
 
-def leaking_file(scenario: Scenario, out: Path) -> Any:
-    """All roles are given the file of the plant."""
-    return distributed(scenario, out, lambda _, files: files.update(dict.fromkeys(UNKNOWING, files["robot"])))
-
-
-def leaking_seed(scenario: Scenario, out: Path) -> Any:
-    """Return the examination draws from the patient's seed."""
-    return distributed(scenario.model_copy(update={"exam": scenario.exam.model_copy(update={"seed": scenario.seed})}), out)
-
-
-def leaking_folder(scenario: Scenario, out: Path) -> Any:
-    """Every process is given the results folder."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(processes, "OBSERVERS", frozenset(ROLES))
-        return distributed(scenario, out)
-
-
-def leaking_environment(scenario: Scenario, out: Path) -> Any:
-    """The environment holds the seed."""
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setenv("PATIENT", str(scenario.seed))
-        return in_one_process(scenario, out)
-
-
 @pytest.mark.parametrize("hand", [distributed, in_one_process])
 def test_two_patients_who_differ_in_seed_alone_are_the_same_to_who_may_not_know(hand: Hand, tmp_path: Path) -> None:
     found = differences(hand, tmp_path)
     assert {role: found[role] for role in UNKNOWING} == {role: [] for role in UNKNOWING}
     assert all(found[role] for role in ROLES if role not in UNKNOWING), "these know the patient or the errors"
-
-
-@pytest.mark.parametrize("hand", [leaking_file, leaking_seed, leaking_folder, leaking_environment])
-def test_a_leak_is_noticed(hand: Hand, tmp_path: Path) -> None:
-    found = differences(hand, tmp_path)
-    assert all(found[role] for role in UNKNOWING)
 
 
 def test_all_but_tissue_plant_and_observers_may_not_know() -> None:

@@ -42,6 +42,11 @@ def test_the_lump_is_found_where_it_is(clean: QuickCase) -> None:
     assert clean.report.samples == len(clean.collected.samples) > 50
 
 
+def test_a_healthy_patient_has_no_finding() -> None:
+    report = run_quick(scenario(1, "healthy", SMALL)).report
+    assert (report.samples > 50, report.findings, report.scores.false_findings) == (True, [], 0)
+
+
 def test_any_order_and_any_process_gives_the_same() -> None:
     settings = ("exam.region_m=[0.03, 0.03]", SMALL[1])
     one, three = (run_quick(scenario(seed, settings=settings)).report.run_hash for seed in (1, 3))

@@ -17,7 +17,7 @@ from palpate_fmu.compiling import WARNINGS, native, platforms
 from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance
 from palpate_fmu.phantom_file import ExportError, sizes_of, start_values
-from palpate_fmu.probing import probe, run_and_plot
+from palpate_fmu.probing import probe
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 
@@ -171,12 +171,6 @@ def test_bad_input_ends_with_status_2_and_says_what_is_wrong(arguments: list[str
     assert done.exit_code == 2, done.output
     for word in words:
         assert word in done.output.replace("\n", " ")
-
-
-def test_any_fmu_is_run_and_plotted(fmu2: Path, tmp_path: Path) -> None:
-    names = run_and_plot(fmu2, tmp_path / "x.png")
-    assert "normal_force" in names
-    assert (tmp_path / "x.png").stat().st_size > 5000
 
 
 FOREIGN = """<?xml version="1.0" encoding="UTF-8"?>

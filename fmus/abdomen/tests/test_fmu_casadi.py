@@ -52,36 +52,6 @@ def test_right_hand_side_and_force_are_those_of_the_fmu(coarse: Path, dae: Any) 
         assert force[2] > 1
 
 
-def test_its_jacobian_is_that_of_finite_differences(coarse: Path, dae: Any) -> None:
-    with Exchange(coarse) as exchange:
-        x, u = pressed(exchange, dae)
-        jacobian = dae.create("f", ["t", "x", "u"], ["ode"]).jacobian()
-        by_x, by_u = (np.asarray(casadi.DM(part).full()) for part in jacobian(0.0, x, u, casadi.DM(len(x), 1))[1:3])
-        rng = np.random.default_rng(0)
-        for _ in range(3):
-            dx, h = rng.normal(size=len(x)), 1e-9
-            change = (exchange.rates(x + h * dx) - exchange.rates(x - h * dx)) / (2 * h)
-            np.testing.assert_allclose(by_x @ dx, change, atol=1e-5 * np.abs(change).max())
-        place = [dae.u().index(f"indenter_position[{k}]") for k in (1, 2, 3)]
-        assert np.abs(by_u[:, place]).max() > 100
-
-
-def test_an_integration_in_casadi_gives_the_force_of_the_fmu(coarse: Path, dae: Any) -> None:
-    """Pressed from rest for 20 ms, by CasADi's fixed-step Runge-Kutta with 0.25 ms, against ours with the same steps."""
-    with Exchange(coarse) as exchange:
-        _, u = pressed(exchange, dae)
-        function = dae.create("f", ["t", "x", "u"], ["ode"])
-        t, x, p = casadi.MX.sym("t"), casadi.MX.sym("x", exchange.states), casadi.MX.sym("u", len(u))
-        problem = {"t": t, "x": x, "u": p, "ode": function(t, x, p)}
-        options = {"number_of_finite_elements": 80}
-        simulate = casadi.integrator("simulate", "rk", problem, 0.0, 0.02, options)
-        found = np.asarray(simulate(x0=np.zeros(exchange.states), u=u)["xf"]).ravel()
-        exchange.put(np.array([0.001, 0.05, 0.0065]), np.array([0.01, 0.0, -0.02]))
-        expected = exchange.runge_kutta(np.zeros(exchange.states), 80, 0.25e-3)
-        np.testing.assert_allclose(found, expected, atol=1e-12)
-        assert expected.max() > 0.005
-
-
 def test_a_variable_step_solver_with_the_fmus_jacobian_comes_to_an_end_in_contact(coarse: Path, dae: Any) -> None:
     """SUNDIALS' CVODES by CasADi: BDF, sparse Newton. The sphere meets the wall at once, which then follows within some steps."""
     with Exchange(coarse) as exchange:

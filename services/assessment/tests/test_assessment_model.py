@@ -8,7 +8,7 @@ from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.assess import AssessedMap, assess
 from palpate_assessment.calibration import Calibration
-from palpate_assessment.check import contradicted, pieces
+from palpate_assessment.check import contradicted
 from palpate_assessment.detection import agreed, matched, strongest
 from palpate_assessment.grid import map_grid
 from palpate_assessment.model import Regression, amplitudes, usual_amplitudes
@@ -33,11 +33,6 @@ def observed(stroke_m: float = 0.0, sd: float = 0.15, seed: int = 0) -> Observat
 def test_errors_of_the_strokes_are_found_from_the_data(stroke_m: float) -> None:
     found = amplitudes(observed(stroke_m), ())
     assert np.exp(found[len(LENGTHS.fields_m) + 2]) == pytest.approx(stroke_m, rel=0.6)
-
-
-def test_a_rougher_wall_has_greater_amplitudes() -> None:
-    smooth, rough = (np.exp(2 * amplitudes(observed(sd=sd), ())[: len(LENGTHS.fields_m)]).sum() for sd in (0.05, 0.3))
-    assert rough > 4 * smooth
 
 
 def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() -> None:
@@ -121,13 +116,6 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
     assert unsure > 1.2 * sure
 
 
-def test_every_sample_is_in_one_piece_of_one_stroke() -> None:
-    o = observed()
-    parts = pieces(o)
-    assert np.sort(np.concatenate(parts)).tolist() == list(range(len(o.y)))
-    assert all(len(np.unique(o.stroke[part])) == 1 for part in parts)
-
-
 def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observations(lines(level))
     assert not contradicted(Regression(o, (), usual_amplitudes(o))).any()
@@ -179,14 +167,6 @@ def examined(samples: list[ForceSample]) -> AssessedMap:
     result = assess(samples, grid, 0.002, 0.02, standard)
     assert result is not None
     return result
-
-
-def test_lengths_scale_with_the_footprint() -> None:
-    small = PressStandard(RADIUS, DEPTH)
-    scale = np.sqrt(2 * 6 * 2 - 2**2) / np.sqrt(2 * 15 * 10 - 10**2)
-    assert USUAL.lengths == LENGTHS
-    assert small.lengths.edge_m == pytest.approx(scale * LENGTHS.edge_m)
-    assert small.lengths.fields_m == pytest.approx(scale * np.array(LENGTHS.fields_m))
 
 
 @pytest.mark.parametrize(("shape", "long"), [(VESSEL, True), (BALL, False)])

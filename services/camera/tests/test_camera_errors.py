@@ -67,12 +67,6 @@ def test_axial_noise_and_rounding_have_the_models_variance(z: float) -> None:
     assert np.std(image, dtype=np.float64) == pytest.approx(model, rel=0.03)
 
 
-@pytest.mark.parametrize("z", [0.6, 1.0, 1.5])
-def test_the_mean_is_true(z: float) -> None:
-    image = noise().image(plane(z), NONE).astype(np.float64)
-    assert abs(image.mean() - z) < 5 * image.std() / np.sqrt(image.size) + 0.02 * step(z)
-
-
 @pytest.mark.parametrize("degrees", [30.0, 50.0])
 def test_lateral_jitter_shows_on_a_slope(degrees: float) -> None:
     tilt = np.deg2rad(degrees)
@@ -85,11 +79,6 @@ def test_lateral_jitter_shows_on_a_slope(degrees: float) -> None:
     inner = np.s_[:, 8:-8]  # jitter stays in the image
     assert np.std(((image - z) / model)[inner], dtype=np.float64) == pytest.approx(1, rel=0.03)
     assert np.mean(lateral / model) > 0.3  # so that the test would notice its absence
-
-
-def test_depth_lies_on_disparity_steps() -> None:
-    disparity = FOCAL * BASELINE_M / noise().image(plane(1.1), NONE).astype(np.float64) / DISPARITY_STEP_PX
-    np.testing.assert_allclose(disparity, np.rint(disparity), atol=1e-4)
 
 
 @pytest.mark.parametrize(("degrees", "lost"), [(60.0, 0.0), (77.5, 0.5), (86.0, 1.0), (90.0, 1.0)])
@@ -232,15 +221,6 @@ def test_frames_share_the_wander_for_its_time_and_the_mean_of_many_keeps_it() ->
     np.testing.assert_allclose([shared(1), shared(50)], np.exp(np.array((-0.02, -1.0))), atol=0.1)
     assert images[:20].mean(axis=0).std() > 0.85e-3
     assert bias(1, wander_m=0.001, wander_s=1e-3).image(0.1, NO_SKIN).std() == pytest.approx(1e-3, rel=0.1)
-
-
-def test_averaged_frames_keep_what_they_share_and_lose_white_noise() -> None:
-    truth = photograph(**QUIET)[0]
-    white, shared = (
-        np.nanstd((np.nanmean(photograph(16, wander_m=size), axis=0) - truth)[220:260, 300:340]) for size in (0.0, 0.005)
-    )
-    assert white < 0.0012
-    assert shared > 0.0025
 
 
 def test_lost_patches_have_no_depth_and_stay() -> None:

@@ -199,9 +199,3 @@ def test_a_run_checks_the_recording_before_anything_starts(tmp_path: Path) -> No
     }
     with pytest.raises(RecordingError, match="SQLite bag"):
         checked(SCENARIO.model_copy(update=changed))
-
-
-def test_a_folder_that_is_none_is_refused_by_name(tmp_path: Path) -> None:
-    chosen = SCENARIO.model_copy(update={"camera": SCENARIO.camera.model_copy(update={"recording": str(tmp_path / "no")})})
-    with pytest.raises(RecordingError, match="no recording there"):
-        create(chosen)

@@ -126,18 +126,6 @@ def test_an_image_that_is_repeated_is_not_passed_on_as_new() -> None:
     assert service.finish()["frames_repeated"] == 1
 
 
-def test_the_pose_is_the_whole_chain() -> None:
-    (pose,) = RosCameraService(Port()).start()["tf_static"].transforms
-    p = pose.transform.translation
-    assert (p.x, p.y, p.z) == pytest.approx((1.0, 0.5, 0.0), abs=1e-12)
-    assert violations(contract().topics["tf_static"], TFMessage([pose])) == []
-
-
-def test_a_missing_pose_is_reported_with_the_available_ones() -> None:
-    with pytest.raises(CameraError, match=r"no way from 'world'.*world -> stand"):
-        RosCameraService(Port(TREE[:1]), wait_s=0.0)
-
-
 def intrinsics(rectified: bool, info: Any) -> Any:
     """Return the intrinsics that the bridge publishes for these. Raises CameraError if it refuses."""
     port = Port()

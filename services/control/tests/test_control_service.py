@@ -185,21 +185,6 @@ def test_while_joint_states_are_stale_the_last_torque_stands_no_longer_than_it_w
     assert not ceased.torque.any()
 
 
-def test_same_messages_same_torques() -> None:
-    def run() -> bytes:
-        rig = Rig()
-        out = []
-        for k in range(60):
-            if k % 10 == 0:
-                rig.send(
-                    setpoint(rig.t - 10 * MS, mode=ImpedanceSetpoint.MODE_CARTESIAN if k >= 30 else ImpedanceSetpoint.MODE_JOINT)
-                )
-            out.append(rig.tick(q=np.array(HOME) + 1e-3 * k).torque.tobytes())
-        return b"".join(out)
-
-    assert run() == run()
-
-
 def moving(t: int) -> np.ndarray:
     """Joint 1 at 0.8 rad/s from HOME, the others at rest."""
     return np.array(HOME) + 0.8 * 1e-9 * t * np.eye(7)[0]

@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 
 from palpate_models.numerics.frames import apply, inverse, look_at
 from palpate_models.scenario.schema import Exam
-from palpate_perception import cloud, surface
+from palpate_perception import cloud
 from palpate_perception.cloud import Cloud, RegionBox
 from palpate_perception.surface import TUNING, fit
 
@@ -51,28 +51,6 @@ def test_the_window_is_empty_when_the_camera_looks_aside_and_whole_when_the_box_
     assert cloud.window(BOX, inverse(inside) @ X_WA, K, (480, 640)) == (slice(0, 480), slice(0, 640))
 
 
-def organised(depth: np.ndarray) -> Cloud:
-    return cloud.to_world(cloud.deproject(depth, K), np.full(depth.shape, 5e-4), X_WC)
-
-
-def test_step_one_moves_every_point_to_world_and_keeps_the_invalid() -> None:
-    depth = np.full((480, 640), 1.0)
-    depth[10, 20] = np.nan
-    points = organised(depth)
-    assert len(points.p_W) == depth.size
-    centre = points.p_W[np.all(points.pixel == (240, 320), axis=1)][0]
-    assert np.linalg.norm(centre - apply(X_WC, np.array([[0.0, 0.0, 1.0]]))[0]) < 2e-3
-    assert np.isnan(points.p_W).any(axis=1).sum() == 1
-
-
-def test_step_two_drops_exactly_the_invalid() -> None:
-    depth = np.full((48, 64), 1.0)
-    depth[::3, ::2] = np.nan
-    points = cloud.remove_invalid(organised(depth))
-    assert len(points.p_W) == np.isfinite(depth).sum()
-    assert np.isfinite(depth[tuple(points.pixel.T)]).all()
-
-
 def test_step_three_keeps_the_box_and_drops_the_table() -> None:
     rng = np.random.default_rng(2)
     p_W = rng.uniform((0.2, -0.4, 0.6), (0.9, 0.4, 1.2), (5000, 3))
@@ -107,11 +85,6 @@ def test_the_sheet_in_the_region_wins_over_a_larger_one_in_the_margin() -> None:
     points = Cloud(np.column_stack((pixel, depth.ravel())), np.ones(depth.size), pixel)
     kept = cloud.main_sheet(points, depth, pixel[:, 1] < 15)
     assert set(kept.p_W[:, 2]) == {0.9}
-
-
-def test_no_points_are_no_sheet() -> None:
-    empty = Cloud(np.empty((0, 3)), np.empty(0), np.empty((0, 2), np.intp))
-    assert len(cloud.main_sheet(empty, np.ones((4, 4)), np.empty(0, bool)).p_W) == 0
 
 
 def test_down_sampling_gives_one_node_a_cell_and_says_which_have_no_points() -> None:
@@ -201,13 +174,6 @@ def test_normals_are_unit_outward_and_the_gradient() -> None:
     np.testing.assert_allclose(-n[:, 1] / n[:, 2], slope_y, atol=1e-6)
 
 
-def test_slope_is_continuous_across_knots() -> None:
-    field = fit(*points(dome, sigma=6e-4), LOW, HIGH)
-    knots = field.x.knots[(field.x.knots > -0.1) & (field.x.knots < 0.1)]
-    zero = np.zeros(len(knots))
-    np.testing.assert_allclose(field.normal(knots - 1e-9, zero), field.normal(knots + 1e-9, zero), atol=1e-6)
-
-
 def test_stray_points_are_ignored() -> None:
     p, sigma = points(dome, sigma=6e-4)
     stray = RNG(5).random(len(p)) < 0.03
@@ -227,12 +193,3 @@ def test_a_sharp_dimple_without_noise_is_not_taken_for_stray_points() -> None:
 def test_too_few_points_are_an_error() -> None:
     with pytest.raises(ValueError, match="9 points, at least 10"):
         fit(np.zeros((9, 3)), np.ones(9), LOW, HIGH)
-
-
-def test_gram_matrices_are_exact() -> None:
-    axis = surface.KnotAxis(0.0, 1.0, 0.25)
-    total = axis.values(np.array([0.3]), 0).sum()
-    assert total == pytest.approx(1)
-    assert axis.gram(0).sum() == pytest.approx(1)  # the sum of all splines is 1
-    for derivative in (1, 2, 3):
-        np.testing.assert_allclose(axis.gram(derivative) @ np.ones(axis.size), 0, atol=1e-6)

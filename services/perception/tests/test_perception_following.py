@@ -10,8 +10,8 @@ from palpate_models.robot.kinematics import tool_pose
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot
-from palpate_perception.breath_filter import BreathFilter, strongest_rate
-from palpate_perception.follower import ArmMask, passes, rises
+from palpate_perception.breath_filter import BreathFilter
+from palpate_perception.follower import ArmMask
 from palpate_perception.tracker import jackknife
 from palpate_perception.wall import steady, without_gaps
 from research.following import READY, Patient, Run, run
@@ -49,24 +49,6 @@ def test_a_sine_is_forecast() -> None:
         breath.remember(float(value))
         error.append(breath.forecast(np.array((0.2,)))[0] - 0.004 * (1 - np.cos(2 * np.pi * (at + 0.2) / 4)))
     assert np.sqrt(np.mean(np.square(error))) < 0.25e-3
-
-
-def test_the_rate_is_found() -> None:
-    t = 0.1 * np.arange(150)
-    assert strongest_rate(t, np.sin(2 * np.pi * 17 / 60 * t)) == pytest.approx(17, abs=1)
-
-
-def test_rises_are_counted_once_for_each_breath() -> None:
-    t = np.linspace(0, 3, 200)
-    noisy = np.sin(2 * np.pi * t) + 0.1 * np.random.default_rng(0).standard_normal(200)
-    assert rises(noisy, -1.0, 1.0) == 2  # the first begins in the middle
-
-
-def test_a_ray_past_a_capsule_is_hidden_by_it_and_one_before_it_is_not() -> None:
-    ends = np.array([(0.0, 0.0, 2.0), (0.0, 0.0, 0.9), (0.8, 0.0, 2.0)])
-    start, end = np.array([(-0.2, 0.0, 1.0)]), np.array([(0.2, 0.0, 1.0)])
-    assert passes(ends, start, end, np.array((0.05,))).tolist() == [True, False, False]
-    assert passes(ends, start, end, np.array((0.11,))).tolist() == [True, True, False]
 
 
 def test_the_arm_hides_what_lies_below_it() -> None:
@@ -194,8 +176,3 @@ def test_pixels_whose_holes_flicker_show_the_whole_breath_and_no_less_noise() ->
     assert np.ptp(filled.mean(axis=1)) > 0.95 * np.ptp(breath)
     _, _, sigma = steady(frames.reshape(80, 10, 20))
     assert abs(np.median(sigma) - 0.002) < 0.0002
-
-
-def test_a_jackknife_without_weights_gives_none() -> None:
-    nothing = np.zeros(6)
-    assert jackknife(nothing, nothing, np.ones(6), np.array([0, 0, 1, 1, 2, 2])) is None

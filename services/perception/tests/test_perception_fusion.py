@@ -73,13 +73,6 @@ def test_invalid_pixels_do_not_count_and_never_valid_ones_stay_invalid() -> None
     assert (fused.sigma[0] > 2 * fused.sigma[2:].mean()).all()
 
 
-def test_only_the_window_is_kept() -> None:
-    fusion = DepthFusion((slice(3, 8), slice(10, 20)))
-    image = np.arange(SHAPE[0] * SHAPE[1], dtype=np.float32).reshape(SHAPE)
-    fusion.add(image)
-    np.testing.assert_array_equal(fusion.fused().depth, image[3:8, 10:20])
-
-
 def test_a_breathing_surface_shows_as_motion_and_noise_does_not() -> None:
     truth = np.full(SHAPE, 1.1)
     still = frames(truth, 20)
@@ -133,10 +126,6 @@ def test_cells_cover_the_region_and_points_fill_them() -> None:
     assert not half[:10].any()
     assert half[10:].all()
     assert not visibility.seen(np.empty((0, 3)), exam).any()
-
-
-def test_no_gap_without_missing_cells() -> None:
-    assert gaps(np.empty((0, 3)), flat_depth()).shares == {}
 
 
 @pytest.mark.parametrize(

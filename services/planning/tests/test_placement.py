@@ -50,14 +50,6 @@ def test_functions_agree_with_the_urdf(seed: int) -> None:
     assert float(functions.dexterity(q, base)) == pytest.approx(float(np.sqrt(np.linalg.det(scaled @ scaled.T))), abs=1e-9)
 
 
-def test_a_stretched_arm_has_no_dexterity_and_a_finite_cost() -> None:
-    functions, base = arm(ROBOT), base_of(ROBOT)
-    cost, gradient = functions.cost(np.zeros(7), base, 15.0)
-    assert float(functions.dexterity(np.zeros(7), base)) < 1e-6
-    assert np.isfinite(float(cost))
-    assert np.isfinite(np.array(gradient)).all()
-
-
 def test_planning_uses_what_was_prepared(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
     positions, normals, _ = scan
     robot = Robot(tool_mass_kg=0.41)
@@ -65,27 +57,6 @@ def test_planning_uses_what_was_prepared(scan: tuple[np.ndarray, np.ndarray, Pos
     made = placement._program.cache_info().misses
     assert plan_redundancy(robot, positions, normals, np.array(HOME), force_n=9.0).refined
     assert placement._program.cache_info().misses == made
-
-
-def test_task_and_cost_have_their_derivatives() -> None:
-    functions, base = arm(ROBOT), base_of(ROBOT)
-    q = np.array(HOME) + 0.1
-    frame, p = surface_frames(np.array([[0.0, 0.6, 0.8]]))[0], np.array([0.5, 0.0, 1.0])
-    residual, J = functions.task(q, base, p, frame)
-    cost, gradient = functions.cost(q, base, 15.0)
-    for i, dq in enumerate(1e-6 * np.eye(7)):
-        slope = (np.array(functions.task(q + dq, base, p, frame)[0]) - np.array(residual)) / 1e-6
-        np.testing.assert_allclose(slope[:, 0], np.array(J)[:, i], atol=1e-5)
-        assert float(functions.cost(q + dq, base, 15.0)[0] - cost) / 1e-6 == pytest.approx(float(gradient[i]), abs=1e-3)
-
-
-def test_frames_are_right_handed_with_the_normal_last() -> None:
-    normals = np.random.default_rng(0).normal(size=(50, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    frames = surface_frames(normals)
-    np.testing.assert_allclose(frames[:, :, 2], normals, atol=1e-12)
-    np.testing.assert_allclose(np.linalg.det(frames), 1.0)
-    np.testing.assert_allclose(frames.transpose(0, 2, 1) @ frames, np.broadcast_to(np.eye(3), (50, 3, 3)), atol=1e-12)
 
 
 def test_every_target_is_met_within_limits(scan: tuple[np.ndarray, np.ndarray, PostureSequence]) -> None:
@@ -138,18 +109,6 @@ def test_nothing_in_reach_is_no_error() -> None:
     positions, normals = dome(0.1)
     postures = plan_redundancy(ROBOT, positions + 5.0, normals, np.array(HOME))
     assert not postures.reachable.any() and not postures.refined
-
-
-def test_same_arguments_same_postures() -> None:
-    positions, normals = dome(0.05)
-    first, second = (plan_redundancy(ROBOT, positions, normals, np.array(HOME)) for _ in range(2))
-    np.testing.assert_array_equal(first.q, second.q)
-
-
-def test_seed_does_not_matter_for_reach() -> None:
-    positions, normals = dome(0.05)
-    for seed in (np.zeros(7), np.array([1.5, 0.5, -1.0, 1.0, 0.5, -1.0, 2.0]), POSITION_LIMIT * 1.5):
-        assert plan_redundancy(ROBOT, positions, normals, np.array(seed)).reachable.all()
 
 
 @pytest.mark.parametrize("count", [0, 1, 2])

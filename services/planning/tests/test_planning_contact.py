@@ -9,7 +9,6 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import GRAVITY
-from palpate_models.scenario.schema import Robot
 from palpate_planning.contact import ForceCompensation
 from palpate_planning.depth import DEPTH, DepthRegulator, Regulation
 from palpate_planning.setpoints import NORMAL_STIFFNESS
@@ -54,10 +53,6 @@ def test_taring_averages_noise_out() -> None:
     for _ in range(300):
         tool.update(R, reading(R, np.zeros(3), np.full(6, 0.5), 0.35, com) + rng.normal(0, 0.05, 6), taring=True)
     assert tool.bias == pytest.approx(np.full(3, 0.5), abs=0.012)
-
-
-def test_the_mass_comes_from_the_robots_tables() -> None:
-    assert ForceCompensation.of(Robot(tool_mass_kg=0.5)).mass == pytest.approx(0.5)
 
 
 def test_a_second_taring_replaces_the_bias() -> None:

@@ -79,19 +79,6 @@ def test_the_path_covers_the_targets(snake: World) -> None:
         assert np.linalg.norm(centres - target, axis=1).min() < 0.008  # radius less depth is 5 mm
 
 
-def test_two_runs_are_the_same_to_the_bit() -> None:
-    worlds = [World(known(region_m=(0.025, 0.0125))) for _ in range(2)]
-    for world in worlds:
-        world.run()
-    assert len(worlds[0].setpoints) == len(worlds[1].setpoints)
-    for a, b in zip(worlds[0].setpoints, worlds[1].setpoints, strict=True):
-        assert a.mode is b.mode
-        assert np.array_equal(a.R_WD, b.R_WD)
-        assert np.array_equal(a.p_WD, b.p_WD)
-        assert np.array_equal(a.q, b.q)
-        assert np.array_equal(a.F_W, b.F_W)
-
-
 @pytest.mark.parametrize(("pattern", "mode", "strokes"), [("raster", Mode.CONTINUOUS, 3), ("snake", Mode.POINT, 6)])
 def test_raster_and_points_lift_between_strokes(pattern: str, mode: Mode, strokes: int) -> None:
     region = (0.025, 0.0125) if mode is Mode.POINT else (0.025, 0.025)
@@ -273,13 +260,6 @@ def test_three_blocked_views_abort() -> None:
     assert world.exam.status.phase is Phase.ABORTED
     assert world.exam.status.cause.reason is Reason.VIEW_BLOCKED
     assert world.exam._views.failed == 3
-
-
-def test_without_a_free_scan_posture_the_message_names_the_settings() -> None:
-    world = World(known())
-    world.exam._views.postures.clear()
-    world.run()
-    assert world.exam.status.cause.reason is Reason.VIEW_UNREACHABLE
 
 
 def test_the_scan_is_repeated_without_an_answer_then_given_up() -> None:

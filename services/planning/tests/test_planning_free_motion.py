@@ -5,7 +5,7 @@ from threading import Event
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, PERIOD_S, World, known
+from planning_fakes import BASE, PERIOD_S
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.robot.lbr import ARM
@@ -14,11 +14,10 @@ from palpate_models.scenario.schema import Limits
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.motion.timing import TIMING, JointTrajectory, RestartRamp, joint_trajectory
+from palpate_planning.motion.timing import TIMING, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import Reason
-from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
@@ -142,38 +141,6 @@ def test_after_a_gap_a_motion_resumes_from_rest(mover: str, late: int) -> None:
         assert (np.abs(b.qd - a.qd) / PERIOD_S <= 1.5 * ARM.acceleration_radps2).all()
     along = np.array([s.q[0] for s in setpoints])
     assert (np.diff(along) >= 0.0).all()
-
-
-def test_after_a_gap_the_follower_arrives_at_its_goal_to_the_bit() -> None:
-    follower, ramp = TrajectoryFollower(KINEMATICS, START), RestartRamp()
-    follower.start(MOTION)
-    for t in ticks(20, 90 * MS, len(MOTION) + 30):
-        last = follower.step(t, ramp.step(t))
-    assert follower.arrived
-    assert np.array_equal(last.q, MOTION.q[-1])
-    assert not last.qd.any()
-
-
-def test_between_samples_a_trajectory_is_interpolated() -> None:
-    trajectory = JointTrajectory(np.array([[0.0] * 7, [1.0] * 7]), np.array([[2.0] * 7, [4.0] * 7]))
-    q, qd = trajectory.at(0.25)
-    assert q == pytest.approx(np.full(7, 0.25))
-    assert qd == pytest.approx(np.full(7, 2.5))
-
-
-def test_after_a_long_gap_an_examination_restarts_its_motion() -> None:
-    world = World(known(region_m=(0.025, 0.0125)))
-    world.q = world.q + np.array([0.6, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0])
-    world.run(
-        lambda: world.exam.status.phase is Phase.HOME and bool(world.setpoints) and np.abs(world.setpoints[-1].qd).max() > 0.2
-    )
-    before = world.setpoints[-1]
-    world.t += 60 * MS
-    world.step()
-    assert np.array_equal(world.setpoints[-1].q, before.q)
-    assert not world.setpoints[-1].qd.any()
-    world.run()
-    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
 
 
 def test_after_a_pause_in_a_free_motion_the_palpation_continues_with_the_next_segment() -> None:

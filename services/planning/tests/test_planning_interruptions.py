@@ -14,7 +14,6 @@ from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.status import Phase
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import Breath, BreathObservation
 
 STOPPED = Cause(Reason.EMERGENCY_STOP, "force 26 N")
@@ -224,14 +223,6 @@ def test_a_soft_stop_above_the_skin_lifts_the_arm() -> None:
     assert world.exam.status.targets_skipped == 0
 
 
-def test_above_the_skin_nothing_is_pushed_back() -> None:
-    world = World(known(**SMALL))
-    reached(world, StrokeStage.REST, stroke=1)
-    world.force = lambda depth: 6.0
-    for _ in range(5):
-        assert np.abs(world.step().setpoint.F_W).max() < 1e-9
-
-
 def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
     world = World(known(**SMALL))
     reached(world, StrokeStage.DESCEND, stroke=2)  # the first only touches
@@ -239,13 +230,6 @@ def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
     assert palpation is not None
     palpation.leave(Cause(Reason.WALL_NOT_TRACKED, "another reason"))
     assert sorted(palpation.ahead) == list(range(world.exam.status.target_count))
-
-
-def test_a_requested_position_moves_with_the_body() -> None:
-    moved = PressRequest(3, np.array((0.01, 0.02))).moved(np.array((0.008, -0.003)))
-    assert moved.xy is not None
-    assert np.allclose(moved.xy, (0.018, 0.017))
-    assert PressRequest(4, None).moved(np.ones(2)).xy is None
 
 
 def test_nothing_waits_in_contact_for_a_breath_that_does_not_come_to_rest() -> None:

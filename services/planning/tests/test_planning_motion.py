@@ -70,13 +70,6 @@ def test_an_unreachable_pose_is_reported() -> None:
     assert solution.error_m > 1.0
 
 
-def test_jacobian_is_the_derivative_of_the_pose() -> None:
-    q, dq = above(0.0, 0.0, 0.02), np.array([0.3, -0.2, 0.1, 0.4, -0.3, 0.2, 0.1])
-    h = 1e-6
-    numeric = (KINEMATICS.pose(q + h * dq)[:3, 3] - KINEMATICS.pose(q - h * dq)[:3, 3]) / (2 * h)
-    assert (KINEMATICS.jacobian(q) @ dq)[:3] == pytest.approx(numeric, abs=1e-7)
-
-
 def test_home_is_free_and_the_table_is_not() -> None:
     assert SCENE.free(np.array(lbr.HOME))
     deep = np.array([0.0, 1.9, 0.0, -0.3, 0.0, 0.5, 0.0])
@@ -202,16 +195,6 @@ def test_a_speed_limit_between_its_places_is_numpys_to_the_bit() -> None:
     for place in (-0.1, 1.1, *s.tolist(), *rng.uniform(0.0, 1.0, 500).tolist()):
         assert limit.at(place) == np.interp(place, s, speed[: len(s)])
     assert [SpeedLimit(s[:1], speed[:1], 0.1).at(place) for place in (-1.0, float(s[0]), 1.0)] == [speed[0]] * 3
-
-
-def test_an_axis_that_counts_from_elsewhere_moves_on_alike() -> None:
-    axis, shifted = JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S), JerkLimitedAxis(0.0, 0.5, 5.0, PERIOD_S)
-    for k in range(100):
-        if k == 10:
-            shifted.shift(0.25)
-        assert axis.step(0.1, 0.05) == shifted.step(0.1 if k < 10 else 0.35, 0.05)
-        assert shifted.position == pytest.approx(axis.position + (0.25 if k >= 10 else 0.0), abs=1e-12)
-        assert shifted.velocity == pytest.approx(axis.velocity, abs=1e-9)
 
 
 def test_an_axis_that_stood_still_starts_from_rest() -> None:

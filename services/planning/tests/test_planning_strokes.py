@@ -11,8 +11,8 @@ from palpate_models.scenario.patterns import TOUCHES_M
 from palpate_models.scenario.schema import Mode
 from palpate_planning.interruptions import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
-from palpate_planning.strokes.coverage import TUNING, strokes, touches, transfer
-from palpate_planning.strokes.path import SurfacePath, angular_velocity, centre, frame, frames_along, least_twist, pose
+from palpate_planning.strokes.coverage import TUNING, strokes, touches
+from palpate_planning.strokes.path import SurfacePath, centre, frame, frames_along, least_twist
 from palpate_planning.wall.surface import PerceivedSurface
 
 SPACING = 0.0125
@@ -73,13 +73,6 @@ def test_raster_has_a_stroke_a_line_and_point_mode_one_a_target() -> None:
     assert [len(p.xy) for p in points] == [1] * 15
 
 
-def test_transfer_is_straight_and_may_be_nothing() -> None:
-    way = transfer(np.array((0.0, 0.0)), np.array((0.03, 0.04)))
-    assert way[0].tolist() == [0, 0]
-    assert way[-1] == pytest.approx((0.03, 0.04))
-    assert len(transfer(np.zeros(2), np.zeros(2))) == 1
-
-
 def test_touches_are_spread_over_all_that_is_usable() -> None:
     xy, _ = grid(17, 17, snake=True)
     usable = np.ones(len(xy), dtype=bool)
@@ -122,43 +115,6 @@ def test_no_other_orientation_with_that_axis_is_nearer(normal: np.ndarray, R_nea
     R = least_twist(-normal, R_near)
     turned = [R @ Rotation.from_rotvec((0, 0, a)).as_matrix() for a in (-0.3, -0.05, 0.05, 0.3)]
     assert all(np.trace(R_near.T @ R) >= np.trace(R_near.T @ other) - 1e-9 for other in turned)
-
-
-@given(units, units, st.floats(0.005, 0.04), st.floats(-0.03, 0.02))
-@settings(deadline=None)
-def test_deepest_point_lies_at_depth_below_the_surface(p: np.ndarray, n: np.ndarray, radius: float, depth: float) -> None:
-    deepest = centre(p, n, radius, depth) - radius * n
-    assert deepest == pytest.approx(p - depth * n, abs=1e-12)
-
-
-@given(st.lists(units, min_size=2, max_size=8), rotations)
-@settings(deadline=None)
-def test_many_at_once_are_the_same_as_one_by_one(normals: list[np.ndarray], R_ref: np.ndarray) -> None:
-    many = least_twist(-np.array(normals), R_ref)
-    assert many == pytest.approx(np.array([least_twist(-n, R_ref) for n in normals]), abs=1e-12)
-
-
-@given(units, vectors, rotations)
-@settings(deadline=None)
-def test_near_normals_have_near_orientations(normal: np.ndarray, change: np.ndarray, R_ref: np.ndarray) -> None:
-    assume(-normal @ R_ref[:, 2] > -0.5)
-    other = normal + 0.01 * change
-    a, b = least_twist(-normal, R_ref), least_twist(-other, R_ref)
-    assert np.abs(a - b).max() < 0.06
-
-
-@given(rotations, vectors)
-@settings(deadline=None)
-def test_angular_velocity_turns_one_into_the_other(R: np.ndarray, w: np.ndarray) -> None:
-    dt = 0.1
-    turned = Rotation.from_rotvec(w * dt).as_matrix() @ R
-    assert angular_velocity(R, turned, dt) == pytest.approx(w, abs=1e-6)
-
-
-def test_pose_is_homogeneous() -> None:
-    X = pose(np.eye(3), np.array((1.0, 2.0, 3.0)))
-    assert X[3].tolist() == [0, 0, 0, 1]
-    assert X[:3, 3].tolist() == [1, 2, 3]
 
 
 @given(rotations, vectors)

@@ -118,13 +118,6 @@ def test_a_silent_perception_is_named_at_once() -> None:
     assert world.exam.status.cause.reason is Reason.VIEW_TIMEOUT
 
 
-def test_the_findings_are_named() -> None:
-    world = Watched(known(**SMALL))
-    world.watch()
-    assert Reason.WAITS_FOR_FINDINGS in world.reasons
-    assert world.exam.status.phase is Phase.DONE
-
-
 def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:
     exam = ExaminationSequence(known(BASE, **SMALL), PERIODS)
     reasons = {}

@@ -7,10 +7,8 @@ import numpy as np
 import pytest
 from lbr_bench import MS
 
-from palpate_bus.messages import codec
 from palpate_models.robot import lbr
 from palpate_robot.backends.emulated import Metronome
-from palpate_robot.backends.lbr import port
 from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession, main
 from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
@@ -152,16 +150,3 @@ def test_the_position_follows_as_the_stacks_controller_makes_it() -> None:
     session.take(HOME + 0.1, ZERO)
     assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.01)
     assert session.cycle(HOME, ZERO).position == pytest.approx(HOME + 0.02)
-
-
-def test_messages_are_the_stacks() -> None:
-    state = codec.store.get_msgdef(port.STATE)
-    names = [name for name, _ in state.fields]
-    assert names[:3] == ["sample_time", "session_state", "connection_quality"]
-    assert len(names) == 18
-    for name in port.DEFINITIONS:
-        assert codec.type_hash(name).startswith("RIHS01_")
-    command = port.LBRTorqueCommand(HOME, np.arange(7.0))
-    raw = codec.encode(command, port.TORQUE_COMMAND)
-    assert len(raw) == 4 + 14 * 8
-    assert np.array_equal(codec.decode(raw, port.TORQUE_COMMAND).torque, np.arange(7.0))

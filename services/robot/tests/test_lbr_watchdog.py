@@ -206,13 +206,6 @@ def test_states_come_and_commands_move_the_arm(tmp_path: Path) -> None:
         assert emulator.wait(timeout=20) == 0
 
 
-def test_a_period_that_fri_does_not_have_ends_with_status_2() -> None:
-    words = [sys.executable, "-m", "palpate_robot.backends.lbr.emulator", "--period-ms", "0"]
-    done = subprocess.run(words, capture_output=True, text=True, timeout=100, check=False)
-    assert done.returncode == 2
-    assert "whole milliseconds" in done.stderr
-
-
 OTHERS = ("tissue", "control", "planning", "supervisor", "assessment", "camera", "perception")
 
 SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=2")

@@ -95,12 +95,6 @@ def test_a_sensor_warms_up_to_its_end_and_no_farther() -> None:
     assert np.abs(drawn.warm_up[:3]).max() > 0.3
 
 
-def test_bias_depends_on_the_seed_only() -> None:
-    one, same, other = (force(seed, bias_n=1.0).bias for seed in (1, 1, 2))
-    np.testing.assert_array_equal(one, same)
-    assert np.all(one[:3] != other[:3])
-
-
 def test_zero_elasticity_and_ripple_appear_in_measured_positions() -> None:
     q, v, torque = np.array(lbr.HOME), np.linspace(0.1, 0.4, 7), np.linspace(-30.0, 30.0, 7)
     drawn = arm(zero_rad=0.002)

@@ -12,13 +12,10 @@ from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import link_names
 from palpate_models.scenario.errors import Errors, ForceErrors
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_robot.backends.dart.service import create
 from palpate_robot.service import RobotService
-
-LINKS = link_names(Robot())
 
 MS = 1_000_000
 STATUS = message_type("palpation_msgs/msg/RobotStatus")
@@ -133,14 +130,6 @@ def test_obeys_torque_and_reports_it(rig: Rig) -> None:
     rig.servo(600, lbr.HOME + 0.02)
     assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
     np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME + 0.02, atol=2e-3)
-
-
-def test_effort_is_the_torque_of_the_command(rig: Rig) -> None:
-    rig.tick()
-    torque = np.arange(7.0) / 10
-    rig.command(torque)
-    rig.tick()
-    np.testing.assert_array_equal(rig.outbox["joint_states"].effort, torque)
 
 
 def test_silent_controller_brings_a_latched_hold_at_its_expiry(rig: Rig) -> None:
@@ -259,12 +248,3 @@ def test_outbox_is_not_changed_by_later_steps(rig: Rig) -> None:
     rig.press(1.0, 2.0, 3.0)
     rig.servo(50, lbr.HOME + 0.1)
     assert bytes_before == {name: encode(message, topics[name].type) for name, message in before.items()}
-
-
-def test_phantom_never_reaches_the_robot() -> None:
-    a, b = (Rig(Scenario.model_validate({"phantom": {"edge_m": edge}})) for edge in (0.005, 0.01))
-    a.tick(20)
-    b.tick(20)
-    topics = contract().topics
-    for name in a.outbox:
-        assert encode(a.outbox[name], topics[name].type) == encode(b.outbox[name], topics[name].type)

@@ -187,15 +187,6 @@ def test_depth_over_a_dome_is_that_of_geometry() -> None:
     assert not surface.depth(np.array((0.08, 0.0, 0.2)))[1], "it is not over the surface"
 
 
-def test_depth_is_that_at_the_nearest_vertex() -> None:
-    rng = np.random.default_rng(2)
-    vertices, normals = rng.normal(size=(500, 3)), rng.normal(size=(500, 3))
-    surface = RestSurface(vertices, normals, 0.015)
-    for p in rng.normal(size=(100, 3)):
-        i = int(np.argmin(np.linalg.norm(vertices - p, axis=1)))
-        assert surface.depth(p)[0] == pytest.approx(0.015 - normals[i] @ (p - vertices[i]))
-
-
 @pytest.mark.parametrize("bad", [np.zeros((0, 3)), np.full((4, 3), np.nan)])
 def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
     with pytest.raises(ValueError, match="perceived surface"):
@@ -336,12 +327,6 @@ def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
     assert latch.level is Level.OK
     latch.update(10 * MS + latch_module.TUNING.driver_grace_ns, [DRIVER], False)
     assert latch.cause is StopCause.DRIVER
-
-
-def test_a_release_of_nothing_is_harmless() -> None:
-    latch = Latch()
-    latch.update(0, [], True)
-    assert (latch.level, latch.releases, latch.stops) == (Level.OK, 1, [])
 
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:

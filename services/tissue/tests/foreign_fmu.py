@@ -3,7 +3,7 @@
 import zipfile
 from pathlib import Path
 
-from palpate_fmu.compiling import compile_library, native, platforms
+from odd_fmu import library
 
 SOURCE = """
 #include <math.h>
@@ -120,20 +120,10 @@ def _description(version: int) -> str:
 
 
 def build_lag(folder: Path, version: int) -> Path:
-    """Write lag.fmu for this platform. FMPy wants every function of the standard to be there: the rest answers fmi2Error."""
-    from fmpy import fmi2, fmi3
-
-    slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
-    missing = [name for name in dir(slave) if name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE]
-    rest = "".join(f"EXPORT int {name}(void) {{ return 3; }}\n" for name in missing)
-    source = folder / f"c{version}"
-    source.mkdir()
-    (source / "lag.c").write_text(f"#define FMI_VERSION {version}\n{SOURCE}{rest}")
-    (target,) = platforms(3, [native()])
+    """Write lag.fmu for this platform."""
     path = folder / f"lag{version}.fmu"
-    place = target.tuple_3 if version == 3 else target.folder_2
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", _description(version))
         archive.writestr("resources/readme.txt", "nothing")
-        archive.writestr(f"binaries/{place}/lag{target.suffix}", compile_library(source, ["lag.c"], target))
+        archive.writestr(*library("lag", SOURCE, version))
     return path

@@ -1,8 +1,10 @@
 """A small FMU that behaves oddly on request, FMI 2.0 or 3.0: a wall of springs with input z and output f."""
 
+import tempfile
 import zipfile
 from collections.abc import Mapping
 from enum import IntEnum
+from functools import cache
 from pathlib import Path
 
 from palpate_fmu.compiling import compile_library, native, platforms
@@ -157,21 +159,29 @@ def description(version: int, more: str = "", start: str = "", base: int | None 
     )
 
 
-def build_wall(path: Path, version: int, text: str = "", others: Mapping[str, str] | None = None) -> Path:
-    """Write the FMU for this platform, with `text` as its model description and `others` as further entries."""
+@cache
+def library(name: str, source: str, version: int) -> tuple[str, bytes]:
+    """Return name in the archive and content of an FMU's library for this platform, compiled once in a process.
+
+    FMPy wants every function of the standard to be there: those that `source` lacks answer fmi2Error or fmi3Error.
+    """
     from fmpy import fmi2, fmi3
 
     slave = fmi2.FMU2Slave if version == 2 else fmi3.FMU3Slave
-    missing = [name for name in dir(slave) if name.startswith(f"fmi{version}") and f"{name}(" not in SOURCE]
-    source = path.parent / f"wall{version}"
-    source.mkdir(exist_ok=True)
-    rest = "".join(f"EXPORT int {name}(void) {{ return 3; }}\n" for name in missing)
-    (source / "wall.c").write_text(f"#define FMI_VERSION {version}\n{SOURCE}{rest}")
+    missing = [function for function in dir(slave) if function.startswith(f"fmi{version}") and f"{function}(" not in source]
+    rest = "".join(f"EXPORT int {function}(void) {{ return 3; }}\n" for function in missing)
     (target,) = platforms(3, [native()])
-    place = target.tuple_3 if version == 3 else target.folder_2
+    with tempfile.TemporaryDirectory() as folder:
+        (Path(folder) / f"{name}.c").write_text(f"#define FMI_VERSION {version}\n{source}{rest}")
+        content = compile_library(Path(folder), [f"{name}.c"], target)
+    return f"binaries/{target.tuple_3 if version == 3 else target.folder_2}/{name}{target.suffix}", content
+
+
+def build_wall(path: Path, version: int, text: str = "", others: Mapping[str, str] | None = None) -> Path:
+    """Write the FMU for this platform, with `text` as its model description and `others` as further entries."""
     with zipfile.ZipFile(path, "w") as archive:
         archive.writestr("modelDescription.xml", text or description(version))
-        archive.writestr(f"binaries/{place}/wall{target.suffix}", compile_library(source, ["wall.c"], target))
+        archive.writestr(*library("wall", SOURCE, version))
         for name, content in (others or {}).items():
             archive.writestr(name, content)
     return path

@@ -127,13 +127,6 @@ def test_a_press_leaves_the_body_at_rest(make: type[TissueBackend]) -> None:
     assert not tissue.touching
 
 
-def test_presses_do_not_know_of_each_other() -> None:
-    tissue = winkler()
-    together, _ = tissue.press(PLACES, UP, 0.015)
-    backwards, _ = tissue.press(PLACES[::-1].copy(), UP, 0.015)
-    assert together.tolist() == backwards[::-1].tolist()
-
-
 def test_what_is_read_is_the_end_of_the_hold_or_the_limit() -> None:
     forces = np.zeros((2, 1000))
     forces[0, 900:] = 3.0
@@ -185,13 +178,6 @@ def test_forces_are_those_of_the_explicit_steps(breathing: BreathingCurve) -> No
     assert implicit[sliding, 0] == pytest.approx(explicit[sliding, 0], abs=0.02 * float(explicit[:, 2].max()))
 
 
-def test_a_shorter_step_is_nearer() -> None:
-    model, still = body(), BreathingCurve(Breathing(kind="none"), 0)
-    explicit = forces(WinklerTissue(model), still)[60:, 2]
-    off = [np.abs(forces(ImplicitTissue(model, dt=dt), still)[60:, 2] - explicit).max() for dt in (0.010, 0.005)]
-    assert off[1] < 0.8 * off[0]
-
-
 def test_a_press_feels_the_same() -> None:
     explicit = WinklerTissue(body())
     places = np.array(((0.0, 0.0, 0.0), (0.012, 0.003, 0.0), (-0.04, 0.03, 0.0)))
@@ -226,12 +212,3 @@ def test_it_forgets_as_slowly() -> None:
         left.append(tissue.inward.copy())
     assert left[0].max() > 5e-5
     assert np.abs(left[1] - left[0]).max() < 0.05 * left[0].max()
-
-
-def test_settled_it_is_as_new() -> None:
-    tissue = ImplicitTissue(body(), dt=0.010)
-    still = BreathingCurve(Breathing(kind="none"), 0)
-    first = forces(tissue, still)
-    tissue.settle()
-    assert not tissue.inward.any()
-    assert np.array_equal(forces(tissue, still), first)
