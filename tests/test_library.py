@@ -75,10 +75,6 @@ def test_keywords_are_the_settings_of_the_command_line() -> None:
     assert dump_scenario(by_keywords) == dump_scenario(load_scenario("clean", words, 3))
 
 
-def test_a_whole_section_may_be_given_by_a_word() -> None:
-    assert palpate.scenario("clean", errors="typical").errors == load_scenario("clean", ["errors=typical"]).errors
-
-
 @pytest.mark.parametrize(
     ("settings", "named"),
     [
@@ -104,16 +100,6 @@ def test_a_scenario_is_whole_and_takes_neither_settings_nor_another_seed() -> No
 
 
 # --- patients ------------------------------------------------------------------------------------------------------------
-
-
-def felt(seed: int) -> Touch:
-    return palpate.Patient("person", seed).press((0.0, 0.04), depth=0.008, speed=0.02, hold=0.1)
-
-
-def test_a_patient_is_determined_by_the_seed() -> None:
-    once, again, other = felt(7), felt(7), felt(8)
-    assert np.array_equal(once.force, again.force)
-    assert not np.allclose(once.force, other.force, rtol=0.02)
 
 
 def test_a_press_has_the_force_of_the_tissue_of_the_system(patient: palpate.Patient) -> None:

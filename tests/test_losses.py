@@ -13,7 +13,7 @@ from examination import assert_held_and_no_harder, kill_in_contact
 
 from palpate.report.evidence import peak_force
 from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, calm_rate, strike
-from palpate_bus.messages import ExamState, RobotStatus
+from palpate_bus.messages import ExamState
 from palpate_bus.runtime.failure import FailureCode
 
 pytestmark = pytest.mark.slow
@@ -66,11 +66,6 @@ def freeze(processes: Mapping[str, psutil.Process]) -> None:
     processes[CONDUCTOR].resume()
 
 
-def kill_with_planning(processes: Mapping[str, psutil.Process]) -> None:
-    for role in ("planning", CONDUCTOR):
-        processes[role].kill()
-
-
 def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
     """Retry, because on a busy machine a wall-clock run may be stopped before contact."""
     for attempt in range(ATTEMPTS):
@@ -103,15 +98,6 @@ def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(blow: Blow,
     if blow is freeze:
         assert struck.said["failure"]["code"] == FailureCode.CONDUCTOR_LOST
         assert "stood still for" in struck.said["failure"]["text"]
-
-
-def test_without_planning_the_driver_holds(tmp_path: Path) -> None:
-    struck = strike_conductor(tmp_path, "wallclock", kill_with_planning)
-    statuses = struck.recorded("robot/status")
-    assert statuses[-1][1].mode == RobotStatus.MODE_SAFE_HOLD
-    held = next(stamp for stamp, status in statuses if status.mode == RobotStatus.MODE_SAFE_HOLD)
-    before = max(force for stamp, force in struck.forces if stamp <= held)
-    assert max(force for stamp, force in struck.forces if stamp > held) <= before + MORE_N
 
 
 @pytest.mark.parametrize("blow", [kill, freeze])

@@ -14,16 +14,8 @@ from examination import SHORT, TINY, Finished, command, palpate_run, service_pro
 from scipy.spatial import KDTree
 
 from palpate.report.recovery import FOLDER
-from palpate.run.composed import load_services
-from palpate.run.roles import WORKERS
-from palpate_bus.messages import ExamState, OperatorRequest, RobotStatus
 from palpate_bus.messages.geometry import Array
-from palpate_bus.messages.stamps import NS, header
 from palpate_bus.recordings import open_recording
-from palpate_bus.runtime.composed import Composed
-from palpate_bus.service import Inbox, Outbox
-from palpate_conductor.collector import Collected, Collector
-from palpate_models.scenario.load import load_scenario
 from palpate_recorder.recover import recover
 
 SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
@@ -138,60 +130,3 @@ def test_a_resumed_examination_is_resumed_again(tmp_path: Path) -> None:
     report = Finished(0, "", folder / FOLDER / FOLDER).report
     assert report["resumed"] == 2
     assert report["samples"] > recorded_samples(folder / FOLDER) >= recorded_samples(folder)
-
-
-class Operator(Collector):
-    """Stops the examination a second after it begins to scan, and sends another request a second later."""
-
-    def __init__(self, request: int | None) -> None:
-        super().__init__()
-        self.request = request
-        self.scan: int | None = None
-        self.sent: list[int] = []
-        self.modes: list[int] = []
-
-    def step(self, t: int, inbox: Inbox) -> Outbox:
-        out: dict[str, Any] = dict(super().step(t, inbox))
-        exam = self.collected.exam
-        if self.scan is None and exam is not None and exam.phase == ExamState.PHASE_SCAN:
-            self.scan = t
-        due = [OperatorRequest.STOP, self.request][len(self.sent) :]
-        if self.request is not None and self.scan is not None and due and t >= self.scan + (1 + len(self.sent)) * NS:
-            self.sent.append(due[0])
-            out["operator/request"] = OperatorRequest(header(t), due[0], "a test")
-        self.modes += [status.mode for status in inbox.new("robot/status")]
-        return out
-
-
-def examine(request: int | None) -> tuple[Collected, Operator]:
-    scenario = load_scenario("clean", SMALL)
-    operator = Operator(request)
-    run = Composed([*load_services(scenario, WORKERS), operator])
-    run.run(lambda: operator.collected.end_tick, 120 * NS)
-    return operator.collected, operator
-
-
-@pytest.mark.slow
-def test_a_released_examination_continues_where_it_was() -> None:
-    undisturbed, _ = examine(None)
-    collected, operator = examine(OperatorRequest.RELEASE)
-    assert operator.sent == [OperatorRequest.STOP, OperatorRequest.RELEASE]
-    assert RobotStatus.MODE_SAFE_HOLD in operator.modes
-    assert operator.modes[-1] == RobotStatus.MODE_ACTIVE
-    assert collected.exam.phase == ExamState.PHASE_DONE, collected.exam.message
-    assert collected.exam.targets_skipped == 0
-    assert len(collected.samples) >= len(undisturbed.samples)
-    assert max(m.normal_force for m in collected.indentation) < 1.2 * max(m.normal_force for m in undisturbed.indentation)
-    (found,), (expected,) = collected.findings.findings, undisturbed.findings.findings
-    assert abs(found.centroid.x - expected.centroid.x) < 3e-3
-    assert abs(found.centroid.y - expected.centroid.y) < 3e-3
-    assert found.ratio == pytest.approx(expected.ratio, rel=0.1)
-
-
-@pytest.mark.slow
-def test_an_examination_that_the_operator_ends_returns_home() -> None:
-    collected, operator = examine(OperatorRequest.END)
-    assert operator.sent == [OperatorRequest.STOP, OperatorRequest.END]
-    assert collected.exam.phase == ExamState.PHASE_ABORTED
-    assert "ended by the operator: a test" in collected.exam.message
-    assert collected.indentation[-1].normal_force == 0.0

@@ -218,18 +218,6 @@ def test_every_fault_stops_the_arm(name: str) -> None:
     assert reaction.speed_after < 0.02
 
 
-def test_every_cause_of_simulated_time_has_a_case() -> None:
-    """All but SILENT, which needs wall-clock mode, UNHEEDED, which follows another cause, and SENSOR: see `test_sensor_judge`."""
-    causes = {int(value) for name, value in vars(SupervisorState).items() if name.startswith("CAUSE_")}
-    others = {
-        SupervisorState.CAUSE_NONE,
-        SupervisorState.CAUSE_SILENT,
-        SupervisorState.CAUSE_UNHEEDED,
-        SupervisorState.CAUSE_SENSOR,
-    }
-    assert {case.cause for case in CASES.values()} == causes - others
-
-
 def table() -> str:
     """All cases, measured, as Markdown."""
     names = {int(value): name.removeprefix("CAUSE_") for name, value in vars(SupervisorState).items() if "CAUSE_" in name}

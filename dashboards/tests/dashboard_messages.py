@@ -1,9 +1,11 @@
 """A short plausible run, as messages: the arm moves, a dome is pressed, a map grows, a finding is made."""
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
+from pathlib import Path as Folder
 from typing import Any
 
 import numpy as np
+from mcap.writer import CompressionType, Writer
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
@@ -38,6 +40,7 @@ from palpate_bus.messages import (
     TransformStamped,
     Vector3,
     Wrench,
+    codec,
 )
 from palpate_bus.messages.stamps import header, time_message
 from palpate_models.numerics.frames import Array
@@ -275,3 +278,22 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
             ]
             new["diagnostics"] = DiagnosticArray(header(t), rows)
         yield t, new
+
+
+def write_recording(folder: Folder, steps: Iterable[tuple[int, Messages]]) -> Folder:
+    """Write messages as the MCAP recording of a run's folder, in chunks of 0.2 MB; return the file."""
+    path = folder / "recording_mcap" / "recording_mcap_0.mcap"
+    path.parent.mkdir(parents=True)
+    with path.open("wb") as stream:
+        writer = Writer(stream, chunk_size=200_000, compression=CompressionType.NONE)
+        writer.start()
+        channels: dict[str, int] = {}
+        for t, messages in steps:
+            for topic, message in messages.items():
+                kind = contract().topics[topic].type
+                if topic not in channels:
+                    schema = writer.register_schema(kind, "ros2msg", b"")
+                    channels[topic] = writer.register_channel(f"/{topic}", "cdr", schema)
+                writer.add_message(channels[topic], t, codec.encode(message, kind), t)
+        writer.finish()
+    return path

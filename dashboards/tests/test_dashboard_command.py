@@ -5,14 +5,11 @@ from pathlib import Path
 
 import pytest
 import typer
-from dashboard_messages import run
-from mcap.writer import CompressionType, Writer
+from dashboard_messages import run, write_recording
 from typer.testing import CliRunner
 
 from palpate.console import CommandGroup
 from palpate.live.dashboard import dashboard
-from palpate_bus.contract import contract
-from palpate_bus.messages import codec
 from palpate_dashboard import replay
 from palpate_dashboard.service import FILE, DashboardService
 from palpate_dashboard.sinks import Live
@@ -25,23 +22,10 @@ app.command()(dashboard)
 
 
 def record(folder: Path, seconds: float) -> Path:
-    """Return a run's folder with an MCAP recording of hand-made messages in chunks of 0.1 s."""
-    (folder / "recording_mcap").mkdir(parents=True)
+    """Return the recording of a run's folder with hand-made messages."""
+    folder.mkdir(exist_ok=True)
     (folder / "scenario.yaml").write_text(dump_scenario(Scenario(name="recorded")), encoding="utf-8")
-    path = folder / "recording_mcap" / "recording_mcap_0.mcap"
-    with path.open("wb") as stream:
-        writer = Writer(stream, chunk_size=200_000, compression=CompressionType.NONE)
-        writer.start()
-        channels: dict[str, int] = {}
-        for t, messages in run(seconds, Scenario().robot):
-            for topic, message in messages.items():
-                kind = contract().topics[topic].type
-                if topic not in channels:
-                    schema = writer.register_schema(kind, "ros2msg", b"")
-                    channels[topic] = writer.register_channel(f"/{topic}", "cdr", schema)
-                writer.add_message(channels[topic], t, codec.encode(message, kind), t)
-        writer.finish()
-    return path
+    return write_recording(folder, run(seconds, Scenario().robot))
 
 
 def test_nothing_to_show_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

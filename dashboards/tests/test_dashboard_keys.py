@@ -1,6 +1,5 @@
 """Geometry, texts and keys of the dashboard."""
 
-import json
 import os
 import pty
 import re
@@ -16,14 +15,12 @@ from typing import Any
 import numpy as np
 import pytest
 from dashboard_messages import dome, look
-from test_dashboard_browser import free_ports, start
 
 from palpate_bus.messages import StiffnessMap
 from palpate_bus.runs.announcement import Run
-from palpate_bus.runs.operator import HINT, OperatorKeys
+from palpate_bus.runs.operator import OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
 from palpate_dashboard import arrays, replay, text
-from palpate_dashboard.arrays import shaded
 from palpate_dashboard.sinks import Live
 from palpate_dashboard.text import truth_page
 from palpate_models.numerics.maps import level_lines
@@ -69,20 +66,6 @@ def test_viewer_setting() -> None:
             Live.parse(wrong)
 
 
-def test_a_cube_keeps_its_edges_and_a_sphere_none() -> None:
-    trimesh = pytest.importorskip("trimesh")
-    cube = trimesh.creation.box()
-    positions, triangles, normals = shaded(cube.vertices, cube.faces)
-    assert len(positions) == 24
-    faces = np.cross(*(np.diff(positions[triangles], axis=1)[:, i] for i in (0, 1)))
-    for corner in range(3):
-        assert np.einsum("ij,ij->i", faces, normals[triangles[:, corner]]) == pytest.approx(1.0)
-    sphere = trimesh.creation.icosphere(subdivisions=3)
-    positions, triangles, normals = shaded(sphere.vertices, sphere.faces)
-    assert len(positions) == len(sphere.vertices)
-    assert np.einsum("ij,ij->i", normals, positions).min() > 0.999
-
-
 def numbers(scenario: Scenario, row: str) -> list[float]:
     (line,) = [line for line in truth_page(scenario).splitlines() if line.startswith(f"| {row} |")]
     return [float(found) for found in re.findall(r"[-+]?\d+\.?\d*", line.removeprefix(f"| {row} |"))]
@@ -101,16 +84,6 @@ def test_truth_page_states_the_drawn_values() -> None:
     motion = BodyMotion(phantom.motion, 7)
     np.testing.assert_allclose(moved, (motion.at_s, motion.until_s), atol=0.06)
     np.testing.assert_allclose(numbers(scenario, "moved [mm]"), 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
-
-
-def test_truth_page_depends_on_the_seed_and_is_empty_without_errors() -> None:
-    errors = Errors(level="typical")
-    assert truth_page(Scenario(seed=1, errors=errors)) != truth_page(Scenario(seed=2, errors=errors))
-    still = Phantom(breathing=Breathing(kind="none"))
-    clean = Scenario(seed=1, phantom=still, errors=Errors(level="none"))
-    for unit in ("mm", "degrees"):
-        assert numbers(clean, f"patient, off by [{unit}]") == [0] * 3
-    assert numbers(clean, "breathing") == numbers(clean, "motion") == []
 
 
 def test_unassessed_places_are_listed_by_reason() -> None:
@@ -176,54 +149,6 @@ def test_without_a_terminal_no_key_is_read(monkeypatch: pytest.MonkeyPatch, tmp_
             assert not keys.attached
             assert keys.pressed() == []
         assert file.read() == "ser"
-
-
-STOPS = ((b"s", "soft-stop: the arm retreats"), (b"r", "release: released"),
-         (b"e", "stop: the driver holds"), (b"r", "release: released"))  # fmt: skip
-LAST = ((b"e", "stop: the driver holds"),)
-"""In wall clock a busy machine may have stopped the arm before us, so only the strongest word has one answer."""
-
-
-@pytest.mark.slow
-@pytest.mark.timeout(900)
-@pytest.mark.parametrize(("mode", "presses"), [("--realtime", STOPS), ("--wallclock", LAST)], ids=["lockstep", "wallclock"])
-def test_keys_stop_and_release_a_live_run(
-    mode: str, presses: tuple[tuple[bytes, str], ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("PALPATE_RUNS", str(tmp_path / "runs"))
-    palpate = str(Path(sys.executable).with_name("palpate"))
-    out, log = tmp_path / "out", tmp_path / "run.log"
-    settings = ["exam.region_m=[0.1,0.1]", "exam.centre_m=[-0.055,-0.055]", "camera.frames=10"]  # a minute to join it
-    words = [word for setting in settings for word in ("--set", setting)]
-    child, end = 0, -1
-    with log.open("w") as file:
-        running = start([palpate, "run", mode, "--out", str(out), *words], dict(os.environ), file)
-    try:
-        recording = out / "recording_mcap" / "recording_mcap_0.mcap"
-        while not (recording.is_file() and recording.stat().st_size > 100_000):
-            assert running.poll() is None, log.read_text()
-            time.sleep(0.2)
-        child, end = in_a_terminal([palpate, "dashboard", "--port", str(free_ports())])
-        text = read_until(end, lambda text: "joined at" in text, 120)
-        assert HINT in text, text + log.read_text()
-        for key, answer in presses:
-            os.write(end, key)
-            assert answer in read_until(end, lambda text: "confirm" in text)
-        os.write(end, b"\x03")
-        os.waitpid(child, 0)
-        child = 0
-        if mode == "--realtime":
-            assert running.wait(600) == 0, log.read_text()
-            stops = json.loads((out / "report.json").read_text())["services"]["supervisor"]["facts"]["stops"]
-            assert [(stop["level"], stop["cause"]) for stop in stops] == [("SOFT_STOP", "OPERATOR"), ("EMERGENCY", "OPERATOR")]
-    finally:
-        if child:
-            os.kill(child, signal.SIGTERM)
-        if running.poll() is None:
-            running.send_signal(signal.SIGINT)
-            running.wait(60)
-        if end >= 0:
-            os.close(end)
 
 
 def test_keys_go_to_a_secure_run_with_the_operators_certificate(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:

@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import pytest
 import rerun as rr
-from dashboard_messages import FakeInbox, Messages, latched, run
+from dashboard_messages import FakeInbox, Messages, latched, run, write_recording
 from mcap.writer import Writer
 from rerun.chunk import RrdReader
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import KeyValue, codec
+from palpate_bus.messages import KeyValue
 from palpate_bus.recordings import RecordingError
 from palpate_dashboard import replay
 from palpate_dashboard.layout import blueprint
@@ -296,18 +296,7 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     scenario = Scenario(name="replayed")
     steps = [(t, {k: v for k, v in new.items() if k in OBSERVED}) for t, new in run(3.0, scenario.robot)]
     draw(tmp_path / "live.rrd", steps)
-    mcap = tmp_path / "recording_mcap" / "recording_mcap_0.mcap"
-    mcap.parent.mkdir()
-    with mcap.open("wb") as stream:
-        writer = Writer(stream)
-        writer.start("ros2")
-        types = {name: contract().topics[name].type for name in OBSERVED}
-        schemas = {kind: writer.register_schema(kind, "ros2msg", b"") for kind in set(types.values())}
-        ids = {name: writer.register_channel(f"/{name}", "cdr", schemas[kind]) for name, kind in types.items()}
-        for t, new in steps:
-            for name, message in new.items():
-                writer.add_message(ids[name], t, codec.encode(message, contract().topics[name].type), t)
-        writer.finish()
+    write_recording(tmp_path, steps)
     with pytest.raises(FileNotFoundError, match=r"scenario\.yaml"):
         replay.main(tmp_path)
     (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")

@@ -137,16 +137,6 @@ def test_an_invalid_level_is_named(setting: str, words: str) -> None:
         level(setting)
 
 
-def test_the_table_has_every_field_and_none_that_is_not() -> None:
-    for section, rows in table().items():
-        kind = type(getattr(Errors(), section))
-        assert set(rows) == set(kind.model_fields) - {"offset"}
-        for row in rows.values():
-            assert set(row) == {"typical", "poor", "mark", "source"}
-            assert row["mark"] in {"V", "S", "C", "A"}
-    assert set(table()) == set(Errors.model_fields) - {"level", "chosen"}
-
-
 def test_poor_equipment_is_nowhere_better_than_typical() -> None:
     slower = {"tare_s", "warm_up_s"}
     for rows in table().values():

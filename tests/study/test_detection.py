@@ -6,7 +6,7 @@ import statsmodels.api as sm
 import synthetic
 from sklearn.metrics import roc_auc_score
 
-from palpate.study.statistics.detectability import FELT, Surface, fit, observed, surface
+from palpate.study.statistics.detectability import FELT, Surface, fit, surface
 from palpate.study.statistics.detection import RATES, by_contrast, froc, rates, roc
 from palpate.study.statistics.estimate import Bootstrap, bounded, percentiles, wilson
 
@@ -15,13 +15,6 @@ def test_the_wilson_interval_of_twenty_in_twenty() -> None:
     rate = wilson(20, 20, "patients")
     assert rate.low == pytest.approx(0.8389, abs=1e-4)
     assert rate.high == 1.0
-
-
-def test_replicates_of_a_mean_spread_as_the_standard_error() -> None:
-    values = np.random.default_rng(1).normal(size=200)
-    replicates = Bootstrap.draw(["a"] * 200, folds=4000).ratio(values, np.ones(200))
-    assert replicates.mean() == pytest.approx(values.mean(), abs=0.01)
-    assert replicates.std() == pytest.approx(values.std() / np.sqrt(200), rel=0.05)
 
 
 def test_findings_of_one_patient_are_drawn_together() -> None:
@@ -42,18 +35,6 @@ def test_a_rate_of_one_has_no_interval_of_width_zero() -> None:
 
 def test_replicates_that_mostly_do_not_exist_give_no_interval() -> None:
     assert percentiles(np.where(np.arange(100) < 60, np.nan, 1.0)) is None
-
-
-def test_the_interval_of_lumps_found_has_its_nominal_coverage() -> None:
-    """Two lumps a patient that are found or missed together: an interval over lumps instead of patients would be too narrow."""
-    held = 0
-    for seed in range(100):
-        found = np.random.default_rng(seed).random(60) < 0.7
-        both = 2.0 * found
-        bootstrap = Bootstrap.draw(["a"] * 60, folds=300, seed=seed)
-        low, high = percentiles(bootstrap.ratio(both, np.full(60, 2.0))) or (1, 0)
-        held += low <= 0.7 <= high
-    assert 90 <= held <= 99
 
 
 def test_no_false_finding_in_a_hundred_healthy_has_an_upper_limit() -> None:
@@ -227,16 +208,3 @@ def test_found_and_missed_lumps_that_do_not_overlap_give_a_finite_surface() -> N
     found = surface(tables.variants[0], FELT, Bootstrap.draw(["lumps"] * 100, 50))
     assert np.isfinite(found.weights).all()
     assert found.threshold("felt_radius_m").value == pytest.approx(0.017, abs=0.002)
-
-
-def test_bins_hold_the_known_probability() -> None:
-    tables = synthetic.psychometric(np.random.default_rng(8), 3000)
-    lumps = tables.variants[0].lumps
-    rows = observed(tables.variants[0], "felt_radius_m", tables.bootstrap)
-    assert sum(row.n for _, row in rows) == 3000
-    edges = np.quantile(lumps["felt_radius_m"], np.linspace(0, 1, len(rows) + 1))
-    held = 0
-    for (_, row), low, high in zip(rows, edges[:-1], edges[1:], strict=True):
-        own = lumps[lumps["felt_radius_m"].between(low, high)]
-        held += row.low <= synthetic.true_probability(own).mean() <= row.high
-    assert held >= len(rows) - 1

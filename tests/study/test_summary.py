@@ -98,15 +98,6 @@ def test_the_page_holds_everything_and_loads_nothing(study: Path) -> None:
     assert "prefers-color-scheme: dark" in text
 
 
-def test_the_human_line_is_in_every_plot_of_detection(study: Path) -> None:
-    text = (study / "study.html").read_text(encoding="utf-8")
-    plots = [svg.partition("</svg>")[0] for svg in text.split("<svg")[1:]]
-    names = ("lumps found", "lump above", "probability of detection")
-    detection = [plot for plot in plots if any(name in plot for name in names)]
-    assert len(detection) >= 3
-    assert all("Fletcher 1985" in plot for plot in detection)
-
-
 def test_the_same_tables_give_the_same_bytes(study: Path) -> None:
     before = [(study / name).read_bytes() for name in ("study.json", "study.html")]
     summarise(study, COMMAND, FOLDS)

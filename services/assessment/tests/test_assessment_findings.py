@@ -60,13 +60,6 @@ def test_two_lumps_are_two_findings() -> None:
     assert len(result.findings) == 2
 
 
-def test_a_lump_is_found_under_errors_of_depth() -> None:
-    wall = natural(5, 0.1)
-    samples = lines(lambda xy: LEVEL + wall(xy) + lump(xy, (0.01, 0.0), 0.025, 3.0), stroke_m=0.0007, breathing_m=0.0007)
-    (found,) = examine(samples).findings
-    assert np.linalg.norm(found.centroid[:2] - (0.01, 0.0)) < 0.008
-
-
 def test_errors_of_strokes_widen_the_band() -> None:
     def width(result: AssessedMap) -> float:
         return float(np.median(np.log(result.upper / result.lower)[result.unassessed == StiffnessMap.ASSESSED]))

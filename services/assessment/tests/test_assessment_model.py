@@ -7,7 +7,6 @@ import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
 from palpate_assessment.assess import AssessedMap, assess
-from palpate_assessment.calibration import Calibration
 from palpate_assessment.check import contradicted
 from palpate_assessment.detection import agreed, matched, strongest
 from palpate_assessment.grid import map_grid
@@ -81,17 +80,6 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     assert strengths[1][1] == pytest.approx(strengths[1][0], rel=0.15)
 
 
-def test_what_the_first_line_alone_says_of_a_place_beyond_it_is_not_believed() -> None:
-    beyond = Bump(0.02, -0.08, 0.008)
-    samples = lines(level, noise=0.005)
-    first = [s.stroke == 0 and abs(s.position[0] - 0.02) < 0.0155 for s in samples]
-    o = observations([replace(s, force=1.2 * s.force) if spoiled else s for s, spoiled in zip(samples, first, strict=True)])
-    regression = Regression(o, (), amplitudes(o, ()))
-    (t,) = matched(regression, [beyond])[1]
-    assert t > 3
-    assert abs(agreed(regression, beyond, float(t))) < 0.5
-
-
 def test_a_lump_in_the_model_takes_its_contrast() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observe(lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.02, 2.0)), USUAL)
@@ -119,26 +107,6 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
 def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observations(lines(level))
     assert not contradicted(Regression(o, (), usual_amplitudes(o))).any()
-
-
-def test_less_false_findings_need_more_evidence() -> None:
-    calibration = Calibration(
-        exponent=1.3,
-        exponent_sd=0.1,
-        conversion=0,
-        conversion_sd=0.03,
-        held=0,
-        lead_s=0,
-        probability=(-5, 1),
-        guarding=(-2, 5, 4),
-        ridge=(0, 0, 0, 0),
-        bone=(0, 0, 0, 0, 0),
-        soft=(0, 0, 0, 0),
-        prevalence=0.3,
-        tail=(-1.0, 0.8),
-    )
-    thresholds = [calibration.threshold(rate) for rate in (0.2, 0.02, 0.002)]
-    assert np.diff(thresholds) == pytest.approx(0.8 * np.log(10) * np.ones(2))
 
 
 RADIUS, DEPTH, FORCE = 0.006, 0.002, 1.0

@@ -161,17 +161,6 @@ def test_joint_mode_is_calm_where_torques_act_late(arm: ArmModel) -> None:
     assert np.abs(plant.q - posture).max() < 5e-4
 
 
-@pytest.mark.parametrize("viscous", [3.0, 20.0])
-def test_joint_mode_bears_a_wrong_friction(arm: ArmModel, viscous: float) -> None:
-    """Late torques, too, where 10 Nms/rad are assumed."""
-    posture = np.array(HOME)
-    firm = np.array([800.0, 800.0, 600.0, 600.0, 400.0, 300.0, 200.0])
-    hold = reference(setpoint(arm, posture, mode=ControlMode.JOINT, joint_stiffness=firm))
-    plant = Plant(posture + 0.01, Robot(joint_damping_nms=viscous))
-    _, torques = simulate(plant, ROBOT, lambda t: hold, 2000, late=6)
-    assert np.abs(np.diff(torques[-200:], axis=0)).max() < 0.01
-
-
 def test_joint_mode_needs_no_friction(arm: ArmModel) -> None:
     """The springs are bounded for every mode, the light wrist's too, where the driver compensates all friction."""
     smooth = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)

@@ -58,15 +58,6 @@ def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: Impe
     np.testing.assert_allclose(unlimited.command(q, REST, ref), -np.array(slope), rtol=1e-5, atol=1e-4)
 
 
-def test_damping_takes_energy(arm: ArmModel, unlimited: ImpedanceController) -> None:
-    rng = np.random.default_rng(3)
-    for q in WORKING:
-        ref = reference(setpoint(arm, q, **NO_POSTURE))
-        for qd in rng.normal(size=(20, 7)) * 0.05:
-            torque = unlimited.command(q, qd, ref) - arm.coriolis
-            assert torque @ qd <= 1e-12
-
-
 def test_feed_forward_wrench_is_exerted_on_the_environment(arm: ArmModel, unlimited: ImpedanceController) -> None:
     F = np.array([1.0, -2.0, -8.0, 0.1, 0.2, -0.3])
     torque = unlimited.command(WORKING[1], REST, reference(setpoint(arm, WORKING[1], F_W=F)))
@@ -148,11 +139,6 @@ def test_joint_limits_repel(arm: ArmModel, unlimited: ImpedanceController, joint
     assert pushes[3] == pytest.approx(safety.REPULSION_FRACTION * TORQUE_LIMIT[joint])
 
 
-def test_repulsion_can_be_switched_off(arm: ArmModel) -> None:
-    off = safety.SafetyNet(arm.position_lower, arm.position_upper, arm.torque_limit, 0.0, 1e-3)
-    assert not off.torque(np.zeros(7), POSITION_LIMIT + 1e-3, np.zeros(7)).any()
-
-
 def test_stretched_out_arm_gives_finite_torque(arm: ArmModel) -> None:
     """Singular: the elbow is straight, wrist and shoulder axes coincide."""
     controller = ImpedanceController(arm)
@@ -228,14 +214,6 @@ def test_pose_moves_with_its_twist(age_ms: int, v: float, w: float) -> None:
     np.testing.assert_allclose(now.motion.p_WD, twist[:3] * age_ms * 1e-3, atol=1e-12)
     np.testing.assert_allclose(now.motion.R_WD, pin.exp3(twist[3:] * age_ms * 1e-3), atol=1e-12)
     np.testing.assert_allclose(now.motion.V_WD, twist)
-
-
-def test_steady_motion_has_no_lag_and_no_steps() -> None:
-    guide = Extrapolator(10 * MS)
-    for t in range(0, 500 * MS, MS):
-        if t % (10 * MS) == 0:
-            guide.accept(at(t - 10 * MS, 0.1 * (t - 10 * MS) * 1e-9, 0.1), t)
-        assert guide.at(t).motion.p_WD[0] == pytest.approx(0.1 * t * 1e-9, abs=1e-12)
 
 
 @pytest.mark.parametrize("mode", ControlMode)

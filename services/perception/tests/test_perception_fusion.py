@@ -164,16 +164,3 @@ def test_largest_gap_comes_first_but_a_blocked_view_is_the_reason() -> None:
 
 def test_reasons_are_those_of_the_message() -> None:
     assert {r.name: r.value for r in ViewReason} == {r.name: getattr(PalpationTargets, r.name) for r in ViewReason}
-
-
-def test_the_rough_guess_follows_the_cloud_and_stays_sane_without_one() -> None:
-    xy, _ = visibility.cells(EXAM)
-
-    def shape(q: np.ndarray) -> np.ndarray:
-        return -0.005 - 1.5 * q[:, 0] ** 2 - 0.5 * q[:, 1] ** 2
-
-    p = np.column_stack((xy, shape(xy)))
-    np.testing.assert_allclose(visibility.quadric(p, xy), shape(xy), atol=2e-3)
-    np.testing.assert_array_equal(visibility.quadric(p[:50], xy), 0)
-    corner = p[(xy[:, 0] > 0.03) & (xy[:, 1] > 0.03)]
-    assert np.abs(visibility.quadric(np.repeat(corner, 5, axis=0), xy) - shape(xy)).max() < 0.05

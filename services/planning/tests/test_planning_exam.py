@@ -14,7 +14,7 @@ from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
 from palpate_planning.reasons import NO_CAUSE, Cause, Loss, Reason
-from palpate_planning.status import Observation, PerceptionFailure, Phase
+from palpate_planning.status import PerceptionFailure, Phase
 from palpate_planning.strokes.segments import STRETCHED
 
 
@@ -156,13 +156,6 @@ def test_force_limit_makes_depth_yield() -> None:
     assert np.median([row[4] for row in steady]) < 0.007
 
 
-def test_hard_surface_is_pressed_with_no_more_than_the_working_limit() -> None:
-    world = World(known(region_m=(0.025, 0.0125)), lambda depth: 1e4 * max(depth, 0.0))  # ISO/TS 15066: 10 N/mm
-    world.run()
-    assert max(row[5] for row in world.rows) < 15.0
-    assert world.exam.status.phase is Phase.DONE
-
-
 def test_soft_stop_skips_targets_then_gives_up() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.SCAN)
@@ -293,10 +286,3 @@ def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None
     speeds = [np.linalg.norm(s.V_WD[:3]) for s, row in zip(snake.setpoints, snake.rows, strict=True) if row[0] is Phase.SCAN]
     assert np.median(speeds) == pytest.approx(0.03, rel=0.05)
     assert max(speeds) < 0.036
-
-
-def test_without_robot_status_there_is_no_setpoint() -> None:
-    world = World(known())
-    outcome = world.exam.step(Observation(0, None))
-    assert outcome.contact is None
-    assert not outcome.setpoint.joint_stiffness.any()

@@ -210,19 +210,6 @@ def test_a_push_where_no_skin_can_be_is_no_touch() -> None:
     assert max(row[4] for row in world.rows) < 0.0115, "no touch was taken from it"
 
 
-def test_a_soft_stop_above_the_skin_lifts_the_arm() -> None:
-    world = World(known(**SMALL))
-    reached(world, StrokeStage.REST, stroke=1)
-    world.stop, world.soft = Cause(Reason.SOFT_STOP, "force 26 N"), True
-    for _ in range(100):
-        world.step()
-    assert world.depth < -0.02
-    world.stop = NO_CAUSE
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    assert world.exam.status.targets_skipped == 0
-
-
 def test_a_stroke_that_is_left_before_it_slides_is_still_ahead() -> None:
     world = World(known(**SMALL))
     reached(world, StrokeStage.DESCEND, stroke=2)  # the first only touches

@@ -8,24 +8,16 @@ import pytest
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate_bus.contract import MS
-from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import link_names, urdf
-from palpate_models.robot.lbr import ARM
+from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart import plant as in_dart
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.backends.mujoco.service import create
-from palpate_robot.plant import END_STOP_MARGIN_RAD
-
-LINKS = link_names(Robot())
-
-NOTHING = np.zeros(3)
 
 NO_DAMPING = np.zeros(7)
 
-FREE = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
 
 TURNED = Robot(base_xy_m=(0.05, -0.1), base_yaw_rad=0.3)
 
@@ -90,41 +82,6 @@ def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float
     assert np.ptp(dart_read, axis=0)[:3].max() > 20
     assert difference[:3].max() < 0.2, "N, of the F/T sensor, while the tool is accelerated"
     assert difference[3:].max() < 0.02, "N m"
-
-
-def test_sensor_at_rest_reads_weight_and_push() -> None:
-    plant = MujocoPlant(Robot())
-    weight = Robot().tool_mass_kg * GRAVITY
-    np.testing.assert_allclose(plant.sensor_wrench(), [0, 0, weight, 0, 0, 0], atol=1e-9)
-    up = np.array([0.0, 0.0, 10.0])
-    for _ in range(50):  # held by gravity torque and the driver's damping: it creeps, as a hold does
-        plant.step(plant.gravity_torque(), up, NOTHING, 50 * ARM.hold_damping_nms)
-    np.testing.assert_allclose(plant.sensor_wrench()[:3], [0, 0, weight - 10.0], atol=0.2)
-
-
-def test_end_stop_stops_the_joint() -> None:
-    """75 % of A7's torque limit pushes on: MuJoCo's stop is soft and the joint bounces in it, by less than half a degree."""
-    plant = MujocoPlant(Robot())
-    push = np.zeros(7)
-    push[6] = 30.0
-    history = []
-    for _ in range(1500):
-        plant.step(plant.gravity_torque() + push, NOTHING, NOTHING, NO_DAMPING)
-        history.append(plant.q[6])
-    stop = lbr.POSITION_LIMIT[6] + END_STOP_MARGIN_RAD
-    assert np.max(history) < stop + 8e-3
-    assert np.min(history[-300:]) > stop - 8e-3
-
-
-def test_limp_arm_comes_to_rest_on_the_table_not_in_it() -> None:
-    robot = Robot()
-    plant = MujocoPlant(robot, np.deg2rad([0.0, 60.0, 0.0, -60.0, 0.0, 20.0, 0.0]))
-    touched = 0
-    for _ in range(2500):
-        plant.step(NO_DAMPING, NOTHING, NOTHING, NO_DAMPING)
-        touched = max(touched, plant.contacts())
-    assert touched > 0
-    assert plant.link_poses()[LINKS.index("lbr_link_7"), 2] > 0.73
 
 
 @pytest.mark.slow

@@ -118,13 +118,6 @@ def test_a_wrong_sign_of_the_wrench_is_reported_at_the_first_contact(arm: str, p
     assert "pulls the tool out" in wrong.driver._driver.reason
 
 
-@pytest.mark.parametrize(("arm", "profile", "rate_hz"), [("panda", "franka", 1000), ("ur5", "ur", 500)])
-def test_states_come_at_the_rate_of_the_arm(arm: str, profile: str, rate_hz: int) -> None:
-    bench = Ros2Bench(arm, profile)
-    bench.tick(200)
-    assert bench.states == pytest.approx(0.2 * rate_hz, abs=1)
-
-
 def test_a_reflex_lasts_until_recovered_and_the_driver_holds_until_released() -> None:
     bench = Ros2Bench("panda", "franka", 'robot.driver.events=["0.1 lose 20", "0.3 recover 1"]')
     bench.tick(250)

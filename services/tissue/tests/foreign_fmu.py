@@ -1,4 +1,4 @@
-"""An FMU that is not ours, built from a few lines of C: three first-order lags in millimetres, FMI 2.0 or 3.0."""
+"""An FMU that is not ours, built from a few lines of C: three first-order lags in millimetres, FMI 3.0."""
 
 import zipfile
 from pathlib import Path
@@ -7,6 +7,7 @@ from odd_fmu import library
 
 SOURCE = """
 #include <math.h>
+#include <stdbool.h>
 #include <stdlib.h>
 #include <string.h>
 
@@ -27,29 +28,6 @@ static int lag_step(Lag *lag, double dt) {
     return 0;
 }
 
-#if FMI_VERSION == 2
-EXPORT void *fmi2Instantiate(const char *n, int t, const char *g, const char *r, const void *f, int v, int l) {
-    (void)n, (void)t, (void)r, (void)f, (void)v, (void)l;
-    return strcmp(g, "lag") ? NULL : lag_new();
-}
-EXPORT void fmi2FreeInstance(void *c) { free(c); }
-EXPORT int fmi2GetReal(void *c, const unsigned *vr, size_t n, double *v) {
-    for (size_t k = 0; k < n; k++) v[k] = ((double *)c)[vr[k]];
-    return 0;
-}
-EXPORT int fmi2SetReal(void *c, const unsigned *vr, size_t n, const double *v) {
-    for (size_t k = 0; k < n; k++) ((double *)c)[vr[k]] = v[k];
-    return 0;
-}
-EXPORT int fmi2DoStep(void *c, double t, double dt, int k) { (void)t, (void)k; return lag_step(c, dt); }
-EXPORT int fmi2SetupExperiment(void *c, int a, double b, double d, int e, double f) {
-    (void)c, (void)a, (void)b, (void)d, (void)e, (void)f;
-    return 0;
-}
-EXPORT int fmi2EnterInitializationMode(void *c) { return !c; }
-EXPORT int fmi2ExitInitializationMode(void *c) { return !c; }
-#else
-#include <stdbool.h>
 EXPORT void *fmi3InstantiateCoSimulation(const char *n, const char *g, const char *r, bool v, bool l, bool e, bool w,
                                          const unsigned *i, size_t m, void *x, void *f, void *u) {
     (void)n, (void)r, (void)v, (void)l, (void)e, (void)w, (void)i, (void)m, (void)x, (void)f, (void)u;
@@ -79,51 +57,26 @@ EXPORT int fmi3EnterInitializationMode(void *c, bool a, double b, double d, bool
     return !c;
 }
 EXPORT int fmi3ExitInitializationMode(void *c) { return !c; }
-#endif
 """
 
-_UNIT = (
-    '<UnitDefinitions><Unit name="mm"><BaseUnit m="1" factor="0.001"/></Unit>'
-    '<Unit name="s"><BaseUnit s="1"/></Unit></UnitDefinitions>'
-)
+DESCRIPTION = """<?xml version="1.0" encoding="UTF-8"?>
+<fmiModelDescription modelName="lag" fmiVersion="3.0" instantiationToken="lag">
+<CoSimulation modelIdentifier="lag" fixedInternalStepSize="0.01"/>
+<UnitDefinitions><Unit name="mm"><BaseUnit m="1" factor="0.001"/></Unit><Unit name="s"><BaseUnit s="1"/></Unit></UnitDefinitions>
+<ModelVariables>
+<Float64 name="time" valueReference="9" causality="independent" variability="continuous"/>
+<Float64 name="u" valueReference="0" causality="input" unit="mm" start="0 0 0"><Dimension start="3"/></Float64>
+<Float64 name="y" valueReference="1" causality="output" unit="mm"><Dimension start="3"/></Float64>
+<Float64 name="tau" valueReference="2" causality="parameter" variability="tunable" unit="s" start="0.1"/>
+</ModelVariables>
+<ModelStructure><Output valueReference="1"/><InitialUnknown valueReference="1"/></ModelStructure></fmiModelDescription>"""
 
 
-def _description(version: int) -> str:
-    head = '<?xml version="1.0" encoding="UTF-8"?>\n<fmiModelDescription modelName="lag" '
-    if version == 3:
-        variables = "".join(
-            f'<Float64 name="{name}" valueReference="{vr}" causality="{causality}" variability="continuous" unit="mm"'
-            f'{start}><Dimension start="3"/></Float64>'
-            for name, vr, causality, start in (("u", 0, "input", ' start="0 0 0"'), ("y", 1, "output", ""))
-        )
-        return (
-            f'{head} fmiVersion="3.0" instantiationToken="lag"><CoSimulation modelIdentifier="lag" fixedInternalStepSize="0.01"/>'
-            f'{_UNIT}<ModelVariables><Float64 name="time" valueReference="9" causality="independent" variability="continuous"/>'
-            f'{variables}<Float64 name="tau" valueReference="2" causality="parameter" variability="tunable" unit="s"'
-            ' start="0.1"/>'
-            '</ModelVariables><ModelStructure><Output valueReference="1"/><InitialUnknown valueReference="1"/></ModelStructure>'
-            "</fmiModelDescription>"
-        )
-    scalars = "".join(
-        f'<ScalarVariable name="{name}[{k + 1}]" valueReference="{3 * vr + k}" causality="{causality}" variability="continuous">'
-        f'<Real unit="mm"{start}/></ScalarVariable>'
-        for name, vr, causality, start in (("u", 0, "input", ' start="0"'), ("y", 1, "output", ""))
-        for k in range(3)
-    )
-    unknowns = "".join(f'<Unknown index="{k}"/>' for k in (4, 5, 6))
-    return (
-        f'{head} fmiVersion="2.0" guid="lag"><CoSimulation modelIdentifier="lag"/>{_UNIT}<ModelVariables>{scalars}'
-        '<ScalarVariable name="tau" valueReference="6" causality="parameter" variability="tunable"><Real unit="s" start="0.1"/>'
-        f"</ScalarVariable></ModelVariables><ModelStructure><Outputs>{unknowns}</Outputs>"
-        f"<InitialUnknowns>{unknowns}</InitialUnknowns></ModelStructure></fmiModelDescription>"
-    )
-
-
-def build_lag(folder: Path, version: int) -> Path:
+def build_lag(folder: Path) -> Path:
     """Write lag.fmu for this platform."""
-    path = folder / f"lag{version}.fmu"
+    path = folder / "lag.fmu"
     with zipfile.ZipFile(path, "w") as archive:
-        archive.writestr("modelDescription.xml", _description(version))
+        archive.writestr("modelDescription.xml", DESCRIPTION)
         archive.writestr("resources/readme.txt", "nothing")
-        archive.writestr(*library("lag", SOURCE, version))
+        archive.writestr(*library("lag", SOURCE, 3))
     return path

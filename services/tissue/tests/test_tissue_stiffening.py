@@ -47,24 +47,6 @@ def test_the_compiled_springs_are_those_of_the_law():
     np.testing.assert_allclose(tissue.displacement, before - tissue.dt / 0.05 * adjacent, atol=1e-17)
 
 
-def test_force_rises_faster_than_that_of_the_linear_wall():
-    shallow, deep = (press(WinklerTissue(flat_wall(0.0)), depth) for depth in (0.002, 0.018))
-    stiff_shallow, stiff_deep = (press(WinklerTissue(flat_wall(100.0)), depth) for depth in (0.002, 0.018))
-    assert stiff_shallow == pytest.approx(shallow, rel=0.02)
-    assert stiff_deep > 1.2 * deep
-
-
-def test_a_contracted_muscle_adds_force_and_a_slack_one_none():
-    forces = []
-    for activation in (0.0, 0.5, 1.0):
-        tissue = WinklerTissue(flat_wall(tension=3.0))
-        tissue.activation = activation
-        forces.append(press(tissue, 0.010, x=0.035))
-    assert forces[0] == press(WinklerTissue(flat_wall()), 0.010, x=0.035)
-    assert forces[0] < forces[1] < forces[2]
-    assert forces[2] > 1.5 * forces[0]
-
-
 @pytest.mark.parametrize("seed", range(2))
 def test_no_closed_cycle_yields_work(seed):
     rng = np.random.default_rng(seed)
