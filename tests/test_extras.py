@@ -208,12 +208,6 @@ def test_all_is_all_but_torch() -> None:
     assert included("all") == {*EXTRAS, BARE} - {"learn"}
 
 
-@pytest.mark.parametrize("name", sorted(GROUPS))
-def test_images_install_nothing_that_no_extra_does(name: str) -> None:
-    group = f"{name} group"
-    assert libraries(group) <= libraries(extra_with(group))
-
-
 def with_required(distributions: set[str]) -> set[str]:
     """Return distributions with all that they require."""
     found, left = set[str](), list(distributions)

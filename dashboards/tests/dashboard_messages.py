@@ -43,6 +43,7 @@ from palpate_bus.messages import (
     codec,
 )
 from palpate_bus.messages.stamps import header, time_message
+from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M
@@ -54,30 +55,19 @@ Messages = dict[str, Any]
 X_WA = np.array((0.56, 0.0, 0.93))
 
 
-class FakeInbox:
-    """An inbox that holds what it is given."""
+class FakeInbox(HandInbox):
+    """The input of the dashboard: messages stay new until newer ones come."""
 
-    def __init__(self) -> None:
-        self.messages: Messages = {}
-        self.stamps: dict[str, int] = {}
-
-    def put(self, t: int, messages: Messages) -> None:
+    def bring(self, t: int, messages: Messages) -> None:
         self.messages.update(messages)
         self.stamps.update(dict.fromkeys(messages, t))
 
     def latest(self, topic: str) -> Any:
         assert topic in OBSERVED, f"{topic} is not for the dashboard"
-        return self.messages.get(topic)
+        return super().latest(topic)
 
     def new(self, topic: str) -> list[Any]:
         return [self.messages[topic]] if topic in self.messages else []
-
-    def stamp(self, topic: str) -> int | None:
-        assert topic in OBSERVED, f"{topic} is not for the dashboard"
-        return self.stamps.get(topic)
-
-    def lost(self, role: str) -> bool:
-        return False
 
 
 def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:

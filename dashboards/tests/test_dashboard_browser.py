@@ -91,7 +91,7 @@ def test_the_live_scene_is_drawn(tmp_path: Path) -> None:
     service = DashboardService(Scenario(name="live"), tmp_path / FILE, Live(serve_port=port))
     inbox = FakeInbox()
     for t, new in run(6.0, Scenario().robot):  # all of it before the viewer joins
-        inbox.put(t, new)
+        inbox.bring(t, new)
         service.step(t, inbox)
     image = look_for(port, SCENE | CURVE)
     assert share(image, palette.TRUTH, 6) < 0.0002  # nothing of the truth is drawn until it is asked for

@@ -155,13 +155,6 @@ def test_the_body_lies_still_before_and_after(motion):
         assert not np.concatenate(body.twist(t)).any()
 
 
-def test_a_shift_is_along_the_table_and_as_far_as_it_is_set():
-    X = BodyMotion(SHIFT, 1).pose(30)
-    np.testing.assert_array_equal(X[:3, :3], np.eye(3))
-    assert np.linalg.norm(X[:2, 3]) == pytest.approx(0.010)
-    assert X[2, 3] == 0
-
-
 def test_a_turn_is_about_the_spine():
     X = BodyMotion(TURN, 1).pose(30)
     turn = Rotation.from_matrix(X[:3, :3]).as_rotvec()
@@ -254,12 +247,6 @@ def test_tension_is_wide_and_smooth_and_leaves_stiffness_alone():
     a, b = guarded.triangles[front[guarded.triangles].all(axis=1)][:, :2].T
     slope = np.abs(tension[a] - tension[b]) / np.linalg.norm(guarded.vertices[a] - guarded.vertices[b], axis=1)
     assert slope.max() < 1.6 * most / LOWER_RIGHT.edge_m
-
-
-def test_where_areas_overlap_the_tenser_one_counts():
-    strong = LOWER_RIGHT.model_copy(update={"ratio": 4.0})
-    alone, both = (build_phantom(Phantom(guarding=areas), 0) for areas in ((strong,), (LOWER_RIGHT, strong)))
-    np.testing.assert_allclose(both.tension, alone.tension)
 
 
 @pytest.mark.parametrize(

@@ -177,10 +177,3 @@ def test_the_map_is_drawn_with_or_without_findings_and_truth(found: bool, known:
     assert image[..., :3].std() > 0.15
     outline = np.abs(image[..., :3] - (0x18 / 255, 0xE0 / 255, 0xD0 / 255)).max(axis=-1) < 0.02
     assert outline.sum() > 400 if found else outline.sum() < 50
-
-
-def test_nothing_scanned_draws_nothing(tmp_path: Path) -> None:
-    message = stiffness_map()
-    message.scanned = np.zeros(len(message.scanned), dtype=bool)
-    draw_map(tmp_path / "map.png", message, None, np.zeros((0, 2)), None, "empty")
-    assert not (tmp_path / "map.png").exists()

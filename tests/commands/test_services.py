@@ -108,11 +108,6 @@ def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:
     assert create("assessment", str(tmp_path / "mine.py"), load_scenario("healthy")).role == "assessment"
 
 
-def test_a_service_of_another_role_is_refused() -> None:
-    with pytest.raises(PluginError, match=r"makes a service of the role 'assessment'"):
-        create("planning", str(EXAMPLE), load_scenario("healthy"))
-
-
 def test_a_missing_library_is_named_with_the_extra_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
     def fails(_: object) -> None:
         raise ModuleNotFoundError("No module named 'mujoco'", name="mujoco")

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from palpate.quick.case import QuickCase, collected, run_quick
+from palpate.quick.case import QuickCase, run_quick
 from palpate.quick.errors import Loop, LoopErrors, UnknownLoopError, known_loops, loop_errors
 from palpate.quick.examination import QuickExamination
 from palpate.quick.patient import NoTissueError, Patient, Touch
@@ -90,20 +90,6 @@ def test_smooth_errors_have_their_size_and_time_constant(name: str, time: str) -
 def test_a_user_defined_level_without_fitted_errors_is_refused() -> None:
     with pytest.raises(UnknownLoopError, match=r"errors\.camera"):
         loop_errors(scenario(1, settings=(*SMALL, "errors.camera.offset_m=0.05")))
-
-
-def test_the_force_sensor_may_be_of_any_kind() -> None:
-    assert loop_errors(scenario(1, settings=(*SMALL, "errors.force.noise_n=0.7"))) is loop_errors(scenario(1, settings=SMALL))
-
-
-def test_states_are_those_of_the_contract() -> None:
-    chosen = scenario(3)
-    examination = QuickExamination(chosen, Loop(chosen, loop_errors(chosen)))
-    gathered = collected(examination, examination.run())
-    stamps = np.array([s.header.stamp.sec + 1e-9 * s.header.stamp.nanosec for s in gathered.exam_states])
-    assert np.diff(stamps[:-1]) == pytest.approx(0.010)
-    assert gathered.exam_states[-1].stroke == 6  # lines
-    assert len(gathered.indentation) == len(gathered.exam_states) - 1
 
 
 def test_a_press_and_a_slide_feel_the_lump() -> None:

@@ -78,12 +78,6 @@ def test_simulation_narrows_the_interval_of_outcomes(tmp_path: Path) -> None:
     assert np.diff(found.prediction_powered_90) < 0.7 * np.diff(found.mean_90)
 
 
-def test_rank_violation_of_a_reversed_order() -> None:
-    found = sim_to_real(np.array((1.0, 2.0, 3.0)), np.array((3.0, 2.0, 1.0)), np.empty(0))
-    assert found.rank_violation == pytest.approx(5 / 3)
-    assert found.prediction_powered_90 == found.mean_90
-
-
 @pytest.mark.parametrize(
     ("text", "named"),
     [

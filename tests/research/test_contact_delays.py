@@ -69,11 +69,6 @@ def test_a_late_message_keeps_its_stamp() -> None:
     assert list(inbox.new("scripted")) == ["now"]
 
 
-def test_a_negative_delay_is_refused() -> None:
-    with pytest.raises(ValueError, match="not be negative"):
-        BusDelay(-0.001)
-
-
 def test_contact_on_either_side_of_its_margin() -> None:
     """The margin is 8 to 10 ms a message; theory and measurement agree that 4 is inside and 14 outside."""
     loop = linearise(1.0, stability.STIFFNESS_NPM)
@@ -89,10 +84,6 @@ def test_the_path_that_hardware_does_not_have_is_not_the_weak_one() -> None:
     assert press(1.0, stability.STIFFNESS_NPM, Delays(CONTACT_PATH, 0.014)).stable
 
 
-def test_a_soft_controller_bears_more_delay() -> None:
-    assert linearise(1.0, 1000.0).margin_ms(CONTROL_PATH) >= linearise(1.0, 5000.0).margin_ms(CONTROL_PATH)
-
-
 @pytest.mark.parametrize("contrast", [1.0, 10.0], ids=["softest wall", "stiffest wall"])
 @pytest.mark.parametrize("loop_ms", [10, 40])
 def test_an_arm_that_takes_positions_is_stable_with_any_delay(contrast: float, loop_ms: int) -> None:
@@ -101,10 +92,6 @@ def test_an_arm_that_takes_positions_is_stable_with_any_delay(contrast: float, l
     contact = press(contrast, stability.STIFFNESS_NPM, Delays(CONTROL_PATH, loop_ms / 2e3), "ur5")
     assert contact.stable
     assert contact.mean_force < 15.0
-
-
-def test_an_admittance_that_yields_at_once_is_not_safe_with_any_delay() -> None:
-    assert admittance_gain(10.0, 0.005) > 1.0
 
 
 @pytest.mark.slow

@@ -287,8 +287,3 @@ def test_without_muscles_or_in_an_older_table_there_is_no_such_calibration() -> 
         pd.DataFrame([synthetic.case(0, "a") | {"case_id": "a"}]), pd.DataFrame(findings), synthetic.frames([], [], [])[2]
     )
     assert guarding(older.variants[0], older.bootstrap) is None
-
-
-def test_no_area_no_calibration() -> None:
-    tables = synthetic.tables([synthetic.case(0, "healthy")], [], [])
-    assert calibration(tables.variants[0], tables.bootstrap) is None

@@ -13,7 +13,7 @@ from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.scene import Caster, Mesh, Scene
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform
 from palpate_camera.messages import Pinhole
-from palpate_models.numerics.frames import apply, look_at
+from palpate_models.numerics.frames import look_at
 from palpate_models.scenario.errors import Errors
 from palpate_models.scenario.load import plant_input
 from palpate_models.scenario.schema import Scenario
@@ -235,12 +235,6 @@ def test_only_layers_that_moved_are_cast_again(monkeypatch: pytest.MonkeyPatch) 
     scene.put("flat_plate", flat_plate(0.302, half=0.05))
     assert scene.view() is not first
     assert len(casts) == 3
-
-
-def test_a_mesh_outside_the_image_is_not_seen() -> None:
-    caster = Caster(PINHOLE, X_WC)
-    aside = apply(X_WC, np.array([[5.0, 0.0, 1.0]]))[0]
-    assert not caster.cast(ball(tuple(aside), 0.2)).w.any()
 
 
 def test_a_mesh_that_reaches_behind_the_camera_is_seen_before_it() -> None:

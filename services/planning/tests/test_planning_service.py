@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, World, known
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
@@ -153,49 +153,43 @@ def test_the_arm_is_held_where_it_was_found() -> None:
     assert np.all(out["planning/setpoint"].joint_stiffness > 0)
 
 
-@pytest.mark.parametrize("cause", ["hold", "unready", "idle", "operator", "soft", "robot"])
-def test_holds_and_stops_wait_and_losses_abort(cause: str) -> None:
-    service = create(Scenario(robot=BASE))
-    inbox = HandInbox()
-    q = np.array(lbr.HOME)
-    inbox.put("robot/status", status(0, q, np.zeros(6)))
-    service.step(10_000_000, inbox)
+def idle(reason: str, mode: int = RobotStatus.MODE_IDLE) -> Any:
+    return status(10 * MS, np.array(lbr.HOME), np.zeros(6), mode, reason)
+
+
+SOFT_STOP = SupervisorState(header(10 * MS), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "", 9.0)
+CAUSES = {
+    "hold": ("robot/status", idle("force 41 N", RobotStatus.MODE_SAFE_HOLD), Reason.ROBOT_HOLD),
+    "not ready": ("robot/status", idle("MONITORING_READY"), Reason.ROBOT_NOT_READY),
+    "idle again": ("robot/status", idle(""), Reason.ROBOT_NOT_READY),
+    "operator": ("operator/request", OperatorRequest(header(10 * MS), OperatorRequest.STOP, "enough"), Reason.OPERATOR_STOP),
+    "soft stop": ("supervisor/state", SOFT_STOP, Reason.SOFT_STOP),
+}
+
+
+def after(topic: str, message: Any) -> Any:
+    """Return the state of an examination under way after a message, or after the loss of a role if there is none."""
+    service, inbox = create(Scenario(robot=BASE)), HandInbox()
+    inbox.put("robot/status", status(0, np.array(lbr.HOME), np.zeros(6)))
+    for t in (0, 10 * MS):
+        service.step(t, inbox)
     inbox.events = {}
-    if cause == "hold":
-        hold = status(10_000_000, q, np.zeros(6), RobotStatus.MODE_SAFE_HOLD, "force 41 N, limit 40 N")
-        inbox.put("robot/status", hold)
-    elif cause == "unready":
-        inbox.put("robot/status", status(10_000_000, q, np.zeros(6), RobotStatus.MODE_IDLE, "MONITORING_READY"))
-    elif cause == "idle":
-        service.step(10_000_000, inbox)
-        inbox.put("robot/status", status(20_000_000, q, np.zeros(6), RobotStatus.MODE_IDLE, ""))
-    elif cause == "operator":
-        inbox.put("operator/request", OperatorRequest(header(10_000_000), OperatorRequest.STOP, "enough"))
-    elif cause == "soft":
-        soft = SupervisorState(
-            header(10_000_000), SupervisorState.LEVEL_SOFT_STOP, 2, "depth 27 mm", 0, 9.0, 0.027, 0.0, 0, "", 9.0
-        )
-        inbox.put("supervisor/state", soft, 10_000_000)
+    if message is None:
+        inbox.gone.add(topic)
     else:
-        inbox.gone.add("robot")
-    state = sent(service.step(20_000_000, inbox))["exam/state"]
-    assert (
-        state.reason
-        == {
-            "hold": Reason.ROBOT_HOLD,
-            "unready": Reason.ROBOT_NOT_READY,
-            "idle": Reason.ROBOT_NOT_READY,
-            "operator": Reason.OPERATOR_STOP,
-            "soft": Reason.SOFT_STOP,
-            "robot": Reason.SERVICE_LOST,
-        }[cause]
-    )
-    if cause == "robot":
-        assert state.phase == Phase.ABORTED
-        assert state.end_tick == 1_020_000_000
-    else:
-        assert state.phase == Phase.HELD
-        assert state.end_tick == -1
+        inbox.put(topic, message, 10 * MS)
+    return sent(service.step(20 * MS, inbox))["exam/state"]
+
+
+@pytest.mark.parametrize(("topic", "message", "reason"), CAUSES.values(), ids=CAUSES)
+def test_holds_and_stops_wait(topic: str, message: Any, reason: Reason) -> None:
+    state = after(topic, message)
+    assert (state.reason, state.phase, state.end_tick) == (reason, Phase.HELD, -1)
+
+
+def test_a_lost_robot_aborts() -> None:
+    state = after("robot", None)
+    assert (state.reason, state.phase, state.end_tick) == (Reason.SERVICE_LOST, Phase.ABORTED, 1020 * MS)
 
 
 def test_a_damaged_surface_causes_a_new_scan() -> None:

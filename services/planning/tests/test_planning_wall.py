@@ -109,12 +109,6 @@ def tilted(xy: np.ndarray) -> np.ndarray:
     return np.asarray(0.015 + xy @ np.array((0.012, -0.008)))
 
 
-def test_without_touches_the_correction_is_zero_and_uncertain() -> None:
-    correction = TouchCorrection()
-    assert correction.height(np.zeros(2)) == 0.0
-    assert correction.sigma(np.zeros(2)) == pytest.approx(np.hypot(PRIOR.offset_m, PRIOR.field_m))
-
-
 def test_errors_agree_with_the_reported_sd() -> None:
     rng = np.random.default_rng(3)
     everywhere = np.vstack((PLACES, BETWEEN))

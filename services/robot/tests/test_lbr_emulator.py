@@ -44,12 +44,6 @@ def test_a_machine_that_stood_still_is_not_made_up_for(late: int) -> None:
     assert {b - a for a, b in pairwise(stamps)} == {PERIOD}, "the arm's own clock stood still, too"
 
 
-def test_a_sleep_that_is_a_little_long_does_no_harm() -> None:
-    began, _ = paced({30: 3 * MS})
-    assert began[-1] == PERIOD * 100
-    assert min(b - a for a, b in pairwise(began)) >= PERIOD // 2
-
-
 def test_an_address_that_is_in_use_is_reported_without_a_traceback(capsys: pytest.CaptureFixture[str]) -> None:
     with socket.socket() as taken:
         taken.bind(("127.0.0.1", 0))
@@ -103,13 +97,6 @@ def test_a_site_that_adds_a_time_out_gets_one() -> None:
     for _ in range(30):
         session.cycle(HOME, ZERO)
     assert "no command for" in session.ended
-
-
-def test_nan_means_no_torque() -> None:
-    session = active()
-    session.take(HOME, np.full(7, np.nan))
-    assert not session.cycle(HOME, ZERO).torque.any()
-    assert not session.ended
 
 
 @pytest.mark.parametrize(

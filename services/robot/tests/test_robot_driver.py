@@ -180,11 +180,6 @@ def test_release_does_not_help_while_the_limit_is_broken(active: Driver) -> None
     assert (active.mode, active.cause) == (DriverMode.SAFE_HOLD, HoldCause.POSITION_LIMIT)
 
 
-def test_release_without_a_hold_changes_nothing(active: Driver) -> None:
-    active.release(2 * MS)
-    assert active.mode is DriverMode.ACTIVE
-
-
 def test_hold_damps_within_the_torque_limits(active: Driver) -> None:
     assert not active.damping(STILL, GRAVITY).any(), "an obeying driver adds no damping"
     active.hold(2 * MS, HoldCause.STOP_REQUESTED, "operator")

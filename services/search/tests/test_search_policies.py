@@ -1,6 +1,5 @@
 """Policies, the posterior they use, and the service that asks for presses."""
 
-from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -40,7 +39,7 @@ from palpate_search.posterior import (
     policies,
     policy,
 )
-from palpate_search.presses import Budget, Press, Task, press_duration
+from palpate_search.presses import Budget, Press, Task
 from palpate_search.service import TUNING, checked, create, next_press
 
 DECIDED = (0.05, 0.0)
@@ -99,12 +98,6 @@ def test_the_learned_policy_decides_as_its_weights_do() -> None:
     assert depth == TASK.deepest
 
 
-def test_ours_counts_the_way() -> None:
-    slow = np.array(presses("informed", 10))
-    assert np.median(np.linalg.norm(np.diff(slow[:, :2], axis=0), axis=1)) < 0.08
-    assert press_duration(np.zeros(2), np.array((0.12, 0.0))) > press_duration(np.zeros(2), np.zeros(2))
-
-
 def test_a_policy_of_a_file(tmp_path: Path) -> None:
     own = tmp_path / "mine.py"
     own.write_text("def next_press(posterior, budget):\n    return posterior.task.places[-1], 0.008\n")
@@ -130,10 +123,6 @@ def test_a_policy_that_cannot_be_used_is_refused(
     Path("broken.py").write_text("def next_press(:\n")
     with pytest.raises(PluginError, match=words):
         policy(choice)
-
-
-def test_a_small_region_has_a_place() -> None:
-    assert replace(TASK, size=(0.01, 0.01)).places.shape == (1, 2)
 
 
 CENTRED = Task(centre=(0.0, 0.0), size=(0.1, 0.08))
@@ -247,13 +236,6 @@ def test_it_finds_the_stiff_area_and_ends() -> None:
     assert (np.linalg.norm(places - 0.02, axis=1) < 0.025).sum() >= 3
 
 
-def test_it_keeps_to_the_budget_of_presses() -> None:
-    rig = played(budget=SearchBudget(presses=5))
-    assert rig.report.passed
-    assert [item.message.request for item in rig.log[REQUEST]] == [SearchRequest.PRESS] * 5 + [SearchRequest.DONE]
-    assert "5 presses made" in rig.last(REQUEST).reason
-
-
 def test_it_keeps_to_the_budget_of_time() -> None:
     rig = played(budget=SearchBudget(seconds=2.0))
     assert rig.last(REQUEST).request == SearchRequest.DONE
@@ -321,10 +303,6 @@ def test_what_is_not_a_press_is_refused(returned: Any) -> None:
     posterior = Posterior(TASK)
     with pytest.raises(PluginError, match=r"search\.policy: returned .*, want \(place, depth\)"):
         next_press(lambda *_: returned, posterior, posterior.left(0.0))
-
-
-def test_the_edge_of_the_region_and_the_greatest_depth_may_be_pressed() -> None:
-    assert checked(SQUARE.high, SQUARE.deepest, SQUARE)[1] == SQUARE.deepest
 
 
 def test_the_report_says_what_it_took() -> None:

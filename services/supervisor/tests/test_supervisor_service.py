@@ -238,14 +238,6 @@ def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
-def test_a_soft_stop_that_helps_stays_one() -> None:
-    latch = Latch()
-    latch.update(0, [SOFT], False)
-    for t in range(10 * MS, 2 * TUNING.soft_stop_timeout_ns, 10 * MS):
-        latch.update(t, [], False)
-    assert latch.level is Level.SOFT_STOP
-
-
 @pytest.mark.parametrize(
     ("breach", "alone"),
     [
