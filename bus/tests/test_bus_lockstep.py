@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from toy_services import TOYS, Control, Robot
 
 from palpate_bus.contract import MS, Edge, contract
-from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Stepper, run_hash
+from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Stepper
 
 TOPICS = contract().topics
 
@@ -138,8 +138,3 @@ def test_latched_topics_are_due_at_start() -> None:
     toy.start = dict  # type: ignore[method-assign, assignment]
     with pytest.raises(LockstepError, match="did not send its latched robot_description"):
         Stepper(toy, contract()).start()
-
-
-def test_run_hash_depends_on_every_digest_and_not_on_their_order() -> None:
-    assert run_hash({"a": "1", "b": "2"}) == run_hash({"b": "2", "a": "1"})
-    assert run_hash({"a": "1", "b": "2"}) != run_hash({"a": "2", "b": "1"})

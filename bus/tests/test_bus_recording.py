@@ -17,7 +17,7 @@ from palpate_bus.messages.codec import CodecError
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, RunAborted
 from palpate_bus.runtime.observer import RecorderNode
-from palpate_bus.runtime.output import CHUNK_PERIOD, ChunkMessage, ChunkWriter, unpack_chunk
+from palpate_bus.runtime.output import ChunkMessage, ChunkWriter, unpack_chunk
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.transport import ReceivedSample
 
@@ -36,14 +36,6 @@ def test_a_chunk_round_trips(sent: list[ChunkMessage]) -> None:
     tick, received = unpack_chunk(spool.chunk(7))
     assert tick == 7
     assert list(received) == sent
-
-
-def test_a_chunk_is_due_once_per_period() -> None:
-    spool = ChunkWriter("robot", TOPICS)
-    assert not spool.due(CHUNK_PERIOD - 1)
-    assert spool.due(CHUNK_PERIOD)
-    spool.chunk(CHUNK_PERIOD)
-    assert not spool.due(CHUNK_PERIOD + 1)
 
 
 def test_garbage_raises_a_codec_error() -> None:
@@ -219,16 +211,3 @@ def test_an_invalid_chunk_is_garbage(again: tuple[int, tuple[str, int, int]]) ->
     RecorderNode(kept, member).run()
     assert kept.messages == [("joint_states", 7 * MS, 8)]
     assert json.loads(member.reports[-1].detail)["garbage"] == 1
-
-
-def test_any_error_completes_the_recording() -> None:
-    kept = Kept()
-    member: Any = Bus(said(RunControl.HELLO))
-
-    def out_of_memory(roles: frozenset[str]) -> frozenset[str]:
-        raise MemoryError
-
-    member.alive, member.conductor_there = out_of_memory, False
-    with pytest.raises(MemoryError):
-        RecorderNode(kept, member).run()
-    assert kept.finished

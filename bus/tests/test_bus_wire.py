@@ -102,14 +102,6 @@ def test_hellos_have_a_key_of_their_own() -> None:
     assert wire.parse_key(hello).type == "sensor_msgs/msg/JointState"
 
 
-def test_any_type_key_meets_topics_whose_definition_differs() -> None:
-    import zenoh
-
-    theirs = "3/ft/wrench/geometry_msgs::msg::dds_::Wrench_/RIHS01_" + "0" * 64
-    assert zenoh.KeyExpr(wire.any_type_key("ft/wrench", 3)).intersects(theirs)
-    assert not zenoh.KeyExpr(wire.any_type_key("wrench", 3)).intersects(theirs)
-
-
 # From rmw_zenoh's docs/design.md.
 LISTENER = "@ros2_lv/0/aac3178e146ba6f1fc6e6a4085e77f21/0/0/NN/%/%/listener"
 TALKER = (

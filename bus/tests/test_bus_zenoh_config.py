@@ -1,6 +1,5 @@
 """Connections between processes: settings of the environment, options, meshes, routers, the end of sessions."""
 
-import signal
 import socket
 import subprocess
 import sys
@@ -115,23 +114,6 @@ def test_peers_meet_through_a_router_and_outlive_it(tmp_path: Path) -> None:
         assert b.zid() in a.info.peers_zid()
         assert close_session(router)
         assert received(a, b, key="test/after") == b"x"
-
-
-def test_router_command_routes_until_a_signal(tmp_path: Path) -> None:
-    endpoint = f"unixsock-stream/{tmp_path}/router.sock"
-    router = subprocess.Popen(
-        [sys.executable, "-m", "palpate_bus.wire.zenoh_config", endpoint], stdout=subprocess.PIPE, text=True
-    )
-    try:
-        assert router.stdout is not None
-        assert endpoint in router.stdout.readline()
-        with session(BusOptions(mode="client", router=endpoint)) as a, session(BusOptions(mode="client", router=endpoint)) as b:
-            assert received(a, b) == b"x"
-        router.send_signal(signal.SIGTERM)
-        assert router.wait(timeout=30) == 0
-    finally:
-        router.kill()
-        router.wait()
 
 
 def test_a_process_that_merely_ends_closes_its_session(tmp_path: Path) -> None:

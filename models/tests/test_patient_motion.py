@@ -60,12 +60,6 @@ def test_breaths_vary_as_much_as_is_set_and_remember_the_one_before():
     assert np.ptp(regular[:, 1:], axis=0).max() < 1e-9
 
 
-def test_expiration_is_longer_and_ends_with_a_pause():
-    breaths = table(expiration_ratio=1.2, pause=0.1, timing_cv=0)
-    np.testing.assert_allclose(breaths[:, 2] / breaths[:, 1], 1.2)
-    np.testing.assert_allclose(breaths[:, 3] / durations(breaths), 0.1)
-
-
 @pytest.mark.parametrize("fields", [{}, {"kind": "deep"}, {"kind": "held"}, {"coughs_per_min": 2}])
 def test_the_curve_is_the_table_and_smooth_and_repeats(fields):
     curve = BreathingCurve(Breathing.model_validate({"kind": "quiet", **fields}), 3)

@@ -95,15 +95,6 @@ def test_background_has_the_asked_mean_variation_and_correlation():
     assert (here * there).mean() == pytest.approx(np.exp(-0.5), abs=0.05)
 
 
-def test_background_without_variation_is_nominal_in_the_middle():
-    phantom = Phantom(background=Background(cv=0.0, margins=1.5))
-    model = build_phantom(phantom, 0)
-    middle = (np.abs(model.vertices[:, :2]) < 0.03).all(axis=1) & (model.normals[:, 2] > 0)
-    np.testing.assert_allclose(model.stiffness[middle], phantom.stiffness.k_w_n_per_m3)
-    head = np.argmax(model.vertices[:, 1])
-    assert model.stiffness[head] == pytest.approx(1.5 * phantom.stiffness.k_w_n_per_m3, rel=0.01)
-
-
 def test_lesion_rises_from_one_to_its_contrast_through_half_at_its_outline():
     lesion = Lesion(centre_m=(0.01, -0.02), radii_m=(0.03, 0.02), contrast=5.0, edge_m=0.008)
     xy = np.array([[0.01, -0.02], [0.04, -0.02], [0.01, 0.0], [0.01 + 0.0345, -0.02], [0.2, 0.2]])

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import matrix
-from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, Errors, draw_errors, levels, table
+from palpate_models.scenario.errors import MOMENT_PER_FORCE_M, Errors, draw_errors, levels
 from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names, true_pose
 from palpate_models.scenario.patterns import Scan, lattice, scan_of
 from palpate_models.scenario.schema import BUILTIN_PATTERNS, Exam
@@ -137,12 +137,6 @@ def test_an_invalid_level_is_named(setting: str, words: str) -> None:
         level(setting)
 
 
-def test_poor_equipment_is_nowhere_better_than_typical() -> None:
-    slower = {"tare_s", "warm_up_s"}
-    for rows in table().values():
-        assert all(row["poor"] >= row["typical"] for name, row in rows.items() if name not in slower)
-
-
 def test_equal_seeds_give_equal_equipment_and_others_do_not() -> None:
     errors = Errors(level="poor")
     one, same, other = (draw_errors(errors, seed) for seed in (1, 1, 2))
@@ -254,12 +248,6 @@ def test_every_node_is_visited_once_line_by_line(exam: Exam, pattern: str) -> No
     assert scan.joined is (pattern == "snake")
     if pattern != "lines":
         assert order == list(range(len(nodes)))
-
-
-def test_no_line_follows_the_one_beside_it() -> None:
-    """Skin that has just been pressed would be found too deep."""
-    x = np.array([line[0, 0] for line in made(Exam(), "lines").lines])
-    assert np.abs(np.diff(x)).min() > 0.024
 
 
 def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:

@@ -63,17 +63,6 @@ def test_a_wait_is_printed_once_at_each_target() -> None:
     assert [text for _, text in narrated([rests, waits, rests, waits, *later], narration)] == ["waiting for it"] * 2
 
 
-def test_touches_are_not_counted_as_progress_of_the_scan() -> None:
-    narration = Narration(EXAM)
-    shares = []
-    for s in examination():
-        s.target_index = 30
-        narration.news(s)
-        shares.append((narration.part(s).partition(" ")[0], narration.done(s)))
-    assert {share for name, share in shares if name == "touch"} == {0.0}
-    assert {share for name, share in shares if name == "scan"} == {30 / 45}
-
-
 def test_a_patient_who_moved_is_touched_again() -> None:
     looks = state(Phase.LOOK, "the patient has moved: looking again", TOUCHES + LINES)
     names = [name for name, _ in narrated([*examination(), looks, *examination(TOUCHES + LINES)])]

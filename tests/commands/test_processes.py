@@ -37,12 +37,6 @@ ROOT = Path(__file__).parents[2]
 # --- the compose file ----------------------------------------------------------------------------------------------------
 
 
-def test_every_role_of_a_run_is_in_the_compose_file() -> None:
-    processes = read_processes(compose_file(), ROLES)
-    assert processes["robot"].command == service.command("robot")
-    assert processes["robot"].environment["OMP_NUM_THREADS"] == "1"
-
-
 @pytest.mark.parametrize(
     ("text", "error"),
     [

@@ -16,21 +16,12 @@ from examination import SHORT, Finished, palpate_run
 
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.contract import contract
-from palpate_bus.settings import COMPOSE_VARIABLES
 from palpate_models.scenario.load import view_of
 
 ROOT = Path(__file__).parents[2]
 DOCKERFILE = (ROOT / "compose/Dockerfile").read_text(encoding="utf-8")
 COMPOSE: dict[str, Any] = yaml.safe_load((ROOT / "docker-compose.yml").read_text(encoding="utf-8"))["services"]
 IPC: dict[str, Any] = yaml.safe_load((ROOT / "compose/ipc.yml").read_text(encoding="utf-8"))["services"]
-
-
-def test_an_image_is_pinned_and_runs_as_no_root() -> None:
-    assert "# syntax=" not in DOCKERFILE
-    assert DOCKERFILE.rstrip().endswith("USER 1000:1000")
-    for line in DOCKERFILE.splitlines():
-        if "pip install" in line and "--no-index" not in line:
-            assert "-c constraints.txt" in line, line
 
 
 def builds() -> list[tuple[str, str]]:
@@ -79,11 +70,6 @@ def test_each_container_has_the_scenario_file_of_its_role_and_no_other() -> None
             view = view_of(role)
             assert COMPOSE[role]["environment"]["PALPATE_SCENARIO"] == f"{folders[view]}/{view}.yaml"
             assert [volume.split(":")[-1 if view == "scenario" else -2] for volume in COMPOSE[role]["volumes"]] == [folders[view]]
-
-
-def test_the_default_scenario_of_containers_is_that_of_palpate_run() -> None:
-    assert COMPOSE["prepare"]["environment"]["PALPATE_SCENARIO_NAME"] == f"${{PALPATE_SCENARIO_NAME:-{DEFAULT_SCENARIO}}}"
-    assert COMPOSE_VARIABLES["PALPATE_SCENARIO_NAME"][0] == DEFAULT_SCENARIO
 
 
 def test_no_container_takes_a_machine_for_itself() -> None:

@@ -7,7 +7,7 @@ import synthetic
 from sklearn.metrics import roc_auc_score
 
 from palpate.study.statistics.detectability import FELT, Surface, fit, surface
-from palpate.study.statistics.detection import RATES, by_contrast, froc, rates, roc
+from palpate.study.statistics.detection import by_contrast, froc, rates, roc
 from palpate.study.statistics.estimate import Bootstrap, bounded, percentiles, wilson
 
 
@@ -100,15 +100,6 @@ def test_equal_confidences_count_at_once() -> None:
     assert curve.at[1 / 4].value == pytest.approx(0.5), "half way from none to one of both"
 
 
-def test_a_failed_examination_of_a_healthy_person_is_a_false_finding_at_every_threshold() -> None:
-    tables = _by_hand()
-    frames = tables.variants[0]
-    frames.cases.loc[frames.cases["population"] == "healthy", "failed"] = True
-    after = froc(frames, tables.bootstrap)
-    assert after.at_zero.value == 0.0
-    assert after.at[RATES[1]].value == pytest.approx(1 / 3)
-
-
 def test_lumps_are_counted_in_the_class_of_what_they_feel_like() -> None:
     cases, lumps = [], []
     made = [
@@ -162,25 +153,6 @@ def test_the_interval_of_the_smallest_lump_has_its_nominal_coverage() -> None:
         smallest = _fitted(seed, 250, folds=80).threshold("felt_radius_m", **HERE)
         held += smallest.low <= true <= smallest.high
     assert 10 <= held <= 12
-
-
-def test_the_smallest_lump_is_found_with_ninety_per_cent() -> None:
-    found = _fitted(1, 800)
-    smallest = found.threshold("felt_radius_m", **HERE)
-    assert smallest.value == pytest.approx(synthetic.true_radius(0.9, **HERE), abs=0.0015)
-    at = {name: np.array([value]) for name, value in HERE.items()} | {"felt_radius_m": np.array([smallest.value or 0.0])}
-    assert found.probability(at)[0][0] == pytest.approx(0.9, abs=1e-6)
-
-
-def test_deeper_lumps_are_found_less_and_their_threshold_is_the_deepest() -> None:
-    found = _fitted(2, 800)
-    deepest = found.threshold("depth_m", felt_contrast=1.6, felt_radius_m=0.018)
-    shallower = {
-        "felt_contrast": np.array([1.6]),
-        "felt_radius_m": np.array([0.018]),
-        "depth_m": np.array([deepest.value - 0.003]),
-    }
-    assert found.probability(shallower)[0][0] > 0.9
 
 
 def test_a_lapse_is_fitted_only_if_there_is_one() -> None:

@@ -8,7 +8,7 @@ import pytest
 from palpate_assessment.grid import map_grid
 from palpate_assessment.messages import skin_of
 from palpate_assessment.sampling import TRAVEL, ContactState, ForceSample, Sampler
-from palpate_assessment.seen_breath import BreathingShares, SeenBreath, depth_seen
+from palpate_assessment.seen_breath import SeenBreath, depth_seen
 from palpate_bus.messages import SurfaceCorrection, SurfaceMesh
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header
@@ -165,11 +165,6 @@ def test_depth_is_unchanged_between_distant_images() -> None:
     time, depth, followed = np.array((0.1, 0.7, 1.3)), np.full(3, DEPTH), np.zeros(3)
     images = (np.array((0.0, 0.2, 1.2, 1.4)), np.full(4, 0.002))
     assert depth_seen(time, depth, followed, np.ones(3), images) - DEPTH == pytest.approx((0.002, 0.0, 0.002))
-
-
-def test_shares_are_those_of_the_nearest_vertex() -> None:
-    assert BreathingShares(VERTICES, SHARES)(np.array([(0.04, 0.0, 0.01), (0.2, 0.0, 0.0)])) == pytest.approx((0.8, 0.5))
-    assert BreathingShares(VERTICES, np.empty(0))(VERTICES) == pytest.approx((0.0, 0.0, 0.0))
 
 
 SLOPE = np.array((-0.6, 0.0, 0.8))

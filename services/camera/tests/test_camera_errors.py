@@ -99,14 +99,6 @@ def test_jitter_at_an_edge_sees_near_or_far_and_nothing_between() -> None:
     assert not ((image > 1.03) & (image < 1.45)).any()
 
 
-@pytest.mark.parametrize("scale", [0.5, 2.0])
-def test_the_scale_multiplies_the_noise(scale: float) -> None:
-    z = 1.0
-    image = noise(scale).image(plane(z), NONE)
-    model = np.hypot(scale * float(axial_sigma(np.float32(z), np.float32(0))), step(z, scale) / np.sqrt(12))
-    assert np.std(image, dtype=np.float64) == pytest.approx(model, rel=0.03)
-
-
 def test_without_noise_depth_is_exact_even_at_grazing_angles() -> None:
     view = plane(1.234)
     view.cos[:] = 0.01

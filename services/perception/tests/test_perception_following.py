@@ -12,7 +12,6 @@ from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.follower import ArmMask
-from palpate_perception.tracker import jackknife
 from palpate_perception.wall import steady, without_gaps
 from research.following import READY, Patient, Run, run
 
@@ -79,13 +78,6 @@ def test_the_error_shared_by_neighbouring_pixels_is_reported(level: str) -> None
     assert 0.6 < ratio < 1.6
 
 
-def test_jackknife_needs_several_patches() -> None:
-    patch, one = np.repeat(np.arange(4), 5), np.ones(20)
-    left = np.repeat((3e-4, -3e-4, 3e-4, -3e-4), 5)
-    assert jackknife(left, one, one, patch) == pytest.approx(4 * (1e-4) ** 2)
-    assert jackknife(left, np.where(patch == 0, 1.0, 0.0), one, patch) is None
-
-
 def test_a_camera_that_warms_up_moves_no_wall() -> None:
     warming = ("exam.region_m=[0.1, 0.1]", "errors.camera.warm_up_m=0.01", "errors.camera.warm_up_s=100")
     case = load_scenario("healthy", warming, 3)
@@ -112,12 +104,6 @@ def test_what_the_camera_sees_bent_for_seconds_averages_out() -> None:
     burst, averaged = bent(outward, p_A[:, :2]), bent(outward - np.asarray(result.correction.outward), p_A[:, :2])
     assert burst > 0.3e-3
     assert averaged < 0.75 * burst
-
-
-def test_a_still_wall_moves_by_next_to_nothing() -> None:
-    result, _ = followed(scenario="clean", seconds=5.0)
-    assert set(result.state) == {SurfaceMotion.QUIET}
-    assert np.abs(result.motion).max() < 0.4e-3
 
 
 def test_a_cough_spoils_and_passes() -> None:

@@ -114,20 +114,6 @@ def gaps(missing: np.ndarray, depth: np.ndarray) -> Gaps:
     return visibility.gaps(missing, len(all_cells()), X_CA, K, depth, (0, 0), SEEN_SHAPE)
 
 
-def test_cells_cover_the_region_and_points_fill_them() -> None:
-    xy, (nx, ny) = visibility.cells(Exam(region_m=(0.2, 0.1), centre_m=(0.05, 0.0)))
-    assert (nx, ny) == (20, 10)
-    assert np.ptp(xy[:, 0]) == pytest.approx(0.19)
-    assert xy.mean(axis=0) == pytest.approx([0.05, 0.0])
-    exam = Exam(region_m=(0.2, 0.1), centre_m=(0.05, 0.0))
-    p = np.column_stack((xy, np.zeros(len(xy))))
-    assert visibility.seen(p, exam).all()
-    half = visibility.seen(p[p[:, 0] > 0.05], exam).reshape(nx, ny)
-    assert not half[:10].any()
-    assert half[10:].all()
-    assert not visibility.seen(np.empty((0, 3)), exam).any()
-
-
 @pytest.mark.parametrize(
     ("offset", "plane_m", "reason"),
     [

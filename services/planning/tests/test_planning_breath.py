@@ -28,13 +28,6 @@ def breathing(t_s: float) -> float:
     return 0.004 * (1 - float(np.cos(2 * np.pi * 14 / 60 * t_s)))
 
 
-def test_without_a_message_the_wall_is_at_rest() -> None:
-    breath = Breath()
-    assert breath.displacement(5 * SECOND) == 0.0
-    assert breath.calm(5 * SECOND)
-    assert not breath.moved
-
-
 def test_in_between_the_forecast_is_interpolated() -> None:
     breath = Breath()
     breath.receive(motion(SECOND, 0.0, 0.001, 0.003), SECOND + 100 * MS)

@@ -11,7 +11,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
-from palpate_planning.motion.scene import CollisionScene, with_skirt
+from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
 from palpate_planning.strokes.path import centre, least_twist, pose
 from palpate_planning.strokes.plan import ExamPlanner, look_postures
@@ -84,21 +84,6 @@ def test_only_the_tool_may_touch_and_only_in_the_contact_phase() -> None:
     assert contact.free(pressed)
     buried = above(0.0, 0.0, -0.10)
     assert not contact.free(buried), "the F/T sensor's body must not touch"
-
-
-def test_skirt_closes_the_surface_down_to_the_table() -> None:
-    vertices, triangles = with_skirt(SEEN.vertices, SEEN.triangles, 0.73)
-    edges = np.sort(np.concatenate([triangles[:, (0, 1)], triangles[:, (1, 2)], triangles[:, (2, 0)]]), axis=1)
-    _, counts = np.unique(edges, axis=0, return_counts=True)
-    low = np.isclose(vertices[:, 2], 0.73)
-    single = np.unique(edges, axis=0)[counts == 1]
-    assert low[single].all(), "open only along the foot of the skirt"
-
-
-def test_a_free_straight_motion_is_taken_as_it_is() -> None:
-    q = above(0.03, 0.02, 0.03)
-    path = plan(SCENE, np.array(lbr.HOME), q, BOUNDS, 1)
-    assert path.shape == (2, 7)
 
 
 def test_round_an_obstacle_the_path_is_free_all_along() -> None:

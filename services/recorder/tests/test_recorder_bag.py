@@ -2,7 +2,6 @@
 
 import shutil
 import subprocess
-import sys
 from collections import namedtuple
 from collections.abc import Iterator
 from pathlib import Path
@@ -248,18 +247,6 @@ def test_a_normal_recording_keeps_every_message_but_of_the_topics_that_weigh_mos
     recording.check(contract(), ["joint_states"], whole=False)
     with pytest.raises(RecordingError, match=r"joint_states.*--record full"):
         recording.check(contract(), ["joint_states"])
-
-
-def test_rerun_opens_the_recording(service: RecorderService, tmp_path: Path) -> None:
-    """Its own reader decodes joint states and meshes alike; nothing of ours takes part."""
-    record(service, 200)
-    service.finish()
-    out = tmp_path / "opened.rrd"
-    file = tmp_path / RECORDING / f"{RECORDING}_0.mcap"
-    command = [Path(sys.executable).with_name("rerun"), "mcap", "convert", file, "-o", out]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=120, check=False)
-    assert done.returncode == 0, done.stdout + done.stderr
-    assert out.stat().st_size > 10_000
 
 
 def test_finish_twice_and_a_shorter_run_in_the_same_folder(tmp_path: Path) -> None:

@@ -126,12 +126,6 @@ def test_status_carries_the_means_since_the_last_one(rig: Rig) -> None:
     np.testing.assert_allclose([wrench.force.x, wrench.force.z, wrench.torque.y], mean[14:], atol=1e-12)
 
 
-def test_obeys_torque_and_reports_it(rig: Rig) -> None:
-    rig.servo(600, lbr.HOME + 0.02)
-    assert rig.mode == (STATUS.MODE_ACTIVE, STATUS.CAUSE_NONE)
-    np.testing.assert_allclose(rig.outbox["joint_states"].position, lbr.HOME + 0.02, atol=2e-3)
-
-
 def test_silent_controller_brings_a_latched_hold_at_its_expiry(rig: Rig) -> None:
     rig.servo(100)
     sent = rig.t

@@ -15,7 +15,7 @@ from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
 from palpate_models.patient.wall import FADING_S
 from palpate_models.scenario.load import load_scenario
-from palpate_models.scenario.press import LIMIT_N, apparent_stiffness, depths, times
+from palpate_models.scenario.press import LIMIT_N, apparent_stiffness, depths
 from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
@@ -52,12 +52,6 @@ def solid(model: PhantomModel) -> ElasticTissue:
 
 def tense(model: PhantomModel, voluntary: bool = True) -> PhantomModel:
     return replace(model, tension=np.full(len(model.vertices), tension_of_ratio(2.6, Stiffness())), voluntary=voluntary)
-
-
-def test_the_course_of_a_press() -> None:
-    at = times(0.001)
-    assert len(at) == 1000
-    assert depths(at)[[0, 249, 499, 999]] == pytest.approx([0.00002, 0.005, 0.010, 0.010])
 
 
 @pytest.mark.parametrize("make", [winkler, elastic, voluntary, voluntary_elastic])
