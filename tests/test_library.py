@@ -11,7 +11,6 @@ import pytest
 from examination import TINY, palpate_run
 
 import palpate
-from palpate.interface.examination import ExaminationError
 from palpate.quick.patient import Touch
 from palpate.truth.pressed import true_tissue
 from palpate_models.scenario import press
@@ -108,15 +107,6 @@ def test_a_press_has_the_force_of_the_tissue_of_the_system(patient: palpate.Pati
         assert touch.force[touch.time > touch.time[-1] - press.READ_S].mean() == pytest.approx(force, rel=0.02)
 
 
-def test_a_slide_is_at_depth_along_its_path(patient: palpate.Patient) -> None:
-    touch = patient.slide([(-0.08, -0.055), (-0.05, -0.055), (-0.05, -0.045)], depth=0.006, speed=0.02)
-    along = touch.position[touch.steady]
-    assert np.allclose(touch.depth[touch.steady], 0.006)
-    assert np.allclose(along[-1, :2], (-0.05, -0.045))
-    assert np.linalg.norm(np.diff(along[:, :2], axis=0), axis=1).max() <= 0.02 * 0.010 + 1e-9
-    assert len(along) == 200
-
-
 @pytest.mark.parametrize(
     ("given", "named"),
     [
@@ -190,12 +180,6 @@ def test_an_examination_is_that_of_the_command_line(tmp_path: Path) -> None:
     )
     command = palpate_run("clean", tmp_path / "command", "--composed", "--record", "none", settings=TINY)
     assert made.report.run_hash == command.report["run_hash"] is not None
-
-
-def test_a_folder_that_cannot_take_the_results_is_named(tmp_path: Path) -> None:
-    (tmp_path / "user's").write_text("", encoding="utf-8")
-    with pytest.raises(ExaminationError, match="user's"):
-        palpate.run("clean", out=tmp_path, quiet=True)
 
 
 @pytest.mark.slow

@@ -10,11 +10,11 @@ import numpy as np
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import CaseOver, _conclude, _Watch, cases
+from palpate_benchmarks.campaign import CaseOver, _conclude, _Watch
 from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
-from palpate_benchmarks.whole_cases import FIXED, _judge, drawn, fixed, is_whole
+from palpate_benchmarks.whole_cases import _judge, drawn
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -156,19 +156,6 @@ def test_findings_are_read_back_from_their_file() -> None:
 def test_a_file_of_other_columns_is_refused() -> None:
     with pytest.raises(ValueError, match="must have the columns kind, where"):
         from_csv("mode,fault\nlockstep,kill\n")
-
-
-def test_the_conductor_and_the_recorder_are_struck_in_both_modes() -> None:
-    listed = list(fixed(["lockstep", "wallclock"], ["kill", "freeze", "drop"], []))
-    assert len(listed) == 2 * 2 * len(FIXED) == len({case.name for case in listed})
-    assert {CONDUCTOR, "recorder"} <= {case.where for case in listed}
-    assert all(is_whole(case) for case in listed)
-    assert not any(is_whole(case) for case in cases(["lockstep"], ["kill", "freeze", "drop"], []))
-    assert {case.where for case in fixed(["lockstep"], ["kill"], ["recorder"])} == {
-        "recorder",
-        "recorder+conductor",
-        "control+recorder",
-    }
 
 
 def test_drawn_cases_follow_their_seed() -> None:

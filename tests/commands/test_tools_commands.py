@@ -17,7 +17,7 @@ import typer
 import zenoh
 from typer.testing import CliRunner, Result
 
-from palpate.console import CommandGroup, TimeLeft
+from palpate.console import CommandGroup
 from palpate.live.doctor import doctor
 from palpate.live.graph import app as node
 from palpate.live.graph import missing
@@ -151,13 +151,6 @@ def test_hz_counts_simulated_time(robot: SmallRobot) -> None:
     assert all(row["contract_hz"] == 1000 for row in rows)
 
 
-def test_bw_counts_bytes(robot: SmallRobot) -> None:
-    result = run("topic", "bw", "ft/wrench", "--seconds", "1.5", "--json")
-    row = json.loads(result.stdout.splitlines()[0])
-    assert row["mean_bytes"] == 76
-    assert row["bytes_per_s"] > 0
-
-
 def test_nodes_and_missing_roles(robot: SmallRobot) -> None:
     found = output_of("node", "list")
     assert [row["node"] for row in found["nodes"]] == ["robot"]
@@ -227,10 +220,3 @@ def test_only_roles_that_the_run_has_are_missed() -> None:
     assert "search" not in unknown, "it is optional"
     run = Run("hardware", {"robot": "tcp/127.0.0.1:1", "search": "tcp/127.0.0.1:2"})
     assert set(missing(RULES, [], run)) == {"robot", "search", *observers}
-
-
-def test_the_bar_follows_the_position_and_is_silent_without_a_terminal(capsys: pytest.CaptureFixture[str]) -> None:
-    with TimeLeft(lambda: "playing", lambda: 15.0, 10.0, 30.0) as bar:
-        list(bar.get_renderables())
-        assert bar.tasks[0].percentage == pytest.approx(25.0)
-    assert capsys.readouterr().err == ""
