@@ -24,14 +24,12 @@ from palpate.run.roles import checked, settings_of
 from palpate.study.statistics.reading import read_tables
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.implementations import create
 from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import header
 from palpate_bus.runtime.lockstep import Stepper
 from palpate_bus.settings import Settings, variable
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario
-from palpate_tissue.backend import TissueBackend
 
 ROOT = Path(__file__).parents[1]
 PAGES = sorted(page for page in ROOT.rglob("*.md") if not {".venv", "out", "node_modules"} & set(page.relative_to(ROOT).parts))
@@ -167,28 +165,6 @@ def test_python_of_the_tutorials_runs(tmp_path: Path, monkeypatch: pytest.Monkey
                 runpy.run_path(str(tmp_path / "shown.py"))
                 count += 1
     assert count >= 3
-
-
-def test_the_example_tissue_resists_a_sphere() -> None:
-    scenario = load_scenario("clean", ["phantom.edge_m=0.015"])
-    service = create("tissue", str(EXAMPLES / "springs.py"), scenario)
-    springs = service.backend  # type: ignore[attr-defined]
-    model = build_phantom(scenario.phantom, scenario.seed)
-    top = int(np.argmin(np.hypot(*model.vertices[:, :2].T)))
-    n, radius = model.normals[top], 0.015
-    forces = []
-    for depth in (-0.001, 0.005, 0.010):
-        force, torque = springs.step(0.0, model.vertices[top] + (radius - depth) * n, np.zeros(3), radius)
-        forces.append(float(force @ n))
-        assert np.isfinite(torque).all()
-    assert forces[0] == 0.0
-    assert 0 < forces[1] < forces[2]
-    vertex, pressed = springs.deepest
-    assert pressed == pytest.approx(0.010, abs=1e-6)
-    assert vertex == top
-    places, normals = model.vertices[[top]], model.normals[[top]]
-    at_once, step_by_step = springs.press(places, normals, radius), TissueBackend.press(springs, places, normals, radius)
-    np.testing.assert_allclose(at_once[0], step_by_step[0], rtol=1e-9)
 
 
 def test_the_example_tissue_conforms() -> None:

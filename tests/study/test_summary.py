@@ -246,18 +246,6 @@ def _areas(n: int, power: float, seed: int = 0) -> Tables:
     return synthetic.tables(cases, findings, [])
 
 
-def test_confidences_that_are_right() -> None:
-    held, less = 0, 0
-    for seed in range(10):
-        calibrated = calibration(_areas(200, 1.0, seed).variants[0], Bootstrap.draw(["lumps"] * 200, 80, seed))
-        found = calibrated.figures
-        held += found.slope.low <= 1.0 <= found.slope.high
-        less += (found.expected_error.value or 0) < found.expected_error_by_chance
-        assert sum(part.n for _, part in calibrated.bins) == 400
-    assert held >= 8
-    assert less >= 8
-
-
 def test_confidences_that_are_too_sure() -> None:
     calibrated = calibration(_areas(600, 2.0).variants[0], Bootstrap.draw(["lumps"] * 600, 80))
     found = calibrated.figures

@@ -65,26 +65,14 @@ def test_apparent_stiffness_is_what_presses_feel(truth: Truth, examined: Examine
     assert np.median(found.apparent[over] / true[over]) == pytest.approx(1.0, abs=0.15)
 
 
-def test_messages_keep_the_contract(examined: Examined) -> None:
-    stiffness_map, findings, samples = examined
-    topics = contract().topics
-    for name, message in (
-        ("assessment/map", stiffness_map),
-        ("assessment/findings", findings),
-        ("assessment/samples", samples[0]),
-    ):
-        assert encode(message, topics[name].type)
-        assert message.header.frame_id == topics[name].frame
+def test_every_vertex_has_an_interval_about_its_stiffness_and_its_finding(examined: Examined) -> None:
+    stiffness_map, _, _ = examined
     n = len(stiffness_map.apparent)
     assert len(stiffness_map.vertices) == 3 * n
     assert stiffness_map.triangles.max() < n
     assert (stiffness_map.lower < stiffness_map.apparent).all()
     assert (stiffness_map.apparent < stiffness_map.upper).all()
     assert set(np.unique(stiffness_map.finding)) == {-1, 0}
-    for field in ("apparent", "lower", "upper"):
-        low, high = topics["assessment/map"].ranges[field]
-        assert low < getattr(stiffness_map, field).min()
-        assert getattr(stiffness_map, field).max() < high
 
 
 def test_the_same_states_give_the_same_bytes(small: Scan, examined: Examined) -> None:

@@ -40,12 +40,6 @@ def offset(arm: ArmModel, q: np.ndarray, twist: np.ndarray) -> Reference:
 
 
 @pytest.mark.parametrize("q", WORKING)
-def test_no_error_no_torque(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
-    for mode in ControlMode:
-        assert unlimited.command(q, REST, reference(setpoint(arm, q, mode=mode))) == pytest.approx(np.zeros(7), abs=1e-9)
-
-
-@pytest.mark.parametrize("q", WORKING)
 def test_springs_are_the_gradient_of_their_energy(arm: ArmModel, unlimited: ImpedanceController, q: np.ndarray) -> None:
     ref = offset(arm, q, np.array([0.01, -0.02, 0.015, 0.2, -0.1, 0.15]))
 

@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites import check
 from palpate_bus.contract import MS
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
@@ -82,13 +81,6 @@ def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float
     assert np.ptp(dart_read, axis=0)[:3].max() > 20
     assert difference[:3].max() < 0.2, "N, of the F/T sensor, while the tool is accelerated"
     assert difference[3:].max() < 0.02, "N m"
-
-
-@pytest.mark.slow
-def test_it_conforms_to_the_role_robot() -> None:
-    scenario = load_scenario("clean")
-    report = check(ServiceRig(create(scenario), RigSettings(scenario, 0.0, True)))
-    assert report.passed, [result for result in report.results if result.verdict == "failed"]
 
 
 def test_it_starts_at_home_and_says_what_it_is() -> None:

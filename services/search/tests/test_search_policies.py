@@ -178,16 +178,6 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     np.testing.assert_allclose(posterior.probability, joint[:, 1:].sum(axis=0), atol=1e-6)
 
 
-def test_a_lump_is_located_and_its_absence_becomes_sure() -> None:
-    places = CENTRED.places[::2]
-    there, place = given(presses_of(places, SOUGHT)), np.array((SOUGHT.x, SOUGHT.y))
-    at, probability = there.at
-    assert probability > 0.95
-    assert np.linalg.norm(at - place) < 0.006
-    healthy = given(presses_of(places, None))
-    assert healthy.lump < 0.1 < Posterior(CENTRED).lump
-
-
 def test_others_are_sought_besides_an_accepted_lump() -> None:
     other = Bump(-0.03, 0.02, 0.014, EDGE_M)
     places = CENTRED.places
