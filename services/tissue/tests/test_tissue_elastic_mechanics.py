@@ -1,6 +1,7 @@
 """The elastic tissue's laws: the layer, the finite elements, lesions, relaxation, energy, contact."""
 
 import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -40,6 +41,12 @@ def hold(tissue: ElasticTissue, depth: float, radius: float, xy: tuple[float, fl
     for k in range(round(seconds / tissue.dt)):
         force, _ = tissue.step(k * tissue.dt, p, STILL, radius)
     return float(force[2])
+
+
+def test_a_thin_and_wide_body_is_refused_at_once() -> None:
+    uneven = replace(flat(), background=flat().background * np.linspace(1, 2, len(flat().vertices)))
+    with pytest.raises(UserError, match=r"\d+ nodes, at most 2000 possible"):
+        compliance(uneven, (LUMP,), 0.005, pitch_m=0.001)
 
 
 def test_finite_elements_of_a_uniform_layer_meet_the_layers_own_solution() -> None:

@@ -188,6 +188,10 @@ GRID_HALF_M = 0.13
 POISSON = 0.49
 MOST_VERTICES = 20_000
 """The matrix of this many vertices takes 1.6 GB."""
+MOST_NODES = 2000
+"""Skin nodes of the body's finite elements: a minute on one core; the time grows with the third power."""
+MOST_LESION_NODES = 1100
+"""Skin nodes about a lesion, whose pitch is coarser for a larger one."""
 
 _CODE = tuple(Path(file) for file in (__file__, solid.__file__, field.__file__, contact.__file__))
 """Source files that the cached matrices depend on."""
@@ -305,7 +309,13 @@ class _Body:
 
     def _grid(self) -> NodeGrid:
         half = self._front()
-        return graded_grid(-half, half, self.thickness, self.pitch)
+        grid = graded_grid(-half, half, self.thickness, self.pitch)
+        if (count := math.prod(map(len, grid.skin))) > MOST_NODES:
+            raise UserError(
+                f"services.tissue = elastic: a body {self.thickness:.3g} m thick and {2 * half[0]:.2g} x {2 * half[1]:.2g} m "
+                f"wide needs {count} nodes, at most {MOST_NODES} possible: a thicker or smaller one, or services.tissue = winkler"
+            )
+        return grid
 
     def _grid_about(self, lesion: Lesion) -> NodeGrid:
         """Return a grid about a lesion: finer for shallow lesions, whose effect also decays faster."""
@@ -314,8 +324,9 @@ class _Body:
         centre = np.clip(np.asarray(lesion.centre_m), -half, half)
         reach = np.asarray(lesion.radii_m) + 0.045 + 0.5 * depth
         finest = max(0.4 * self.pitch, 0.3 * min(lesion.radii_m))
-        pitch = min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth)
-        return graded_grid(np.maximum(centre - reach, -half), np.minimum(centre + reach, half), self.thickness, pitch)
+        low, high = np.maximum(centre - reach, -half), np.minimum(centre + reach, half)
+        pitch = max(min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth), math.sqrt(math.prod(high - low) / MOST_LESION_NODES))
+        return graded_grid(low, high, self.thickness, pitch)
 
 
 def _smoothing(nx: int, ny: int) -> sparse.csr_array:
