@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from palpate.console import number, output_folder, print_json, table
+from palpate.console import number, output_folder, print_json, say, table
 
 
 def compare(
@@ -48,7 +48,10 @@ def compare(
         figures = asdict(outcome)
     else:
         first = comparing.read_palpated(a, mapping)
-        compared = comparing.compare(first, comparing.read_palpated(b, mapping, first.depth_m), register)
+        second = comparing.read_palpated(b, mapping, first.depth_m)
+        for text in (*first.faults, *second.faults):
+            say(text)
+        compared = comparing.compare(first, second, register)
         comparing.draw(out / "compare.png", compared)
         figures = asdict(compared.figures)
     write_text(out / "compare.json", dumps(figures, indent=2) + "\n")

@@ -56,6 +56,8 @@ class ComparedPalpation:
     """[m], shape (k, 3)."""
     force: Array
     """Measured there [N], shape (k,): at the depth of the map, or of the comparison if the recording has its curve."""
+    faults: tuple[str, ...] = ()
+    """What is wrong with the recording."""
 
     def moved(self, X: Array) -> ComparedPalpation:
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
@@ -68,13 +70,14 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
     Raises UserError if there is no map.
     """
     at_depth = None
+    faults: tuple[str, ...] = ()
     table: Any
     if (path / FILE).is_file():
         message = read_evidence(path).stiffness_map
         table = np.genfromtxt(path / "samples.csv", delimiter=",", names=True, encoding="utf-8", ndmin=1)
     else:
         recording = read_recording(path, mapping)
-        found = collected(recording)
+        found, faults = collected(recording), tuple(fault.text for fault in recording.faults)
         message, table = found.stiffness_map, sample_columns(found.samples)
         at_depth = None if depth_m is None else recording.samples(depth_m)
     if at_depth is None:
@@ -82,9 +85,9 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
     else:
         places, force = np.array([sample.position for sample in at_depth]), np.array([sample.force for sample in at_depth])
     if message is None:
-        raise UserError(f"{path}: there is no map to compare: its samples are too few")
+        raise UserError(f"{path}: there is no map to compare: {faults[-1] if faults else 'its samples are too few'}")
     return ComparedPalpation(
-        path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force
+        path.stem if path.is_file() else path.name, map_of(message), float(message.common_depth), places, force, faults
     )
 
 

@@ -31,7 +31,7 @@ def fit(
     from dataclasses import asdict
     from json import dumps
 
-    from palpate.console import print_json
+    from palpate.console import print_json, say
     from palpate.recording.assessed import collected
     from palpate.recording.read import read_recording
     from palpate.report.evidence import map_of
@@ -39,6 +39,8 @@ def fit(
     from palpate.twin.scenario import write_twin
 
     read = read_recording(recording, mapping)
+    for fault in read.faults:
+        say(fault.text)
     message = collected(read).stiffness_map
     found = None if message is None else map_of(message)
     quality = write_twin(read, out, found, elastic, thickness_m)

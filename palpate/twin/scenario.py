@@ -14,6 +14,7 @@ from palpate.report.files import write_text
 from palpate.report.scoring import Map
 from palpate.twin.fit import FittedWall, fit_wall, skin_at
 from palpate.twin.presses import simulated
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.field import lesion_field
 from palpate_models.patient.phantom import build_phantom
@@ -65,7 +66,12 @@ class Quality:
 
 
 def centred(recording: PalpationRecording) -> tuple[PalpationRecording, Array]:
-    """Return the recording with the origin on the skin in the middle of the contacts, and that origin [m], shape (3,)."""
+    """Return the recording with the origin on the skin in the middle of the contacts, and that origin [m], shape (3,).
+
+    Raises UserError without contacts.
+    """
+    if not recording.touches:
+        raise UserError(f"{recording.name}: no contact of which a twin can be made")
     places = np.array([touch.position.mean(axis=0) for touch in recording.touches])
     middle = (places.min(axis=0) + places.max(axis=0)) / 2
     origin = np.append(middle[:2], places[np.argmin(np.linalg.norm((places - middle)[:, :2], axis=1)), 2]).round(3)

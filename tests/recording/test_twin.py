@@ -1,5 +1,6 @@
 """A twin fitted to presses of a simulated body."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -67,3 +68,5 @@ def test_too_few_presses_are_refused(recording: PalpationRecording, tmp_path: Pa
     few = PalpationRecording("body", RADIUS_M, recording.touches[:5], recording.surface, recording.normals)
     with pytest.raises(UserError, match="5 presses"):
         write_twin(few, tmp_path)
+    with pytest.raises(UserError, match="no contact"):
+        write_twin(replace(few, touches=()), tmp_path)
