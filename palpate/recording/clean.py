@@ -15,6 +15,8 @@ _RUN: Final = 10
 """A value that repeats this much longer than usual is frozen."""
 _FEWEST: Final = 5
 """Least number of readings of a clipped or frozen stretch."""
+_COARSE: Final = 0.2
+"""Share of rows with the time of another one from which the clock is too coarse for the rows."""
 _LIMIT: Final = 0.2
 """Least end of a sensor's range, as a share of the greatest force."""
 _LIMIT_COUNT: Final = 3.0
@@ -24,6 +26,8 @@ _LIMIT_COUNT: Final = 3.0
 def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
     """Return the readings without invalid, repeated, frozen and displaced ones, clipped ones marked, and the faults."""
     faults: list[Fault] = []
+    if readings.probe is not None and 2 * len(np.unique(readings.probe)) < np.count_nonzero(np.diff(readings.probe)):
+        readings = readings.part(np.argsort(readings.probe, kind="stable"))  # rows of one probe are apart
 
     def drop(code: FaultCode, wrong: Mask, value: float = 0.0) -> None:
         nonlocal readings
@@ -47,15 +51,36 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
             faults.append(Fault(FaultCode.BACKWARD, int(late.sum()), len(late), Remedy.CORRECTED))
             readings = readings.part(np.argsort(readings.time, kind="stable"))
         assert readings.time is not None
+        if (coarse := _unlike_at_once(readings)) > _COARSE * len(late):
+            faults.append(Fault(FaultCode.COARSE, coarse, len(late), Remedy.CORRECTED))
+            readings = replace(readings, time=_spread(readings.time))
+        assert readings.time is not None
         drop(FaultCode.REPEATED, np.append(False, np.diff(readings.time) == 0))
         drop(FaultCode.FROZEN, _frozen(readings.force, readings.position))
         away = np.linalg.norm(readings.position - median_filter(readings.position, (5, 1), mode="nearest"), axis=1)
-        usual = np.linalg.norm(np.diff(readings.position, axis=0), axis=1)
-        drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * float(np.median(usual))), float(away.max(initial=0.0)))
+        p = readings.position
+        usual, second = (float(np.median(np.linalg.norm(p[k:] - p[:-k], axis=1))) if len(p) > k else 0.0 for k in (1, 2))
+        if usual > max(radius, 3 * second):  # every other row is of another tool
+            faults.append(Fault(FaultCode.TWO_TOOLS, len(p), len(p), Remedy.REFUSED, usual))
+        drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * usual), float(away.max(initial=0.0)))
     clipped, limit = _clipped(readings.force, readings.position)
     if clipped.any():
         faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
     return replace(readings, clipped=clipped), faults
+
+
+def _unlike_at_once(readings: Readings) -> int:
+    """Return the number of rows that have the time of the row before, but not its values."""
+    assert readings.time is not None
+    rows = np.column_stack((readings.position, readings.force))
+    return int(np.count_nonzero((np.diff(readings.time) == 0) & (np.diff(rows, axis=0) != 0).any(axis=1)))
+
+
+def _spread(time: Array) -> Array:
+    """Return times [s] with rows of equal time spread evenly up to the next one, shape (n,)."""
+    known, first = np.unique(time, return_index=True)
+    end = known[-1] + (float(np.median(np.diff(known))) if len(known) > 1 else 1.0)
+    return np.interp(np.arange(len(time)), [*first, len(time)], [*known, end])
 
 
 def _runs(same: Mask) -> list[slice]:

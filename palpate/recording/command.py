@@ -5,7 +5,7 @@ from typing import Annotated
 
 import typer
 
-from palpate.console import SteadyConsole, print_line, say
+from palpate.console import EXIT_BAD_INPUT, SteadyConsole, print_line, say
 
 
 def assess(
@@ -43,7 +43,9 @@ def assess(
         report, page = write_assessed(folder, read)
     if as_json:
         print_line({"folder": str(out), **report.model_dump(mode="json")})
-        return
-    console = SteadyConsole(highlight=False, soft_wrap=True)
-    print_findings(console, report)
-    console.print(f"to read: {page}")
+    else:
+        console = SteadyConsole(highlight=False, soft_wrap=True)
+        print_findings(console, report)
+        console.print(f"to read: {page}")
+    if not report.assessed:
+        raise typer.Exit(EXIT_BAD_INPUT)

@@ -19,8 +19,14 @@ class FaultCode(StrEnum):
     REPEATED = "repeated"
     CLOCK = "clock"
     BACKWARD = "backward"
+    ORDER = "order"
+    LINE = "line"
+    NORMALS = "normals"
+    COARSE = "coarse"
     NO_CONTACT = "no_contact"
+    NOTHING = "nothing"
     JUMP = "jump"
+    TWO_TOOLS = "two_tools"
     DISAGREE = "disagree"
     SHALLOW = "shallow"
     INVALID = "invalid"
@@ -31,7 +37,7 @@ class FaultCode(StrEnum):
 _TEXTS = {
     FaultCode.SIGN: "the force pulls where the tool presses: its sign is wrong, see force.on of the mapping",
     FaultCode.UNIT: "a contact travels {value:.3g} m, which does not suit the tool's radius: see units.length of the mapping",
-    FaultCode.FORCE_UNIT: "the force of presses is {value:.3g} N, which no palpation has: see units.force of the mapping",
+    FaultCode.FORCE_UNIT: "a press needs {value:.3g} N, which does not suit a soft body: see units.force of the mapping",
     FaultCode.TIME_UNIT: "there is a row every {value:.3g} s: see units.time of the mapping",
     FaultCode.FRAME: "the force is {value:.0f} deg off the direction of pressing: wrong frame, see force.axes of the mapping",
     FaultCode.NO_FREE_AIR: "no part of the recording is free of contact, so that the force cannot be tared",
@@ -41,8 +47,14 @@ _TEXTS = {
     FaultCode.REPEATED: "{count} of {of} rows are there twice",
     FaultCode.CLOCK: "force and position are {value:.3g} s apart",
     FaultCode.BACKWARD: "time goes back at {count} of {of} rows",
+    FaultCode.NORMALS: "the normals point into the body",
+    FaultCode.LINE: "{count} of {of} contacts lie on one line, so that nothing is known aside of it: see table.position",
+    FaultCode.ORDER: "the rows of {count} of {of} probes are out of order",
+    FaultCode.COARSE: "{count} of {of} rows have the time of the row before them: they are spread evenly",
+    FaultCode.NOTHING: "no contact is recognised: the force nowhere rises over its noise",
     FaultCode.NO_CONTACT: "{count} of {of} contacts never touch",
     FaultCode.JUMP: "{count} of {of} positions jump by up to {value:.3g} m",
+    FaultCode.TWO_TOOLS: "every other position is {value:.3g} m away: the table has the rows of two tools",
     FaultCode.DISAGREE: "{count} of {of} contacts disagree with others at the same place",
     FaultCode.SHALLOW: "{count} of {of} contacts are too shallow to be assessed",
     FaultCode.INVALID: "{count} of {of} rows have no number, or a normal of length 0",

@@ -10,9 +10,11 @@ import pandas as pd
 import yaml
 from matplotlib.figure import Figure
 
+from palpate.recording.clean import cleaned
 from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
 from palpate.recording.probes import probes
+from palpate.recording.read import LEAST_ROWS, recording_of
 from palpate.recording.readings import (
     KINDS,
     TABLES,
@@ -20,22 +22,27 @@ from palpate.recording.readings import (
     Readings,
     from_bag,
     from_table,
+    is_date,
     moved,
     numbers_of,
     opened,
     read_table,
 )
+from palpate.recording.recording import implied_young
 from palpate.report.files import write_text
+from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY
 
 _UNKNOWN_RADIUS_M: Final = 0.01
-_FORCE: Final = re.compile(r"f|force|wrench", re.I)
+_FORCE: Final = re.compile(r"f|forces?|wrench|kraft", re.I)
+_SINGLE: Final = re.compile(r"(normal[_ ]?)?(f|force|kraft)([_ ]?z|[_ ]?n|[_ ]?normal)?", re.I)
 _POSITION: Final = re.compile(r"|p|pos(ition)?|tip|tcp|ee|tool|ball|c(entre|enter)?", re.I)
 _NORMAL: Final = re.compile(r"n(ormal)?", re.I)
 _TOUCH: Final = re.compile(r"(p|pos|tip|ee)?_?(0|touch|contact|start)", re.I)
-_TIME: Final = re.compile(r"(t|time|stamp|timestamp|sec|secs|seconds)(_?(s|ms|us|ns|sec))?", re.I)
-_PROBE: Final = re.compile(r"(probe|press|point|touch|contact|trial|id|number)(_?(id|nr|no|number|index))?", re.I)
-_UNIT: Final = re.compile(r"[_\[( ]*(mm|cm|mN|kgf|gf|m|N|s|ms|us|ns)[\])]*$")
+_TIME: Final = re.compile(r"(t|time|zeit|stamp|time_?stamp|sec|secs|seconds)", re.I)
+_PROBE: Final = re.compile(r"(probe|press|point|(mess)?punkt|touch|contact|trial|id|nr|number)([_ ]?(id|nr|no|number))?", re.I)
+_UNIT: Final = re.compile(r"([_ ]*[\[(]|[_ ]+|(?<=[xyzXYZ]))(mm|cm|mN|kgf|gf|lbf|m|N|s|ms|us|ns)[\])]*$")
+"""The unit at the end of a column's name, in brackets or after a space, an underscore or the axis."""
 
 
 def propose(path: Path, out: Path) -> list[str]:
@@ -48,15 +55,37 @@ def propose(path: Path, out: Path) -> list[str]:
     else:
         mapping = _of_bag(path, lines)
         raw = from_bag(path, mapping)
-    good = np.all([np.isfinite(v).all(axis=1) for v in (raw.position, raw.force)], axis=0)
-    mapping, axis = _with_force(mapping, raw.part(good), lines)
+    clean = cleaned(raw, _UNKNOWN_RADIUS_M)[0]
+    mapping, axis = _with_force(mapping, clean, lines)
     lines.append(f"not sure: tool.radius_m: {_UNKNOWN_RADIUS_M} is a guess; measure the ball")
     lines.append("not sure: tool.point: centre; write tip if the positions are of the lowest point of the ball")
+    lines += _as_proposed(raw, mapping, path.name)
     text = yaml.safe_dump(mapping.model_dump(mode="json", exclude_defaults=True), sort_keys=False, default_flow_style=None)
     write_text(out, f"# Proposed for {path.name}.\n" + "".join(f"# {line}\n" for line in lines) + text)
     picture = out.with_suffix(".png")
-    _draw(picture, moved(raw.part(good), mapping), axis)
+    _draw(picture, moved(clean, mapping), axis)
     return [*lines, f"to check: {out}, and the picture {picture}"]
+
+
+def _as_proposed(raw: Readings, mapping: Mapping, name: str) -> list[str]:
+    """Return faults, contacts, depth and force of the recording under the proposal, and the modulus that they imply."""
+    try:
+        found = recording_of(raw, mapping, name)
+    except UserError as error:
+        return [f"as proposed: {error}"]
+    lines = [f"as proposed: {fault.text}" for fault in found.faults]
+    if found.touches:
+        young, force = implied_young(found.touches, mapping.tool.radius_m)
+        lines.append(
+            f"as proposed: {len(found.touches)} contacts to {1e3 * found.depth_m:.2g} mm and {force:.2g} N, as on a body of "
+            f"{1e-3 * young:.2g} kPa; organs and phantoms have about 1 to 300 kPa: see units.force"
+        )
+    return lines
+
+
+def _bare(name: str) -> str:
+    """Return the name of a column without its unit, and without the message that it is of."""
+    return re.split(r"[./](?=..)", _UNIT.sub("", name).strip("% "))[-1].strip(". ")
 
 
 def _triples(names: list[str]) -> dict[str, tuple[str, str, str]]:
@@ -67,7 +96,7 @@ def _triples(names: list[str]) -> dict[str, tuple[str, str, str]]:
             letters = "xyz" if at[0] == "x" else "XYZ"
             triple = tuple(name[: at.start()] + letter + name[at.end() :] for letter in letters)
             if all(one in names for one in triple):
-                stem = _UNIT.sub("", name[: at.start()] + name[at.end() :]).strip("_. ")
+                stem = _bare(_UNIT.sub("", name)[: at.start()] + _UNIT.sub("", name)[at.end() :]).strip("_- ")
                 found[stem] = (triple[0], triple[1], triple[2])
     return found
 
@@ -80,10 +109,10 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
         return next((columns for stem, columns in triples.items() if pattern.fullmatch(stem)), None)
 
     def column(pattern: re.Pattern[str]) -> str | None:
-        return next((one for one in names if pattern.fullmatch(one)), None)
+        return next((one for one in names if pattern.fullmatch(_bare(one))), None)
 
     position, force = triple(_POSITION), triple(_FORCE)
-    single = next((one for one in names if re.fullmatch(r"(normal_?)?f(orce)?z?(_?N)?", one, re.I)), None)
+    single = column(_SINGLE)
     if position is None or (force is None and single is None):
         raise ReadingError(
             f"{name}: columns of position or force are not recognised among {', '.join(names[:20])}; write the mapping by hand"
@@ -108,16 +137,21 @@ def _of_table(table: pd.DataFrame, name: str, lines: list[str]) -> Mapping:
     lines.append(f"sure: position {', '.join(position)}; force {', '.join(columns.force)}; {time or probe} orders the rows")
     if quaternion:
         lines.append(f"not sure: quaternion {', '.join(quaternion)} in the order {order}")
-    span = float(np.nanmax(np.ptp(table[list(position)].apply(pd.to_numeric, errors="coerce").dropna().to_numpy(), axis=0)))
-    named = [suffix[1] if (suffix := _UNIT.search(one)) else None for one in (position[0], columns.force[0])]
+    places = table[list(position)].apply(pd.to_numeric, errors="coerce").dropna().to_numpy()
+    if not len(places):
+        raise ReadingError(f"{name}: columns {', '.join(position)} have no numbers")
+    span = float(np.ptp(places, axis=0).max())
+    named = [suffix[2] if (suffix := _UNIT.search(one)) else "" for one in (position[0], columns.force[0], time or "")]
     length = named[0] if named[0] in ("m", "cm", "mm") else "mm" if span > 3 else "m"
     lines.append(f"{'sure' if span > 10 or span < 1 else 'not sure'}: lengths in {length}: the positions span {span:.3g}")
     unit = "s"
     if time:
         step = float(np.nanmedian(np.diff(numbers_of(table[time]))))
-        unit = "ns" if step > 1e5 else "us" if step > 500 else "ms" if step > 0.5 else "s"
-        lines.append(f"sure: time in {unit}: a row every {step:.3g}")
-    force_unit = named[1] if named[1] in ("N", "mN", "gf", "kgf") else "N"
+        unit = "ns" if step > 1e5 else "us" if step > 500 else "ms" if step > 0.9 else "s"
+        unit = named[2] if named[2] in ("s", "ms", "us", "ns") and not is_date(table[time]) else unit
+        lines.append(f"{'not sure' if 0.2 < step < 5 and not named[2] else 'sure'}: time in {unit}: a row every {step:.3g}")
+    force_unit = named[1] if named[1] in ("N", "mN", "gf", "kgf", "lbf") else "N"
+    lines.append(f"sure: force in {force_unit}" if named[1] == force_unit else "not sure: units.force: N; the table has no unit")
     units = Units.model_validate({"length": length, "force": force_unit, "time": unit})
     return Mapping(table=columns, units=units, tool=MappedTool(radius_m=_UNKNOWN_RADIUS_M))
 
@@ -167,6 +201,8 @@ def _frames(bag: Any) -> tuple[list[str], list[str]]:
 
 def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapping, Axis]:
     """Return the mapping with axes, sign, weight and delay of the force as the data say, and the pressing axis."""
+    if len(raw.position) < LEAST_ROWS:
+        raise ReadingError(f"{len(raw.position)} usable rows; want at least {LEAST_ROWS}")
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
         candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})

@@ -18,7 +18,7 @@ Turn = Annotated[float, Field(ge=-2 * pi, le=2 * pi)]
 """[rad]; larger numbers are degrees."""
 SCALES: Final = {
     **{"m": 1.0, "cm": 1e-2, "mm": 1e-3},
-    **{"N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "kgf": 9.80665},
+    **{"N": 1.0, "mN": 1e-3, "gf": 9.80665e-3, "kgf": 9.80665, "lbf": 4.4482216},
     **{"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9},
 }
 """Metres, newtons and seconds in a unit."""
@@ -88,7 +88,7 @@ class Units(Section):
     """Units of the table. Messages are in SI units."""
 
     length: Literal["m", "cm", "mm"] = "m"
-    force: Literal["N", "mN", "gf", "kgf"] = "N"
+    force: Literal["N", "mN", "gf", "kgf", "lbf"] = "N"
     time: Literal["s", "ms", "us", "ns"] = "s"
 
 

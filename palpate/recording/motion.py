@@ -16,6 +16,8 @@ from scipy.signal import correlate, correlation_lags
 from palpate.recording.readings import Readings
 from palpate_models.numerics.frames import Array
 
+_LEAST_M2: Final = 1e-15
+"""Least variance of the positions within a part [m^2]."""
 Mask = NDArray[np.bool_]
 
 
@@ -88,13 +90,15 @@ def pressing_axis(position: Array, force: Array, parts: Sequence[slice], outward
     """
     covariance, motion = np.zeros((force.shape[1], 3)), np.zeros((3, 3))
     variance = np.array([position[one].var(axis=0).sum() for one in parts])
-    usual = float(np.median(variance[variance > 0])) if (variance > 0).any() else 0.0
+    if not variance.max(initial=0.0) > _LEAST_M2:
+        return None
+    usual = float(np.median(variance[variance > 0]))
     for one, size in zip(parts, variance, strict=True):
         p, F = position[one] - position[one].mean(axis=0), force[one] - force[one].mean(axis=0)
-        weight = 1 / (size + usual) if usual else 0.0  # a fast motion in free air counts no more than another
+        weight = 1 / (size + usual)  # a fast motion in free air counts no more than another
         covariance += weight * F.T @ p
         motion += weight * p.T @ p
-    if not np.trace(motion) > 0 or not np.abs(covariance).max() > 0:
+    if not np.abs(covariance).max() > 0:
         return None
     u, _, v = np.linalg.svd(covariance @ np.linalg.inv(motion + 0.02 * np.trace(motion) * np.eye(3)))
     along, by = v[0], u[:, 0]

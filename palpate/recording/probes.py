@@ -8,7 +8,7 @@ from palpate.recording import cutting
 from palpate.recording.faults import Fault, FaultCode, Remedy
 from palpate.recording.motion import Axis, noise
 from palpate.recording.readings import Readings
-from palpate.recording.recording import Contact, ContactKind, Palpated
+from palpate.recording.recording import Contact, ContactKind, Palpated, width
 from palpate.recording.skin import fitted, grid_over
 from palpate.recording.timed import implausible_unit, normal_force
 from palpate_models.numerics.frames import Array
@@ -17,7 +17,13 @@ _AWAY: Final = 3.0
 """A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
 _TOUCHED: Final = 3.0
 """Least force of a contact, in SD of the force."""
-_UNTARED: Final = 0.3
+_DISORDER: Final = 2.5
+"""Way of a probe's rows, over its depth, that is not one press and its retreat."""
+_MANY: Final = 50
+"""Contacts whose places and normals are the skin."""
+_DOUBT: Final = 0.2
+"""Largest uncertainty of a position at first contact that is given, over the travel of a probe."""
+_UNTARED: Final = 0.5
 """Force at first contact, over that of the probe, that light contact does not have."""
 
 
@@ -30,9 +36,16 @@ def probes(readings: Readings) -> list[slice]:
 
 def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list[slice], faults: list[Fault]) -> Palpated:
     """Return the contacts of readings in A, and the skin; adds faults."""
-    p, normals = readings.position, readings.normal
+    p, normals = readings.position.copy(), readings.normal
     n = np.tile(axis.outward, (len(p), 1)) if normals is None else normals
     force = normal_force(readings.force, n)
+    heights = [p[one] @ n[one][0] for one in rows]
+    disordered = [np.abs(np.diff(z)).sum() > _DISORDER * np.ptp(z) for z in heights]
+    if np.mean(disordered) > 0.5:
+        faults.append(Fault(FaultCode.ORDER, int(np.sum(disordered)), len(rows), Remedy.CORRECTED))
+        for one, z in zip(rows, heights, strict=True):
+            order = np.argsort(-z)
+            p[one], force[one] = p[one][order], force[one][order]
     start = p if readings.touch is None else readings.touch
     travel = np.array([float(np.ptp(p[one] @ n[one][0])) for one in rows])
     aside = np.array([float(np.linalg.norm(p[one] - start[one][0], axis=1).max()) for one in rows])
@@ -65,15 +78,17 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     for one, s, at, begin in zip(kept, inward, begin_at, onsets, strict=True):
         if begin is None and not given:
             continue
-        sd = scatter if given or begin is None else begin.sd
+        sd = min(scatter, _DOUBT * usual) if given or begin is None else begin.sd
         contacts.append(
             _contact(p[one], n[one], force[one], s - (at if given or begin is None else begin.at), (radius, sd, sigma))
         )
     points = np.array([contact.position[0] for contact in contacts]).reshape(-1, 3)
-    if normals is not None:
-        at = np.array([contact.normal[0] for contact in contacts]).reshape(-1, 3)
-        return Palpated(contacts, points, at, power, len(kept) - len(contacts))
     reach = float(np.sqrt(radius * usual))
+    if not contacts:
+        return Palpated.nothing()
+    if normals is not None and len(points) >= _MANY and width(points) > reach:
+        at = np.array([contact.normal[0] for contact in contacts])
+        return Palpated(contacts, points, at, power, len(kept) - len(contacts))
     skin = fitted(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
     return Palpated(contacts, *skin.points(), power, len(kept) - len(contacts))
 

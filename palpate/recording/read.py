@@ -13,16 +13,21 @@ from palpate.recording.motion import Axis, blocks, pressing_axis
 from palpate.recording.own import is_own, own_recording
 from palpate.recording.probes import contacts_of_probes, probes
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
-from palpate.recording.recording import PalpationRecording
+from palpate.recording.recording import Contact, PalpationRecording, implied_young
 from palpate.recording.timed import contacts_over_time
 from palpate.recording.usable import usable
 from palpate_models.numerics.frames import Array, inverse, matrix
 
+LEAST_ROWS: Final = 10
 _UPRIGHT: Final = 0.7
 """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
+_RISEN: Final = 0.5
+"""Mean way of probes along their normals, over its size, from which the normals point inward."""
 _WRONG_FRAME_DEG: Final = 40.0
 _FORCE_N: Final = (0.01, 200.0)
 """Plausible change of the force in a recording."""
+_YOUNG_PA: Final = (50.0, 3e6)
+"""Plausible modulus of the body."""
 _STEP_S: Final = (2e-5, 2.0)
 """Plausible time between rows."""
 
@@ -60,11 +65,15 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     """Return the recording of readings as a file has them. Raises UserError."""
     readings, faults = cleaned(raw, mapping.tool.radius_m)
     readings = moved(readings, mapping)
-    if len(readings.position) < 10:
-        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least 10")
-    if wrong := _implausible(readings):
-        return _refused(name, mapping, faults + wrong)
+    if len(readings.position) < LEAST_ROWS:
+        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LEAST_ROWS}")
+    faults += _implausible(readings)
+    if any(fault.remedy is Remedy.REFUSED for fault in faults):
+        return _refused(name, mapping, faults)
     parts = probes(readings) if readings.time is None else blocks(readings.time)
+    if readings.normal is not None and _inward(readings, parts):
+        faults.append(Fault(FaultCode.NORMALS, 1, 1, Remedy.CORRECTED))
+        readings = replace(readings, normal=-readings.normal)
     known = None if readings.normal is None else readings.normal.mean(axis=0)
     axis = pressing_axis(readings.position, readings.force, parts, known)
     if axis is None:
@@ -89,6 +98,8 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         if in_A.time is None
         else contacts_over_time(in_A, axis, mapping, X_WA, faults)
     )
+    if palpated.contacts and not any(fault.remedy is Remedy.REFUSED for fault in faults):
+        faults += _implausible_force(palpated.contacts, mapping.tool.radius_m)
     touches = (
         []
         if any(fault.remedy is Remedy.REFUSED for fault in faults)
@@ -111,6 +122,15 @@ def _refused(name: str, mapping: Mapping, faults: list[Fault]) -> PalpationRecor
     return PalpationRecording(name, mapping.tool.radius_m, (), np.empty((0, 3)), np.empty((0, 3)), faults=tuple(faults))
 
 
+def _inward(readings: Readings, parts: list[slice]) -> bool:
+    """Return True if most probes go along their normals, not against them."""
+    p, n = readings.position, readings.normal
+    assert n is not None
+    start = p if readings.touch is None else readings.touch
+    risen = [float(((p[one] - start[one][0]) @ n[one][0]).mean()) for one in parts]
+    return readings.time is None and float(np.median(risen)) > _RISEN * float(np.median(np.abs(risen)))
+
+
 def _implausible(readings: Readings) -> list[Fault]:
     """Return faults of the units of force and time."""
     faults: list[Fault] = []
@@ -123,6 +143,12 @@ def _implausible(readings: Readings) -> list[Fault]:
         if not _STEP_S[0] < step < _STEP_S[1]:
             faults.append(Fault(FaultCode.TIME_UNIT, 1, 1, Remedy.REFUSED, step))
     return faults
+
+
+def _implausible_force(contacts: list[Contact], radius: float) -> list[Fault]:
+    """Return the fault of forces in another unit."""
+    (low, high), (young, force) = _YOUNG_PA, implied_young(contacts, radius)
+    return [] if low < young < high else [Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force)]
 
 
 def _body_frame(mapping: Mapping, axis: Axis, position: Array) -> Array:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -33,7 +34,7 @@ KINDS: Final = {
     "joints": "sensor_msgs/msg/JointState",
 }
 _SNIFFED: Final = 100_000
-"""Bytes of a table with semicolons in which decimal commas are sought."""
+"""Bytes of a table in which separator and decimal commas are sought."""
 _SHORTEST_S: Final = 0.005
 """Forces of a bag are averaged over this time."""
 
@@ -80,14 +81,26 @@ def read_table(path: Path) -> pd.DataFrame:
         if path.suffix == ".parquet":
             _check_parquet(file, path)
             return pd.read_parquet(file)
-        first = next((line for line in file if not line.startswith(b"#")), b"")
+        start = file.read(_SNIFFED)
         file.seek(0)
-        separator = max(",;\t", key=lambda one: first.count(one.encode()))
-        decimal = "," if separator == ";" and b"," in file.read(_SNIFFED) else "."
-        file.seek(0)
-        return pd.read_csv(file, sep=separator, decimal=decimal, comment="#", skipinitialspace=True, low_memory=False).rename(
-            columns=str.strip
-        )
+        encoding = "utf-16" if start[:2] in (b"\xff\xfe", b"\xfe\xff") else "utf-8"
+        text = start.decode(encoding, "replace")
+        lines = (line.strip(" ") for line in text.splitlines() if not line.startswith("#"))
+        first, second, *_ = [*filter(None, lines), "", ""]
+        separator = max(",;\t|", key=first.count)
+        separator = separator if separator in first else r"\s+"
+        decimal = "," if separator != "," and re.search(r"\d,\d", text) and not re.search(r"\d\.\d", text) else "."
+        return pd.read_csv(
+            file,
+            sep=separator,
+            decimal=decimal,
+            comment="#",
+            skipinitialspace=True,
+            low_memory=False,
+            index_col=False if second.endswith(separator) and not first.endswith(separator) else None,
+            encoding=encoding,
+            encoding_errors="replace",
+        ).rename(columns=str.strip)
     except ImportError:
         raise ReadingError(f"{path}: {needs(('pyarrow',), 'study')}") from None
     except UserError:
@@ -141,7 +154,10 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
     quaternion = values(columns.orientation)
     if quaternion is not None:
         quaternion = np.roll(quaternion, -1, axis=1) if columns.quaternion == "wxyz" else quaternion
-        quaternion[~(np.linalg.norm(np.nan_to_num(quaternion), axis=1) > 0)] = (0, 0, 0, 1)
+        norm = np.linalg.norm(np.nan_to_num(quaternion), axis=1)
+        if not 0.9 < (usual := float(np.median(norm))) < 1.1:
+            raise ReadingError(f"{name}: table.orientation: its norm is {usual:.3g}; want a quaternion, whose norm is 1")
+        quaternion[~(norm > 0)] = (0, 0, 0, 1)
     return Readings(
         position=values(columns.position, units.length),
         force=values(columns.force, units.force),

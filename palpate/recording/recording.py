@@ -1,5 +1,6 @@
 """A recording of palpation, by any robot, as contacts with a body."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
@@ -135,6 +136,19 @@ class PalpationRecording:
     def _loading(self, ends: tuple[float, ...]) -> Loading:
         touches = list(self._presses.values())
         return loading([t.depth for t in touches], [t.force for t in touches], ends, [t.force_noise for t in touches])
+
+
+def width(places: Array) -> float:
+    """Return the extent of places across the line through them in the xy plane [m]; `places` [m], shape (n, 3)."""
+    xy = places[:, :2] - places[:, :2].mean(axis=0)
+    return float(np.ptp(xy @ np.linalg.svd(xy, full_matrices=True)[2][1]))
+
+
+def implied_young(touches: Sequence[Contact], radius: float) -> tuple[float, float]:
+    """Return the plane-strain modulus of a half-space that needs the forces of contacts [Pa] (Hertz), and their force [N]."""
+    most = [np.quantile(np.maximum((touch.depth, touch.force), 1e-9), 0.95, axis=1) for touch in touches]
+    moduli = [0.75 * force / np.sqrt(radius * depth**3) for depth, force in most]
+    return float(np.median(moduli)), float(np.median([force for _, force in most]))
 
 
 def force_at(touch: Contact, nominal: float) -> tuple[float, float, float, int]:

@@ -27,6 +27,8 @@ _NODES: Final = 40
 _OUTLIERS: Final = 3
 """Times that points are given less weight, which are this many SD off the skin through the others:"""
 _STRANGE: Final = 4.0
+_NARROW: Final = 0.1
+"""Least RMS width of the points, over the shortest length of the skin, over which it has a slope."""
 _PLANE: Final = 4
 """Least number of points that a plane is fitted to."""
 
@@ -95,7 +97,8 @@ def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float
     points, sd = points[chosen], sd[chosen]
     centre = points.mean(axis=0)
     terms = 3 if len(points) >= _PLANE else 1
-    plane = np.linalg.lstsq(_terms(points, centre, terms) / sd[:, None], (points[:, 2] - centre[2]) / sd, rcond=None)[0]
+    sloping = _terms(points, centre, terms) / sd[:, None]
+    plane = np.linalg.lstsq(sloping, (points[:, 2] - centre[2]) / sd, rcond=_NARROW * least)[0]  # a line shows no slope across it
     rest = points[:, 2] - centre[2] - _terms(points, centre, terms) @ plane
     size = max(float(np.sqrt(np.mean(rest**2))), float(np.median(sd)), 1e-6)
     extent = float(np.ptp(points[:, :2], axis=0).max()) + least

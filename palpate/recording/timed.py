@@ -47,11 +47,11 @@ def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: A
     assert readings.time is not None
     height, force = readings.position @ axis.outward, normal_force(readings.force, axis.outward)
     found = cutting.cut(readings.time, height, force, sigma)
-    if found.blind or not found.touching:
-        of = found.blind + len(found.touching)
-        faults.append(Fault(FaultCode.NO_CONTACT, found.blind, of, Remedy.LEFT_OUT if found.touching else Remedy.REFUSED))
     if not found.touching:
+        faults.append(Fault(FaultCode.NOTHING, 1, 1, Remedy.REFUSED))
         return Palpated.nothing()
+    if found.blind:
+        faults.append(Fault(FaultCode.NO_CONTACT, found.blind, found.blind + len(found.touching), Remedy.LEFT_OUT))
     span = float(np.median([np.ptp(height[one]) for one in found.touching]))
     faults += implausible_unit(span, mapping.tool.radius_m)
     work = _Measured(readings, axis.outward, mapping.tool.radius_m, sigma, found.touching, span)
@@ -148,6 +148,8 @@ class _Measured:
             onsets = [cutting.onset(load.loaded, self.power, self.sigma) for load in loads]
             kept = self._kept(loads, onsets)
             points, sd = self._skin_points(loads, onsets, kept)
+            if not len(points):
+                return replace(Palpated.nothing(), untold=len(self.touching))
             if not given:
                 self.skin = fitted(points, sd, self.stations, 2 * self.reach)
         assert self.skin is not None

@@ -6,12 +6,14 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from palpate.recording.faults import Fault, FaultCode, Remedy
-from palpate.recording.recording import Contact, ContactKind, force_at
+from palpate.recording.recording import Contact, ContactKind, force_at, width
 
 _DISAGREE: Final = 0.35
 """Log ratio of forces at one place that is reported."""
 _SURE: Final = 4.0
 """Least depth, in SD of its zero; least force, in SD of its noise."""
+_LINE: Final = 0.1
+"""Least width of the places, over the radius of the footprint, from which on there is a map."""
 _SHARE: Final = 0.3
 """Least depth, as a share of the usual one."""
 
@@ -31,7 +33,14 @@ def usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: lis
     wrong = _disagreeing(deep_ones, usual, radius)
     if wrong:
         faults.append(Fault(FaultCode.DISAGREE, len(wrong), len(deep_ones), Remedy.LEFT_OUT))
-    return [contact for k, contact in enumerate(deep_ones) if k not in wrong]
+    good = [contact for k, contact in enumerate(deep_ones) if k not in wrong]
+    if not good:
+        return []
+    places = np.concatenate([contact.position[0 if contact.kind is ContactKind.SLIDE else -1 :] for contact in good])
+    wide = width(places) / float(np.sqrt(radius * usual))
+    if wide < 1:
+        faults.append(Fault(FaultCode.LINE, len(good), len(good), Remedy.KEPT if wide > _LINE else Remedy.REFUSED))
+    return good if wide > _LINE else []
 
 
 def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[int]:

@@ -145,6 +145,14 @@ def in_newtons_as_mN(t):
     return t.assign(**{name: 1e-3 * t[name] for name in F})
 
 
+def in_grams(t):
+    return t.assign(**{name: t[name] / 9.80665e-3 for name in F})
+
+
+def of_two_tools(t):
+    return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 2))
+
+
 def mapped(mapping, **changes):
     return mapping.model_copy(update=changes)
 
@@ -195,6 +203,15 @@ SPOILED = {
     "grazing": (grazing, OVER_TIME, C.SHALLOW),
     "holes": (holes, OVER_TIME, C.INVALID),
     "millinewtons": (in_newtons_as_mN, mapped(OVER_TIME, units=Units(force="mN")), C.FORCE_UNIT),
+    "grams": (in_grams, OVER_TIME, C.FORCE_UNIT),
+    "probes-grams": (in_grams, PROBES, C.FORCE_UNIT),
+    "two-tools": (of_two_tools, OVER_TIME, C.TWO_TOOLS),
+    "probes-one-x": (lambda t: t.assign(x=0.0), PROBES, C.LINE),
+    "probes-inward": (lambda t: t.assign(**{name: -t[name] for name in N}), PROBES, C.NORMALS),
+    "probes-shuffled": (lambda t: t.sample(frac=1, random_state=0), PROBES, C.ORDER),
+    "coarse-clock": (lambda t: t.assign(t=t.t.round(1)), OVER_TIME, C.COARSE),
+    "two-tools-at-once": (lambda t: of_two_tools(t).assign(t=t.t // 0.02 * 0.02), OVER_TIME, C.TWO_TOOLS),
+    "noise": (lambda t: t.assign(**{name: np.random.default_rng(0).normal(0, 1, len(t)) for name in F}), OVER_TIME, C.FRAME),
     "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
     "header-again": (header_again, OVER_TIME, C.INVALID),
     "probes-flipped": (flipped, PROBES, C.SIGN),
