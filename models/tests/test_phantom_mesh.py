@@ -122,11 +122,31 @@ def test_a_file_that_was_cut_off_is_refused(tmp_path, kind, share):
         ("zero.obj", BOX.export(file_type="obj") + "\nf 0 1 2\n", "face 12 names vertex 0, the vertices are 1 to 8"),
         ("backwards.obj", BOX.export(file_type="obj") + "\nf -1 -2 -9\n", "face 12 names vertex -9"),
         ("short.obj", BOX.export(file_type="obj") + "\nf 1 2", "names 2 vertices"),
+        ("wide.obj", BOX.export(file_type="obj").encode("utf-16"), "not a text in UTF-8"),
+        ("fewer.ply", ply(BOX.vertices, BOX.faces, promised=-5), "its header promises 15 rows, 20 are there"),
+        ("count.ply", ply(BOX.vertices, BOX.faces).replace(b"vertex 8", b"vertex -8"), "is not whole"),
+        ("stl.ply", BOX.export(file_type="stl"), "is not whole"),
+        ("ply.stl", ply(BOX.vertices, BOX.faces), "not whole, or no STL"),
     ],
 )
-def test_a_face_that_names_a_missing_vertex_is_refused(tmp_path, name, content, words):
+def test_a_file_that_is_not_what_its_header_says_is_refused(tmp_path, name, content, words):
     (tmp_path / name).write_bytes(content if isinstance(content, bytes) else content.encode())
     refused(tmp_path / name, words)
+
+
+@pytest.mark.parametrize(
+    ("name", "content"),
+    [
+        ("comment.obj", "# größe\n".encode("latin-1") + BOX.export(file_type="obj").encode()),
+        ("lines.obj", BOX.export(file_type="obj").encode().replace(b"f ", b"f \\\n ")),
+        ("comment.ply", ply(BOX.vertices, BOX.faces, comment="comment größe\n").decode().encode("latin-1")),
+        ("name.stl", BOX.export(file_type="stl_ascii").encode().replace(b"solid", "solid größe".encode("latin-1"), 1)),
+        ("upper.stl", BOX.export(file_type="stl_ascii").upper().encode()),
+    ],
+)
+def test_other_writers_texts_are_read(tmp_path, name, content):
+    (tmp_path / name).write_bytes(content)
+    build_phantom(Phantom(kind="mesh", mesh=str(tmp_path / name)), 0)
 
 
 @pytest.mark.parametrize("name", ["texture.ply", "material.obj"])
@@ -175,7 +195,7 @@ def test_missing_and_wrong_files_are_named(tmp_path):
     (tmp_path / "x.step").write_text("x")
     refused(tmp_path / "x.step", r"want a file in \.obj")
     (tmp_path / "junk.ply").write_bytes(b"\x00\x01 no mesh at all")
-    refused(tmp_path / "junk.ply", r"cannot be read as \.ply")
+    refused(tmp_path / "junk.ply", "is not whole")
 
 
 def test_empty_mesh_is_refused(tmp_path):

@@ -46,13 +46,16 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     content = read_bytes(path, MeshError)
     try:
         if path.suffix.lower() == ".stl":
+            if content[:5].lower() == b"solid" and b"facet" in content[:1000].lower():
+                content = _utf8(content.lower())
             _check_stl(content)
         elif path.suffix.lower() == ".obj":
-            _check_obj(content.decode(errors="replace"))
+            content = _utf8(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "))  # lines may be continued
+            _check_obj(content.decode())
         else:
-            _check_counts(
-                *map(int, re.findall(rb"^element\s+\w+\s+(\d{1,18})", content.partition(b"end_header")[0], re.MULTILINE))
-            )
+            header, end, body = content.partition(b"end_header")
+            content = _utf8(header) + end + body
+            _check_ply_header(header if end else b"", body)
         loaded = trimesh.load_mesh(io.BytesIO(content), file_type=path.suffix.lower()[1:], process=False, skip_materials=True)
         _check_ply(loaded)
         vertices = np.array(loaded.vertices, dtype=np.float64).reshape(-1, 3)
@@ -78,6 +81,21 @@ def _check_indices(faces: IntArray, first: int, last: int) -> None:
         raise MeshError(f"face {face} names vertex {faces[face, corner]}, the vertices are {first} to {last}")
 
 
+def _utf8(text: bytes) -> bytes:
+    """Return a text whose comments and names are of another encoding as UTF-8."""
+    return text.decode(errors="replace").encode()
+
+
+def _check_ply_header(header: bytes, body: bytes) -> None:
+    """Raise MeshError if the header of a PLY file is not whole, or promises fewer rows than the text after it has."""
+    counts = [int(count) for count in re.findall(rb"^element\s+\w+\s+(\d{1,18})\s*$", header, re.MULTILINE)]
+    if not (header.startswith(b"ply") and len(counts) == len(re.findall(rb"^element\b", header, re.MULTILINE))):
+        raise MeshError("its header, from `ply` to `end_header`, is not whole")
+    _check_counts(*counts)
+    if re.search(rb"^format\s+ascii", header, re.MULTILINE) and (rows := len(re.findall(rb"\S.*", body))) > sum(counts):
+        raise MeshError(f"its header promises {sum(counts)} rows, {rows} are there")
+
+
 def _check_ply(loaded: trimesh.Trimesh) -> None:
     """Raise MeshError if an element of a PLY file has fewer rows than its header says."""
     for name, element in loaded.metadata.get("_ply_raw", {}).items():
@@ -99,15 +117,17 @@ def _check_stl(content: bytes) -> None:
             raise MeshError(f"{begun} triangles begin and {ended} end, and it has no endsolid: the file is not whole")
         return
     promised = int.from_bytes(content[80:STL_HEADER_BYTES], "little")
-    _check_counts(promised)
     room = max(len(content) - STL_HEADER_BYTES, 0)
     if room != promised * STL_TRIANGLE_BYTES:
         there = room / STL_TRIANGLE_BYTES
         raise MeshError(f"its header promises {promised} triangles, {there:g} are there: the file is not whole, or no STL")
+    _check_counts(promised)
 
 
 def _check_obj(content: str) -> None:
     """Raise MeshError if a face of an OBJ file names vertices that are not there: they count from 1, or from -1 backwards."""
+    if "\0" in content:
+        raise MeshError("it is not a text in UTF-8")
     vertices = len(re.findall(r"^[ \t]*v\s", content, re.MULTILINE))
     faces = re.findall(r"^[ \t]*f[ \t](.*)$", content, re.MULTILINE)
     _check_counts(vertices, len(faces))
