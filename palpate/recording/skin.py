@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Final
@@ -10,11 +9,9 @@ from typing import Final
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
 from scipy.linalg import cho_solve
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import RBF, ConstantKernel, WhiteKernel
 from threadpoolctl import threadpool_limits
 
+from palpate.recording.process import PlaceProcess
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.patient.mesh import vertex_normals
@@ -102,29 +99,22 @@ def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float
     rest = points[:, 2] - centre[2] - _terms(points, centre, terms) @ plane
     size = max(float(np.sqrt(np.mean(rest**2))), float(np.median(sd)), 1e-6)
     extent = float(np.ptp(points[:, :2], axis=0).max()) + least
-    kernel = ConstantKernel(1.0, (0.05, 1e3)) * RBF(max(least, 0.5 * extent), (least, 10 * extent)) + WhiteKernel(
-        0.05, (1e-4, 1.0)
-    )
-    process = GaussianProcessRegressor(kernel, alpha=(sd / size) ** 2, random_state=0)
-    with warnings.catch_warnings(), threadpool_limits(1):
-        warnings.simplefilter("ignore", ConvergenceWarning)
-        process.fit(points[:, :2], rest / size)
+    begin = np.log((1.0, max(least, 0.5 * extent), 0.05))
+    process = PlaceProcess(points[:, :2], rest / size, (sd / size) ** 2, begin)
+    with threadpool_limits(1):
+        process = process.fitted(((0.05, 1e3), (least, 10 * extent), (1e-4, 1.0)))
         for _ in range(_OUTLIERS):
-            precision = cho_solve((process.L_, True), np.eye(len(points)))
-            off = (precision @ (rest / size)) / np.diag(precision)  # of each point from the skin through the others
-            strange = np.abs(off) * np.sqrt(np.diag(precision)) > _STRANGE
+            precision = np.diag(cho_solve((process.cholesky, True), np.eye(len(points))))
+            off = process.weights / precision  # of each point from the skin through the others
+            strange = np.abs(off) * np.sqrt(precision) > _STRANGE
             if not strange.any():
                 break
-            process.set_params(
-                alpha=np.where(strange, np.maximum(process.alpha, off**2), process.alpha), kernel=process.kernel_, optimizer=None
-            )
-            process.fit(points[:, :2], rest / size)
+            noise = np.where(strange, np.maximum(process.known_noise, off**2), process.known_noise)
+            process = replace(process, known_noise=noise)
     x, y = stations
     xy = np.stack(np.meshgrid(x, y, indexing="ij"), axis=-1).reshape(-1, 2)
-    process.kernel_ = process.kernel_.k1  # the noise of the points is not the skin's
-    mean, spread = process.predict(xy, return_std=True)
-    z = centre[2] + _terms(xy, centre, terms) @ plane + size * mean
-    return RecordedSkin(x, y, z.reshape(len(x), len(y)), (size * spread).reshape(len(x), len(y)))
+    z = centre[2] + _terms(xy, centre, terms) @ plane + size * process.mean(xy)
+    return RecordedSkin(x, y, z.reshape(len(x), len(y)), (size * process.sd(xy)).reshape(len(x), len(y)))
 
 
 def _terms(places: Array, centre: Array, count: int) -> Array:

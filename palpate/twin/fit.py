@@ -6,7 +6,6 @@ simulated on the body, and the logarithms of measured over simulated force are t
 surface, in a few rounds. A tenth of the presses is held out.
 """
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,10 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.optimize import least_squares
 from scipy.spatial import cKDTree
-from sklearn.exceptions import ConvergenceWarning
-from sklearn.gaussian_process import GaussianProcessRegressor
-from sklearn.gaussian_process.kernels import ConstantKernel, Matern, WhiteKernel
 
+from palpate.recording.process import PlaceProcess, matern
 from palpate.recording.recording import PalpationRecording
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate.twin.presses import FittedPress, amplitude, presses_of, simulated
@@ -107,27 +104,25 @@ class _Field:
         """`places` [m], shape (n, 2); `level` [N/m^3]: value before the first correction."""
         self._scale = _spacing(places)
         self._places, self._level = places, np.log(level)
-        self._process: GaussianProcessRegressor | None = None
+        self._process: PlaceProcess | None = None
 
     def correct(self, ratio: Array) -> None:
         """Take the ratios of a simulation with the present field [1], shape (n,)."""
         values = self._log(self._places) + np.log(np.maximum(ratio, 1e-3))
-        if self._process is None:  # its lengths are those of the first observations
-            kernel = ConstantKernel(0.05) * Matern(3.0, (1.0, 100.0), nu=1.5) + WhiteKernel(0.01, (1e-5, 1.0))
-            process = GaussianProcessRegressor(kernel)
-        else:
-            process = GaussianProcessRegressor(self._process.kernel_, optimizer=None)
         self._level = float(np.median(values))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", ConvergenceWarning)  # noise at its lower bound: the places hardly disagree
-            self._process = process.fit(self._places / self._scale, values - self._level)
+        rest = values - self._level
+        if self._process is None:  # its lengths are those of the first observations
+            begin = PlaceProcess(self._places / self._scale, rest, np.zeros(len(rest)), np.log((0.05, 3.0, 0.01)), matern)
+            self._process = begin.fitted(((1e-5, 1e5), (1.0, 100.0), (1e-5, 1.0)))
+        else:
+            self._process = replace(self._process, values=rest)
 
     def __call__(self, xy: Array) -> Array:
         """Return the modulus at points [m], shape (p, 2) -> (p,)."""
         return np.exp(self._log(xy))
 
     def _log(self, xy: Array) -> Array:
-        rest = 0.0 if self._process is None else self._process.predict(xy / self._scale)
+        rest = 0.0 if self._process is None else self._process.mean(xy / self._scale)
         return np.asarray(np.full(len(xy), self._level) + rest)
 
 
