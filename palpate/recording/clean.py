@@ -80,7 +80,7 @@ def _spread(time: Array) -> Array:
     """Return times [s] with rows of equal time spread evenly up to the next one, shape (n,)."""
     known, first = np.unique(time, return_index=True)
     end = known[-1] + (float(np.median(np.diff(known))) if len(known) > 1 else 1.0)
-    return np.interp(np.arange(len(time)), [*first, len(time)], [*known, end])
+    return np.asarray(np.interp(np.arange(len(time)), [*first, len(time)], [*known, end]))
 
 
 def _runs(same: Mask) -> list[slice]:

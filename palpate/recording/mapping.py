@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from math import pi
 from pathlib import Path
-from typing import Annotated, Final, Literal
+from typing import Annotated, Any, Final, Literal
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -105,6 +105,12 @@ class ForceSource(Section):
     """True to take the zero of the force from motion in free air; needs time."""
     delay_s: float = 0.0
     """Time by which the force's stamps are later than those of equal positions [s]."""
+
+    @model_validator(mode="before")
+    @classmethod
+    def _on(cls, given: Any) -> Any:
+        """Return the fields with the key `on`, which YAML takes for True if it has no quotes."""
+        return {"on" if name is True else name: value for name, value in given.items()} if isinstance(given, dict) else given
 
 
 class MappedTool(Section):

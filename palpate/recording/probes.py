@@ -79,9 +79,9 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
         if begin is None and not given:
             continue
         sd = min(scatter, _DOUBT * usual) if given or begin is None else begin.sd
-        contacts.append(
-            _contact(p[one], n[one], force[one], s - (at if given or begin is None else begin.at), (radius, sd, sigma))
-        )
+        down = slice(one.start, one.start + cutting.before_lift(s).stop)
+        depth = (s - (at if given or begin is None else begin.at))[: down.stop - down.start]
+        contacts.append(_contact(p[down], n[down], force[down], depth, (radius, sd, sigma)))
     points = np.array([contact.position[0] for contact in contacts]).reshape(-1, 3)
     reach = float(np.sqrt(radius * usual))
     if not contacts:

@@ -148,6 +148,12 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
             raise ReadingError(f"{name}: columns {', '.join(names)} have no numbers")
         return numbers * SCALES.get(unit, 1.0)
 
+    def numbers_or_names(column: str) -> Any:
+        if column not in table or pd.to_numeric(table[column], errors="coerce").notna().any():
+            return values((column,))[:, 0]
+        number = pd.factorize(table[column])[0]
+        return np.where(number < 0, np.nan, number)
+
     times = values(
         (columns.time,) if columns.time else None, "s" if columns.time in table and is_date(table[columns.time]) else units.time
     )
@@ -162,7 +168,7 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
         position=values(columns.position, units.length),
         force=values(columns.force, units.force),
         time=None if times is None else times[:, 0],
-        probe=None if columns.probe is None else values((columns.probe,))[:, 0],
+        probe=None if columns.probe is None else numbers_or_names(columns.probe),
         rotation=None if quaternion is None else Rotation.from_quat(np.nan_to_num(quaternion)),
         normal=values(columns.normal),
         touch=values(columns.touch, units.length),

@@ -64,6 +64,20 @@ def test_columns_and_units_are_recognised_by_their_names(names: tuple[str, ...],
     assert len(read_recording(tmp_path / "probes.csv", mapping).touches) == 36
 
 
+def test_probes_may_have_names_and_yaml_takes_on_for_true(tmp_path: Path) -> None:
+    table = probes().set_axis(list(HEADERS["plain"]), axis=1)
+    table.assign(probe="P" + table.probe.astype(str), **{name: -table[name] for name in ("fx", "fy", "fz")}).to_csv(
+        tmp_path / "probes.csv", index=False
+    )
+    (tmp_path / "mapping.yaml").write_text(
+        "table: {position: [x, y, z], force: [fx, fy, fz], probe: probe}\nunits: {length: mm}\n"
+        "force: {on: body}\ntool: {radius_m: 0.01}\n"
+    )
+    recording = read_recording(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
+    assert len(recording.touches) == 36
+    assert not recording.faults
+
+
 @pytest.mark.parametrize("written", WRITTEN.values(), ids=WRITTEN)
 def test_tables_of_any_separator_are_read(written: dict[str, str], tmp_path: Path) -> None:
     table = probes().set_axis(list(HEADERS["plain"]), axis=1)
