@@ -223,6 +223,8 @@ def _interrupt(number: int, _: FrameType | None) -> NoReturn:
 def _portable(error: BaseException) -> BaseException:
     """Return an exception that can be sent; prints the traceback of an unexpected one."""
     if not isinstance(error, UserError | RunError | KeyboardInterrupt):
+        if signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:  # a library swallowed the interruption
+            return KeyboardInterrupt()
         if not isinstance(error, SystemExit):
             traceback.print_exception(error)
         return ChildLost(f"raised {type(error).__name__}: {error}")

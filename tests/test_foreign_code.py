@@ -5,12 +5,14 @@ import os
 import signal
 import subprocess
 import sys
+from contextlib import suppress
 from pathlib import Path
 from threading import Timer
 
 import pytest
 from toy_runs import ROLES, composed_hash, run_toys, toy_services
 
+from palpate.apart import run_apart
 from palpate.check.perform import check_here
 from palpate.check.rig import RigSettings
 from palpate.run import composed
@@ -127,6 +129,16 @@ def test_an_interruption_is_that_of_the_child(tmp_path: Path, monkeypatch: pytes
     assert result.interrupted
     assert result.failure is not None
     assert result.failure.code is FailureCode.INTERRUPTED
+
+
+def test_an_interruption_that_a_library_swallows_is_not_an_error_of_its_own() -> None:
+    def compile_it(_: object) -> None:
+        with suppress(KeyboardInterrupt):  # as a callback of ctypes does
+            signal.raise_signal(signal.SIGTERM)
+        raise RuntimeError("no compiled object yet")
+
+    with pytest.raises(KeyboardInterrupt):
+        run_apart(compile_it)
 
 
 @pytest.mark.parametrize("how", ["exit0", "leave", "hang"])
