@@ -8,7 +8,7 @@ from functools import cached_property
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
-from scipy.optimize import minimize
+from scipy.optimize import Bounds, minimize
 from scipy.spatial.distance import cdist
 
 from palpate_models.numerics.frames import Array
@@ -59,7 +59,7 @@ class PlaceProcess:
             tried = replace(self, log_parameters=parameters)
             return float(0.5 * tried.values @ tried.weights + np.log(np.diag(tried.cholesky)).sum())
 
-        found = minimize(misfit, self.log_parameters, method="L-BFGS-B", bounds=np.log(bounds))
+        found = minimize(misfit, self.log_parameters, method="L-BFGS-B", bounds=Bounds(*np.log(bounds).T))
         return replace(self, log_parameters=found.x)
 
     def mean(self, places: Array) -> Array:
