@@ -1,17 +1,12 @@
 """A recording through the assessment, as messages of a run: one way from evidence to map, findings and report."""
 
 from itertools import chain
-from pathlib import Path
 from typing import Any, Final
 
 import numpy as np
 
 from palpate.exam_state import exam_state
-from palpate.recording.faults import Remedy
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
-from palpate.report.page import write_page
-from palpate.report.results import write_results
-from palpate.report.rows import FaultRow, RecordedRow, Report
 from palpate_assessment.assess import assess
 from palpate_assessment.grid import map_grid
 from palpate_assessment.places import places_of
@@ -19,14 +14,9 @@ from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
 from palpate_bus.messages import ExamState, SurfaceMesh
 from palpate_bus.messages.stamps import NS, header
-from palpate_bus.runs.run_folder import name_run
 from palpate_conductor.collector import Collected
-from palpate_conductor.outcome import RunResult
-from palpate_models.scenario.load import dump_scenario
-from palpate_models.scenario.schema import Exam, Mode, Robot, Scenario
-from palpate_models.section import Pose
+from palpate_models.scenario.schema import Exam
 
-RUNTIME: Final = "recording"
 _SHOWN: Final = 5000
 """Readings in the figures of a report."""
 _FALSE_FINDINGS: Final = Exam().false_findings
@@ -93,34 +83,3 @@ def _state(touch: Contact, k: int, number: int, setpoint: float) -> Any:
         depth_uncertainty=touch.depth_uncertainty,
         stroke=number,
     )
-
-
-def scenario_of(recording: PalpationRecording) -> Scenario:
-    """Return what a report says about an examination: name, region, depth, tool."""
-    samples = recording.samples()
-    centre, size, spacing = region(samples) if samples else ((0.0, 0.0), (0.01, 0.01), 0.01)
-    sliding = any(touch.kind is ContactKind.SLIDE for touch in recording.touches)
-    low, high = 1e-3, 1.0
-    exam = Exam(
-        pose=Pose(),
-        centre_m=centre,
-        region_m=tuple(np.clip(size, low, high).tolist()),
-        depth_m=recording.depth_m if samples else Exam().depth_m,
-        spacing_m=max(spacing, low),
-        mode=Mode.CONTINUOUS if sliding else Mode.POINT,
-    )
-    return Scenario(name=recording.name, exam=exam, robot=Robot(indenter_radius_m=recording.indenter_radius_m))
-
-
-def write_assessed(folder: Path, recording: PalpationRecording) -> tuple[Report, Path]:
-    """Write the results of a recording into a folder, as those of a run; return report and page."""
-    gathered, scenario = collected(recording), scenario_of(recording)
-    times = [float(touch.time[-1]) for touch in recording.touches if touch.time is not None]
-    result = RunResult(RUNTIME, gathered, sim_time_s=max(times, default=0.0))
-    faults = [
-        FaultRow(code=f.code, count=f.count, of=f.of, text=f.text, refused=f.remedy is Remedy.REFUSED) for f in recording.faults
-    ]
-    name_run(folder)
-    (folder / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
-    recorded = RecordedRow(abdomen=recording.abdomen, faults=faults)
-    return write_results(folder, scenario, result, recorded), write_page(folder)

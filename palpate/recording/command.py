@@ -31,19 +31,23 @@ def assess(
         for line in propose(recording, out):
             print(line)
         return
-    from palpate.recording.assessed import write_assessed
+    from palpate.recording.assessed import collected
     from palpate.recording.read import read_recording
-    from palpate.report.results import print_findings
     from palpate.run.folder import results_folder
 
     read = read_recording(recording, mapping)
     for fault in read.faults:
         say(fault.text)
     with results_folder(out, overwrite=overwrite) as folder:
-        report, page = write_assessed(folder, read)
+        gathered = collected(read)
+        from palpate.recording.written import write_assessed  # figures take memory that the assessment needs before
+
+        report, page = write_assessed(folder, read, gathered)
     if as_json:
         print_line({"folder": str(out), **report.model_dump(mode="json")})
     else:
+        from palpate.report.results import print_findings
+
         console = SteadyConsole(highlight=False, soft_wrap=True)
         print_findings(console, report)
         console.print(f"to read: {page}")

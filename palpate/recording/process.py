@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -13,6 +14,7 @@ from scipy.spatial.distance import cdist
 
 from palpate_models.numerics.frames import Array
 
+_TOGETHER: Final = 200
 Correlation = Callable[[Array], Array]
 """Of values at two places, by their distance over the length, any shape."""
 
@@ -25,6 +27,11 @@ def gaussian(distance: Array) -> Array:
 def matern(distance: Array) -> Array:
     """Return Matern's correlation with nu = 3/2."""
     return np.asarray((1 + np.sqrt(3) * distance) * np.exp(-np.sqrt(3) * distance))
+
+
+def _parts(places: Array) -> list[Array]:
+    """Return places in parts, whose covariances take little memory."""
+    return np.array_split(places, len(places) // _TOGETHER + 1)
 
 
 @dataclass(frozen=True, eq=False)
@@ -64,12 +71,16 @@ class PlaceProcess:
 
     def mean(self, places: Array) -> Array:
         """Return the mean at places, shape (k, 2) -> (k,)."""
-        return np.asarray(self._covariance(places) @ self.weights)
+        return np.concatenate([self._covariance(part) @ self.weights for part in _parts(places)])
 
     def sd(self, places: Array) -> Array:
         """Return the SD of the mean at places, shape (k, 2) -> (k,)."""
-        explained = solve_triangular(self.cholesky, self._covariance(places).T, lower=True)
-        return np.asarray(np.sqrt(np.maximum(np.exp(self.log_parameters[0]) - (explained**2).sum(axis=0), 0)))
+        explained = np.concatenate([self._explained(part) for part in _parts(places)])
+        return np.asarray(np.sqrt(np.maximum(np.exp(self.log_parameters[0]) - explained, 0)))
+
+    def _explained(self, places: Array) -> Array:
+        """Return the variance that the observations take away at places, shape (k, 2) -> (k,)."""
+        return np.asarray((solve_triangular(self.cholesky, self._covariance(places).T, lower=True) ** 2).sum(axis=0))
 
     def _covariance(self, places: Array) -> Array:
         """Return the covariance of values at places with the process at its own, shape (k, 2) -> (k, n)."""
