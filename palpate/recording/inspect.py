@@ -11,7 +11,7 @@ import yaml
 from matplotlib.figure import Figure
 
 from palpate.recording.clean import cleaned
-from palpate.recording.mapping import ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
+from palpate.recording.mapping import SCALES, ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
 from palpate.recording.probes import probes
 from palpate.recording.read import LEAST_ROWS, recording_of
@@ -34,6 +34,8 @@ from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY
 
 _UNKNOWN_RADIUS_M: Final = 0.01
+_SOFT_PA: Final = 1e4
+"""Modulus up to which the forces may be in kgf."""
 _FORCE: Final = re.compile(r"f|forces?|wrench|kraft", re.I)
 _SINGLE: Final = re.compile(r"(normal[_ ]?)?(f|force|kraft)([_ ]?z|[_ ]?n|[_ ]?normal)?", re.I)
 _POSITION: Final = re.compile(r"|p|pos(ition)?|tip|tcp|ee|tool|ball|c(entre|enter)?", re.I)
@@ -76,9 +78,10 @@ def _as_proposed(raw: Readings, mapping: Mapping, name: str) -> list[str]:
     lines = [f"as proposed: {fault.text}" for fault in found.faults]
     if found.touches:
         young, force = implied_young(found.touches, mapping.tool.radius_m)
+        other = f" ({1e-3 * SCALES['kgf'] * young:.2g} kPa if the forces are in kgf)" if young < _SOFT_PA else ""
         lines.append(
             f"as proposed: {len(found.touches)} contacts to {1e3 * found.depth_m:.2g} mm and {force:.2g} N, as on a body of "
-            f"{1e-3 * young:.2g} kPa; organs and phantoms have about 1 to 300 kPa: see units.force"
+            f"{1e-3 * young:.2g} kPa{other}; organs and phantoms have about 1 to 300 kPa: see units.force"
         )
     return lines
 
