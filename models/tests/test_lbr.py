@@ -13,7 +13,6 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_MASS_KG, FT_TO_INDENTER_M, link_names, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.kinematics import link_transforms, tool_pose
-from palpate_models.robot.solids import cone
 from palpate_models.robot.table import Box, boxes
 from palpate_models.robot.visual import VisualMesh, visual_meshes
 from palpate_models.scenario.schema import Robot
@@ -168,8 +167,12 @@ def test_meshes_are_closed_and_face_outward(meshes: dict[str, list[VisualMesh]])
 
 def _outside(points: np.ndarray, capsules: tuple[Capsule, ...]) -> float:
     """Distance of the farthest point outside all capsules [m]."""
-    depth = [cone(c.start, np.add(c.end, (0, 0, 1e-9)), c.radius, c.radius)(points) for c in capsules]
-    return float(np.min(depth, axis=0).max())
+    distances = []
+    for capsule in capsules:
+        start, axis = np.array(capsule.start), np.subtract(capsule.end, capsule.start)
+        share = np.clip((points - start) @ axis / max(axis @ axis, 1e-12), 0.0, 1.0)
+        distances.append(np.linalg.norm(points - start - share[:, None] * axis, axis=1) - capsule.radius)
+    return float(np.min(distances, axis=0).max())
 
 
 @pytest.mark.parametrize("link", LINKS[1:8])
