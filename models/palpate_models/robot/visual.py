@@ -1,4 +1,4 @@
-"""Visual meshes of the robot by link: drawn for the LBR iiwa 7 R800 (`data/lbr_visual.npz`), collision capsules for other arms."""
+"""Visual meshes of the robot by link: of the LBR iiwa 7 R800 in a file (`data/lbr_visual.npz`), of other arms their capsules."""
 
 from collections.abc import Sequence
 from functools import cache

@@ -260,7 +260,7 @@ def test_steps_that_were_missed_are_made_up_one_by_one(lag: Path, rules: Contrac
         ("  place:", "  follower:", ("follower", "may place")),
         ("{u: {field", "{v: {field", ("place.pose.position", "no variable 'v'", "u, y")),
         ("u: {field", "y: {field", ("y", "only inputs and tunable parameters")),
-        ("field: pose.position", "field: pose.posture", ("pose.posture", "position, orientation")),
+        ("field: pose.position", "field: pose.posture", ("pose.posture", "pose.position.x")),
         ("field: pose.position", "field: pose.orientation", ("4 values", "3 of the FMU")),
         ("frame: body", "frame: moon", ("moon", "world, body")),
         ("variable: y", "variable: tau", ("3 values", "1 of the FMU")),

@@ -8,17 +8,20 @@ fields.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
 from operator import attrgetter
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
+from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Topic
-from palpate_bus.messages.codec import Message, message_type, store
+from palpate_bus.contract.conformance import LeafField, leaves, numbers
+from palpate_bus.messages.codec import CodecError, Message, message_type, store
 from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.typestore import array_dtype
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
@@ -86,109 +89,50 @@ def fmu_unit(name: str, description: Any) -> Unit | None:
         return None
 
 
-Values = Mapping[str, Any]
-"""Field values of a message by path: arrays, numbers or text."""
-Make = Callable[[int, Values], Any]
-
-_HEADER = "std_msgs/msg/Header"
-_NAME, _ARRAY, _SEQUENCE = 2, 3, 4
-
-
-def _fields(name: str) -> list[tuple[str, Any]]:
-    return list(store.get_msgdef(name).fields)
-
-
-def _triple(name: str) -> list[str] | None:
-    """Return the fields of a message of numbers only, else None."""
-    fields = _fields(name)
-    if fields and all(int(kind) == 1 and detail[0] not in ("string", "wstring") for _, (kind, detail) in fields):
-        return [field for field, _ in fields]
-    return None
-
-
-def describe(name: str, path: str) -> Any:
-    """Return the type of a field of a message type. Raises MapError if it does not exist."""
-    here: Any = (_NAME, name)
-    for part in path.split("."):
-        found = dict(_fields(here[1])) if int(here[0]) == _NAME else {}
-        if part not in found:
-            raise MapError(f"{name} has no field {path!r}: at {part!r} the fields are {', '.join(found) or 'none'}")
-        here = found[part]
-    return here
+def fields(name: str, path: str) -> list[LeafField]:
+    """Return the fields of base type at and below `path` in a message type. Raises MapError if it has no such field."""
+    try:
+        return leaves(name, path)
+    except CodecError as error:
+        raise MapError(str(error)) from error
 
 
 def size(name: str, path: str) -> int | None:
     """Return the number of values of a field, None for an array of any length. Raises MapError if it is not numeric."""
-    kind, detail = describe(name, path)
-    if int(kind) == _NAME:
-        members = _triple(detail)
-        if members is None:
-            raise MapError(f"{name}: field {path!r} has type {detail}, which is not numeric")
-        return len(members)
-    if int(kind) == _SEQUENCE:
-        return None
-    return int(detail[1]) if int(kind) == _ARRAY else 1
+    found = fields(name, path)
+    if any(leaf.base == "string" or leaf.repeated or (leaf.array and leaf.path != path) for leaf in found):
+        raise MapError(f"{name}: field {path!r} is not numeric")
+    return numbers(blank(name), path).size or None
 
 
-def reader(name: str, path: str) -> Callable[[Message], ArrayLike]:
-    """Return a function that reads the numbers of a field of a message."""
-    kind, detail = describe(name, path)
-    get = attrgetter(path)
-    members = _triple(detail) if int(kind) == _NAME else None
-    if members is None:
-        return get
-    inner = attrgetter(*(f"{path}.{member}" for member in members))
-    return lambda message: np.array(inner(message))
+def blank(name: str, t: int = 0, frame: str = "") -> Message:
+    """Return a message of zeros, empty texts and empty lists; its headers are stamped `t` [ns], in `frame`."""
+    if name == "std_msgs/msg/Header":
+        return header(t, frame)
+    return message_type(name)(*(_zero(kind, detail, t, frame) for _, (kind, detail) in store.get_msgdef(name).fields))
 
 
-def _cast(base: str) -> Callable[[Any], Any]:
-    if base == "string":
-        return str
-    if base == "bool":
-        return bool
-    return float if base.startswith("float") else int
+def _zero(kind: int, detail: Any, t: int, frame: str) -> Any:
+    if kind == Nodetype.NAME:
+        return blank(detail, t, frame)
+    if kind == Nodetype.BASE:
+        return "" if detail[0] == "string" else array_dtype(detail[0]).type(0).item()
+    (item_kind, item), length = detail
+    if item_kind == Nodetype.NAME or item[0] == "string":
+        return []
+    return np.zeros(length if kind == Nodetype.ARRAY else 0, array_dtype(item[0]))
 
 
-def maker(name: str, frame: str, filled: frozenset[str], prefix: str = "") -> Make:
-    """Return a function of (t [ns], values by path) that creates a message; fields not in `filled` are zero or empty.
-
-    Headers are stamped t, in `frame`.
-    """
-    if name == _HEADER:
-        return lambda t, _: header(t, frame)
-    cls = message_type(name)
-    members = _triple(name)
-    if prefix and prefix[:-1] in filled and members is not None:
-        path = prefix[:-1]
-        return lambda _, values: cls(*np.asarray(values[path]).ravel().tolist())
-    makes = tuple(_field_maker(kind, detail, frame, filled, prefix + field) for field, (kind, detail) in _fields(name))
-    return lambda t, values: cls(*(make(t, values) for make in makes))
-
-
-def _field_maker(kind: Any, detail: Any, frame: str, filled: frozenset[str], path: str) -> Make:
-    if int(kind) == _NAME:
-        return maker(detail, frame, filled, f"{path}.")
-    if int(kind) in (_ARRAY, _SEQUENCE):
-        return _array_maker(detail, path if path in filled else None, int(kind) == _ARRAY)
-    cast = _cast(detail[0])
-    if path not in filled:
-        blank = cast(0) if cast is not str else ""
-        return lambda _t, _values: blank
-    if cast is str:
-        return lambda _, values: str(values[path])
-    return lambda _, values: cast(np.asarray(values[path]).ravel()[0])
-
-
-def _array_maker(detail: Any, path: str | None, fixed: bool) -> Make:
-    """Return a function for a numeric array; empty or zero without a path. Arrays of messages stay empty."""
-    (inner, item), extent = detail
-    if int(inner) != 1 or item[0] == "string":
-        return lambda _t, _values: []
-    dtype = np.dtype(item[0])
-    if path is None:
-        empty = np.zeros(extent if fixed else 0, dtype=dtype)
-        return lambda _t, _values: empty
-    return lambda _, values: np.ascontiguousarray(np.asarray(values[path], dtype=dtype).ravel())
+def fill(message: Message, paths: Sequence[str], value: Any) -> None:
+    """Set fields of base type to a value each, or the only one to all of it: a text, a number or an array."""
+    for path, own in zip(paths, [value] if len(paths) == 1 else np.ravel(value).tolist(), strict=True):
+        *parents, last = path.split(".")
+        owner = attrgetter(".".join(parents))(message) if parents else message
+        before = getattr(owner, last)
+        if isinstance(before, np.ndarray):
+            setattr(owner, last, np.ascontiguousarray(np.ravel(own), before.dtype))
+        else:
+            setattr(owner, last, str(own) if isinstance(before, str) else type(before)(np.ravel(own)[0]))
 
 
 Change = Callable[[Any], Any]
@@ -200,12 +144,13 @@ class InputTopic:
 
     topic: Topic
     ports: tuple[Port, ...]
-    moves: tuple[tuple[NDArray[Any], Callable[[Message], Any], Change], ...]
+    moves: tuple[tuple[NDArray[Any], str, Change], ...]
+    """Place in a port, field of the message, and change of its values."""
 
     def write(self, message: Message) -> None:
         """Set the FMU's variables from a message."""
-        for target, read, change in self.moves:
-            target[...] = np.reshape(change(read(message)), target.shape)
+        for target, path, change in self.moves:
+            target[...] = np.reshape(change(numbers(message, path)), target.shape)
         for port in self.ports:
             port.push()
 
@@ -217,10 +162,10 @@ class OutputTopic:
     fmu: str
     """Name of the FMU's file."""
     topic: Topic
-    make: Make
     ports: tuple[Port, ...]
-    moves: tuple[tuple[str, NDArray[Any], Change], ...]
-    constants: dict[str, Any] = field(default_factory=dict)
+    moves: tuple[tuple[tuple[str, ...], NDArray[Any], Change], ...]
+    """Fields of base type, place in a port of their values, and change of these."""
+    constants: tuple[tuple[tuple[str, ...], Any], ...]
 
     def message(self, t: int) -> Message:
         """Return the message of time `t` [ns]. Raises FmuError if a variable is not finite."""
@@ -228,10 +173,10 @@ class OutputTopic:
             port.pull()
             if wrong := port.not_finite():
                 raise FmuError(f"{self.fmu}: {wrong} at {t / NS:g} s, for {self.topic.name}: want finite numbers")
-        values = dict(self.constants)
-        for path, source, change in self.moves:
-            values[path] = change(source)
-        return self.make(t, values)
+        message = blank(self.topic.type, t, self.topic.frame or "")
+        for paths, value in (*self.constants, *((paths, change(source)) for paths, source, change in self.moves)):
+            fill(message, paths, value)
+        return message
 
 
 class Wiring:
@@ -281,16 +226,16 @@ class Wiring:
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
                 raise MapError(f"{where}: only inputs and tunable parameters can be set, this is {variable.causality}")
             self._fit(topic, entry.field, variable, where)
-            change = _chain(
-                self._turn(entry, topic, where, into_fmu=True), self._scale(entry, topic, entry.field, variable, where, True)
-            )
-            moves.append((ports[variable_name][variable_name], reader(topic.type, entry.field), change))
+            turn = self._turn(entry, topic, where, into_fmu=True)
+            scale = self._scale(entry, topic, entry.field, variable, where, into_fmu=True)
+            moves.append((ports[variable_name][variable_name], entry.field, _chain(turn, scale)))
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
 
     def _output(self, name: str, entries: Mapping[str, OutputEntry]) -> OutputTopic:
         topic = self._topic(name, {row.name for row in self._rules.outputs(self._table.role)}, "send")
-        constants: dict[str, Any] = {}
+        constants: list[tuple[tuple[str, ...], Any]] = []
         wanted: dict[str, tuple[FmuVariable, OutputEntry]] = {}
+        leaf_paths = {path: tuple(leaf.path for leaf in fields(topic.type, path)) for path in entries}
         for path, entry in entries.items():
             where = f"{entry.variable or entry.scenario or entry.value} -> {name}.{path}"
             if entry.variable is not None:
@@ -302,19 +247,17 @@ class Wiring:
                 value = self._turn(entry, topic, where, into_fmu=False)(self._scenario[entry.scenario])
                 if size(topic.type, path) not in (None, np.size(value)):
                     raise MapError(f"{where}: {np.size(value)} values do not fit")
-                constants[path] = value
+                constants.append((leaf_paths[path], value))
             else:
-                constants[path] = entry.value
+                constants.append((leaf_paths[path], entry.value))
         ports = self._ports({variable.name: variable for variable, _ in wanted.values()}.values())
         moves = []
         for path, (variable, entry) in wanted.items():
             where = f"{variable.name} -> {name}.{path}"
-            change = _chain(
-                self._scale(entry, topic, path, variable, where, False), self._turn(entry, topic, where, into_fmu=False)
-            )
-            moves.append((path, ports[variable.name][variable.name], change))
-        make = maker(topic.type, topic.frame or "", frozenset(entries))
-        return OutputTopic(self._fmu.path.name, topic, make, tuple(dict.fromkeys(ports.values())), tuple(moves), constants)
+            scale = self._scale(entry, topic, path, variable, where, into_fmu=False)
+            turn = self._turn(entry, topic, where, into_fmu=False)
+            moves.append((leaf_paths[path], ports[variable.name][variable.name], _chain(scale, turn)))
+        return OutputTopic(self._fmu.path.name, topic, tuple(dict.fromkeys(ports.values())), tuple(moves), tuple(constants))
 
     def _fit(self, topic: Topic, path: str, variable: FmuVariable, where: str) -> None:
         room = size(topic.type, path)
@@ -365,8 +308,4 @@ def _same(values: Any) -> Any:
 
 
 def _chain(first: Change, second: Change) -> Change:
-    if first is _same:
-        return second
-    if second is _same:
-        return first
     return lambda values: second(first(values))
