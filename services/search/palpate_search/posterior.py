@@ -13,6 +13,7 @@ adds one row to each Cholesky factor, so an update takes about a millisecond.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from itertools import product
 from typing import Final
 
@@ -28,39 +29,58 @@ from palpate_assessment.standard import ABDOMEN, USUAL
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_plugins import PluginKind
-from palpate_search.presses import LEAST_MEASURED_M, PRESS_S, Budget, Press, Task, press_duration
+from palpate_search.presses import PRESSES, Budget, Press, Task, press_duration
 
-RADII_M: Final = (0.014, 0.022, 0.030)
-"""Palpable radii of the lump hypotheses."""
-EDGE_M: Final = 0.013
-"""SD of the smooth edge of a palpated lump: a press deforms a few centimetres of skin."""
-OUTSIDE: Final = 0.2
-"""Relative prior of a lump that extends beyond the region: the region is chosen to contain the lump."""
-LUMP_PROBABILITY: Final = 0.5
-"""Prior probability of a lump."""
-ANOTHER: Final = 0.2
-"""Prior probability of another lump after one was found."""
+
+@dataclass(frozen=True)
+class LumpPrior:
+    """Hypotheses of a lump, and when one is found."""
+
+    radii_m: tuple[float, float, float] = (0.014, 0.022, 0.030)
+    """Palpable radii of the lump hypotheses."""
+    edge_m: float = 0.013
+    """SD of the smooth edge of a palpated lump: a press deforms a few centimetres of skin."""
+    outside: float = 0.2
+    """Relative prior of a lump that extends beyond the region: the region is chosen to contain the lump."""
+    probability: float = 0.5
+    """Prior probability of a lump."""
+    another: float = 0.2
+    """Prior probability of another lump after one was found."""
+    near_m: float = 0.020
+    """Hypotheses within this distance count as one lump."""
+    found: float = 0.95
+    """A lump with this probability counts as found."""
+    placed_m: float = 0.006
+    """RMS uncertainty of the place below which a lump counts as located."""
+
+
+LUMPS: Final = LumpPrior()
+
 CONTRAST: Final = (float(np.log(2.0)), 0.25)
 """Prior mean and standard deviation of a lump's log-contrast."""
-NATURAL_SD: Final = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
-"""Amplitudes of the fields of natural variation, strips last (`palpate_assessment.model.natural`)."""
-BONE_SD: Final = 0.27
-"""Amplitude of bone."""
+
+
+@dataclass(frozen=True)
+class FieldPrior:
+    """Natural variation of the log-force, and errors of the depth."""
+
+    natural_sd: tuple[float, float, float, float, float, float] = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)
+    """Amplitudes of the fields of natural variation, strips last (`palpate_assessment.model.natural`)."""
+    bone_sd: float = 0.27
+    """Amplitude of bone."""
+    variation_scales: tuple[float, float] = (0.75, 1.3)
+    """Model variants: natural variation over its typical amplitude."""
+    depth_error_scales: tuple[float, float] = (0.75, 1.3)
+    """Model variants: depth errors over their typical size."""
+
+
+FIELD: Final = FieldPrior()
+
 SURFACE_SHARE, STROKE_SHARE = 0.45, 0.75
 """Fractions of the reported depth uncertainty that are spatially correlated and independent. Maximum likelihood over healthy
 tuning patients (`research.search.prior`, docs/search.md)."""
-VARIATION_SCALES: Final = (0.75, 1.3)
-"""Model variants: natural variation over its typical amplitude."""
-DEPTH_ERROR_SCALES: Final = (0.75, 1.3)
-"""Model variants: depth errors over their typical size."""
 USUAL_N, LEVEL_SD = 2.2, 1.0
 """Prior mean [N] and SD (in the logarithm) of the force of the standard press; much wider than the variation between people."""
-NEAR_M: Final = 0.020
-"""Hypotheses within this distance count as one lump."""
-FOUND: Final = 0.95
-"""A lump with this probability counts as found."""
-PLACED_M: Final = 0.006
-"""RMS uncertainty of the place below which a lump counts as located."""
 
 
 class Posterior:
@@ -70,7 +90,7 @@ class Posterior:
         self,
         task: Task,
         accepted: Sequence[Bump] = (),
-        models: Sequence[tuple[float, float]] = tuple(product(VARIATION_SCALES, DEPTH_ERROR_SCALES)),
+        models: Sequence[tuple[float, float]] = tuple(product(FIELD.variation_scales, FIELD.depth_error_scales)),
     ) -> None:
         """`accepted`: lumps that were found; the search is for others. `models`: scales of natural variation and depth errors."""
         self.task = task
@@ -79,19 +99,19 @@ class Posterior:
         self.vain = 0
         """Presses that were asked for and gave no sample."""
         places = task.places
-        self.centres: Array = np.tile(places, (len(RADII_M), 1))
+        self.centres: Array = np.tile(places, (len(LUMPS.radii_m), 1))
         """Centres of the hypotheses' lumps [m], shape (h, 2)."""
         self.open: NDArray[np.bool_] = np.ones(len(places), dtype=bool)
         """Places that may be pressed, shape (p,): all but those that the arm could not take."""
-        self.radii: Array = np.repeat(RADII_M, len(places))
+        self.radii: Array = np.repeat(LUMPS.radii_m, len(places))
         """Their radii [m], shape (h,)."""
         self.shapes: Array = self._shapes(places)
         """Each bump at each place, shape (p, h)."""
         likely = self._likely()
-        there = ANOTHER if self.accepted else LUMP_PROBABILITY
+        there = LUMPS.another if self.accepted else LUMPS.probability
         self._log_prior = np.log(np.append(there * likely / max(likely.sum(), 1e-9), 1 - there) + 1e-300)
         self._models = tuple(models)
-        self._parts = np.array([[*(np.array(NATURAL_SD) * rough) ** 2, BONE_SD**2] for rough, _ in self._models])
+        self._parts = np.array([[*(np.array(FIELD.natural_sd) * rough) ** 2, FIELD.bone_sd**2] for rough, _ in self._models])
         count, most = len(self._models), 16
         self._factor = np.zeros((count, most, most))
         self._whitened = np.zeros((count, most))
@@ -113,11 +133,11 @@ class Posterior:
 
     @property
     def at(self) -> tuple[Array, float]:
-        """Most probable place of a lump [m], shape (2,), and the probability of a lump within NEAR_M of it."""
+        """Most probable place of a lump [m], shape (2,), and the probability of a lump within LUMPS.near_m of it."""
         centre = self.task.places
         there = self.by_place
         peak = centre[int(np.argmax(there))]
-        near = np.linalg.norm(centre - peak, axis=1) <= NEAR_M
+        near = np.linalg.norm(centre - peak, axis=1) <= LUMPS.near_m
         weight = there[near]
         total = float(weight.sum())
         return (weight @ centre[near] / total if total > 0 else peak), total
@@ -125,7 +145,7 @@ class Posterior:
     @property
     def by_place(self) -> Array:
         """Probability that a lump's centre is at each place, shape (p,)."""
-        return np.asarray(self.probability.reshape(len(RADII_M), -1).sum(axis=0))
+        return np.asarray(self.probability.reshape(len(LUMPS.radii_m), -1).sum(axis=0))
 
     @property
     def asked(self) -> int:
@@ -139,13 +159,13 @@ class Posterior:
 
     @property
     def found(self) -> Bump | None:
-        """A lump with probability FOUND and uncertainty of place PLACED_M; None without one."""
+        """A lump with probability LUMPS.found and uncertainty of place LUMPS.placed_m; None without one."""
         (x, y), probability = self.at
         apart = np.hypot(self.centres[:, 0] - x, self.centres[:, 1] - y)
-        weight = np.where(apart <= NEAR_M, self.probability, 0.0)
-        if probability < FOUND or weight @ apart**2 > PLACED_M**2 * weight.sum():
+        weight = np.where(apart <= LUMPS.near_m, self.probability, 0.0)
+        if probability < LUMPS.found or weight @ apart**2 > LUMPS.placed_m**2 * weight.sum():
             return None
-        return Bump(float(x), float(y), float(weight @ self.radii / weight.sum()), EDGE_M)
+        return Bump(float(x), float(y), float(weight @ self.radii / weight.sum()), LUMPS.edge_m)
 
     @property
     def likeliest(self) -> int:
@@ -184,7 +204,7 @@ class Posterior:
     def add(self, felt: Press) -> None:
         """Update the posterior with a press."""
         calibration = learned()
-        depth, force = max(felt.depth, LEAST_MEASURED_M), max(felt.force, 0.1)
+        depth, force = max(felt.depth, PRESSES.least_measured_m), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)
         xy, n = felt.xy[None], len(self.presses)
@@ -257,12 +277,12 @@ class Posterior:
     def _shapes(self, xy: Array) -> Array:
         """Return the bump of each hypothesis at places, shape (k, 2) -> (k, h)."""
         r = np.linalg.norm(xy[:, None] - self.centres, axis=2)
-        return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * EDGE_M)))
+        return np.asarray(0.5 * erfc((r - self.radii) / (np.sqrt(2) * LUMPS.edge_m)))
 
     def _likely(self) -> Array:
         """Return the unnormalised prior of each hypothesis given the accepted lumps, shape (h,)."""
         out = np.abs(self.centres - self.task.centre) + self.radii[:, None] > 0.5 * np.array(self.task.size) + 1e-9
-        likely = np.where(out.any(axis=1), OUTSIDE, 1.0)
+        likely = np.where(out.any(axis=1), LUMPS.outside, 1.0)
         for bump in self.accepted:
             likely *= np.hypot(self.centres[:, 0] - bump.x, self.centres[:, 1] - bump.y) > self.radii + bump.radius
         return likely
@@ -296,7 +316,7 @@ def maps(posterior: Posterior) -> Array:
     layers = np.empty((LAYERS, len(mean)))
     layers[0] = np.log(posterior.by_place * len(mean) + 0.01) / np.log(len(mean))
     layers[1], layers[2] = mean - mean.mean(), np.sqrt(variance)
-    layers[3] = press_duration(posterior.here, posterior.task.places) - PRESS_S
+    layers[3] = press_duration(posterior.here, posterior.task.places) - PRESSES.press_s
     layers[4], layers[5] = posterior.lump, left
     return layers.reshape(LAYERS, *shape(posterior))
 

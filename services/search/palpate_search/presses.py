@@ -4,26 +4,35 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import Final
 
 import numpy as np
 
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import ExamInput
 
-PLACES_M = 0.010
-"""Spacing of candidate places."""
-BORDER_M = 0.010
-"""Least distance of presses from the region's edge: reach and surface are known only inside."""
-LEAST_MEASURED_M = 0.002
-"""Least measured depth that methods use: a measured depth may be zero, and its logarithm is taken."""
-SHALLOWEST_RATIO = 0.6
-"""Depth of the shallowest press, as a multiple of the nominal depth."""
-DEEPEST_RATIO = 1.4
-"""Depth of the deepest press, as a multiple of the nominal depth."""
-TRAVEL_MPS = 0.12
-"""Mean speed between presses."""
-PRESS_S = 3.2
-"""Duration of a press without travel: rest and tare in free air, descent, settling, hold and lift."""
+
+@dataclass(frozen=True)
+class PressTuning:
+    """Places, depths and durations of presses."""
+
+    places_m: float = 0.010
+    """Spacing of candidate places."""
+    border_m: float = 0.010
+    """Least distance of presses from the region's edge: reach and surface are known only inside."""
+    least_measured_m: float = 0.002
+    """Least measured depth that methods use: a measured depth may be zero, and its logarithm is taken."""
+    shallowest_ratio: float = 0.6
+    """Depth of the shallowest press, as a multiple of the nominal depth."""
+    deepest_ratio: float = 1.4
+    """Depth of the deepest press, as a multiple of the nominal depth."""
+    travel_mps: float = 0.12
+    """Mean speed between presses."""
+    press_s: float = 3.2
+    """Duration of a press without travel: rest and tare in free air, descent, settling, hold and lift."""
+
+
+PRESSES: Final = PressTuning()
 
 
 @dataclass(frozen=True)
@@ -87,19 +96,19 @@ class Task:
     @property
     def shallowest(self) -> float:
         """Least depth of a press [m]."""
-        return SHALLOWEST_RATIO * self.depth
+        return PRESSES.shallowest_ratio * self.depth
 
     @classmethod
     def of(cls, known: ExamInput) -> Task:
         """Return the task of an examination."""
         exam, limits = known.exam, known.limits
-        deepest = min(DEEPEST_RATIO * exam.depth_m, limits.depth_m)
+        deepest = min(PRESSES.deepest_ratio * exam.depth_m, limits.depth_m)
         budget = Budget(exam.budget.presses, exam.budget.seconds)
         return cls(exam.centre_m, exam.region_m, exam.depth_m, deepest, limits.force_working_n, budget=budget, seed=exam.seed)
 
     @cached_property
     def places(self) -> Array:
-        """Candidate places [m], shape (p, 2): a lattice with a spacing of about PLACES_M, ordered by x."""
+        """Candidate places [m], shape (p, 2): a lattice with a spacing of about PRESSES.places_m, ordered by x."""
         axes = [self._axis(k) for k in (0, 1)]
         return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2)
 
@@ -115,14 +124,14 @@ class Task:
 
     @property
     def _half(self) -> Array:
-        return np.maximum(0.5 * np.array(self.size) - BORDER_M, 0.0)
+        return np.maximum(0.5 * np.array(self.size) - PRESSES.border_m, 0.0)
 
     def _axis(self, k: int) -> Array:
         low, high = self.low[k], self.high[k]
-        return np.linspace(low, high, max(round((high - low) / PLACES_M), 0) + 1)
+        return np.linspace(low, high, max(round((high - low) / PRESSES.places_m), 0) + 1)
 
 
 def press_duration(begin: Array | None, end: Array) -> Array:
     """Return the duration [s], shape () or (k,), of a press at `end` [m], shape (2,) or (k, 2), with the way from `begin` [m]."""
     hop = np.linalg.norm(end - (end if begin is None else begin), axis=-1)
-    return np.asarray(PRESS_S + hop / TRAVEL_MPS)
+    return np.asarray(PRESSES.press_s + hop / PRESSES.travel_mps)

@@ -23,18 +23,13 @@ from palpate_search.policies.fixed import latin_hypercube, raster
 from palpate_search.policies.informed import information
 from palpate_search.policies.learned import convolved, ppo
 from palpate_search.posterior import (
-    BONE_SD,
     CONTRAST,
-    DEPTH_ERROR_SCALES,
-    EDGE_M,
+    FIELD,
     LEVEL_SD,
-    LUMP_PROBABILITY,
-    NATURAL_SD,
-    OUTSIDE,
+    LUMPS,
     STROKE_SHARE,
     SURFACE_SHARE,
     USUAL_N,
-    VARIATION_SCALES,
     Posterior,
     policies,
     policy,
@@ -126,7 +121,7 @@ def test_a_policy_that_cannot_be_used_is_refused(
 
 
 CENTRED = Task(centre=(0.0, 0.0), size=(0.1, 0.08))
-SOUGHT = Bump(0.02, -0.01, 0.018, EDGE_M)
+SOUGHT = Bump(0.02, -0.01, 0.018, LUMPS.edge_m)
 
 
 def presses_of(xy: np.ndarray, bump: Bump | None, contrast: float = 2.5, depth: float = 0.010) -> list[Press]:
@@ -156,19 +151,19 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     parts = natural(xy, xy, USUAL)
     log_joint = []
     out = np.any(np.abs(posterior.centres) + posterior.radii[:, None] > 0.5 * np.array(CENTRED.size) + 1e-9, axis=1)
-    prior = np.where(out, OUTSIDE, 1.0)
-    prior *= LUMP_PROBABILITY / prior.sum()
-    for rough in VARIATION_SCALES:
-        for wrong in DEPTH_ERROR_SCALES:
+    prior = np.where(out, LUMPS.outside, 1.0)
+    prior *= LUMPS.probability / prior.sum()
+    for rough in FIELD.variation_scales:
+        for wrong in FIELD.depth_error_scales:
             u = wrong * presses[0].depth_uncertainty
-            S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(NATURAL_SD, parts, strict=False))
-            S = S + BONE_SD**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
+            S = LEVEL_SD**2 + sum((sd * rough) ** 2 * part for sd, part in zip(FIELD.natural_sd, parts, strict=False))
+            S = S + FIELD.bone_sd**2 * parts[-1] + calibration.exponent_sd**2 * np.outer(away, away)
             apart = ((xy[:, None] - xy) ** 2).sum(axis=2)
             S += (SURFACE_SHARE * u) ** 2 * np.outer(lever, lever) * np.exp(-0.5 * apart / USUAL.errors.surface_m**2)
             S += np.diag((STROKE_SHARE * u * lever) ** 2 + USUAL.errors.white_sd**2 + (0.02**2 + USUAL.tare_n**2) / force**2)
-            row = [np.log(1 - LUMP_PROBABILITY) + multivariate_normal(np.zeros(len(y)), S).logpdf(y)]
+            row = [np.log(1 - LUMPS.probability) + multivariate_normal(np.zeros(len(y)), S).logpdf(y)]
             for x, y0, radius, p in zip(*posterior.centres.T, posterior.radii, prior, strict=True):
-                b = Bump(x, y0, radius, EDGE_M)(xy)
+                b = Bump(x, y0, radius, LUMPS.edge_m)(xy)
                 lumpy = multivariate_normal(CONTRAST[0] * b, S + CONTRAST[1] ** 2 * np.outer(b, b))
                 row.append(np.log(p) + lumpy.logpdf(y))
             log_joint.append(row)
@@ -179,7 +174,7 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
 
 
 def test_others_are_sought_besides_an_accepted_lump() -> None:
-    other = Bump(-0.03, 0.02, 0.014, EDGE_M)
+    other = Bump(-0.03, 0.02, 0.014, LUMPS.edge_m)
     places = CENTRED.places
     both = [
         Press(a.x, a.y, a.depth, a.force * b.force / 4.0, a.time)

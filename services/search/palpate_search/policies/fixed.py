@@ -5,14 +5,14 @@ from scipy.stats import qmc
 
 from palpate_models.numerics.frames import Array
 from palpate_search.posterior import Posterior
-from palpate_search.presses import PLACES_M, Budget
+from palpate_search.presses import PRESSES, Budget
 
 
 def raster(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Return the next place of a serpentine lattice with as many places as the budget has presses."""
     task, k = posterior.task, posterior.asked
     width, height = task.high - task.low
-    columns = max(1, round(np.sqrt(task.budget.presses * width / max(height, PLACES_M))))
+    columns = max(1, round(np.sqrt(task.budget.presses * width / max(height, PRESSES.places_m))))
     rows = -(-task.budget.presses // columns)
     column, row = divmod(k % (columns * rows), rows)
     row = row if column % 2 == 0 else rows - 1 - row

@@ -16,7 +16,7 @@ from palpate_assessment.calibration import learned
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
-from palpate_search.presses import LEAST_MEASURED_M, Budget, Task
+from palpate_search.presses import PRESSES, Budget, Task
 
 
 @dataclass(frozen=True)
@@ -52,7 +52,7 @@ def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
     exponent = learned().exponent
     xy = np.array([felt.xy for felt in posterior.presses])
     force = np.array([max(felt.force, 0.1) for felt in posterior.presses])
-    depth = np.array([max(felt.depth, LEAST_MEASURED_M) for felt in posterior.presses])
+    depth = np.array([max(felt.depth, PRESSES.least_measured_m) for felt in posterior.presses])
     y = np.log(force) - exponent * np.log(depth / press.DEPTH_M)
     y = (y - y.mean()) / max(float(y.std()), 0.05)
     kernel = RBF(TUNING.length_m) + WhiteKernel(TUNING.noise**2)

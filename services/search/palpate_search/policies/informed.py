@@ -8,6 +8,7 @@ in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The
 (Lindley 1956; MacKay 1992, "Information-based objective functions for active data selection").
 """
 
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -87,12 +88,19 @@ def information(unexplained: Array, contrast: Array, contrast_variance: Array, p
     return out
 
 
-_PROMISING: Final = 12
-"""Number of best places that are also evaluated for a deeper press."""
-_SAFE: Final = 0.8
-"""A deeper press must have an expected force below this share of the force limit."""
-_KNOWN: Final = 1.0
-"""A deeper press needs a variance of the log-force below this."""
+@dataclass(frozen=True)
+class DeeperTuning:
+    """When a deeper press is considered."""
+
+    promising: int = 12
+    """Number of best places that are also evaluated for a deeper press."""
+    safe: float = 0.8
+    """A deeper press must have an expected force below this share of the force limit."""
+    known: float = 1.0
+    """A deeper press needs a variance of the log-force below this."""
+
+
+DEEPER: Final = DeeperTuning()
 
 
 def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
@@ -117,9 +125,9 @@ def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
         best = int(np.argmin(np.where(posterior.open, np.linalg.norm(task.places - np.array(task.centre), axis=1), np.inf)))
         return task.places[best], task.depth
     greatest = rates[best]
-    promising = np.argsort(-rates)[:_PROMISING]
+    promising = np.argsort(-rates)[: DEEPER.promising]
     force = np.exp(mean + exponent * np.log(task.deepest / press.DEPTH_M))
-    safe = promising[(force[promising] < _SAFE * task.force) & (variance[promising] < _KNOWN)]
+    safe = promising[(force[promising] < DEEPER.safe * task.force) & (variance[promising] < DEEPER.known)]
     if len(safe) and (deeper := rate(safe, task.deepest)).max() > greatest:
         best, depth = int(safe[int(np.argmax(deeper))]), task.deepest
     return task.places[best], depth
