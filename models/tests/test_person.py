@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.healthy import belly, healthy_wall
-from palpate_models.patient.person import FAT_YOUNG_PA, MEASURED_FAT_M, drawn, under_fat
+from palpate_models.patient.person import PEOPLE, drawn, under_fat
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.schema import Anatomy, Build, Draw, Muscles, Phantom, Skeleton, Stiffness, Variation
@@ -125,7 +125,7 @@ def test_bones_are_where_the_skeleton_says() -> None:
 
 def test_under_fat_the_wall_is_two_springs_in_series() -> None:
     wall, fat = Stiffness(k_w_n_per_m3=2e5, length_m=0.015, stiffening_per_m=80.0), 0.045
-    extra = fat - MEASURED_FAT_M
+    extra = fat - PEOPLE.measured_fat_m
     both = under_fat(wall, fat)
     pressure = 200.0  # small: the springs are expanded to third order
 
@@ -134,11 +134,11 @@ def test_under_fat_the_wall_is_two_springs_in_series() -> None:
         roots = np.roots((beta**2 / 3, 0, 1, -linear))
         return float(roots[np.argmin(abs(roots.imag))].real)
 
-    apart = yields(wall.k_w_n_per_m3, wall.stiffening_per_m) + yields(FAT_YOUNG_PA / extra, 1 / extra)
+    apart = yields(wall.k_w_n_per_m3, wall.stiffening_per_m) + yields(PEOPLE.fat_young_pa / extra, 1 / extra)
     assert yields(both.k_w_n_per_m3, both.stiffening_per_m) == pytest.approx(apart, rel=1e-5)
     shear = [one.k_w_n_per_m3 * one.length_m**2 for one in (wall, both)]
     assert shear[0] == pytest.approx(shear[1])
-    assert under_fat(wall, MEASURED_FAT_M) == wall
+    assert under_fat(wall, PEOPLE.measured_fat_m) == wall
 
 
 def test_lumps_are_within_their_ranges() -> None:

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +13,26 @@ from palpate_models.patient.field import smoothstep
 from palpate_models.patient.mesh import orient, vertex_normals
 from palpate_models.patient.schema import Anatomy, Skeleton
 
-COSTAL_EDGE_M = 0.04
-"""Width of the transition from belly to rib cage."""
+
+@dataclass(frozen=True)
+class BodyShape:
+    """Relief of the parametric abdomen, and its mesh."""
+
+    costal_edge_m: float = 0.04
+    """Width of the transition from belly to rib cage."""
+    umbilicus_m: tuple[float, float] = (0.0015, 0.009)
+    """Depth and radius (standard deviation) of the umbilicus; its radius of curvature is 54 mm."""
+    costal_rise_m: float = 0.004
+    """Rise of the rib cage above the costal arch."""
+    iliac_rise_m: float = 0.005
+    """Rise of the iliac crests."""
+    examined_half_m: float = 0.106
+    """Half width and length of the finely meshed region: 0.10 m and a margin."""
+    growth: float = 0.23
+    """Growth of the edge length with distance from the examined region."""
+
+
+SHAPE: Final = BodyShape()
 
 
 def _in_skeleton(x: Array, y: Array, skeleton: Skeleton) -> tuple[Array, Array]:
@@ -38,20 +57,8 @@ def iliac_bump(x: Array, y: Array, skeleton: Skeleton) -> Array:
 
 def bone_share(x: Array, y: Array, skeleton: Skeleton) -> Array:
     """Return the share of bone under the wall, from 0 on the belly to 1."""
-    ribs = smoothstep(above_costal_arch(x, y, skeleton) / COSTAL_EDGE_M)
+    ribs = smoothstep(above_costal_arch(x, y, skeleton) / SHAPE.costal_edge_m)
     return np.maximum(ribs, smoothstep(2 * iliac_bump(x, y, skeleton) - 0.5))
-
-
-UMBILICUS_M = (0.0015, 0.009)
-"""Depth and radius (standard deviation) of the umbilicus; its radius of curvature is 54 mm."""
-COSTAL_RISE_M = 0.004
-"""Rise of the rib cage above the costal arch."""
-ILIAC_RISE_M = 0.005
-"""Rise of the iliac crests."""
-EXAMINED_HALF_M = 0.106
-"""Half width and length of the finely meshed region: 0.10 m and a margin."""
-_GROWTH = 0.23
-"""Growth of the edge length with distance from the examined region."""
 
 
 @dataclass(frozen=True)
@@ -95,10 +102,10 @@ class _Body:
         waist /= 1 - 0.05 * np.exp(-((0.15 / 0.45) ** 2))
         x = np.sign(s) * np.interp(np.abs(s), self._s, self._x) * waist
         share = 1 + np.interp(np.abs(s), self._s, self._z) / self.height
-        depth, sigma = UMBILICUS_M
+        depth, sigma = SHAPE.umbilicus_m
         relief = -self._dome * eta**2 + depth * (1 - np.exp(-(x**2 + y**2) / (2 * sigma**2)))
-        relief += COSTAL_RISE_M * smoothstep(above_costal_arch(x, y, self._skeleton) / COSTAL_EDGE_M)
-        relief += ILIAC_RISE_M * iliac_bump(x, y, self._skeleton)
+        relief += SHAPE.costal_rise_m * smoothstep(above_costal_arch(x, y, self._skeleton) / SHAPE.costal_edge_m)
+        relief += SHAPE.iliac_rise_m * iliac_bump(x, y, self._skeleton)
         return np.column_stack((x, y, -self.height + share * (self.height + relief)))
 
 
@@ -116,7 +123,7 @@ def rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float)
     rings: list[Array] = []
     offset = 0.9 * edge
     while offset < np.hypot(outer[0] - half_s, outer[1] - half_y):
-        size = edge + _GROWTH * offset
+        size = edge + SHAPE.growth * offset
         quarter = np.array([2 * half_y, offset * np.pi / 2, 2 * half_s, offset * np.pi / 2])
         at = np.linspace(0, 2 * quarter.sum(), round(2 * quarter.sum() / size), endpoint=False)
         bends = np.concatenate(([0.0], np.cumsum(np.tile(quarter, 2))))
@@ -137,7 +144,7 @@ def rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float)
 def _graded(half: float, other_distance: float, inner: float, edge: float) -> Array:
     """Coordinates from 0 to `half` along a border, spaced like the rings that end there; shape (k,)."""
     x = np.linspace(0, half, 2001)
-    size = edge + _GROWTH * np.hypot(np.maximum(x - inner, 0), other_distance)
+    size = edge + SHAPE.growth * np.hypot(np.maximum(x - inner, 0), other_distance)
     count = np.concatenate(([0.0], np.cumsum(np.diff(x) / size[1:])))
     return np.interp(np.linspace(0, count[-1], max(3, round(count[-1]) + 1)), count, x)
 
@@ -152,7 +159,10 @@ def _strip(left: NDArray[np.intp], right: NDArray[np.intp]) -> NDArray[np.int32]
 
 def _plan(body: _Body, edge: float) -> tuple[Array, int]:
     """Points in (s, y), shape (n, 2), the border's last, and how many are within the border."""
-    half_s, half_y = (body.arc(min(EXAMINED_HALF_M, 0.8 * float(body._x.max()))), min(EXAMINED_HALF_M, 0.8 * body.half_length))
+    half_s, half_y = (
+        body.arc(min(SHAPE.examined_half_m, 0.8 * float(body._x.max()))),
+        min(SHAPE.examined_half_m, 0.8 * body.half_length),
+    )
     outer = (body.half_arc, body.half_length)
     inside = np.concatenate((lattice(half_s, half_y, edge), rings(half_s, half_y, outer, edge)))
     end = _graded(outer[0], outer[1] - half_y, half_s, edge)
@@ -203,7 +213,7 @@ def parametric_surface(size_m: tuple[float, float, float], edge_m: float, anatom
         # Rounded: points of a ring lie on a circle, where the last bit, another on each processor, would choose the diagonal.
         skin = Delaunay(np.round(plan, 7)).simplices.astype(np.int32)
         vertices = body(plan[:, 0], plan[:, 1])
-        fine = (np.abs(vertices[:, :2]) <= EXAMINED_HALF_M - edge_m).all(axis=1) & (vertices[:, 2] > -size_m[2] / 2)
+        fine = (np.abs(vertices[:, :2]) <= SHAPE.examined_half_m - edge_m).all(axis=1) & (vertices[:, 2] > -size_m[2] / 2)
         pairs = np.concatenate((skin[:, :2], skin[:, 1:], skin[:, ::2]))
         pairs = pairs[fine[pairs].all(axis=1)]
         longest = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1).max()

@@ -17,7 +17,9 @@ of 40 mm that touches the skin is felt 15 % too little. S was chosen on one ridg
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from statistics import harmonic_mean
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,12 +29,20 @@ from palpate_models.numerics.seeds import generator
 from palpate_models.patient.schema import Background, Lesion, Structure
 from palpate_models.patient.wall import Guarding
 
-_SHARE = 0.857
-_FADE_M = 0.0146
-_SHIELD = 0.161
-_SHIELD_M = 0.0187
-_CAP_M = 0.006
-_SPREAD = 0.5
+
+@dataclass(frozen=True)
+class FeltLump:
+    """Constants of the head of this file."""
+
+    share: float = 0.857
+    fade_m: float = 0.0146
+    shield: float = 0.161
+    shield_m: float = 0.0187
+    cap_m: float = 0.006
+    spread: float = 0.5
+
+
+FELT: Final = FeltLump()
 
 
 def at_skin(lesion: Lesion) -> Lesion:
@@ -41,10 +51,10 @@ def at_skin(lesion: Lesion) -> Lesion:
         return lesion
     depth, half, size = lesion.depth_m, min(lesion.radii_m), harmonic_mean(lesion.radii_m)
     more = lesion.contrast - 1
-    polarised = more / (1 + _SHIELD * abs(more) * (depth + _SHIELD_M) / (half + depth))
-    caught = _SHARE * (size / (size + depth)) ** 2 / (1 + (depth / _FADE_M) ** 2)
-    cap = math.sqrt(2 * _CAP_M / half)
-    a, b = (radius * cap + _SPREAD * depth for radius in lesion.radii_m)
+    polarised = more / (1 + FELT.shield * abs(more) * (depth + FELT.shield_m) / (half + depth))
+    caught = FELT.share * (size / (size + depth)) ** 2 / (1 + (depth / FELT.fade_m) ** 2)
+    cap = math.sqrt(2 * FELT.cap_m / half)
+    a, b = (radius * cap + FELT.spread * depth for radius in lesion.radii_m)
     return lesion.model_copy(
         update={
             "contrast": 1 + polarised * caught,
@@ -55,12 +65,19 @@ def at_skin(lesion: Lesion) -> Lesion:
     )
 
 
-_FEATURES = 512
-"""Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""
-_MARGIN_START = 0.35
-"""Part of the half length from which the wall grows stiffer towards costal margin and pelvis [assumption]."""
-_COSTAL_SLOPE = 0.45
-"""Descent of the costal arch a metre off the midline, so flanks under the ribs are stiffer earlier [assumption]."""
+@dataclass(frozen=True)
+class HealthyField:
+    """The healthy wall's variation."""
+
+    features: int = 512
+    """Random Fourier features of the background field: its covariance is within 1/sqrt(512) = 4 % of the Gaussian one."""
+    margin_start: float = 0.35
+    """Part of the half length from which the wall grows stiffer towards costal margin and pelvis [assumption]."""
+    costal_slope: float = 0.45
+    """Descent of the costal arch a metre off the midline, so flanks under the ribs are stiffer earlier [assumption]."""
+
+
+HEALTHY: Final = HealthyField()
 
 
 def smoothstep(t: Array) -> Array:
@@ -76,9 +93,9 @@ def gaussian_field(points: Array, correlation_m: float, seed: int) -> Array:
     position, so the field does not depend on the mesh.
     """
     rng = generator(seed, "phantom")
-    frequencies = rng.standard_normal((3, _FEATURES)) / correlation_m
-    phases = rng.uniform(0, 2 * np.pi, _FEATURES)
-    return np.asarray(np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2 / _FEATURES))
+    frequencies = rng.standard_normal((3, HEALTHY.features)) / correlation_m
+    phases = rng.uniform(0, 2 * np.pi, HEALTHY.features)
+    return np.asarray(np.cos(points @ frequencies + phases).sum(axis=1) * np.sqrt(2 / HEALTHY.features))
 
 
 def background_factor(points: Array, background: Background, half_length: float, seed: int) -> Array:
@@ -89,8 +106,8 @@ def background_factor(points: Array, background: Background, half_length: float,
     sigma = np.sqrt(np.log1p(background.cv**2))
     variation = np.exp(sigma * gaussian_field(points, background.correlation_m, seed) - sigma**2 / 2)
     x, y = points[:, 0], points[:, 1]
-    along = np.where(y > 0, y + _COSTAL_SLOPE * np.abs(x), -y) / half_length
-    margin = 1 + (background.margins - 1) * smoothstep((along - _MARGIN_START) / (1 - _MARGIN_START))
+    along = np.where(y > 0, y + HEALTHY.costal_slope * np.abs(x), -y) / half_length
+    margin = 1 + (background.margins - 1) * smoothstep((along - HEALTHY.margin_start) / (1 - HEALTHY.margin_start))
     return np.asarray(variation * margin)
 
 

@@ -5,6 +5,7 @@ The file is CSV with a header and one row per node of a complete regular grid, i
 
 from dataclasses import dataclass, fields
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -15,12 +16,20 @@ from palpate_models.patient.abdomen import Shape, lattice, rings
 from palpate_models.patient.mesh import boundary_vertices, orient, vertex_normals
 from palpate_models.patient.mesh_file import MeshError
 
-APRON_M = 0.12
-"""Continuation of a body around its grid: the camera follows the wall next to the arm."""
-LEAST_NODES = 4
-"""Least number of nodes along an axis."""
-_PITCH_TOLERANCE = 0.01
-"""Largest deviation of a node from its place, over the pitch."""
+
+@dataclass(frozen=True)
+class GridTuning:
+    """A grid that can be a body."""
+
+    apron_m: float = 0.12
+    """Continuation of a body around its grid: the camera follows the wall next to the arm."""
+    least_nodes: int = 4
+    """Least number of nodes along an axis."""
+    pitch_tolerance: float = 0.01
+    """Largest deviation of a node from its place, over the pitch."""
+
+
+GRID: Final = GridTuning()
 
 
 class GridError(MeshError):
@@ -49,11 +58,11 @@ class BodyGrid:
         return np.asarray(RegularGridInterpolator(axes, values)(inside))
 
     def surface(self, edge_m: float) -> Shape:
-        """Return the surface with edges of about `edge_m` [m]; it continues by `APRON_M` to a fixed border."""
+        """Return the surface with edges of about `edge_m` [m]; it continues by `GRID.apron_m` to a fixed border."""
         low, high = (np.array((f(self.x_m), f(self.y_m))) for f in (np.min, np.max))
         half = (high - low) / 2
         inner = lattice(half[0], half[1], edge_m)
-        apron = rings(half[0], half[1], (half[0] + APRON_M, half[1] + APRON_M), edge_m)
+        apron = rings(half[0], half[1], (half[0] + GRID.apron_m, half[1] + GRID.apron_m), edge_m)
         xy = (low + high) / 2 + np.concatenate((inner, apron))
         vertices = np.column_stack((xy, self.at("z_m", xy)))
         triangles = Delaunay(np.round(xy, 7)).simplices.astype(np.int32)
@@ -98,9 +107,9 @@ def read_grid(path: Path) -> BodyGrid:
     axes = [np.unique(table[name]) for name in ("x_m", "y_m")]
     for name, axis in zip(("x_m", "y_m"), axes, strict=True):
         steps = np.diff(axis)
-        if len(axis) < LEAST_NODES or np.ptp(steps) > _PITCH_TOLERANCE * steps.mean():
+        if len(axis) < GRID.least_nodes or np.ptp(steps) > GRID.pitch_tolerance * steps.mean():
             raise GridError(
-                f"phantom.grid = {path}: {name} has {len(axis)} values; want {LEAST_NODES} or more at equal distances"
+                f"phantom.grid = {path}: {name} has {len(axis)} values; want {GRID.least_nodes} or more at equal distances"
             )
     table = table[np.lexsort((table["y_m"], table["x_m"]))]
     if len(np.unique(table[["x_m", "y_m"]])) != len(table) or len(table) != len(axes[0]) * len(axes[1]):

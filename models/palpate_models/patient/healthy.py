@@ -7,7 +7,7 @@ Fields are functions of position, made from random Fourier features (Rahimi and 
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -17,12 +17,26 @@ from palpate_models.patient.abdomen import bone_share, parametric_surface
 from palpate_models.patient.field import smoothstep
 from palpate_models.patient.schema import Anatomy, Muscles
 
-_FEATURES = 96
-_COMPONENTS = 2
-_MOST_ANISOTROPIC = 3.0
-"""Largest ratio of the lengths along and across a component's direction [A]."""
-_MOST = 3.0
-"""Bound of a field in standard deviations: healthy tissue has no extreme places."""
+
+@dataclass(frozen=True)
+class VariationTuning:
+    """Random fields of a person, and what muscles add."""
+
+    features: int = 96
+    components: int = 2
+    most_anisotropic: float = 3.0
+    """Largest ratio of the lengths along and across a component's direction [A]."""
+    most_sd: float = 3.0
+    """Bound of a field in standard deviations: healthy tissue has no extreme places."""
+    muscle_edge_m: float = 0.010
+    """Width of the transition between bands [A]."""
+    least_random: float = 0.3
+    """Minimum share of the random variation next to muscles."""
+    coarse_m: float = 0.02
+    belly_half_m: float = 0.10
+
+
+VARIATION: Final = VariationTuning()
 
 
 Family = Callable[[Array], Array]
@@ -45,14 +59,14 @@ def _waves(rng: np.random.Generator, lengths: Array, heavy: bool) -> _Waves:
 
     `heavy`: Student frequencies, so the correlation is Matern's of smoothness 3/2, and Student weights: a few waves stand out.
     """
-    frequency = rng.standard_normal((3, _FEATURES))
-    weight = np.ones(_FEATURES)
+    frequency = rng.standard_normal((3, VARIATION.features))
+    weight = np.ones(VARIATION.features)
     if heavy:
-        frequency /= np.sqrt(rng.chisquare(3, _FEATURES) / 3)
-        weight = rng.standard_t(3, _FEATURES)
+        frequency /= np.sqrt(rng.chisquare(3, VARIATION.features) / 3)
+        weight = rng.standard_t(3, VARIATION.features)
     angle = rng.uniform(0, np.pi)
     turn = np.array([[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]])
-    phase = rng.uniform(0, 2 * np.pi, _FEATURES)
+    phase = rng.uniform(0, 2 * np.pi, VARIATION.features)
     return _Waves(turn @ (frequency / lengths[:, None]), phase, weight * np.sqrt(2 / (weight**2).sum()))
 
 
@@ -93,7 +107,7 @@ def _component(rng: np.random.Generator, length_m: tuple[float, float], share: f
     """Draw a component with this share of the field's variance: family, lengths and direction."""
     family = _FAMILIES[int(rng.integers(len(_FAMILIES)))]
     length = np.exp(rng.uniform(*np.log(length_m)))
-    longer = np.exp(rng.uniform(0, np.log(_MOST_ANISOTROPIC)))
+    longer = np.exp(rng.uniform(0, np.log(VARIATION.most_anisotropic)))
     lengths = np.array((min(length * longer, length_m[1]), length, length))
     part = _Component(_waves(rng, lengths, heavy=family is _unchanged), family, float(np.sqrt(share)))
     values = part(reference)
@@ -105,10 +119,10 @@ class NaturalField:
 
     def __init__(self, rng: np.random.Generator, length_m: tuple[float, float], reference: Array) -> None:
         """`length_m`: the shortest and the longest length of a component [m]; `reference` (m, 3) in A [m]."""
-        shares = rng.dirichlet(np.ones(_COMPONENTS))
+        shares = rng.dirichlet(np.ones(VARIATION.components))
         self._parts = [_component(rng, length_m, float(share), reference) for share in shares]
         total = self._sum(reference)
-        self._middle, self._reach = float(total.mean()), _MOST * float(total.std())
+        self._middle, self._reach = float(total.mean()), VARIATION.most_sd * float(total.std())
         bounded = self._bounded(reference)
         self._mean, self._sd = float(bounded.mean()), float(bounded.std())
 
@@ -126,14 +140,6 @@ class NaturalField:
         return np.asarray((self._bounded(points) - self._mean) / self._sd)
 
 
-_MUSCLE_EDGE_M = 0.010
-"""Width of the transition between bands [A]."""
-_LEAST_RANDOM = 0.3
-"""Minimum share of the random variation next to muscles."""
-_COARSE_M = 0.02
-_BELLY_HALF_M = 0.10
-
-
 class HealthyWall(NamedTuple):
     """Wall of a person relative to its mean, at n points."""
 
@@ -145,9 +151,9 @@ class HealthyWall(NamedTuple):
 
 def belly(size_m: tuple[float, float, float], anatomy: Anatomy) -> Array:
     """Return reference points on the belly [m], shape (m, 3): the front within 0.1 m of the umbilicus, without bones."""
-    shape = parametric_surface(size_m, _COARSE_M, anatomy)
+    shape = parametric_surface(size_m, VARIATION.coarse_m, anatomy)
     x, y, _ = shape.vertices.T
-    near = (np.abs(x) <= _BELLY_HALF_M) & (np.abs(y) <= _BELLY_HALF_M) & (shape.normals[:, 2] > 0.5)
+    near = (np.abs(x) <= VARIATION.belly_half_m) & (np.abs(y) <= VARIATION.belly_half_m) & (shape.normals[:, 2] > 0.5)
     return np.asarray(shape.vertices[near & (bone_share(x, y, anatomy.skeleton) < 0.01)])
 
 
@@ -155,8 +161,8 @@ def muscle_factor(x: Array, y: Array, muscles: Muscles) -> Array:
     """Return the stiffness relative to the sides at points [m]. The linea alba narrows below the umbilicus."""
     middle = muscles.linea_alba_m / 2 * (0.75 + 0.25 * np.tanh(y / 0.03))
     away = np.abs(x)
-    alba = smoothstep(0.5 - (away - middle) / _MUSCLE_EDGE_M)
-    within = smoothstep(0.5 - (away - middle - muscles.rectus_m) / _MUSCLE_EDGE_M)
+    alba = smoothstep(0.5 - (away - middle) / VARIATION.muscle_edge_m)
+    within = smoothstep(0.5 - (away - middle - muscles.rectus_m) / VARIATION.muscle_edge_m)
     return np.asarray(1 + (muscles.linea_alba - 1) * alba + (muscles.rectus - 1) * (within - alba))
 
 
@@ -173,7 +179,7 @@ def healthy_wall(
     rng = generator(seed, "variation")
     level, other = (NaturalField(rng, variation.length_m, reference) for _ in range(2))
     at_belly = np.log(muscle_factor(reference[:, 0], reference[:, 1], anatomy.muscles))
-    random = np.sqrt(max(variation.stiffness**2 - at_belly.var(), (_LEAST_RANDOM * variation.stiffness) ** 2))
+    random = np.sqrt(max(variation.stiffness**2 - at_belly.var(), (VARIATION.least_random * variation.stiffness) ** 2))
     x, y = points[:, 0], points[:, 1]
     log_level = np.log(muscle_factor(x, y, anatomy.muscles)) - at_belly.mean() + random * level(points)
     total = np.sqrt(random**2 + at_belly.var())

@@ -2,6 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,15 +12,24 @@ from scipy.sparse.csgraph import connected_components
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import IntArray, MeshError, read_mesh
 
-LARGEST_M = 3.0
-SMALLEST_M = 0.05
-MOST_VERTICES = 20_000
-_REGION_HALF_M = 0.112
-"""Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
-_NEAR_UMBILICUS_M = 0.03
+
+@dataclass(frozen=True)
+class MeshLimits:
+    """Surfaces that can be a body."""
+
+    largest_m: float = 3.0
+    smallest_m: float = 0.05
+    most_vertices: int = 20_000
+    region_half_m: float = 0.112
+    """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
+    near_umbilicus_m: float = 0.03
+    smallest_body_m: float = 0.15
+    least_normal_z: float = 0.7
+
+
+LIMITS: Final = MeshLimits()
+
 UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048, "kilometres": 1e3}
-SMALLEST_BODY_M = 0.15
-LEAST_NORMAL_Z = 0.7
 
 
 @dataclass(frozen=True)
@@ -42,10 +52,10 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
         triangles = orient(vertices, triangles)
         check_place(vertices, triangles)
         surface = refine(vertices, triangles, edge_m)
-        if len(surface.vertices) > MOST_VERTICES:
+        if len(surface.vertices) > LIMITS.most_vertices:
             raise MeshError(
-                f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {MOST_VERTICES} are simulated: "
-                "decimate the mesh or raise phantom.edge_m"
+                f"{len(surface.vertices)} vertices with edges up to edge_m = {edge_m}; at most {LIMITS.most_vertices} are "
+                "simulated: decimate the mesh or raise phantom.edge_m"
             )
     except MeshError as error:
         raise MeshError(f"phantom.mesh = {path}: {error}") from error.__cause__
@@ -69,14 +79,15 @@ def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
 def check(vertices: Array, triangles: IntArray) -> None:
     """Raise MeshError unless the mesh is a manifold of sound triangles, in metres."""
     size = float(np.ptp(vertices, axis=0).max())
-    if not SMALLEST_M <= size <= LARGEST_M:
+    if not LIMITS.smallest_m <= size <= LIMITS.largest_m:
         fitting = [
             f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
             for unit, factor in UNITS_M.items()
-            if SMALLEST_BODY_M <= size * factor <= LARGEST_M
+            if LIMITS.smallest_body_m <= size * factor <= LIMITS.largest_m
         ]
         raise MeshError(
-            f"its size is {size:.4g}, want {SMALLEST_M} to {LARGEST_M} metres; {', '.join(fitting) or 'no unit fits'}"
+            f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; "
+            f"{', '.join(fitting) or 'no unit fits'}"
         )
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
@@ -102,7 +113,6 @@ def check(vertices: Array, triangles: IntArray) -> None:
         )
     if pieces > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
-    _check_fans(vertices, triangles)
 
 
 def check_place(vertices: Array, triangles: IntArray) -> None:
@@ -112,15 +122,15 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     frame = "abdomen frame: x to the patient's left, y to the head, z outward"
     nearest = trimesh.triangles.closest_point(vertices[triangles], np.zeros((len(triangles), 3)))
     away = np.linalg.norm(nearest, axis=1)
-    if away.min() > _NEAR_UMBILICUS_M:
+    if away.min() > LIMITS.near_umbilicus_m:
         place = _place(nearest[[away.argmin()]])
         raise MeshError(f"the umbilicus must be at the origin ({frame}), but the surface is nearest to it at {place}")
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
     border = boundary_vertices(len(vertices), triangles)
-    if normal[2] < LEAST_NORMAL_Z:
+    if normal[2] < LIMITS.least_normal_z:
         raise MeshError(f"at the umbilicus the surface faces ({', '.join(f'{x:.2g}' for x in normal)}), want +z ({frame})")
-    if border.any() and vertices[border, 2].mean() > _NEAR_UMBILICUS_M:
+    if border.any() and vertices[border, 2].mean() > LIMITS.near_umbilicus_m:
         rise = vertices[border, 2].mean()
         raise MeshError(f"its border lies {rise:.2g} m above the umbilicus, want it below: it seems to lie face down ({frame})")
 
@@ -150,7 +160,7 @@ def orient(vertices: Array, triangles: IntArray) -> IntArray:
     closed = len(twin) * 2 == len(half)
     middle = vertices[out].mean(axis=1)
     away = np.linalg.norm(middle, axis=1)
-    near = away <= away.min() + _NEAR_UMBILICUS_M
+    near = away <= away.min() + LIMITS.near_umbilicus_m
     outward = float((cross * middle).sum()) if closed else float(cross[near, 2].sum())
     return np.ascontiguousarray(out if outward > 0 else out[:, ::-1], dtype=np.int32)
 
@@ -162,13 +172,13 @@ def refine(vertices: Array, triangles: IntArray, edge_m: float) -> TriangleMesh:
         of_face = inverse.reshape(3, -1).T  # edges (0 1), (1 2), (2 0) of each triangle
         length = np.linalg.norm(vertices[pairs[:, 0]] - vertices[pairs[:, 1]], axis=1)
         corners = vertices[triangles]
-        near = (corners[:, :, :2].min(axis=1) < _REGION_HALF_M).all(axis=1)
-        near &= (corners[:, :, :2].max(axis=1) > -_REGION_HALF_M).all(axis=1)
+        near = (corners[:, :, :2].min(axis=1) < LIMITS.region_half_m).all(axis=1)
+        near &= (corners[:, :, :2].max(axis=1) > -LIMITS.region_half_m).all(axis=1)
         near &= _cross(vertices, triangles)[:, 2] > 0
         wanted = np.zeros(len(pairs), dtype=np.bool_)
         wanted[of_face[near]] = True
         split = wanted & (length > edge_m)
-        if not split.any() or len(vertices) > MOST_VERTICES:
+        if not split.any() or len(vertices) > LIMITS.most_vertices:
             break
         # Split only the longest edges of a neighbourhood at a time: bisection of longest edges keeps angles sound.
         longest_of_face = length[of_face].max(axis=1)
@@ -228,27 +238,6 @@ def vertex_normals(vertices: Array, triangles: IntArray) -> Array:
         np.add.at(normals, triangles[:, k], cross)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)))
-
-
-def _check_fans(vertices: Array, triangles: IntArray) -> None:
-    """Raise MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
-    m = len(triangles)
-    half = np.sort(_half_edges(triangles), axis=1)
-    face = np.tile(np.arange(m), 3)
-    order = np.lexsort((half[:, 1], half[:, 0]))
-    same = np.flatnonzero((half[order][1:] == half[order][:-1]).all(axis=1))
-    f, g, edge = face[order[same]], face[order[same + 1]], half[order[same]]
-    rows, columns = [], []
-    for vertex in edge.T:  # corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge
-        rows.append(3 * f + np.argmax(triangles[f] == vertex[:, None], axis=1))
-        columns.append(3 * g + np.argmax(triangles[g] == vertex[:, None], axis=1))
-    graph = sparse.coo_array((np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m))
-    _, fan = connected_components(graph, directed=False)
-    fans = np.unique(np.column_stack((triangles.ravel(), fan)), axis=0)
-    touched, count = np.unique(fans[:, 0], return_counts=True)
-    if (count > 1).any():
-        where = _place(vertices[touched[count > 1][:1]])
-        raise MeshError(f"non-manifold: surfaces touch in {int((count > 1).sum())} single vertices, the first at {where}")
 
 
 def _half_edges(triangles: IntArray) -> IntArray:

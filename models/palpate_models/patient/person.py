@@ -6,7 +6,7 @@ Marks of certainty: [V] read in the source, [C] computed from measurements, [M] 
 from dataclasses import dataclass
 from functools import cache
 from math import dist
-from typing import NamedTuple
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,9 +18,27 @@ from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.wall import Guarding
 
-GAP_M = (0.002, 0.020)
-"""Range of the gap between the outlines of a pair of lumps, uniform."""
-_TRIES = 50
+
+@dataclass(frozen=True)
+class PersonTuning:
+    """Distributions of a person, besides the body and the wall."""
+
+    gap_m: tuple[float, float] = (0.002, 0.020)
+    """Range of the gap between the outlines of a pair of lumps, uniform."""
+    tries: int = 50
+    measured_fat_m: float = 0.015
+    """Fat thickness included in the measurements: young men with a body mass index of 19.5 to 24.6 [A]."""
+    fat_young_pa: float = 3000.0
+    """Young's modulus of fat [M: 1.6 to 3.3 kPa excised]."""
+    build_shares: tuple[float, float, float] = (0.2, 0.5, 0.3)
+    """Share of each build [A]."""
+    breaths_per_min: tuple[float, float, float] = (12.0, 14.0, 20.0)
+    """Minimum, mode and maximum of a person's mean quiet breathing rate. Mode: Ragnarsdottir 2006 [V]; ends [A]."""
+    breath_m: tuple[float, float] = (0.005, 0.012)
+    """Range of a person's mean quiet breathing depth at the umbilicus, uniform [A]."""
+
+
+PEOPLE: Final = PersonTuning()
 
 
 def drawn_lumps(draw: schema.Draw, rng: np.random.Generator) -> tuple[schema.Lesion, ...]:
@@ -63,7 +81,7 @@ def _log_uniform(limits: schema.Range, rng: np.random.Generator) -> float:
 def _separate_lump(draw: schema.Draw, rng: np.random.Generator, others: list[schema.Lesion]) -> schema.Lesion:
     """Return a lump that overlaps no other; if no try succeeds, the one farthest from the others."""
     best, most = _lump(draw, rng, _place(draw, rng)), -np.inf
-    for _ in range(_TRIES):
+    for _ in range(PEOPLE.tries):
         lump = best.model_copy(update={"centre_m": _place(draw, rng)})
         gaps = (dist(lump.centre_m, other.centre_m) - max(lump.radii_m) - max(other.radii_m) for other in others)
         gap = min(gaps, default=np.inf)
@@ -78,7 +96,7 @@ def _moved_beside(first: schema.Lesion, second: schema.Lesion, rng: np.random.Ge
     """Return the second lump of a pair, moved in a random direction from the first to a random gap between the outlines."""
     angle = rng.uniform(0, 2 * np.pi)
     away = np.array((np.cos(angle), np.sin(angle)))
-    reach = sum(1 / np.hypot(*(away / np.array(lump.radii_m))) for lump in (first, second)) + rng.uniform(*GAP_M)
+    reach = sum(1 / np.hypot(*(away / np.array(lump.radii_m))) for lump in (first, second)) + rng.uniform(*PEOPLE.gap_m)
     x, y = (np.array(first.centre_m) + reach * away).tolist()
     return second.model_copy(update={"centre_m": (x, y)})
 
@@ -126,17 +144,7 @@ def moments(values: Array, person: NDArray[np.str_]) -> WallStatistics:
 
 Interval = tuple[float, float]
 
-MEASURED_FAT_M = 0.015
-"""Fat thickness included in the measurements: young men with a body mass index of 19.5 to 24.6 [A]."""
-FAT_YOUNG_PA = 3000.0
-"""Young's modulus of fat [M: 1.6 to 3.3 kPa excised]."""
 BUILDS = (schema.Build.SLIM, schema.Build.MEDIAN, schema.Build.OBESE)
-SHARES = (0.2, 0.5, 0.3)
-"""Share of each build [A]."""
-BREATHS_PER_MIN = (12.0, 14.0, 20.0)
-"""Minimum, mode and maximum of a person's mean quiet breathing rate. Mode: Ragnarsdottir 2006 [V]; ends [A]."""
-BREATH_M: Interval = (0.005, 0.012)
-"""Range of a person's mean quiet breathing depth at the umbilicus, uniform [A]."""
 
 
 class Figure(NamedTuple):
@@ -166,7 +174,7 @@ def drawn(phantom: schema.Phantom, seed: int) -> schema.Phantom:
         return phantom
     rng = generator(seed, "person")
     build = phantom.build
-    chosen = BUILDS[int(rng.choice(len(BUILDS), p=SHARES))]
+    chosen = BUILDS[int(rng.choice(len(BUILDS), p=PEOPLE.build_shares))]
     figure = FIGURES[chosen if build is schema.Build.DRAWN else build]
     width, length, height, dome, exponent, fat = rng.uniform(*np.transpose(figure)).tolist()
     statistics = wall_statistics()
@@ -219,10 +227,10 @@ def under_fat(wall: schema.Stiffness, fat_m: float) -> schema.Stiffness:
     to third order  1 / k_s = 1 / k_w + 1 / k_f,  beta_s^2 = beta_w^2 phi_w^3 + beta_f^2 phi_f^3:  a softer start. The fat itself
     stiffens as it is flattened, beta_f = 1 / t. The wall's shear G = k_w l^2 stays, so the length grows to l (k_w / k_s)^(1/2).
     """
-    extra = fat_m - MEASURED_FAT_M
+    extra = fat_m - PEOPLE.measured_fat_m
     if extra <= 0:
         return wall
-    k_f = FAT_YOUNG_PA / extra
+    k_f = PEOPLE.fat_young_pa / extra
     of_wall = k_f / (wall.k_w_n_per_m3 + k_f)
     stiffening = np.sqrt(wall.stiffening_per_m**2 * of_wall**3 + (1 / extra) ** 2 * (1 - of_wall) ** 3)
     return wall.model_copy(
@@ -236,7 +244,7 @@ def under_fat(wall: schema.Stiffness, fat_m: float) -> schema.Stiffness:
 
 def _breathing(breathing: Breathing, rng: np.random.Generator) -> Breathing:
     """Draw mean rate and depth of breathing where the scenario gives none. Deep breathing keeps its own values."""
-    own = {"rate_per_min": rng.triangular(*BREATHS_PER_MIN), "peak_to_peak_m": rng.uniform(*BREATH_M)}
+    own = {"rate_per_min": rng.triangular(*PEOPLE.breaths_per_min), "peak_to_peak_m": rng.uniform(*PEOPLE.breath_m)}
     return breathing.model_copy(update={name: value for name, value in own.items() if name not in breathing.model_fields_set})
 
 

@@ -13,12 +13,23 @@ from palpate_plugins import PluginError
 
 Surface = Callable[[Array], tuple[Array, Array]]
 """Perceived surface: maps xy in A [m], shape (n, 2), to points [m] and outward unit normals, both (n, 3), in A."""
-LARGEST: Final = 20_000
-"""Maximum number of targets, which already take hours."""
-OUTSIDE_M: Final = 0.001
-"""Tolerance of targets outside of the examined region."""
-APART_M: Final = 1e-4
-"""Least distance of consecutive targets of a stroke."""
+
+
+@dataclass(frozen=True)
+class PatternLimits:
+    """Targets that a pattern may give, and the first touches."""
+
+    most_targets: int = 20_000
+    """Maximum number of targets, which already take hours."""
+    outside_m: float = 0.001
+    """Tolerance of targets outside of the examined region."""
+    apart_m: float = 1e-4
+    """Least distance of consecutive targets of a stroke."""
+    touches_m: float = 0.07
+    """Maximum spacing of the first touches, which determine offset, tilt and field of the surface correction."""
+
+
+LIMITS: Final = PatternLimits()
 
 
 @dataclass(frozen=True)
@@ -56,26 +67,22 @@ def scan_of(exam: Exam, surface: Surface) -> Scan:
         if line.ndim != 2 or line.shape[1] != 2 or not len(line) or not np.isfinite(line).all():
             raise PluginError(f"exam.pattern = {exam.pattern!r}: line {k} has the shape {line.shape}, want finite (k, 2), k > 0")
     count = sum(map(len, lines))
-    if not 0 < count <= LARGEST:
-        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LARGEST}")
+    if not 0 < count <= LIMITS.most_targets:
+        raise PluginError(f"exam.pattern = {exam.pattern!r}: {count} targets, want 1 to {LIMITS.most_targets}")
     scan = Scan(lines, made.joined)
     off = np.abs(scan.targets - exam.centre_m) - np.array(exam.region_m) / 2
-    if off.max() > OUTSIDE_M:
+    if off.max() > LIMITS.outside_m:
         raise PluginError(f"exam.pattern = {exam.pattern!r}: targets lie up to {1e3 * off.max():.0f} mm outside of exam.region_m")
     for k, stroke in enumerate([scan.targets] if scan.joined else lines):
         steps = np.linalg.norm(np.diff(stroke, axis=0), axis=1)
-        if len(steps) and steps.min() < APART_M:
+        if len(steps) and steps.min() < LIMITS.apart_m:
             i = int(steps.argmin())
             where = "" if scan.joined else f" of line {k}"
             raise PluginError(
                 f"exam.pattern = {exam.pattern!r}: targets {i} and {i + 1}{where} are both at {stroke[i].round(4).tolist()} m; "
-                f"consecutive targets must be {1e3 * APART_M:g} mm apart"
+                f"consecutive targets must be {1e3 * LIMITS.apart_m:g} mm apart"
             )
     return scan
-
-
-TOUCHES_M: Final = 0.07
-"""Maximum spacing of the first touches, which determine offset, tilt and field of the surface correction."""
 
 
 def touch_centres(targets: Array) -> Array:
@@ -84,7 +91,7 @@ def touch_centres(targets: Array) -> Array:
     They go to and fro, and end near the first target.
     """
     low, high = targets.min(axis=0), targets.max(axis=0)
-    counts = np.maximum(1, np.ceil((high - low) / TOUCHES_M - 1e-9)).astype(int)
+    counts = np.maximum(1, np.ceil((high - low) / LIMITS.touches_m - 1e-9)).astype(int)
     columns, rows = (low[k] + (high[k] - low[k]) * (np.arange(counts[k]) + 0.5) / counts[k] for k in (0, 1))
     centres = np.array([(x, y) for j, y in enumerate(rows) for x in columns[:: -1 if j % 2 else 1]])
     if np.linalg.norm(centres[-1] - targets[0]) > np.linalg.norm(centres[0] - targets[0]):

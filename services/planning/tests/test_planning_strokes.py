@@ -7,7 +7,7 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
-from palpate_models.scenario.patterns import TOUCHES_M
+from palpate_models.scenario.patterns import LIMITS
 from palpate_models.scenario.schema import Mode
 from palpate_planning.interruptions import Displacement
 from palpate_planning.stroke_motion import stroke_setpoint
@@ -81,7 +81,7 @@ def test_touches_are_spread_over_all_that_is_usable() -> None:
     assert all(piece.touch and len(piece.xy) == 1 and usable[piece.targets[0]] for piece in spread)
     places = np.array([piece.xy[0] for piece in spread])
     assert len(places) == 9
-    assert np.linalg.norm(xy[usable][:, None] - places, axis=-1).min(axis=1).max() < TOUCHES_M
+    assert np.linalg.norm(xy[usable][:, None] - places, axis=-1).min(axis=1).max() < LIMITS.touches_m
     assert touches(xy, np.zeros(len(xy), dtype=bool)) == []
 
 
