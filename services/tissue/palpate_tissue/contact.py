@@ -9,7 +9,8 @@ P removes the component along the normal. It is passive: k is constant, and slip
 """
 
 import math
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -71,12 +72,19 @@ class VertexSearch:
         return Near(p, max(self._margin, float(distance) - ball), radius, index[keep], n[keep], X[keep])
 
 
-REFERENCE_K_W = 1.7e5
-REFERENCE_E = 1.0e4
-"""A half-space of 10 kPa corresponds to k_w = 1.7e5 N/m^3 (`palpate validate`: Hertz and the foundation agree at 10 mm)."""
-REFERENCE_RADIUS_M = 0.012
-"""Contact radius at 10 mm depth, about sqrt(R d) for indenters of 15 mm."""
-POISSON = 0.49
+@dataclass(frozen=True)
+class ReferenceWall:
+    """A half-space, and the wall and contact that correspond to it."""
+
+    k_w_n_per_m3: float = 1.7e5
+    young_pa: float = 1.0e4
+    """A half-space of 10 kPa corresponds to k_w = 1.7e5 N/m^3 (`palpate validate`: Hertz and the foundation agree at 10 mm)."""
+    radius_m: float = 0.012
+    """Contact radius at 10 mm depth, about sqrt(R d) for indenters of 15 mm."""
+    poisson: float = 0.49
+
+
+REFERENCE: Final = ReferenceWall()
 
 
 def shear_stiffness(k_w: float) -> float:
@@ -84,8 +92,8 @@ def shear_stiffness(k_w: float) -> float:
 
     8 a G / (2 - nu) of a sticking contact of radius a on a half-space (Mindlin 1949; Johnson, Contact Mechanics, section 7.2).
     """
-    shear_modulus = REFERENCE_E * k_w / REFERENCE_K_W / (2 * (1 + POISSON))
-    return 8 * REFERENCE_RADIUS_M * shear_modulus / (2 - POISSON)
+    shear_modulus = REFERENCE.young_pa * k_w / REFERENCE.k_w_n_per_m3 / (2 * (1 + REFERENCE.poisson))
+    return 8 * REFERENCE.radius_m * shear_modulus / (2 - REFERENCE.poisson)
 
 
 class Bristle(NamedTuple):

@@ -12,10 +12,16 @@ from palpate_errors import UserError
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import Compliance, LayerKernel, compliance
+from palpate_tissue.backends.elastic.compliance import (
+    Compliance,
+    ComplianceTuning,
+    LayerKernel,
+    compliance,
+    graded_grid,
+    skin_compliance,
+)
 from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.slab import FlatSlab, hertz_force
-from palpate_tissue.backends.elastic.solid import graded_grid, skin_compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue, update_rule
 
 STILL = np.zeros(3)
@@ -174,7 +180,7 @@ def test_breathing_lifts_the_skin_into_the_sphere() -> None:
 
 def test_too_many_vertices_are_refused_with_what_to_do(monkeypatch: pytest.MonkeyPatch) -> None:
     with monkeypatch.context() as patch, pytest.raises(UserError, match="edge_m"):
-        patch.setattr("palpate_tissue.backends.elastic.compliance.MOST_VERTICES", 100)
+        patch.setattr("palpate_tissue.backends.elastic.compliance.COMPLIANCE", ComplianceTuning(most_vertices=100))
         compliance(flat(), thickness_m=0.1)
     with pytest.raises(ValueError, match="thickness_m"):
         compliance(flat(), (LUMP,), thickness_m=np.inf)

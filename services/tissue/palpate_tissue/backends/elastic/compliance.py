@@ -8,18 +8,25 @@ of the healthy body, and by one lesion after another. Each change E -> E' turns 
 D scales by the modulus at the skin, (E / E')^(1/2), which is exact for near points. The remainder, from modulus changes along and
 below the skin, comes from finite elements: F and F' are their compliances before and after on one coarse grid, whose local errors
 cancel in the difference; P M interpolates them to the vertices.
+
+The elements are trilinear bricks on a graded grid, condensed to normal forces and displacements of the skin. The volumetric
+strain is averaged over the element (B-bar; Hughes 1980), because trilinear bricks of nearly incompressible tissue lock otherwise.
+Base and sides are fixed.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from itertools import product
 from pathlib import Path
+from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy import sparse
 from scipy.integrate import simpson
 from scipy.interpolate import CubicSpline, LinearNDInterpolator, NearestNDInterpolator
+from scipy.linalg import cholesky, solve_triangular
 from scipy.spatial.distance import cdist
 from scipy.special import j0
 
@@ -31,17 +38,33 @@ from palpate_models.patient.field import lesion_field, smoothstep
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Lesion
 from palpate_tissue import contact
-from palpate_tissue.backends.elastic import solid
-from palpate_tissue.backends.elastic.solid import NodeGrid, graded_grid, skin_compliance
-from palpate_tissue.contact import REFERENCE_E, REFERENCE_K_W
+from palpate_tissue.contact import REFERENCE
 
-SELF_WEIGHT = 3.92
-"""Displacement from a vertex's own pressure, over force / sqrt(area), for which the sum of 1/r over a lattice equals the integral
-(corrected trapezoidal rule; Marin, Runborg and Tornberg 2014). Regularised lattice sums (Epstein zeta at 1/2) give 3.900 on a
-square and 3.921 on a hexagonal lattice, so it hardly depends on the mesh."""
 
-_FARTHEST = 12.0
-"""Largest tabulated distance over thickness; beyond it the skin of a layer is at rest."""
+@dataclass(frozen=True)
+class ComplianceTuning:
+    """Discretisation of the solid."""
+
+    self_weight: float = 3.92
+    """Displacement from a vertex's own pressure, over force / sqrt(area), for which the sum of 1/r over a lattice equals the
+    integral (corrected trapezoidal rule; Marin, Runborg and Tornberg 2014). Regularised lattice sums (Epstein zeta at 1/2) give
+    3.900 on a square and 3.921 on a hexagonal lattice, so it hardly depends on the mesh."""
+    farthest: float = 12.0
+    """Largest tabulated distance over thickness; beyond it the skin of a layer is at rest."""
+    pitch_m: float = 0.0125
+    """Edge of the finite elements of the healthy body; those of a lesion near the skin are finer."""
+    grid_half_m: float = 0.13
+    """Largest half width of the uniform part of the grid: 0.1 m of region plus a margin."""
+    poisson: float = 0.49
+    most_vertices: int = 20_000
+    """The matrix of this many vertices takes 1.6 GB."""
+    most_nodes: int = 2000
+    """Skin nodes of the body's finite elements: a minute on one core; the time grows with the third power."""
+    most_lesion_nodes: int = 1100
+    """Skin nodes about a lesion, whose pitch is coarser for a larger one."""
+
+
+COMPLIANCE: Final = ComplianceTuning()
 
 
 def layer_factor(wave: Array, poisson: float) -> Array:
@@ -85,26 +108,26 @@ class LayerKernel:
 
     def at_own_place(self, area: Array) -> Array:
         """Return k of a vertex on itself [1/m], for vertices of `area` [m^2], same shape."""
-        own = SELF_WEIGHT / np.sqrt(area)
+        own = COMPLIANCE.self_weight / np.sqrt(area)
         return own if self._base is None else own - self._by_base(np.zeros_like(area))
 
     def _by_base(self, distance: Array) -> Array:
         assert self._base is not None
         s = distance / self.thickness_m
-        inside = s < _FARTHEST
+        inside = s < COMPLIANCE.farthest
         # Far away the base cancels the half-space's displacement.
-        return np.where(inside, self._base(np.minimum(s, _FARTHEST)), 1 / np.maximum(s, 1.0)) / self.thickness_m
+        return np.where(inside, self._base(np.minimum(s, COMPLIANCE.farthest)), 1 / np.maximum(s, 1.0)) / self.thickness_m
 
 
 def _base_term(poisson: float) -> CubicSpline:
-    """Return g(s) for 0 <= s <= _FARTHEST."""
+    """Return g(s) for 0 <= s <= COMPLIANCE.farthest."""
     wave = np.linspace(0, 20, 8001)
     short = 1 - layer_factor(wave, poisson)
-    at = np.concatenate((np.linspace(0, 4, 161), np.linspace(4, _FARTHEST, 121)[1:]))
+    at = np.concatenate((np.linspace(0, 4, 161), np.linspace(4, COMPLIANCE.farthest, 121)[1:]))
     return CubicSpline(at, simpson(short[None, :] * j0(at[:, None] * wave[None, :]), x=wave, axis=1))
 
 
-YOUNG_OVER_K_W = REFERENCE_E / REFERENCE_K_W
+YOUNG_OVER_K_W = REFERENCE.young_pa / REFERENCE.k_w_n_per_m3
 """Young's modulus over the foundation modulus of an equally stiff wall at 10 mm depth [m]."""
 
 
@@ -179,21 +202,144 @@ def _ellipsoid_distance(points: Array, lesion: Lesion) -> Array:
     return np.asarray(np.where(rho > 1e-6, (rho - 1) * rho / np.maximum(slope, 1e-9), -radii.min()))
 
 
+@dataclass(frozen=True)
+class NodeGrid:
+    """Nodes of the layer: x and y in the plane of the skin, depth below it (0 first, the base last), all ascending [m]."""
+
+    x: Array
+    y: Array
+    depth: Array
+    loaded_x: slice
+    """Nodes of the skin that may be loaded, along x."""
+    loaded_y: slice
+
+    @property
+    def skin(self) -> tuple[Array, Array]:
+        """Return x and y of the loaded skin nodes [m]; the compliance is ordered with y fastest."""
+        return self.x[self.loaded_x], self.y[self.loaded_y]
+
+
+def graded_grid(low: Array, high: Array, thickness: float, pitch: float) -> NodeGrid:
+    """Return a grid uniform with `pitch` [m] between the corners `low` and `high` (2,) [m], coarser outside and below."""
+    half = (high - low) / 2
+    x, along_x = _axis(float(half[0]), pitch)
+    y, along_y = _axis(float(half[1]), pitch)
+    centre = (low + high) / 2
+    return NodeGrid(centre[0] + x, centre[1] + y, _layers(thickness, pitch), along_x, along_y)
+
+
+def _axis(half: float, pitch: float) -> tuple[Array, slice]:
+    count = int(np.ceil(half / pitch - 1e-9))
+    inside = pitch * np.arange(-count, count + 1)
+    others = inside[-1] + np.cumsum(pitch * 1.6 ** np.arange(1, 6))
+    return np.concatenate((-others[::-1], inside, others)), slice(len(others), len(others) + len(inside))
+
+
+def _layers(thickness: float, pitch: float) -> Array:
+    """Return the depths of the nodes: cubes at the skin, each layer 14 % thicker than the previous."""
+    sizes = pitch * 1.14 ** np.arange(200)
+    below = np.cumsum(sizes)
+    count = int(np.searchsorted(below, thickness)) + 1
+    return np.concatenate(([0.0], below[:count] * (thickness / below[count - 1])))
+
+
+def brick_stiffness(size: Array, poisson: float) -> Array:
+    """Return the stiffness of bricks of unit Young's modulus and edges `size` [m], shape (e, 3): shape (e, 24, 24) [m].
+
+    Nodes in the order of `product((0, 1), repeat=3)` over (x, y, depth), three displacements each.
+    """
+    corners = np.array(list(product((-1.0, 1.0), repeat=3)))
+    shear = 1 / (2 * (1 + poisson))
+    bulk = 1 / (3 * (1 - 2 * poisson))
+    deviatoric = shear * (np.diag((2.0, 2, 2, 1, 1, 1)) - np.pad(np.full((3, 3), 2 / 3), (0, 3)))
+    volume = size.prod(axis=1)
+    total = np.zeros((len(size), 24, 24))
+    mean = np.zeros((len(size), 24))
+    for point in corners / np.sqrt(3.0):
+        one = 1 + corners * point  # (8, 3)
+        slope = np.stack([corners[:, k] * one[:, (k + 1) % 3] * one[:, (k + 2) % 3] for k in range(3)], axis=1) / 8
+        slope = slope[None] * (2 / size)[:, None, :]  # d N / d x, (e, 8, 3)
+        by_node = np.zeros((len(size), 6, 8, 3))
+        for k in range(3):
+            i, j = (k + 1) % 3, (k + 2) % 3
+            by_node[:, k, :, k] = slope[:, :, k]
+            by_node[:, 3 + k, :, i], by_node[:, 3 + k, :, j] = slope[:, :, j], slope[:, :, i]
+        strain = by_node.reshape(len(size), 6, 24)
+        total += (volume / 8)[:, None, None] * (strain.transpose(0, 2, 1) @ (deviatoric @ strain))
+        mean += slope.reshape(len(size), 24) / 8
+    return np.asarray(total + bulk * volume[:, None, None] * mean[:, :, None] * mean[:, None, :])
+
+
+def skin_compliance(grid: NodeGrid, young: Callable[[Array], Array], poisson: float) -> Array:
+    """Return the normal displacement of the loaded skin nodes per normal force on them [m/N], shape (k, k), symmetric.
+
+    `young` gives Young's modulus [Pa], shape (p,), at points (x, y, depth) [m], shape (p, 3). The stiffness matrix is block
+    tridiagonal over planes of constant x. With its block Cholesky factor L, the compliance is (L^-1 B)' (L^-1 B).
+    """
+    nx, ny, nd = len(grid.x), len(grid.y) - 2, len(grid.depth) - 1  # free nodes of a plane: y without sides, depth without base
+    size = 3 * ny * nd
+    slabs = (_slab(grid, young, poisson, column) for column in range(nx - 1))
+    y_inside = np.arange(len(grid.y))[grid.loaded_y] - 1
+    normal = 3 * (y_inside * nd) + 2  # unknowns of the skin's normal displacement in a plane; depth 0 is first
+    loaded = set(range(nx)[grid.loaded_x])
+    width = len(normal)
+    result = np.zeros((len(loaded) * width, len(loaded) * width))
+    carried = np.zeros((size, 0))  # L^-1 B of this plane, for the loads on planes before it
+    _, after, _ = next(slabs)  # plane 0 is fixed
+    for plane in range(1, nx - 1):
+        before, next_after, coupling = next(slabs)
+        factor = cholesky(after + before, lower=True, overwrite_a=True, check_finite=False)
+        right = -carried
+        if plane in loaded:
+            load = np.zeros((size, width))
+            load[normal, np.arange(width)] = 1
+            right = np.hstack((right, load))
+        solved = solve_triangular(factor, right, lower=True, overwrite_b=True, check_finite=False)
+        k = solved.shape[1]
+        result[:k, :k] += solved.T @ solved
+        below = solve_triangular(factor, coupling, lower=True, overwrite_b=True, check_finite=False)
+        after = next_after - below.T @ below
+        carried = below.T @ solved
+    return result
+
+
+def _slab(grid: NodeGrid, young: Callable[[Array], Array], poisson: float, column: int) -> tuple[Array, Array, Array]:
+    """Return the stiffness of the bricks between planes `column` and `column + 1`: of the first plane, the second, the coupling.
+
+    Dense matrices on the free unknowns of a plane, ordered by y, depth, axis.
+    """
+    dy, dd = np.diff(grid.y), np.diff(grid.depth)
+    wide = grid.x[column + 1] - grid.x[column]
+    j, d = (index.ravel() for index in np.meshgrid(np.arange(len(dy)), np.arange(len(dd)), indexing="ij"))
+    size = np.column_stack((np.full(len(j), wide), dy[j], dd[d]))
+    origin = np.column_stack((np.full(len(j), grid.x[column]), grid.y[j], grid.depth[d]))
+    places = (np.array(list(product((-1, 0, 1), repeat=3))) * np.sqrt(0.6) + 1) / 2  # Gauss-Legendre
+    weights = np.array([np.prod([(5, 8, 5)[k] / 18 for k in at]) for at in product(range(3), repeat=3)])
+    points = origin[:, None, :] + places[None] * size[:, None, :]
+    modulus = young(points.reshape(-1, 3)).reshape(len(j), -1) @ weights
+    stiffness = modulus[:, None, None] * brick_stiffness(size, poisson)
+    nd, ny = len(dd), len(dy) - 1
+    corner = np.array(list(product((0, 1), repeat=2)))
+    at_y, at_d = j[:, None] + corner[:, 0] - 1, d[:, None] + corner[:, 1]
+    free = (at_y >= 0) & (at_y < ny) & (at_d < nd)
+    node = np.where(free, at_y * nd + at_d, 0)
+    unknown = (3 * node[:, :, None] + np.arange(3)).reshape(len(j), 12)
+    keep = np.repeat(free, 3, axis=1)
+    pair = keep[:, :, None] & keep[:, None, :]
+    n = 3 * ny * nd
+    rows = np.broadcast_to(unknown[:, :, None], pair.shape)[pair]
+    flat = rows * n + np.broadcast_to(unknown[:, None, :], pair.shape)[pair]
+
+    def gather(block: Array) -> Array:
+        return np.asarray(np.bincount(flat, block[pair], minlength=n * n), dtype=np.float64).reshape(n, n)
+
+    return gather(stiffness[:, :12, :12]), gather(stiffness[:, 12:, 12:]), gather(stiffness[:, :12, 12:])
+
+
 Array32 = NDArray[np.float32]
 
-PITCH_M = 0.0125
-"""Edge of the finite elements of the healthy body; those of a lesion near the skin are finer."""
-GRID_HALF_M = 0.13
-"""Largest half width of the uniform part of the grid: 0.1 m of region plus a margin."""
-POISSON = 0.49
-MOST_VERTICES = 20_000
-"""The matrix of this many vertices takes 1.6 GB."""
-MOST_NODES = 2000
-"""Skin nodes of the body's finite elements: a minute on one core; the time grows with the third power."""
-MOST_LESION_NODES = 1100
-"""Skin nodes about a lesion, whose pitch is coarser for a larger one."""
 
-_CODE = tuple(Path(file) for file in (__file__, solid.__file__, field.__file__, contact.__file__))
+_CODE = tuple(Path(file) for file in (__file__, field.__file__, contact.__file__))
 """Source files that the cached matrices depend on."""
 
 
@@ -213,8 +359,8 @@ def compliance(
     model: PhantomModel,
     lesions: Sequence[Lesion] = (),
     thickness_m: float | None = None,
-    poisson: float = POISSON,
-    pitch_m: float = PITCH_M,
+    poisson: float = COMPLIANCE.poisson,
+    pitch_m: float = COMPLIANCE.pitch_m,
 ) -> Compliance:
     """Return the skin compliance of a phantom, cached or computed (tens of seconds; well under one second if uniform).
 
@@ -229,10 +375,10 @@ def compliance(
     Raises UserError for a mesh that is too large.
     """
     free = np.flatnonzero(~model.fixed)
-    if len(free) > MOST_VERTICES:
+    if len(free) > COMPLIANCE.most_vertices:
         raise UserError(
-            f"services.tissue = elastic: {len(free)} free vertices, at most {MOST_VERTICES} possible: use a coarser mesh "
-            "(phantom.edge_m), or services.tissue = winkler"
+            f"services.tissue = elastic: {len(free)} free vertices, at most {COMPLIANCE.most_vertices} possible: use a coarser "
+            "mesh (phantom.edge_m), or services.tissue = winkler"
         )
     thickness = float(np.ptp(model.vertices[:, 2])) if thickness_m is None else thickness_m
     young = ModulusField(model, lesions).at_skin()[free]
@@ -303,17 +449,18 @@ class _Body:
         return matrix
 
     def _front(self) -> Array:
-        """Return half width and length of the body's front, at most GRID_HALF_M [m], shape (2,)."""
+        """Return half width and length of the body's front, at most COMPLIANCE.grid_half_m [m], shape (2,)."""
         front = self.model.vertices[self.model.normals[:, 2] > 0.5, :2]
-        return np.asarray(np.minimum(np.abs(front).max(axis=0), GRID_HALF_M))
+        return np.asarray(np.minimum(np.abs(front).max(axis=0), COMPLIANCE.grid_half_m))
 
     def _grid(self) -> NodeGrid:
         half = self._front()
         grid = graded_grid(-half, half, self.thickness, self.pitch)
-        if (count := math.prod(map(len, grid.skin))) > MOST_NODES:
+        if (count := math.prod(map(len, grid.skin))) > COMPLIANCE.most_nodes:
             raise UserError(
                 f"services.tissue = elastic: a body {self.thickness:.3g} m thick and {2 * half[0]:.2g} x {2 * half[1]:.2g} m "
-                f"wide needs {count} nodes, at most {MOST_NODES} possible: a thicker or smaller one, or services.tissue = winkler"
+                f"wide needs {count} nodes, at most {COMPLIANCE.most_nodes} possible: a thicker or smaller one, "
+                "or services.tissue = winkler"
             )
         return grid
 
@@ -325,7 +472,10 @@ class _Body:
         reach = np.asarray(lesion.radii_m) + 0.045 + 0.5 * depth
         finest = max(0.4 * self.pitch, 0.3 * min(lesion.radii_m))
         low, high = np.maximum(centre - reach, -half), np.minimum(centre + reach, half)
-        pitch = max(min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth), math.sqrt(math.prod(high - low) / MOST_LESION_NODES))
+        pitch = max(
+            min(self.pitch, finest, 0.4 * self.pitch + 0.2 * depth),
+            math.sqrt(math.prod(high - low) / COMPLIANCE.most_lesion_nodes),
+        )
         return graded_grid(low, high, self.thickness, pitch)
 
 

@@ -9,7 +9,7 @@ from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
 from palpate_plugins import PluginError
-from palpate_tissue.backends.elastic.compliance import PITCH_M, compliance
+from palpate_tissue.backends.elastic.compliance import COMPLIANCE, compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.moving import carried
 from palpate_tissue.service import TissueService
@@ -18,7 +18,7 @@ LEAST_LAYERS = 5
 """Layers of finite elements in a body from a grid file."""
 
 
-def create(scenario: Scenario, pitch_m: float = PITCH_M) -> Service:
+def create(scenario: Scenario, pitch_m: float = COMPLIANCE.pitch_m) -> Service:
     """Return the elastic tissue of a scenario. The first time takes half a minute; the compliance is cached.
 
     `pitch_m` is the edge of the finite elements. Raises PluginError for a mesh that is too large.

@@ -16,7 +16,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import POISSON, YOUNG_OVER_K_W, Compliance, compliance
+from palpate_tissue.backends.elastic.compliance import COMPLIANCE, YOUNG_OVER_K_W, Compliance, compliance
 from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
@@ -53,7 +53,7 @@ class FlatSlab:
     def __init__(
         self,
         young_pa: float = 1e4,
-        poisson: float = POISSON,
+        poisson: float = COMPLIANCE.poisson,
         thickness_m: float = math.inf,
         half_m: float = 0.025,
         edge_m: float = 0.0015,

@@ -28,8 +28,6 @@ class Mechanics:
     """Diagonal of C [N s/m], shape (n,)."""
     rate: float
     """Largest eigenvalue of C^-1 K [1/s], with the nonlinear springs at their largest stiffness."""
-    gershgorin: float
-    """Upper bound of `rate`, max_i (K_ii + sum_j |K_ij|) / C_i [1/s]."""
 
     def substeps(self, dt: float) -> int:
         """Return the number of equal explicit steps per period `dt` [s] for which each is stable and passive.
@@ -81,19 +79,16 @@ def assemble(model: PhantomModel, stiffness: Stiffness) -> Mechanics:
     damping = stiffness.dashpot_s * model.stiffness * model.areas
     adjacent = wall.largest_slope(model.stiffening, model.tension)
     hardest = matrix + sparse.diags_array(np.where(~model.fixed, model.stiffness * model.areas * adjacent, 0.0))
-    return Mechanics(matrix, damping, _largest_rate(hardest, damping), _gershgorin(hardest, damping))
-
-
-def _gershgorin(matrix: sparse.csr_array, damping: Array) -> float:
-    return float((abs(matrix).sum(axis=1) / damping).max())
+    return Mechanics(matrix, damping, _largest_rate(hardest, damping))
 
 
 def _largest_rate(matrix: sparse.csr_array, damping: Array) -> float:
     """Return the largest eigenvalue of C^-1 K by Lanczos with a 1 % margin; Gershgorin's bound if it does not converge."""
+    bound = float((abs(matrix).sum(axis=1) / damping).max())
     scale = sparse.diags_array(1 / np.sqrt(damping))
     try:
         start = 1 + np.arange(len(damping)) % 7 / 7.0  # fixed start: runs repeat
         largest = eigsh(scale @ matrix @ scale, k=1, which="LA", v0=start, tol=1e-3, return_eigenvectors=False)[0]
     except ArpackNoConvergence:
-        return _gershgorin(matrix, damping)
-    return float(min(1.01 * largest, _gershgorin(matrix, damping)))
+        return bound
+    return float(min(1.01 * largest, bound))

@@ -28,7 +28,6 @@ def create(scenario: Scenario) -> Service:
         raise PluginError(f"services.tissue = winkler: {error}") from error
     facts = {
         "stability_dt_rate": round(tissue.dt * tissue.mechanics.rate, 4),  # passive below 2
-        "gershgorin_dt_rate": round(tissue.dt * tissue.mechanics.gershgorin, 4),
         "substeps": tissue.substeps,
     }
     return carried(TissueService(tissue, model, true_pose(scenario), facts), scenario)
