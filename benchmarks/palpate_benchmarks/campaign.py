@@ -27,7 +27,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import close_session, open_session
 from palpate_conductor.conductor import conduct
-from palpate_conductor.grants import WALLCLOCK_LEAD
+from palpate_conductor.grants import GRANTS
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Timing
 from palpate_models.scenario.load import load_scenario
 
@@ -156,7 +156,7 @@ class _Watch:
 def _now_s(progress: RunProgress, *, wallclock: bool) -> float:
     """Return the simulated time [s] of the last message; in wall-clock mode the elapsed time, since messages may be late."""
     received = progress.t / NS
-    return max(received, received / progress.real_time_factor - WALLCLOCK_LEAD / NS) if wallclock else received
+    return max(received, received / progress.real_time_factor - GRANTS.wallclock_lead_ns / NS) if wallclock else received
 
 
 def signs_of(progress: RunProgress) -> list[Sign]:

@@ -22,7 +22,7 @@ from palpate_bus.runtime.process import rare_collections
 from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collector, FrameTree
 from palpate_conductor.diagnostics import ContractWatch, service_statuses
-from palpate_conductor.grants import EXAM_SILENT_S, Grants
+from palpate_conductor.grants import GRANTS, Grants
 from palpate_conductor.handover import Slots
 from palpate_conductor.operator import OperatorRequestServer
 from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Tell, Timing, failure_of, gave_up
@@ -272,8 +272,6 @@ class Conductor:
             self._operator_requests.poll(self._collector.collected.supervisor)
             self._contract.poll()
             self._extend_grant()
-            if self._wallclock and not finished:  # a service that finished reports nothing more
-                self.watchdog.note_silence()
             self._check_progress(finished)
             tell(self)
             sleep(TUNING.poll_s)
@@ -306,7 +304,7 @@ class Conductor:
             if self.grants.paused_s > self._patience.pause:
                 raise RunFailed(FailureCode.STOPPED, f"paused for {self._patience.pause:g} s without palpate resume")
         if self.grants.exam_silent_s > self._patience.quiet:
-            self._notify_once([f"waiting for exam/state of planning, {EXAM_SILENT_S:g} s at most"])
+            self._notify_once([f"waiting for exam/state of planning, {GRANTS.exam_silent_s:g} s at most"])
         collected = self._collector.collected
         records = "recorder" in self._observers and "recorder" not in self.result.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
@@ -474,8 +472,6 @@ def conduct(
         with rare_collections():
             conductor.run(exited, report)
         result.failure = result.failure or gave_up(collector.collected)
-        if result.failure and (interruption := conductor.watchdog.interruption):
-            result.failure = result.failure.with_note(interruption)
     except RunFailed as error:
         result.failure = error.failure
     result.start_time_s = (conductor.started_at_perf or perf_counter()) - begin

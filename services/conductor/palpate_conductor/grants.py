@@ -1,12 +1,14 @@
 """Grants of simulated time.
 
-Time is granted up to `WINDOW` beyond the newest exam state, so that the end tick, which planning announces a second ahead, is
-never overrun; up to a second beyond what the recorder has written; in real time not beyond the wall clock; not at all while
-paused. In wall-clock mode only the common start and the end are granted.
+Time is granted up to `GRANTS.window_ns` beyond the newest exam state, so that the end tick, which planning announces a second
+ahead, is never overrun; up to a second beyond what the recorder has written; in real time not beyond the wall clock; not at all
+while paused. In wall-clock mode only the common start and the end are granted.
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from time import monotonic, time_ns
+from typing import Final
 
 from palpate_bus.contract import MS
 from palpate_bus.messages.stamps import NS
@@ -16,14 +18,22 @@ from palpate_bus.runtime.lockstep import NEVER
 from palpate_conductor.outcome import RunFailed, Timing
 from palpate_errors import UserError
 
-WINDOW = 500 * MS
-"""Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
-RECORDER_WINDOW = NS
-WALLCLOCK_LEAD = 200 * MS
-"""From the start message to the common start [ns]."""
-REGRANT_S = 0.5
-EXAM_SILENT_S = 10.0
-"""Time without a new exam state after which a wall-clock run ends, since planning would not announce its end."""
+
+@dataclass(frozen=True)
+class GrantTuning:
+    """Limits of the granted time."""
+
+    window_ns: int = 500 * MS
+    """Simulated time [ns] granted beyond the newest exam state; less than the second by which planning announces the end."""
+    recorder_window_ns: int = NS
+    wallclock_lead_ns: int = 200 * MS
+    """From the start message to the common start [ns]."""
+    regrant_s: float = 0.5
+    exam_silent_s: float = 10.0
+    """Time without a new exam state after which a wall-clock run ends, since planning would not announce its end."""
+
+
+GRANTS: Final = GrantTuning()
 
 
 class Grants:
@@ -45,7 +55,7 @@ class Grants:
     def begin(self) -> None:
         """Send the first grant."""
         self._paced_since = self._exam_at = monotonic()
-        self.grant(time_ns() + WALLCLOCK_LEAD if self._wallclock else WINDOW - MS)
+        self.grant(time_ns() + GRANTS.wallclock_lead_ns if self._wallclock else GRANTS.window_ns - MS)
 
     def grant(self, tick: int, last: bool = False) -> None:
         """Grant time up to and including `tick` [ns]."""
@@ -66,11 +76,11 @@ class Grants:
         if self.last:
             self._repeat()
             return
-        if end is None and exam + WINDOW >= self._limit:
+        if end is None and exam + GRANTS.window_ns >= self._limit:
             end = self._limit
-        tick = max(exam, 0) + WINDOW
+        tick = max(exam, 0) + GRANTS.window_ns
         if recorded is not None:
-            tick = min(tick, recorded + RECORDER_WINDOW)
+            tick = min(tick, recorded + GRANTS.recorder_window_ns)
         if self._realtime is not None:
             tick = min(tick, self._paced_from + int((monotonic() - self._paced_since) * self._realtime * NS))
         tick = self.horizon if self.paused else max(tick - tick % MS, self.horizon)
@@ -91,8 +101,8 @@ class Grants:
         self._repeat()
         if exam != self._exam:
             self._exam, self._exam_at = exam, monotonic()
-        elif self.exam_silent_s > EXAM_SILENT_S:
-            text = f"planning has sent nothing on exam/state since {max(exam, 0) / NS:.3f} s, for {EXAM_SILENT_S:.0f} s"
+        elif self.exam_silent_s > GRANTS.exam_silent_s:
+            text = f"planning has sent nothing on exam/state since {max(exam, 0) / NS:.3f} s, for {GRANTS.exam_silent_s:.0f} s"
             raise RunFailed(FailureCode.EXAM_SILENT, text, "planning", topics=("exam/state",))
 
     @property
@@ -106,8 +116,8 @@ class Grants:
         return monotonic() - self._paused_at if self.paused else 0.0
 
     def _repeat(self) -> None:
-        """Send the newest grant again every `REGRANT_S`, for services that join late and as a sign of life."""
-        if monotonic() - self._at > REGRANT_S:
+        """Send the newest grant again every `GRANTS.regrant_s`, for services that join late and as a sign of life."""
+        if monotonic() - self._at > GRANTS.regrant_s:
             self.grant(self.horizon, self.last)
 
     def pace(self, request: str, ms: int) -> str:
@@ -130,8 +140,8 @@ class Grants:
             self.paused = False
             self._paced_from, self._paced_since = self.horizon, monotonic()
             return "continues"
-        elif not 0 < ms <= WINDOW // MS:
-            raise UserError(f"step of {ms} ms: allowed are 1 to {WINDOW // MS} ms")
+        elif not 0 < ms <= GRANTS.window_ns // MS:
+            raise UserError(f"step of {ms} ms: allowed are 1 to {GRANTS.window_ns // MS} ms")
         else:
             self._paused_at = monotonic()
             self.grant(self.horizon + ms * MS)

@@ -21,10 +21,24 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.process import Activity, is_running, pid_space
 from palpate_conductor.outcome import Patience
 
-HUNG_S: Final = 2.0
-"""Time after which a loop that has not turned counts as hanging."""
-RECENT_S: Final = 2.0
-"""Time after a standstill within which a loss may be its consequence."""
+
+@dataclass(frozen=True)
+class WatchdogTuning:
+    """Times after which silence means something."""
+
+    hung_s: float = 2.0
+    """Time after which a loop that has not turned counts as hanging."""
+    recent_s: float = 2.0
+    """Time after a standstill within which a loss may be its consequence."""
+    check_period_s: float = 0.25
+    exit_s: float = 0.05
+    """A process that exits closes its connections this long before it is gone."""
+    interrupted_s: float = 0.5
+    """If all services are silent for longer, the connection to the conductor is interrupted; they report every 0.2 s."""
+
+
+TUNING: Final = WatchdogTuning()
+
 QOS: Final = "control"
 """A late beat is worse than a lost one, and a frozen reader must not delay the others' beats."""
 
@@ -66,7 +80,7 @@ class Heartbeat:
     @property
     def stood_still_s(self) -> float:
         """Duration [s] of a recent standstill of loop and heartbeat beyond the services' deadline; 0 without one."""
-        return self._stood_still_s if monotonic() - self._resumed_at < RECENT_S else 0.0
+        return self._stood_still_s if monotonic() - self._resumed_at < TUNING.recent_s else 0.0
 
     def stop(self) -> None:
         """Stop the thread, if it was started."""
@@ -78,18 +92,11 @@ class Heartbeat:
         sequence = 0
         while not self._stop.wait(self._period_s):
             now = monotonic()
-            if now - self._turned_at <= HUNG_S:
+            if now - self._turned_at <= TUNING.hung_s:
                 self._late_at = now if now - self._sent_at > self._deadline_s else self._late_at
                 self._sent_at = now
                 sequence += 1
                 self._publisher.put(self._message, sequence)
-
-
-CHECK_PERIOD_S: Final = 0.25
-EXIT_S: Final = 0.05
-"""A process that exits closes its connections this long before it is gone."""
-INTERRUPTED_S: Final = 0.5
-"""If all services are silent for longer, the connection to the conductor is interrupted; they report every 0.2 s."""
 
 
 class FreezeWatch:
@@ -111,7 +118,7 @@ class FreezeWatch:
         activity = self._activity.get(role)
         if activity is None or not is_running(activity.pid):
             return "its connection closed"
-        sleep(EXIT_S)
+        sleep(TUNING.exit_s)
         if not is_running(activity.pid):
             return "its connection closed"
         return f"its connection closed, but its process {activity.pid} runs: the connection broke, or the machine is overloaded"
@@ -122,7 +129,7 @@ class FreezeWatch:
         A stopped process blocks others that send to it; these sleep without being at fault.
         """
         now = monotonic()
-        if now - self._checked_at < CHECK_PERIOD_S:
+        if now - self._checked_at < TUNING.check_period_s:
             return {}
         self._checked_at = now
         states = {role: activity.check() for role, activity in self._activity.items()}
@@ -155,7 +162,6 @@ class RunWatchdog:
         """`producers` gives the producing role of each topic."""
         self.progress = {role: RoleProgress() for role in roles}
         self._producers = producers
-        self._longest_silence = 0.0
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:
         """Take a report. A role that the run does not have is ignored."""
@@ -177,18 +183,6 @@ class RunWatchdog:
         """Return those of `roles` without a report for `limit_s` [s]. A service reports while it waits, not in its step."""
         return [role for role in roles if monotonic() - self.progress[role].reported > limit_s]
 
-    def note_silence(self) -> None:
-        """Update the longest silence of all services."""
-        self._longest_silence = max(self._longest_silence, self.silent_for())
-
-    @property
-    def interruption(self) -> str:
-        """A text if all services were silent for longer than they ever should be; else empty."""
-        silent = self._longest_silence
-        if silent < INTERRUPTED_S:
-            return ""
-        return f"no report of any service for {silent:.1f} s: the transport or the whole machine stood still"
-
     def stalled_for(self) -> float:
         """Return the time [s] since any service finished a tick."""
         return monotonic() - max(progress.moved for progress in self.progress.values())
@@ -208,7 +202,7 @@ class RunWatchdog:
 
         Follows who-waits-for-whom from the slowest waiting service to one that does not wait, or around a cycle.
         """
-        computing = self.silent(roles, INTERRUPTED_S)  # what they waited for before their step is past
+        computing = self.silent(roles, TUNING.interrupted_s)  # what they waited for before their step is past
         waiting = {
             role: self._producers[p.waiting_for]
             for role, p in self.progress.items()

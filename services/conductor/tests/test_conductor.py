@@ -69,7 +69,7 @@ def test_a_pause_has_a_bound_and_is_named() -> None:
 
 
 def test_a_planning_that_never_sends_a_state_is_awaited_for_a_time(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(grants, "EXAM_SILENT_S", 0.1)
+    monkeypatch.setattr(grants, "GRANTS", grants.GrantTuning(exam_silent_s=0.1))
     awaited = grants.Grants(lambda tick, last: None, Timing(wallclock=True))
     awaited.begin()
     awaited.extend(NEVER, None, None)
@@ -268,18 +268,6 @@ def test_only_the_given_roles_can_be_the_culprit() -> None:
     assert w.longest_stall(ROLES) < 50.0
     assert w.longest_stall(()) < 1.0
     assert w.culprit(ROLES)[0] != "dashboard"
-
-
-def test_an_interruption_is_a_silence_of_all_services() -> None:
-    w = watchdog()
-    w.progress["robot"].reported -= 2.0
-    w.note_silence()
-    assert w.interruption == "", "one role was silent, the others reported"
-    for progress in w.progress.values():
-        progress.reported -= 2.0
-    w.note_silence()
-    w.report("robot", 1_000_000, "")
-    assert "2.0 s" in w.interruption
 
 
 def test_every_error_has_a_failure_code() -> None:
