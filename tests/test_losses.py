@@ -11,9 +11,11 @@ import psutil
 import pytest
 from examination import assert_held_and_no_harder, kill_in_contact
 
-from palpate.report.evidence import peak_force
-from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, calm_rate, strike
+from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, StruckRun, calm_rate, strike
+from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
+from palpate_bus.messages.codec import decode
+from palpate_bus.recordings import open_recording
 from palpate_bus.runtime.failure import FailureCode
 
 pytestmark = pytest.mark.slow
@@ -66,11 +68,22 @@ def freeze(processes: Mapping[str, psutil.Process]) -> None:
     processes[CONDUCTOR].resume()
 
 
+def recorded(struck: Struck, topic: str) -> list[tuple[int, Any]]:
+    """Return the recorded messages of a topic: (stamp [ns], message)."""
+    row = contract().topics[topic]
+    return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(struck.folder).messages([topic])]
+
+
+def forces_of(struck: Struck) -> list[tuple[int, float]]:
+    """Return simulated times [ns] and the peak true force [N] since the previous one."""
+    return [(stamp, peak_force(message)) for stamp, message in recorded(struck, "truth/indentation")]
+
+
 def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
     """Retry, because on a busy machine a wall-clock run may be stopped before contact."""
     for attempt in range(ATTEMPTS):
-        rate = calm_rate() if runtime == "wallclock" else 1.0
-        struck = strike(folder / str(attempt), runtime, blow, rate=rate)
+        wallclock = runtime == "wallclock"
+        struck = strike(StruckRun(folder / str(attempt), wallclock, calm_rate() if wallclock else 1.0), blow)
         if struck is not None:
             assert not struck.staying
             return struck
@@ -79,13 +92,13 @@ def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
 
 def assert_lifted(struck: Struck) -> None:
     """Planning lifted the arm clear of the patient before the services left, and the force did not rise."""
-    states = struck.recorded("exam/state")
+    states, forces = recorded(struck, "exam/state"), forces_of(struck)
     reported = next(stamp for stamp, state in states if state.reason == ExamState.REASON_SERVICE_LOST)
-    before = max(force for stamp, force in struck.forces if stamp <= reported)
-    after = max(force for stamp, force in struck.forces if stamp > reported)
+    before = max(force for stamp, force in forces if stamp <= reported)
+    after = max(force for stamp, force in forces if stamp > reported)
     assert 0.5 < before < 15.0
     assert after <= before + MORE_N
-    assert struck.forces[-1][1] == 0.0
+    assert forces[-1][1] == 0.0
     assert states[-1][1].depth < -CLEAR_M
     assert states[-1][1].phase == ExamState.PHASE_ABORTED
     print(f"before {before:.2f} N, after {after:.2f} N, left after {struck.left_after_s:.1f} s")
@@ -96,15 +109,16 @@ def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(blow: Blow,
     struck = strike_conductor(tmp_path, "wallclock", blow)
     assert_lifted(struck)
     if blow is freeze:
-        assert struck.said["failure"]["code"] == FailureCode.CONDUCTOR_LOST
-        assert "stood still for" in struck.said["failure"]["text"]
+        assert struck.watched is not None and struck.watched.result.failure is not None
+        assert struck.watched.result.failure.code == FailureCode.CONDUCTOR_LOST
+        assert "stood still for" in struck.watched.result.failure.text
 
 
 @pytest.mark.parametrize("blow", [kill, freeze])
 def test_in_lockstep_the_measured_data_are_recovered(blow: Blow, tmp_path: Path) -> None:
     struck = strike_conductor(tmp_path, "lockstep", blow)
-    last = struck.forces[-1]
-    assert last[1] <= max(force for _, force in struck.forces[:-1]) + MORE_N
+    *before, last = forces_of(struck)
+    assert last[1] <= max(force for _, force in before) + MORE_N
     command = [str(Path(sys.executable).with_name("palpate")), "report", str(struck.folder), "--recover", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
@@ -112,6 +126,6 @@ def test_in_lockstep_the_measured_data_are_recovered(blow: Blow, tmp_path: Path)
     assert report["run_hash"] is None
     assert report["runtime"] == "recovered"
     assert abs(report["sim_time_s"] - last[0] / 1e9) < 0.2
-    strongest = max(peak_force(contact) for _, contact in struck.recorded("truth/indentation"))
+    strongest = max(force for _, force in (*before, last))
     assert report["max_force_N"] == pytest.approx(strongest)
     assert Path(json.loads(done.stdout)["html"]).is_file()

@@ -37,8 +37,7 @@ def faults(
     """
     from palpate.study.folder import code_digest
     from palpate_benchmarks import lies
-    from palpate_benchmarks.campaign import cases, forks, run_case
-    from palpate_benchmarks.whole_cases import drawn, fixed, is_whole, run_whole
+    from palpate_benchmarks.campaign import cases, drawn, run_case
 
     console = SteadyConsole(stderr=True, width=max(WIDTH, SteadyConsole().width))
     modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
@@ -47,7 +46,7 @@ def faults(
             if value not in known:
                 refuse(f"{name} {value}: allowed are {', '.join(known)}")
     found = _load(out)
-    todo = [*fixed(modes, kinds, only or ()), *cases(modes, kinds, only or ())]
+    todo = list(cases(modes, kinds, only or ()))
     if LIE in kinds:
         todo += [*lies.cases(modes, only or ()), *lies.drawn(random, seed, modes)]
     else:
@@ -59,13 +58,9 @@ def faults(
     if not again:
         todo = [case for case in todo if done.get(case.identity) != code]
     todo = sorted(todo, key=lambda case: case.identity in done)[:limit]
-    started_by = forks()
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
-        others = (case for case in todo if case.kind != LIE)
-        findings = (
-            run_whole(case, Path(folder)) if is_whole(case) else run_case(case, Path(folder), started_by) for case in others
-        )
+        findings = (run_case(case, Path(folder)) for case in todo if case.kind != LIE)
         lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
         for number, finding in enumerate(chain(findings, lying), 1):
             finding.code = code

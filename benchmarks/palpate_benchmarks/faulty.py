@@ -20,15 +20,17 @@ messages, 0 for all. `palpate faults` starts its processes in this way.
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from time import sleep
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 import zenoh
 
 from palpate_benchmarks.fault_cases import MESSAGE_KINDS
+from palpate_benchmarks.liar import filled, stamped
 from palpate_bus.contract import Qos, Topic, contract
+from palpate_bus.contract.conformance import leaves, numbers
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS
 from palpate_bus.run import chosen, run_service
@@ -136,39 +138,22 @@ def _corrupt(payload: bytes, topic: Topic) -> bytes:
     return payload[:begin] + bytes(byte ^ 0xFF for byte in payload[begin:end]) + payload[end:]
 
 
-def _truncate(payload: bytes, topic: Topic) -> bytes:
-    return payload[: len(payload) // 2]
-
-
 def _nan(payload: bytes, topic: Topic) -> bytes:
-    return codec.encode(_with_nan(codec.decode(payload, topic.type)), topic.type)
-
-
-def _with_nan(value: Any) -> Any:
-    """Return a copy of the value in which every float is NaN."""
-    if isinstance(value, float):
-        return float("nan")
-    if isinstance(value, np.ndarray):
-        return np.full_like(value, np.nan) if value.dtype.kind == "f" else value
-    if isinstance(value, list):
-        return [_with_nan(item) for item in value]
-    if is_dataclass(value) and not isinstance(value, type):
-        names = [field.name for field in fields(value) if not field.name.startswith("__")]
-        return type(value)(**{name: _with_nan(getattr(value, name)) for name in names})
-    return value
+    message = codec.decode(payload, topic.type)
+    for leaf in leaves(topic.type):
+        if leaf.base.startswith("float"):
+            message = filled(message, leaf.path, np.full_like(numbers(message, leaf.path), np.nan))
+    return codec.encode(message, topic.type)
 
 
 def _stamp(payload: bytes, topic: Topic) -> bytes:
     message = codec.decode(payload, topic.type)
-    if not hasattr(message, "header"):
-        return payload
-    message.header.stamp.sec -= PAST_S
-    return codec.encode(message, topic.type)
+    return codec.encode(stamped(message, -PAST_S), topic.type) if hasattr(message, "header") else payload
 
 
 CHANGES: Final[dict[str, Callable[[bytes, Topic], bytes]]] = {
     "corrupt": _corrupt,
-    "truncate": _truncate,
+    "truncate": lambda payload, _: payload[: len(payload) // 2],
     "nan": _nan,
     "stamp": _stamp,
 }

@@ -131,9 +131,9 @@ class LyingTopic:
             self._odd = not self._odd
             return self._past[-3][1] if self._odd and len(self._past) > 2 else message
         if lie.kind == "stale":
-            return _stamped(message, -lie.amount)
+            return stamped(message, -lie.amount)
         old = [one for stamp, one in self._past if stamp <= t - lie.amount * 1e6] or [self._past[0][1]]
-        return old[-1] if lie.kind == "late" else _filled(message, lie.field, numbers(old[-1], lie.field))
+        return old[-1] if lie.kind == "late" else filled(message, lie.field, numbers(old[-1], lie.field))
 
     _odd = False
 
@@ -147,17 +147,17 @@ class LyingTopic:
         changed = message
         for path in lie.field.split(","):
             values = CHANGES[lie.kind](numbers(message, path), numbers(self._first, path), lie.amount, t / NS - lie.at_s)
-            changed = _filled(changed, path, values)
+            changed = filled(changed, path, values)
         return changed
 
 
-def _stamped(message: Message, seconds: float) -> Message:
+def stamped(message: Message, seconds: float) -> Message:
     """Return a copy whose stamp is changed by `seconds`."""
     stamp = max(nanoseconds(message.header.stamp) + round(seconds * NS), 0)
     return replace(message, header=replace(message.header, stamp=time_message(stamp)))
 
 
-def _filled(message: Message, path: str, values: Array) -> Message:
+def filled(message: Message, path: str, values: Array) -> Message:
     """Return a copy with other numbers at and below a field, in the order of `numbers`."""
     return _with(message, path.split("."), iter(values.tolist()))
 

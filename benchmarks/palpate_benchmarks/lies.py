@@ -16,15 +16,14 @@ from typing import Any, Final
 
 from palpate.apart import guarded
 from palpate.environment import given
-from palpate.report.evidence import peak_force
 from palpate.run.composed import load_services
 from palpate.run.distributed import run_distributed
 from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
-from palpate_benchmarks.campaign import SETTINGS, Sign, _reaction, set_peaks, signs_of, with_producers
+from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.liar import WHOLE, Lie
-from palpate_benchmarks.struck import kept_rate
+from palpate_benchmarks.struck import SETTINGS, Watched, kept_rate
 from palpate_bus.contract import MS, Edge, Topic, contract
 from palpate_bus.contract.conformance import leaves
 from palpate_bus.messages import ExamState
@@ -32,10 +31,9 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree
-from palpate_conductor.outcome import RunProgress, Timing, gave_up
+from palpate_conductor.outcome import RunProgress, RunResult, Timing, gave_up
 from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input, load_scenario
-from palpate_models.scenario.schema import Scenario
 
 MOMENTS: Final = ("rest", "descent", "depth", "transfer")
 BEFORE_STROKES: Final = frozenset(
@@ -231,31 +229,14 @@ def undetectable(lie: Lie) -> str:
     return next(found, "")
 
 
-def _scenario() -> Scenario:
-    return load_scenario("clean", SETTINGS)
-
-
-@dataclass
-class LieOutcome:
-    """LieOutcome of a run with a lie."""
-
-    collected: Collected
-    failure: Failure | None
-    t: int
-    """Last tick [ns]."""
-    signs: list[Sign]
-    first: int | None = None
-    """Simulated time of the first sign [ns]."""
-
-
 class Lockstep:
     """One examination without a lie, from which the cases are forked at their moments: all share what came before."""
 
     def __init__(self) -> None:
-        scenario = _scenario()
+        scenario = load_scenario("clean", SETTINGS)
         self._collector = Collector(tree=FrameTree(exam_input(scenario)))
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
-        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None)), CASE_S)
+        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None).result), CASE_S)
 
     def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
         """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
@@ -263,14 +244,15 @@ class Lockstep:
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
         try:
-            return guarded(str(lie), lambda: _judged(finding, lie, self._finished(lie), self.twin), CASE_S)
+            return guarded(str(lie), lambda: judged(finding, lie, self._finished(lie), self.twin), CASE_S)
         except RunError as error:  # one case must not end the campaign
             finding.hung, finding.outcome, finding.ended = True, CaseOutcome.ENDED, str(error)
             return finding
 
-    def _finished(self, lie: Lie | None) -> LieOutcome:
+    def _finished(self, lie: Lie | None) -> Watched:
         """Run to the end, in a child process."""
-        run, collected, outcome = self._run, self._collector.collected, LieOutcome(self._collector.collected, None, 0, [])
+        run, collected = self._run, self._collector.collected
+        watched = Watched(RunResult("composed", collected))
         since = NEVER_NS if lie is None else lie.at_s * NS
         if lie is not None:
             stepper = run.steppers[lie.role]
@@ -278,50 +260,41 @@ class Lockstep:
 
         def end() -> int | None:
             if run.t >= since and not run.t % SIGNS_EVERY:
-                watch(outcome, RunProgress(run.t, 1.0, collected, ()))
+                watched.add(RunProgress(run.t, 1.0, collected), (run.t - since) / 1e6)
             return collected.end_tick
 
+        failure: Failure | None
         try:
             run.run(end, LONGEST_NS)
-            outcome.failure = gave_up(collected)
-            if outcome.failure is None and collected.end_tick is None:
-                outcome.failure = Failure(FailureCode.BLOCKED, HANGS)
+            failure = gave_up(collected)
+            if failure is None and collected.end_tick is None:
+                failure = Failure(FailureCode.BLOCKED, HANGS)
         except ServiceFailed as error:
-            outcome.failure = error.failure
-        outcome.t = run.t
-        return outcome
+            failure = error.failure
+        watched.result = RunResult("composed", collected, sim_time_s=run.t / NS, failure=failure)
+        return watched
 
 
-def watch(outcome: LieOutcome, progress: RunProgress) -> None:
-    """Add the new signs."""
-    new = [sign for sign in signs_of(progress) if sign not in outcome.signs]
-    if new and outcome.first is None:
-        outcome.first = progress.t
-    outcome.signs += new
-
-
-def by_wall_clock(lie: Lie | None, folder: Path) -> LieOutcome:
-    """Return the outcome of an examination in wall-clock mode, at the rate that this machine keeps."""
-    settings = () if lie is None else (f"services.{lie.role}={liar.__file__}",)
-    outcome = LieOutcome(Collected(), None, 0, [])
+def by_wall_clock(lie: Lie, folder: Path) -> Watched:
+    """Return an examination with a lie in wall-clock mode, at the rate that this machine keeps."""
+    watched = Watched(RunResult("wallclock", Collected()))
 
     def on_progress(progress: RunProgress) -> None:
-        if lie is not None and progress.t >= lie.at_s * NS:
-            watch(outcome, progress)
+        if progress.t >= lie.at_s * NS:
+            watched.add(progress, progress.t / 1e6 - lie.at_s * 1e3)
 
     with given({liar.VARIABLE: str(lie)}):
-        scenario = load_scenario("clean", (*SETTINGS, *settings))
-        result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=kept_rate()))
-    outcome.collected, outcome.failure, outcome.t = result.collected, result.failure, round(result.sim_time_s * NS)
-    return outcome
+        scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
+        watched.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=kept_rate()))
+    return watched
 
 
-def healthy(outcome: LieOutcome) -> Healthy:
+def healthy(result: RunResult) -> Healthy:
     """Return the figures of the run without a lie. Raises RunError if the run failed."""
-    if outcome.failure is not None:
-        raise RunError(f"the examination without a lie failed: {outcome.failure}")
-    states = outcome.collected.exam_states
-    felt, findings, background = _felt(outcome.collected)
+    if result.failure is not None:
+        raise RunError(f"the examination without a lie failed: {result.failure}")
+    states = result.collected.exam_states
+    felt, findings, background = _felt(result.collected)
     return Healthy(moments_of(states), felt, findings, background, nanoseconds(states[-1].header.stamp) / NS)
 
 
@@ -356,35 +329,30 @@ def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
         begin, lie = monotonic(), lie_of(case.where, twin)
         finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
         if case.wallclock:
-            finding = _judged(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+            finding = judged(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
         else:
             finding = lockstep.judged(finding, lie)
         finding.wall_s = round(monotonic() - begin, 1)
         yield finding
 
 
-def _judged(finding: FaultFinding, lie: Lie, outcome: LieOutcome, twin: Healthy) -> FaultFinding:
+def judged(finding: FaultFinding, lie: Lie, watched: Watched, twin: Healthy) -> FaultFinding:
     """Return the finding with forces, signs and outcome."""
-    c, failure = outcome.collected, outcome.failure
-    set_peaks(finding, [(nanoseconds(m.header.stamp), peak_force(m)) for m in c.indentation], lie.at_s * NS)
+    collected, failure = watched.result.collected, watched.result.failure
     finding.hung = failure is not None and failure.text == HANGS
-    felt, findings, background = _felt(c)
-    if outcome.signs or failure is not None:
-        finding.sign = str(outcome.signs[0] if outcome.signs else failure)
-        finding.detected_ms = round(((outcome.first or outcome.t) - lie.at_s * NS) / 1e6, 1)
-    blamed = {sign.culprit for sign in outcome.signs} | {state.culprit for state in c.exam_states}
-    finding.outcome = CaseOutcome.ENDED
+    felt, findings, background = _felt(collected)
     if failure is not None:
-        blamed |= {*failure.roles, *failure.topics}
         finding.ended = str(failure)
     elif felt < LEAST_SHARE * twin.felt:
-        finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {c.exam.message if c.exam else ''}"
+        message = collected.exam.message if collected.exam else ""
+        finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {message}"
     elif findings == twin.findings and abs(background - twin.background) <= SAME_BACKGROUND * twin.background:
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
         finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
-    finding.named = not with_producers(blamed).isdisjoint(with_producers(lie.topics))
+    if failure is not None and watched.detected_ms is None:
+        watched.detected_ms = round((watched.result.sim_time_s - lie.at_s) * 1e3, 1)
+    enter(finding, watched, lie.topics, lie.at_s * NS)
     if not finding.named and (reason := undetectable(lie)):
         finding.named, finding.sign = True, f"not detectable: {reason}"
-    finding.reaction = _reaction(c, finding.outcome)
     return finding

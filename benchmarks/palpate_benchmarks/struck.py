@@ -1,52 +1,60 @@
-"""Runs with a fault from outside, in contact: in the conductor, the recorder, or several processes at once.
+"""Short examinations with a fault from outside: in a process, in messages, in the conductor, in the machine.
 
-    python -m palpate_benchmarks.struck FOLDER RUNTIME RATE SECONDS ROLES [secure]
-
-is the conductor of such a run. It forks the services and observers of ROLES (comma-separated), prints their process ids, and
-prints a line when the indenter has slid at depth for SECONDS of simulated time. `strike` starts it, injects the fault and returns
-the outcome. Forces and reactions are read from the recording, or, if the fault hit the recorder, from the conductor's messages.
+`strike` starts a conductor as a process of its own, which may be hit as well, injects the fault when it says so, and returns what
+it saw. The conductor forks the other processes, prints their process ids, and prints a line when the fault is due.
 """
 
-import json
 import os
+import pickle
 import subprocess
 import sys
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import nullcontext, suppress
-from dataclasses import asdict, dataclass, field
-from functools import cached_property
+from dataclasses import dataclass, field, replace
+from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import psutil
+from pydantic import TypeAdapter
 
 from palpate.environment import FIXED
-from palpate.report.evidence import peak_force
-from palpate.run.group import one_per_process
+from palpate.run.forks import Forks
+from palpate.run.group import Groups, one_per_process
+from palpate.run.options import Record
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
-from palpate.run.roles import WORKERS, write_scenario_files
+from palpate.run.roles import WORKERS, choice, write_scenario_files
 from palpate.run.self_test import RATES, SIMULATED_PROCESSES, measure
-from palpate_benchmarks.campaign import PATIENCE, SETTINGS, forks, signs_of
-from palpate_benchmarks.fault_cases import LIMITS
-from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState
-from palpate_bus.messages.codec import decode
-from palpate_bus.messages.stamps import NS, nanoseconds
-from palpate_bus.recordings import open_recording
+from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
+from palpate_bus import implementations
+from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
+from palpate_bus.messages.stamps import NS
+from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.zenoh_config import close_session, open_session
+from palpate_conductor.collector import Collected
 from palpate_conductor.conductor import conduct
-from palpate_conductor.outcome import RunProgress, Timing
+from palpate_conductor.grants import GRANTS
+from palpate_conductor.outcome import Patience, RunFailed, RunProgress, RunResult, Timing
 from palpate_models.scenario.load import load_scenario
 
+SETTINGS: Final = (
+    "exam.region_m=[0.0125, 0.03]",
+    "exam.centre_m=[-0.055, -0.055]",
+    "camera.frames=2",
+    "limits.release_patience_s=0.5",
+)
+"""Two lines over the lesion of `clean` and a short wait for the operator, so that a case is short."""
+PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
 Blow = Callable[[Mapping[str, psutil.Process]], None]
 """Injects the fault; its argument has the processes of the run by role, with the conductor."""
 CONDUCTOR: Final = "conductor"
 ROLES: Final = (*WORKERS, "recorder")
-AT_DEPTH: Final = "the indenter slides at depth"
+EACH: Final = one_per_process(ROLES)
+DUE: Final = "the fault is due at "
 PROCESSES: Final = "processes: "
-RESULT: Final = "result: "
+FILE: Final = "struck.pickle"
 
 
 @dataclass(frozen=True)
@@ -64,17 +72,76 @@ class FaultTimes:
 TIMES: Final = FaultTimes()
 
 
+@dataclass(frozen=True)
+class StruckRun:
+    """A short examination in which a fault is injected."""
+
+    folder: Path
+    wallclock: bool = False
+    rate: float = 1.0
+    """Simulated per wall time in wall-clock mode."""
+    groups: Groups = EACH
+    phase: int = ExamState.PHASE_SCAN
+    """Phase of the fault; while scanning, the indenter slides at depth."""
+    at_s: float = LIMITS.at_depth_s
+    """Simulated time in the scan before the fault."""
+    faulty: tuple[str, ...] = ()
+    """A role and the command that starts it, instead of its usual one."""
+    early: bool = False
+    """True to end the run as soon as its outcome is known, before the arm has returned home."""
+    secure: bool = False
+    """True if all processes are clients of a secure router, so that a fault in its network affects all."""
+
+
+@dataclass(frozen=True)
+class Sign:
+    """A message that reports a problem. The text does not count in comparisons."""
+
+    source: str
+    """Role that reported it (supervisor, driver or planning); empty for the conductor."""
+    code: int
+    """Cause or reason; for the conductor the number of its message."""
+    culprit: str
+    """Role or topic at fault, if the message has one."""
+    text: str = field(compare=False)
+
+    def __str__(self) -> str:
+        return f"{self.source}: {self.text}" if self.source else self.text
+
+
+@dataclass
+class Watched:
+    """What the conductor saw of a run with a fault."""
+
+    result: RunResult
+    before: list[Sign] = field(default_factory=list)
+    """Signs before the fault."""
+    signs: list[Sign] = field(default_factory=list)
+    """Signs after it."""
+    detected_ms: float | None = None
+    """Time from the fault to the first sign."""
+    outcome: CaseOutcome | None = None
+    """Outcome, if it was known before the run ended."""
+
+    def add(self, progress: RunProgress, after_ms: float) -> None:
+        """Add the new signs, seen some time [ms] after the fault."""
+        new = [sign for sign in signs_of(progress) if sign not in (*self.signs, *self.before)]
+        if new and self.detected_ms is None:
+            self.detected_ms = round(after_ms, 1)
+        self.signs += new
+
+
 @dataclass
 class Struck:
-    """Outcome of a run with a fault from outside."""
+    """A run after its fault."""
 
     folder: Path
     own: Path
     """Folder of the run's sockets."""
     status: int | None
     """Exit status of the conductor; None if it hung."""
-    said: dict[str, Any]
-    """Result printed by the conductor: failure, lost roles, signs of the fault and received forces; empty if it was killed."""
+    watched: Watched | None
+    """None if the conductor was killed."""
     struck_s: float
     """Simulated time of the fault."""
     left_after_s: float
@@ -82,21 +149,32 @@ class Struck:
     staying: list[str] = field(default_factory=list)
     """Services that hung."""
 
-    def log(self, role: str) -> str:
-        """Return the log of a service."""
-        return (self.folder / "logs" / f"{role}.log").read_text(encoding="utf-8")
 
-    @cached_property
-    def forces(self) -> list[tuple[int, float]]:
-        """Simulated times [ns] and the peak true force [N] since the previous one."""
-        return [(stamp, peak_force(message)) for stamp, message in self.recorded("truth/indentation")]
+class CaseOver(RunFailed):
+    """Ends a run once reaction and outcome of its case are known."""
 
-    def recorded(self, topic: str) -> list[tuple[int, Any]]:
-        """Return the recorded messages of a topic: (stamp [ns], message)."""
-        row = contract().topics[topic]
-        return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(self.folder).messages([topic])]
+    def __init__(self, text: str) -> None:
+        super().__init__(FailureCode.STOPPED, text)
 
 
+def signs_of(progress: RunProgress) -> list[Sign]:
+    """Return all messages that report a problem."""
+    found = [Sign("", number, "", text) for number, text in enumerate(progress.trouble)]
+    collected = progress.collected
+    stop = collected.supervisor
+    if stop is not None and stop.level != SupervisorState.LEVEL_OK:
+        found.append(Sign("supervisor", stop.cause, stop.culprit, stop.reason))
+    held = [status for status in collected.status_changes if status.mode == RobotStatus.MODE_SAFE_HOLD]
+    found += [Sign("driver", status.cause, status.culprit, status.reason) for status in held]
+    exam = collected.exam
+    if exam is not None and (
+        exam.phase in (ExamState.PHASE_HELD, ExamState.PHASE_ABORTED) or exam.reason == ExamState.REASON_SERVICE_LOST
+    ):
+        found.append(Sign("planning", exam.reason, exam.culprit, exam.message))
+    return found
+
+
+@cache
 def kept_rate() -> float:
     """Return the rate that this machine sustains for a second."""
     return measure(SIMULATED_PROCESSES).rate or RATES[-1]
@@ -108,116 +186,151 @@ def calm_rate() -> float:
     return next((rate for rate in RATES if rate < kept), kept)
 
 
-def strike(
-    folder: Path,
-    runtime: str,
-    blow: Blow,
-    seconds: float = LIMITS.at_depth_s,
-    roles: Sequence[str] = ROLES,
-    namespace: str = "",
-    rate: float = 1.0,
-) -> Struck | None:
-    """Run a short examination and inject the fault when the indenter has slid at depth for `seconds` [s] of simulated time.
+def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
+    """Run a short examination, in a network `namespace` if it is given, and inject the fault when it is due.
 
-    `rate` is simulated per wall time in wall-clock mode. In a network `namespace` all processes are clients of a secure router,
-    so that a fault in its loopback affects all. Returns None if the indenter did not reach the depth: on a busy machine a run in
-    wall-clock mode may be stopped before.
+    Returns None if it never was: on a busy machine a run in wall-clock mode may be stopped before contact.
     """
-    arguments = [
-        sys.executable,
-        "-m",
-        "palpate_benchmarks.struck",
-        str(folder),
-        runtime,
-        str(rate),
-        str(seconds),
-        ",".join(roles),
-    ]
+    program = "from palpate_benchmarks.struck import serve; serve()"
+    arguments = [sys.executable, "-c", program, TypeAdapter(StruckRun).dump_json(run).decode()]
     if namespace:
-        arguments = ["ip", "netns", "exec", namespace, *arguments, "secure"]
-    log = folder / "logs" / f"{CONDUCTOR}.log"
+        arguments = ["ip", "netns", "exec", namespace, *arguments]
+    log = run.folder / "logs" / f"{CONDUCTOR}.log"
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("w") as stderr:
-        run = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
-    assert run.stdout is not None
-    own, at, struck_s, said = Path(), 0.0, 0.0, {}
+        child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
+    assert child.stdout is not None
+    own, at, struck_s = Path(), 0.0, 0.0
     processes: dict[str, psutil.Process] = {}
-    hanging = threading.Event()
-    alarm: threading.Timer | None = None
+    hung = threading.Event()
 
     def end_hanging() -> None:
-        hanging.set()
-        run.kill()
+        hung.set()
+        child.kill()
 
+    alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
     try:
-        for line in run.stdout:
+        for line in child.stdout:
             if line.startswith(PROCESSES):
-                places = json.loads(line.removeprefix(PROCESSES))
-                own = Path(places.pop("folder"))
-                processes = {role: psutil.Process(pid) for role, pid in places.items()}
-                processes[CONDUCTOR] = psutil.Process(run.pid)
-            elif line.startswith(AT_DEPTH):
-                struck_s, at = float(line.rsplit(" ", 1)[1]), time.monotonic()
+                own, pids = TypeAdapter(tuple[Path, dict[str, int]]).validate_json(line.removeprefix(PROCESSES))
+                processes = {CONDUCTOR: psutil.Process(child.pid), **{role: psutil.Process(pid) for role, pid in pids.items()}}
+            elif line.startswith(DUE):
+                struck_s, at = float(line.removeprefix(DUE)), time.monotonic()
                 blow(processes)
-                alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
                 alarm.start()
-            elif line.startswith(RESULT):
-                said = json.loads(line.removeprefix(RESULT))
-        code = run.wait()
+        code = child.wait()
     finally:
-        if alarm is not None:
-            alarm.cancel()
-        if run.poll() is None:  # an exception must not leave the run behind
+        alarm.cancel()
+        if child.poll() is None:  # an exception must not leave the run behind
             for process in processes.values():
                 with suppress(psutil.Error):
                     process.kill()
-            run.kill()
-    status = None if hanging.is_set() else code
+            child.kill()
     services = {role: process for role, process in processes.items() if role != CONDUCTOR}
     _, staying = psutil.wait_procs(services.values(), timeout=TIMES.services_leave_s)
     left = time.monotonic() - at
-    hung = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
+    stuck = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
     for process in staying:
         process.kill()
+    watched: Watched | None = None
+    with suppress(FileNotFoundError):
+        watched = pickle.loads((run.folder / FILE).read_bytes())
+    if watched is not None and watched.result.interrupted:
+        raise KeyboardInterrupt
     if not at:
-        print(f"the indenter did not reach the depth: {said.get('failure')}", file=sys.stderr)
+        print(f"the fault was never due: {watched and watched.result.failure}", file=sys.stderr)
         return None
-    return Struck(folder, own, status, said, struck_s, left, hung)
+    return Struck(run.folder, own, None if hung.is_set() else code, watched, struck_s, left, stuck)
 
 
-def _conduct(folder: Path, timing: Timing, seconds: float, roles: tuple[str, ...], secure: SecureBus | None) -> None:
-    began: list[int] = []
+class Watch:
+    """Says when the fault is due, collects its signs and ends a run early."""
 
-    def report_depth(progress: RunProgress) -> None:
+    def __init__(self, run: StruckRun) -> None:
+        self._run = run
+        self._phase_since: int | None = None
+        self.since: float | None = None
+        """Wall time of the fault [s], from `monotonic`; None before it is due."""
+        self.watched = Watched(RunResult("", Collected()))
+
+    def on_progress(self, progress: RunProgress) -> None:
+        """Called every 20 ms of wall time. Raises CaseOver once the outcome is known, if the run ends early."""
         exam = progress.collected.exam
-        if exam is not None and exam.phase == ExamState.PHASE_SCAN:
-            if not began:
-                began.append(progress.t)
-            elif began[-1] >= 0 and progress.t - began[0] > seconds * NS:
-                began.append(-1)
-                print(AT_DEPTH, progress.t / NS, flush=True)
+        if exam is None:
+            return
+        if self.since is not None:
+            self.watched.add(progress, self._after_ms)
+            if self._run.early and not progress.trouble:  # with trouble the conductor ends the run, after it recorded reactions
+                self._end(exam)
+            return
+        if exam.phase != self._run.phase:
+            return
+        if self._phase_since is None:
+            self._phase_since = progress.t
+        if exam.phase == ExamState.PHASE_SCAN and progress.t - self._phase_since < self._run.at_s * NS:
+            return
+        self.since, self.watched.before = time.monotonic(), signs_of(progress)
+        received = progress.t / NS
+        if self._run.wallclock:  # messages may be late
+            received = max(received, received / progress.real_time_factor - GRANTS.wallclock_lead_ns / NS)
+        print(f"{DUE}{received}", flush=True)
 
+    @property
+    def _after_ms(self) -> float:
+        return 0.0 if self.since is None else (time.monotonic() - self.since) * 1e3
+
+    def _end(self, exam: ExamState) -> None:
+        """Raise CaseOver if the outcome is known."""
+        over = {
+            ExamState.PHASE_DONE: (CaseOutcome.COMPLETED, "complete"),
+            ExamState.PHASE_ABORTED: (CaseOutcome.ENDED, str(exam.message)),
+        }
+        if not self.watched.signs:
+            over[ExamState.PHASE_RETURN] = CaseOutcome.CONTINUED, "the scan was finished"
+        if exam.phase in over:
+            self.watched.outcome, text = over[exam.phase]
+            raise CaseOver(text)
+
+    def finished(self, result: RunResult) -> Watched:
+        """Return what was seen, with the result of the run."""
+        watched = self.watched
+        columns = {name: list(kept) if isinstance(kept, Sequence) else kept for name, kept in vars(result.collected).items()}
+        watched.result = replace(result, collected=Collected(**columns))
+        if self.since is not None:
+            watched.add(RunProgress(0, 0.0, result.collected), self._after_ms)
+            failed = result.failure is not None and not (watched.outcome and watched.outcome.unharmed)
+            if failed and watched.detected_ms is None:
+                watched.detected_ms = round(self._after_ms, 1)
+        return watched
+
+
+def serve() -> None:
+    """Conduct the run of the command line; write what was seen into its folder."""
+    run = TypeAdapter(StruckRun).validate_json(sys.argv[1])
+    with SecureBus() if run.secure else nullcontext() as bus:
+        _conduct(run, bus)
+
+
+def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
+    roles = tuple(role for group in run.groups for role in group)
     scenario = load_scenario("clean", SETTINGS)
-    files = write_scenario_files(scenario, folder)
-    local = LocalProcesses(one_per_process(roles), folder, files, timing, record="full", secure=secure, forks=forks())
+    forks = Forks(implementations.kind(role).entry_point(choice(scenario, role)).module for role in WORKERS)
+    timing = Timing(run.wallclock, rate=run.rate)
+    record: Record = "full" if "recorder" in roles else "none"
+    files = write_scenario_files(scenario, run.folder)
+    local = LocalProcesses(run.groups, run.folder, files, timing, record=record, secure=secure, forks=forks)
     session = open_session(local.bus[CONDUCTOR])
-    for process in read_processes(compose_file(), roles).values():
-        local.start(process)
+    processes = read_processes(compose_file(), roles)
+    if run.faulty:
+        role, *command = run.faulty
+        processes[role] = replace(processes[role], command=tuple(command))
+    for group in run.groups:
+        local.start(*(processes[role] for role in group))
     pids = {role: child.pid for role, child in local.running.items()}
-    print(f"{PROCESSES}{json.dumps({**pids, 'folder': str(local.folder)})}", flush=True)
+    print(f"{PROCESSES}{TypeAdapter(tuple[Path, dict[str, int]]).dump_json((local.folder, pids)).decode()}", flush=True)
+    watch = Watch(run)
     with local.as_conductor():
-        result = conduct(session, roles, report_depth, local.ended, timing, PATIENCE)
-    forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in result.collected.indentation]
-    failure = None if result.failure is None else asdict(result.failure)
-    signs = [asdict(sign) for sign in signs_of(RunProgress(0, 0.0, result.collected, ()))]
-    said = {"failure": failure, "lost": list(result.lost), "signs": signs, "forces": forces}
-    print(f"{RESULT}{json.dumps(said)}", flush=True)
+        result = conduct(session, roles, watch.on_progress, local.ended, timing, PATIENCE)
+    (run.folder / FILE).write_bytes(pickle.dumps(watch.finished(result)))
     close_session(session)
     local.stop(patience_s=3.0)
-
-
-if __name__ == "__main__":
-    with SecureBus() if "secure" in sys.argv else nullcontext() as bus:
-        folder, runtime, rate, seconds, roles = sys.argv[1:6]
-        timing = Timing(runtime == "wallclock", rate=float(rate))
-        _conduct(Path(folder), timing, float(seconds), tuple(roles.split(",")), bus)

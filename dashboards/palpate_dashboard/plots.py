@@ -4,8 +4,8 @@ Force over depth is drawn in a 2-D view, because rerun's plots only have time on
 its y is minus force [N] times `STRETCH`: image axes point down.
 """
 
-from collections.abc import Sequence
-from itertools import cycle
+from collections.abc import Mapping
+from itertools import cycle, islice
 from typing import Final
 
 import numpy as np
@@ -13,9 +13,8 @@ import rerun as rr
 
 from palpate_bus.contract import contract
 from palpate_dashboard import palette
-from palpate_dashboard.sinks import TIMELINE, Columns, scalars
+from palpate_dashboard.sinks import Canvas, scalars
 from palpate_dashboard.text import LEVELS, Health
-from palpate_models.numerics.frames import Array
 
 STRETCH: Final = 10.0
 FLUSH: Final = 20
@@ -43,46 +42,34 @@ class ForceDepthPlane:
 class ForceDepth:
     """Draws the force-depth plane under `force_depth`."""
 
-    def __init__(self, recording: rr.RecordingStream, plane: ForceDepthPlane) -> None:
-        self._recording = recording
+    def __init__(self, canvas: Canvas, plane: ForceDepthPlane) -> None:
+        self._canvas = canvas
         self._past: list[tuple[float, float]] = []
         self._new = 0
-        self._axes(plane)
-
-    def _axes(self, plane: ForceDepthPlane) -> None:
         x, y = plane.size
         lines = [[(0, 0), (x, 0)], [(0, 0), (0, -y)]]
         depths, forces = np.arange(0, plane.depth_max_mm + 0.1, 5.0), np.arange(0, plane.force_max_n + 0.1, 5.0)
         lines += [[(STRETCH * d, 0), (STRETCH * d, 0.02 * y)] for d in depths]
         lines += [[(0, -STRETCH * f), (-0.015 * x, -STRETCH * f)] for f in forces]
-        shape = rr.LineStrips2D(lines, colors=[_AXIS], radii=[rr.Radius.ui_points(0.7)])
-        self._recording.log("force_depth/axes", shape, static=True)
+        canvas.log("force_depth/axes", rr.LineStrips2D(lines, colors=[_AXIS], radii=[rr.Radius.ui_points(0.7)]))
         places = [(STRETCH * d, 0.06 * y) for d in depths] + [(-0.06 * x, -STRETCH * f) for f in forces[1:]]
         words = [f"{d:.0f} mm" for d in depths] + [f"{f:.0f} N" for f in forces[1:]]
         marks = rr.Points2D(places, labels=words, colors=[_AXIS], radii=[0.01], show_labels=True)
-        self._recording.log("force_depth/axes/ticks", marks, static=True)
+        canvas.log("force_depth/axes/ticks", marks)
         wanted = [[(STRETCH * plane.wanted_mm, 0), (STRETCH * plane.wanted_mm, -y)]]
         guide = rr.LineStrips2D(wanted, colors=[(230, 230, 230, 120)], radii=[rr.Radius.ui_points(0.5)])
-        self._recording.log("force_depth/wanted_depth", guide, static=True)
+        canvas.log("force_depth/wanted_depth", guide)
 
-    def add(self, t: int, depth_m: float, force_n: float, in_contact: bool) -> None:
-        """Add a sample at simulated time `t` [ns]; samples without contact are skipped."""
-        if not in_contact:
-            return
+    def add(self, t: int, depth_m: float, force_n: float) -> None:
+        """Add a sample in contact at simulated time `t` [ns]. The latest piece is drawn as a line, earlier ones as dots."""
         self._past.append((STRETCH * 1e3 * depth_m, -STRETCH * force_n))
         self._new += 1
-        if self._new >= FLUSH:
-            self.flush(t)
-
-    def flush(self, t: int) -> None:
-        """Draw the new samples; the view shows the latest piece as a line and earlier ones as dots."""
-        if not self._new:
+        if self._new < FLUSH:
             return
-        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
         bright = rr.LineStrips2D([self._past[-self._new - 1 :]], colors=[palette.FORCE], radii=[rr.Radius.ui_points(1.5)])
-        self._recording.log("force_depth/now", bright)
+        self._canvas.log("force_depth/now", bright, t)
         dots = rr.Points2D(self._past[-self._new :], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(1.2)])
-        self._recording.log("force_depth/past", dots)
+        self._canvas.log("force_depth/past", dots, t)
         self._new = 0
         del self._past[:-1]
 
@@ -123,99 +110,58 @@ AWAITED: Final = (*(name for name, role in contract().roles.items() if not role.
 """Possible causes of a wait: the services, and the conductor's grant of simulated time."""
 DEPTH_FLOOR_M: Final = -0.02
 """The depth plot is blank further above the surface than this: free motion would flatten the contact to a line."""
+_TRUE, _THIN, _WIDE = (150, 110, 240), 1.0, 1.5
+SERIES: Final[Mapping[str, tuple[str, tuple[int, int, int], float]]] = {
+    "force/measured": ("measured [N]", (255, 110, 110), _WIDE),
+    "force/true": ("true [N]", _TRUE, _WIDE),
+    "force/limit": ("working limit [N]", (240, 200, 60), _THIN),
+    "depth/measured": ("measured [mm]", (255, 170, 40), _WIDE),
+    "depth/setpoint": ("set-point [mm]", (230, 230, 230), _THIN),
+    "depth/true": ("true [mm]", _TRUE, _WIDE),
+    "truth/breath": ("true breath [mm]", _TRUE, _WIDE),
+    "truth/moved": ("true motion of the umbilicus [mm]", (240, 200, 60), _WIDE),
+    "wall/displacement": ("followed [mm]", (255, 170, 40), _WIDE),
+    "wall/forecast": ("forecast 0.2 s before [mm]", (230, 230, 230), _THIN),
+    "speed/real_time_factor": ("real-time factor [1]", (70, 180, 200), _WIDE),
+    "progress/targets": ("targets visited [%]", (70, 190, 90), _WIDE),
+}
+"""Name, colour and width of each line, by its path below `plots`."""
 
-Series = tuple[str, tuple[int, int, int]]
+
+def depth_mm(depth_m: float) -> float:
+    """Return a depth for its plot [mm]; NaN in free motion."""
+    return 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else float("nan")
 
 
 class Plots:
     """Draws plots, states and log."""
 
-    def __init__(self, recording: rr.RecordingStream, columns: Columns, force_limit_n: float, legend: str, truth: str) -> None:
-        """`force_limit_n`: working limit, drawn as a line; `legend` and `truth`: pages in Markdown."""
-        self._recording = recording
-        self._columns = columns
-        self._limit = np.array([force_limit_n])
+    def __init__(self, canvas: Canvas, legend: str, truth: str) -> None:
+        """`legend` and `truth`: pages in Markdown."""
+        self._canvas = canvas
         self._states: dict[str, str] = {}
         self._texts: dict[str, str] = {}
-        for name, page in (("legend", legend), ("truth", truth)):
-            recording.log(f"text/{name}", rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN), static=True)
-        self._series("plots/force/measured", [("measured [N]", (255, 110, 110))])
-        self._series("plots/force/true", [("true [N]", (150, 110, 240))])
-        self._series("plots/force/limit", [("working limit [N]", (240, 200, 60))], width=1.0)
-        self._series("plots/depth/measured", [("measured [mm]", (255, 170, 40))])
-        self._series("plots/depth/setpoint", [("set-point [mm]", (230, 230, 230))], width=1.0)
-        self._series("plots/depth/true", [("true [mm]", (150, 110, 240))])
-        self._series("plots/truth/breath", [("true breath [mm]", (150, 110, 240))])
-        self._series("plots/truth/moved", [("true motion of the umbilicus [mm]", (240, 200, 60))])
-        self._series("plots/wall/displacement", [("followed [mm]", (255, 170, 40))])
-        self._series("plots/wall/forecast", [("forecast 0.2 s before [mm]", (230, 230, 230))], width=1.0)
-        names = [f"A{i + 1} [% of limit]" for i in range(7)]
-        self._series("plots/torque/joints", list(zip(names, JOINT_COLORS, strict=True)))
-        self._series("plots/speed/real_time_factor", [("real-time factor [1]", (70, 180, 200))])
-        self._series("plots/waits/roles", list(zip(AWAITED, cycle((*JOINT_COLORS, (190, 190, 190))), strict=False)))
-        self._series("plots/progress/targets", [("targets visited [%]", (70, 190, 90))])
-        for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
-            shown = rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states])
-            recording.log(path, shown, static=True)
         self._health_lines: set[str] = set()
+        for name, page in (("legend", legend), ("truth", truth)):
+            canvas.log(f"text/{name}", rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN))
+        for path, (name, color, width) in SERIES.items():
+            canvas.log(f"plots/{path}", rr.SeriesLines(names=[name], colors=[color], widths=[width]))
+        for path, names in (("torque/joints", [f"A{i + 1} [% of limit]" for i in range(7)]), ("waits/roles", AWAITED)):
+            colors = list(islice(cycle((*JOINT_COLORS, (190, 190, 190))), len(names)))
+            canvas.log(f"plots/{path}", rr.SeriesLines(names=names, colors=colors, widths=[_WIDE] * len(names)))
+        for path, states in (("state/phase", PHASES), ("state/driver", MODES)):
+            canvas.log(path, rr.StateConfiguration(values=[name for name, _ in states], colors=[color for _, color in states]))
 
-    def _series(self, path: str, series: Sequence[Series], width: float = 1.5) -> None:
-        names = [name for name, _ in series]
-        colors = [color for _, color in series]
-        lines = rr.SeriesLines(names=names, colors=colors, widths=[width] * len(series))
-        self._recording.log(path, lines, static=True)
-
-    def _add(self, path: str, t: int, *values: float) -> None:
-        self._columns.add(path, scalars, t, np.array(values, dtype=np.float64))
-
-    def force(self, t: int, measured_n: float) -> None:
-        """Plot the tared normal force and its working limit."""
-        self._add("plots/force/measured", t, measured_n)
-        self._columns.add("plots/force/limit", scalars, t, self._limit)
-
-    def true_contact(self, t: int, depth_m: float, force_n: float) -> None:
-        """Plot the true contact depth and force."""
-        self._add("plots/force/true", t, force_n)
-        self._add("plots/depth/true", t, 1e3 * depth_m if depth_m > DEPTH_FLOOR_M else np.nan)
-
-    def true_patient(self, t: int, excursion_m: float, moved_m: float) -> None:
-        """Plot the true breathing excursion and the displacement of the umbilicus from its initial position."""
-        self._add("plots/truth/breath", t, 1e3 * excursion_m)
-        self._add("plots/truth/moved", t, 1e3 * moved_m)
-
-    def wall(self, t: int, displacement_m: float, forecast_m: float, ahead: int) -> None:
-        """Plot the measured breathing displacement, and its forecast `ahead` [ns] later."""
-        self._add("plots/wall/displacement", t, 1e3 * displacement_m)
-        self._add("plots/wall/forecast", t + ahead, 1e3 * forecast_m)
-
-    def depth(self, t: int, measured_m: float, setpoint_m: float) -> None:
-        """Plot measured depth and set-point, along the inward normal from the perceived surface."""
-        self._add("plots/depth/measured", t, 1e3 * measured_m if measured_m > DEPTH_FLOOR_M else np.nan)
-        self._add("plots/depth/setpoint", t, 1e3 * setpoint_m if setpoint_m > DEPTH_FLOOR_M else np.nan)
-
-    def torques(self, t: int, share: Array) -> None:
-        """Plot applied torques over their limits [1], shape (7,)."""
-        self._columns.add("plots/torque/joints", scalars, t, 100.0 * share)
-
-    def progress(self, t: int, visited: int, total: int) -> None:
-        """Plot the share of visited targets."""
-        self._add("plots/progress/targets", t, 100.0 * visited / total if total else 0.0)
-
-    def speed(self, t: int, real_time_factor: float) -> None:
-        """Plot simulated over wall time during the last simulated second."""
-        self._add("plots/speed/real_time_factor", t, real_time_factor)
-
-    def waits(self, t: int, share: Array) -> None:
-        """Plot the share of the observed waits caused by each of `AWAITED` [1], shape (k,)."""
-        self._columns.add("plots/waits/roles", scalars, t, 100.0 * share)
+    def add(self, t: int, path: str, *values: float) -> None:
+        """Plot the values of the lines of a path below `plots` at `t` [ns]."""
+        self._canvas.add(f"plots/{path}", scalars, t, np.array(values, dtype=np.float64))
 
     def state(self, t: int, path: str, name: str) -> bool:
         """Write a state when it changes; return True if it did."""
         if self._states.get(path) == name:
             return False
         self._states[path] = name
-        self._at(t)
-        self._recording.log(path, rr.StateChange(state=name))
+        self._canvas.log(path, rr.StateChange(state=name), t)
         return True
 
     def health(self, t: int, row: Health) -> None:
@@ -223,25 +169,21 @@ class Plots:
         path = f"health/{'topics' if row.is_topic else 'services'}/{row.name}"
         if path not in self._health_lines:
             self._health_lines.add(path)
-            shown = rr.StateConfiguration(values=list(LEVELS), colors=list(LEVEL_COLORS))
-            self._recording.log(path, shown, static=True)
+            self._canvas.log(path, rr.StateConfiguration(values=list(LEVELS), colors=list(LEVEL_COLORS)))
         self.state(t, path, row.word)
         if row.word in _LOG_LEVELS:
             self.log(t, f"log/{path}", row.message, _LOG_LEVELS[row.word])
 
     def log(self, t: int, path: str, text: str, level: str = "INFO") -> None:
         """Log a line unless it equals the previous one on this path."""
-        if text and self._texts.get(path) != text:
-            self._texts[path] = text
-            self._at(t)
-            self._recording.log(path, rr.TextLog(text, level=level))
+        if text and self._changes(path, text):
+            self._canvas.log(path, rr.TextLog(text, level=level), t)
 
     def document(self, t: int, path: str, markdown: str) -> None:
         """Write a page of text when it changes."""
-        if self._texts.get(path) != markdown:
-            self._texts[path] = markdown
-            self._at(t)
-            self._recording.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN))
+        if self._changes(path, markdown):
+            self._canvas.log(path, rr.TextDocument(markdown, media_type=rr.MediaType.MARKDOWN), t)
 
-    def _at(self, t: int) -> None:
-        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
+    def _changes(self, path: str, text: str) -> bool:
+        before, self._texts[path] = self._texts.get(path), text
+        return text != before

@@ -1,16 +1,25 @@
-"""The 3-D scene in world: table, robot, camera, abdomen, perception, plan, contact. Arrays in, rerun entities out."""
+"""The 3-D scene in world (table, robot, camera, abdomen, plan, contact), and the map from above in the abdomen frame A.
 
-from collections.abc import Iterable, Mapping
-from typing import Final, NamedTuple
+Messages in, rerun entities out.
+"""
+
+from collections.abc import Iterable
+from functools import cache
+from typing import Final
 
 import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from palpate_bus.messages.geometry import quaternion
+from palpate_bus.contract import contract
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.geometry import depth_in_metres, quaternion, transform_matrix
 from palpate_dashboard import palette
-from palpate_dashboard.arrays import Carry, Floats, Indices, VertexNormals
-from palpate_dashboard.sinks import TIMELINE, Columns, arrows, deformations, transforms
+from palpate_dashboard.arrays import Carry, Floats, Indices, VertexNormals, cloud, points, shaded, transform, triples
+from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
+from palpate_models.robot import table
+from palpate_models.robot.visual import visual_meshes
+from palpate_models.scenario.schema import Camera, Robot
 
 METRES_PER_NEWTON: Final = 0.03
 """Scale of the force arrow: 5 N are 15 cm."""
@@ -22,27 +31,33 @@ CLOUD_POINTS: Final = 6000
 """Greatest number of drawn points of the perceived cloud."""
 CARRY_M: Final = 0.012
 """Greatest distance from a vertex of the abdomen to the map vertex that colours it."""
-AXES_M: Final = 0.15
-"""Length of the axes of the patient's true pose."""
 TRAIL_STEP_M: Final = 0.001
 """Distance between points of the travelled path."""
+CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
+FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
+LAYERS: Final = ("mean", "band")
+"""Layers of the map."""
 
 
-class Shaded(NamedTuple):
-    """A mesh for drawing: positions [m] and unit normals, shapes (n, 3); triangles, shape (m, 3)."""
-
-    positions: NDArray[np.float32]
-    triangles: Indices
-    normals: NDArray[np.float32]
-    color: palette.Rgba
+@cache
+def _link_shapes(robot: Robot) -> dict[str, list[rr.Mesh3D]]:
+    """Return the shapes of the robot's links, each in its own frame."""
+    shapes: dict[str, list[rr.Mesh3D]] = {}
+    for link, meshes in visual_meshes(robot).items():
+        for mesh in meshes:
+            positions, triangles, normals = shaded(mesh.vertices, mesh.triangles)
+            color = [round(255 * channel) for channel in mesh.rgba]
+            shape = rr.Mesh3D(vertex_positions=positions, triangle_indices=triangles, vertex_normals=normals, albedo_factor=color)
+            shapes.setdefault(link, []).append(shape)
+    return shapes
 
 
 class SceneView:
-    """Draws the scene into a recording. Poses are X_WB; positions are in world, metres."""
+    """Draws the scene. Poses are X_WB; positions are in world, metres."""
 
-    def __init__(self, recording: rr.RecordingStream, columns: Columns) -> None:
-        self._recording = recording
-        self._columns = columns
+    def __init__(self, canvas: Canvas, robot: Robot, camera: Camera) -> None:
+        self._canvas = canvas
+        self._shapes = dict(_link_shapes(robot))
         self._poses: dict[str, Floats] = {}
         self._normals: VertexNormals | None = None
         self._rest: NDArray[np.float32] | None = None
@@ -52,59 +67,48 @@ class SceneView:
         self._force_shown = False
         self._lifted: Floats | None = None
         self._trail: list[Floats] = []
-        recording.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-        red = rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004])
-        recording.log("world/tool/force", red, static=True)
+        canvas.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        canvas.log("world/tool/force", rr.Arrows3D.from_fields(colors=[palette.FORCE], radii=[0.004]))
+        for box in table.boxes(robot):
+            path = f"world/furniture/{box.name}"
+            color = FURNITURE.get(box.name, palette.STEEL)
+            canvas.log(path, rr.Transform3D(translation=box.X_WB[:3, 3], mat3x3=box.X_WB[:3, :3]))
+            canvas.log(path, rr.Boxes3D(sizes=[box.size], colors=[color], fill_mode="solid"))
+        k = np.array(((camera.focal_px, 0, camera.width_px / 2), (0, camera.focal_px, camera.height_px / 2), (0, 0, 1)))
+        self._lens(k, camera.width_px, camera.height_px)  # for viewers that join after the camera_info message
 
-    def at(self, t: int) -> None:
-        """Set the simulated time [ns] of the following rows."""
-        self._recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
-
-    def box(self, name: str, X_WB: Floats, size: tuple[float, float, float], color: palette.Rgba) -> None:
-        """Draw a static box: centre pose, shape (4, 4), and edge lengths [m]."""
-        path = f"world/furniture/{name}"
-        self._recording.log(path, rr.Transform3D(translation=X_WB[:3, 3], mat3x3=X_WB[:3, :3]), static=True)
-        shape = rr.Boxes3D(sizes=[size], colors=[color], fill_mode="solid")
-        self._recording.log(path, shape, static=True)
-
-    def link_shape(self, link: str, meshes: Iterable[Shaded]) -> None:
-        """Draw the shape of a robot link, in its own frame."""
-        for i, mesh in enumerate(meshes):
-            shape = rr.Mesh3D(
-                vertex_positions=mesh.positions,
-                triangle_indices=mesh.triangles,
-                vertex_normals=mesh.normals,
-                albedo_factor=mesh.color,
-            )
-            self._recording.log(f"world/robot/{link}/shape_{i}", shape, static=True)
-
-    def link_poses(self, t: int, poses: Mapping[str, Floats]) -> None:
-        """Draw link poses by name: x y z [m] qx qy qz qw, shape (7,). A resting link is not repeated."""
-        for link, pose in poses.items():
+    def link_poses(self, t: int, message: Message, in_contact: bool, pressed_n: float) -> None:
+        """Draw the links that have moved, the tool's path, and the contact force `pressed_n` [N] next to the tool."""
+        for item in message.transforms:
+            link, pose = item.child_frame_id, transform(item.transform)
+            for i, shape in enumerate(self._shapes.pop(link, ())):
+                self._canvas.log(f"world/robot/{link}/shape_{i}", shape)
             before = self._poses.get(link)
             if before is None or np.abs(pose - before).max() > 2e-5:
                 self._poses[link] = pose
-                self._columns.add(f"world/robot/{link}", transforms, t, pose)
+                self._canvas.add(f"world/robot/{link}", transforms, t, pose)
+            if link == "indenter":
+                X_WI = transform_matrix(item.transform)
+                self._tool(t, X_WI[:3, 3], in_contact)
+                self._force(t, X_WI[:3, 3], -pressed_n * X_WI[:3, 2])
 
-    def abdomen(self, t: int, vertices: NDArray[np.float32], triangles: Indices | None) -> None:
-        """Draw the deformed surface: vertices, shape (n, 3); `triangles`, shape (m, 3), only on the first call."""
+    def abdomen(self, t: int, message: Message) -> None:
+        """Draw the deformed surface; its triangles come with the first message only."""
+        vertices = triples(message.vertices)
         if self._normals is None:
-            if triangles is None:
-                return
+            triangles = triples(message.triangles)
             self._normals = VertexNormals(triangles, len(vertices))
             self._rest = vertices
             skin = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
-            path = "world/abdomen"
-            self._recording.log(path, rr.Mesh3D.from_fields(triangle_indices=triangles), static=True)
-            self.at(t)
-            self._recording.log(path, rr.Mesh3D.from_fields(vertex_colors=skin))
-            self._recording.flush()  # a live viewer must receive the triangles before the vertices
+            self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=triangles))
+            self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=skin), t)
+            self._canvas.recording.flush()  # a live viewer must receive the triangles before the vertices
         rounded = np.round(vertices / RESOLUTION_M).astype(np.float32) * np.float32(RESOLUTION_M)
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
         normals = np.round(self._normals(rounded) * 64.0) / np.float32(64.0)
-        self._columns.add("world/abdomen", deformations, t, (rounded, normals))
+        self._canvas.add("world/abdomen", deformations, t, (rounded, normals))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Floats, scanned: NDArray[np.bool_]) -> None:
         """Colours the abdomen by the map: vertices, shape (k, 3), stiffness over background [1], and a mask of assessed ones."""
@@ -115,95 +119,95 @@ class SceneView:
             self._carry = Carry(vertices, self._rest, CARRY_M)
         skin = palette.packed(palette.SKIN)
         colors = self._carry(np.where(scanned, palette.stiffness_colors(ratio), skin), skin)
-        self.at(t)
-        self._recording.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)))
+        self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)), t)
 
     def body(self, t: int, X_WA: NDArray[np.float64], excursion: float) -> None:
         """Move `world/truth` by the patient's true pose, shape (4, 4), and breathing excursion [m]."""
         lifted = np.concatenate((X_WA[:3, 3] + excursion * X_WA[:3, 2], quaternion(X_WA[:3, :3])))
         if self._lifted is None or np.abs(lifted - self._lifted).max() > RESOLUTION_M:
             self._lifted = lifted
-            self._columns.add("world/truth", transforms, t, lifted)
+            self._canvas.add("world/truth", transforms, t, lifted)
 
     def lesions(self, segments: Iterable[Floats]) -> None:
         """Draw true lesion outlines in A, one (k, 2, 3) array of segments each, and A's axes; initially hidden."""
-        axes = rr.Arrows3D(vectors=AXES_M * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
-        self._recording.log("world/truth/axes", axes, static=True)
-        strips = [segment for outline in segments for segment in outline]
-        shape = rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
-        self._recording.log("world/truth/lesions", shape, static=True)
+        axes = rr.Arrows3D(vectors=0.15 * np.eye(3), colors=[palette.TRUTH], labels=list("xyz"), radii=[0.001])
+        self._canvas.log("world/truth/axes", axes)
+        self._canvas.log("world/truth/lesions", _outlines([segment for outline in segments for segment in outline]))
 
     def findings(self, t: int, centroids: Floats, labels: list[str]) -> None:
         """Draw centroids of the findings, shape (n, 3), with labels."""
-        self.at(t)
         shape = rr.Points3D(centroids, colors=[palette.FINDING], radii=[0.006], labels=labels, show_labels=True)
-        self._recording.log("world/findings", shape)
+        self._canvas.log("world/findings", shape, t)
 
-    def camera(self, X_WC: Floats) -> None:
-        """Draw the camera at the calibrated pose of its optical frame, shape (4, 4), with its tripod."""
+    def camera(self, _t: int, message: Message) -> None:
+        """Draw the camera at the calibrated pose of its optical frame, with its tripod."""
+        for item in message.transforms:
+            if item.child_frame_id == CAMERA_FRAME:
+                self._camera(transform_matrix(item.transform))
+
+    def _camera(self, X_WC: Floats) -> None:
         pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
-        self._recording.log("world/camera", pose, static=True)
-        self._recording.log("world/furniture/camera", pose, static=True)
+        self._canvas.log("world/camera", pose)
+        self._canvas.log("world/furniture/camera", pose)
         body = rr.Boxes3D(sizes=[(0.28, 0.06, 0.06)], centers=[(0, 0, -0.04)], colors=[palette.PLINTH], fill_mode="solid")
-        self._recording.log("world/furniture/camera", body, static=True)
+        self._canvas.log("world/furniture/camera", body)
         x, y, z = X_WC[:3, 3]
-        top = np.array((x, y, z - 0.04))
-        knee = np.array((x, y, min(0.9, 0.6 * z)))
-        angles = np.deg2rad((90, 210, 330))
-        feet = [np.array((x + 0.38 * np.cos(a), y + 0.38 * np.sin(a), 0.0)) for a in angles]
+        top, knee = np.array((x, y, z - 0.04)), np.array((x, y, min(0.9, 0.6 * z)))
+        feet = [(x + 0.38 * np.cos(a), y + 0.38 * np.sin(a), 0.0) for a in np.deg2rad((90, 210, 330))]
         legs = rr.LineStrips3D([[top, knee], *([knee, foot] for foot in feet)], colors=[palette.PLINTH], radii=[0.011])
-        self._recording.log("world/furniture/tripod", legs, static=True)
+        self._canvas.log("world/furniture/tripod", legs)
 
-    def lens(self, k: Floats, width: int, height: int) -> None:
-        """Set the camera intrinsics, shape (3, 3) [px]."""
+    def lens(self, _t: int, message: Message) -> None:
+        """Set the camera intrinsics."""
+        self._lens(np.asarray(message.k).reshape(3, 3), message.width, message.height)
+
+    def _lens(self, k: Floats, width: int, height: int) -> None:
         view = rr.Pinhole(
             image_from_camera=k, width=width, height=height, camera_xyz=rr.ViewCoordinates.RDF, image_plane_distance=0.2
         )
-        self._recording.log("world/camera", view, static=True)
+        self._canvas.log("world/camera", view)
 
-    def depth(self, t: int, image: NDArray[np.float32]) -> None:
-        """Draw a depth image [m], shape (height, width), NaN where invalid; stored in whole millimetres."""
-        self.at(t)
+    def depth(self, t: int, message: Message) -> None:
+        """Draw a depth image; stored in whole millimetres, 0 where invalid."""
+        image = depth_in_metres("camera/depth/image_raw", message)
         millimetres = np.nan_to_num(image * 1000.0, nan=0.0).astype(np.uint16)
         shape = rr.DepthImage(millimetres, meter=1000.0, colormap="viridis", depth_range=(500.0, 1700.0))
-        self._recording.log("world/camera/depth", shape)
+        self._canvas.log("world/camera/depth", shape, t)
 
-    def cloud(self, t: int, points: NDArray[np.float32]) -> None:
-        """Draw the perceived point cloud, shape (n, 3), thinned to `CLOUD_POINTS`."""
-        self.at(t)
-        thinned = points[:: max(1, -(-len(points) // CLOUD_POINTS))]
-        shape = rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012])
-        self._recording.log("world/perception/points", shape)
+    def cloud(self, t: int, message: Message) -> None:
+        """Draw the perceived point cloud, thinned to `CLOUD_POINTS`."""
+        seen = cloud(message)
+        thinned = seen[:: max(1, -(-len(seen) // CLOUD_POINTS))]
+        self._canvas.log("world/perception/points", rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012]), t)
 
     def clear_cloud(self, t: int) -> None:
         """Remove the cloud: it would hide the abdomen's colours."""
-        self.at(t)
-        self._recording.log("world/perception/points", rr.Points3D([]))
+        self._canvas.log("world/perception/points", rr.Points3D([]), t)
 
-    def perceived(self, t: int, vertices: NDArray[np.float32], triangles: Indices) -> None:
+    def perceived(self, t: int, message: Message) -> None:
         """Draw the perceived rest surface."""
-        self.at(t)
+        vertices, triangles = triples(message.vertices), triples(message.triangles)
         normals = VertexNormals(triangles, len(vertices))(vertices)
         shape = rr.Mesh3D(
             vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=palette.POINTS
         )
-        self._recording.log("world/perception/surface", shape)
+        self._canvas.log("world/perception/surface", shape, t)
 
-    def targets(self, t: int, positions: Floats, normals: Floats) -> None:
-        """Draw palpation targets and outward normals, shapes (n, 3)."""
-        self.at(t)
-        points = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
-        self._recording.log("world/perception/targets", points)
-        needles = rr.Arrows3D(origins=positions, vectors=0.02 * normals, colors=[palette.TARGETS], radii=[0.0004])
-        self._recording.log("world/perception/normals", needles)
+    def targets(self, t: int, message: Message) -> None:
+        """Draw palpation targets and outward normals."""
+        positions = points(message.positions)
+        dots = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
+        self._canvas.log("world/perception/targets", dots, t)
+        needles = rr.Arrows3D(origins=positions, vectors=0.02 * points(message.normals), colors=[palette.TARGETS], radii=[0.0004])
+        self._canvas.log("world/perception/normals", needles, t)
 
-    def planned(self, t: int, positions: Floats) -> None:
-        """Draw the planned path of the tool, shape (n, 3)."""
-        self.at(t)
+    def planned(self, t: int, message: Message) -> None:
+        """Draw the planned path of the tool."""
+        positions = points(pose.pose.position for pose in message.poses)
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
-        self._recording.log("world/plan/path", shape)
+        self._canvas.log("world/plan/path", shape, t)
 
-    def tool(self, t: int, position: Floats, in_contact: bool) -> None:
+    def _tool(self, t: int, position: Floats, in_contact: bool) -> None:
         """Extend the travelled path by the tool's position, shape (3,)."""
         if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
             return
@@ -215,16 +219,91 @@ class SceneView:
         """Draw the travelled path since the last call."""
         if len(self._trail) < 2:
             return
-        self.at(t)
         color = palette.PRESSED if in_contact else palette.TRAVELLED
         shape = rr.LineStrips3D([np.array(self._trail)], colors=[color], radii=[rr.Radius.ui_points(0.7)])
-        self._recording.log("world/tool/travelled", shape)
+        self._canvas.log("world/tool/travelled", shape, t)
         del self._trail[:-1]
 
-    def force(self, t: int, position: Floats, force: Floats) -> None:
+    def _force(self, t: int, position: Floats, force: Floats) -> None:
         """Draw the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
             vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
-            self._columns.add("world/tool/force", arrows, t, (position + FORCE_OFFSET_W_M, vector))
+            self._canvas.add("world/tool/force", arrows, t, (position + FORCE_OFFSET_W_M, vector))
         self._force_shown = shown
+
+
+def _outlines(strips: list[Floats]) -> rr.LineStrips3D:
+    return rr.LineStrips3D(strips, colors=[palette.TRUTH], radii=[rr.Radius.ui_points(1.5)])
+
+
+class MapView:
+    """Draws the stiffness map seen from above: mean, uncertainty, findings, true outlines, legend. Positions are in A [m], z is
+    dropped.
+    """
+
+    def __init__(self, canvas: Canvas, region_m: tuple[float, float], centre_m: tuple[float, float]) -> None:
+        """`region_m`: width and height of the examined region around `centre_m`."""
+        self._canvas = canvas
+        self._shape: tuple[NDArray[np.float32], Indices] | None = None
+        (w, h), (x, y) = region_m, centre_m
+        self._corner = np.array((x + w / 2 + 0.012, y - h / 2, 0.0))
+        self._height = h
+        canvas.log("map", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+        self._frame(w, h, x, y)
+        self._legend("mean", [f"{r:g} ×" for r in palette.LEGEND], palette.stiffness_colors(np.array(palette.LEGEND)))
+        spreads = np.array((0.1, 0.2, 0.4, 0.6))
+        self._legend("band", [f"± {100 * s:.0f} %" for s in spreads], palette.spread_colors(spreads))
+
+    def _frame(self, w: float, h: float, x: float, y: float) -> None:
+        left, right, low, high = x - w / 2, x + w / 2, y - h / 2, y + h / 2
+        strips = [[(left, low, 0.002), (right, low, 0.002), (right, high, 0.002), (left, high, 0.002), (left, low, 0.002)]]
+        if left < 0 < right:
+            strips.append([(0, low, 0.002), (0, high, 0.002)])
+        if low < 0 < high:
+            strips.append([(left, 0, 0.002), (right, 0, 0.002)])
+        lines = rr.LineStrips3D(strips, colors=[(150, 150, 150, 255)], radii=[rr.Radius.ui_points(0.7)])
+        quadrants = {"RUQ": (-1, 1), "LUQ": (1, 1), "RLQ": (-1, -1), "LLQ": (1, -1)}
+        here = {name: (a, b) for name, (a, b) in quadrants.items() if max(a * left, a * right) > 0 < max(b * low, b * high)}
+        names = _labels([(x + 0.42 * a * w, y + 0.42 * b * h, 0.003) for a, b in here.values()], list(here))
+        for layer in LAYERS:
+            self._canvas.log(f"map/{layer}/frame", lines)
+            self._canvas.log(f"map/{layer}/quadrants", names)
+
+    def _legend(self, layer: str, labels: list[str], colors: NDArray[np.uint32]) -> None:
+        step = self._height / len(labels)
+        places = self._corner + np.outer((np.arange(len(labels)) + 0.5) * step, (0.0, 1.0, 0.0))
+        swatches = rr.Boxes3D(centers=places, half_sizes=[(0.006, step / 2, 0.0005)], colors=colors, fill_mode="solid")
+        self._canvas.log(f"map/{layer}/legend", swatches)
+        self._canvas.log(f"map/{layer}/legend/labels", _labels(places + np.array((0.034, 0.0, 0.0)), labels))
+
+    def update(
+        self, t: int, vertices: NDArray[np.float32], triangles: Indices, ratio: Floats, spread: Floats, scanned: NDArray[np.bool_]
+    ) -> None:
+        """Draw stiffness over background [1] and half width of the 90 % band over the mean [1], at the vertices."""
+        flat = vertices * np.array((1, 1, 0), dtype=np.float32)
+        shape = self._shape
+        if shape is None or not (np.array_equal(shape[0], flat) and np.array_equal(shape[1], triangles)):
+            self._shape = (flat, triangles)
+            mesh = rr.Mesh3D.from_fields(vertex_positions=flat, triangle_indices=triangles)
+            for layer in LAYERS:
+                self._canvas.log(f"map/{layer}/surface", mesh, t)
+        unknown = palette.packed((70, 72, 78, 255))
+        for layer, colors in (("mean", palette.stiffness_colors(ratio)), ("band", palette.spread_colors(spread))):
+            mesh = rr.Mesh3D.from_fields(vertex_colors=np.where(scanned, colors, unknown).astype(np.uint32))
+            self._canvas.log(f"map/{layer}/surface", mesh, t)
+
+    def lesions(self, segments: Iterable[Floats]) -> None:
+        """Draw true lesion outlines, one (k, 2, 3) array of segments each."""
+        strips = [segment * (1, 1, 0) + (0, 0, 0.003) for outline in segments for segment in outline]
+        self._canvas.log("map/mean/truth", _outlines(strips))
+
+    def findings(self, t: int, centroids: Floats, labels: list[str]) -> None:
+        """Draw centroids of the findings, shape (n, 3)."""
+        places = centroids * (1, 1, 0) + (0, 0, 0.004)
+        shape = rr.Points3D(places, colors=[palette.FINDING], radii=[0.003], labels=labels, show_labels=True)
+        self._canvas.log("map/mean/findings", shape, t)
+
+
+def _labels(places: Iterable[Floats | tuple[float, float, float]], labels: list[str]) -> rr.Points3D:
+    return rr.Points3D(list(places), labels=labels, radii=[0.0001], colors=[palette.TARGETS], show_labels=True)

@@ -5,7 +5,6 @@ It sends nothing, so it cannot change a run. Late messages are skipped.
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from time import perf_counter
 from typing import Any, Final
@@ -16,28 +15,24 @@ from numpy.typing import NDArray
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_in_metres, pose_matrix, transform_matrix
+from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
-from palpate_dashboard import arrays, palette, plots, text
-from palpate_dashboard.arrays import VertexNormals, shaded
+from palpate_dashboard import arrays, plots, text
+from palpate_dashboard.arrays import VertexNormals
 from palpate_dashboard.layout import blueprint
-from palpate_dashboard.map import MapView
-from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots
-from palpate_dashboard.scene import SceneView, Shaded
-from palpate_dashboard.sinks import Columns, Live, open_recording
+from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots, depth_mm
+from palpate_dashboard.scene import MapView, SceneView
+from palpate_dashboard.sinks import Canvas, Live, open_recording
 from palpate_models.numerics.frames import apply
 from palpate_models.numerics.maps import half_width, level_lines
-from palpate_models.robot import table
 from palpate_models.robot.arm import arm_of
-from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Robot, Scenario
+from palpate_models.scenario.schema import Scenario
 
 FILE: Final = "recording.rrd"
-CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
 
 
 @dataclass(frozen=True)
@@ -64,21 +59,6 @@ FORECAST_INDEX: Final = 4
 """The drawn forecast of the breathing motion: 0.2 s ahead, about what planning uses."""
 ABOVE_SKIN_M: Final = 0.002
 """Height of outlines above the surface."""
-FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
-
-
-@cache
-def _shapes(robot: Robot) -> dict[str, list[Shaded]]:
-    """Return the robot's link shapes by name."""
-    return {
-        link: [Shaded(*shaded(mesh.vertices, mesh.triangles), _rgba(mesh.rgba)) for mesh in meshes]
-        for link, meshes in visual_meshes(robot).items()
-    }
-
-
-def _rgba(color: tuple[float, float, float, float]) -> palette.Rgba:
-    r, g, b, a = (round(255 * channel) for channel in color)
-    return r, g, b, a
 
 
 class DashboardService(Service):
@@ -98,22 +78,16 @@ class DashboardService(Service):
         self._name = scenario.name
         self._path = path
         self._X_WA = np.array(given.X_WA)
-        exam, limit = given.exam, given.limits.force_working_n
-        plane = ForceDepthPlane(exam.depth_m, limit)
+        exam, self._limit_n = given.exam, given.limits.force_working_n
+        plane = ForceDepthPlane(exam.depth_m, self._limit_n)
         layout = blueprint(exam.region_m, exam.centre_m, exam.depth_m, plane.bounds)
-        self._recording = open_recording(path, live, layout, scenario.name, "" if path is None else run_of(path.parent))
-        self._force_depth = ForceDepth(self._recording, plane)
+        run = "" if path is None else run_of(path.parent)
+        self._canvas = Canvas(open_recording(path, live, layout, scenario.name, run))
+        self._force_depth = ForceDepth(self._canvas, plane)
         self._send_period = PERIODS.send_live_ns if paced and live != Live() else PERIODS.send_ns
-        self._columns = Columns(self._recording)
-        self._scene = SceneView(self._recording, self._columns)
-        self._map = MapView(self._recording, exam.region_m, exam.centre_m)
-        self._plots = Plots(self._recording, self._columns, limit, text.LEGEND, text.truth_page(scenario))
-        self._shapes = dict(_shapes(given.robot))
-        for box in table.boxes(given.robot):
-            self._scene.box(box.name, box.X_WB, box.size, FURNITURE.get(box.name, palette.STEEL))
-        lens = given.camera
-        k = np.array(((lens.focal_px, 0, lens.width_px / 2), (0, lens.focal_px, lens.height_px / 2), (0, 0, 1)))
-        self._scene.lens(k, lens.width_px, lens.height_px)  # for viewers that join after the camera_info message
+        self._scene = scene = SceneView(self._canvas, given.robot, given.camera)
+        self._map = MapView(self._canvas, exam.region_m, exam.centre_m)
+        self._plots = Plots(self._canvas, text.LEGEND, text.truth_page(scenario))
         self._waits = np.zeros(len(plots.AWAITED))
         self._producers = {topic.name: topic.producer for topic in contract().topics.values()}
         self._seen: dict[str, Message] = {}
@@ -132,16 +106,16 @@ class DashboardService(Service):
         self._busy_s = 0.0
         often = full or live != Live()
         self._drawing: tuple[tuple[str, int, Callable[[int, Message], None]], ...] = (
-            ("sim/surface", PERIODS.mesh_ns if often else PERIODS.sparse_ns, self._surface),
+            ("sim/surface", PERIODS.mesh_ns if often else PERIODS.sparse_ns, scene.abdomen),
             ("truth/phantom", 0, self._phantom),
-            ("tf_static", 0, self._tf_static),
-            ("camera/depth/camera_info", PERIODS.image_ns, self._camera_info),
-            ("camera/depth/image_raw", PERIODS.image_ns if often else PERIODS.sparse_ns, self._depth),
-            ("perception/points", PERIODS.image_ns, self._points),
-            ("perception/surface", PERIODS.image_ns, self._perceived),
+            ("tf_static", 0, scene.camera),
+            ("camera/depth/camera_info", PERIODS.image_ns, scene.lens),
+            ("camera/depth/image_raw", PERIODS.image_ns if often else PERIODS.sparse_ns, scene.depth),
+            ("perception/points", PERIODS.image_ns, scene.cloud),
+            ("perception/surface", PERIODS.image_ns, scene.perceived),
             ("perception/targets", 0, self._targets),
             ("perception/motion", PERIODS.plot_ns, self._wall),
-            ("planning/path", 0, self._path_planned),
+            ("planning/path", 0, scene.planned),
             ("exam/state", PERIODS.plot_ns, self._exam),
             ("truth/indentation", PERIODS.plot_ns, self._indentation),
             ("truth/patient", PERIODS.plot_ns, self._patient),
@@ -167,20 +141,20 @@ class DashboardService(Service):
             self._measure_speed(t)
         if self._is_due("send", t, self._send_period):
             self._due["send"] = t + self._send_period
-            self._columns.send()
+            self._canvas.send()
         self._steps += 1
         self._busy_s += perf_counter() - start
         return {}
 
     def flush(self) -> None:
         """Send the collected rows."""
-        self._columns.send()
-        self._recording.flush()
+        self._canvas.send()
+        self._canvas.recording.flush()
 
     def finish(self) -> Mapping[str, Any]:
         """Complete the recording."""
         self.flush()
-        self._recording.disconnect()
+        self._canvas.recording.disconnect()
         return {
             "file": None if self._path is None else self._path.name,
             "file_bytes": 0 if self._path is None else self._path.stat().st_size,
@@ -198,22 +172,10 @@ class DashboardService(Service):
         self._speed_mark = (t, now)
         if t > before > 0:
             self._speed = (t - before) / 1e9 / (now - then)
-            self._plots.speed(t, self._speed)
+            self._plots.add(t, "speed/real_time_factor", self._speed)
 
     def _link_poses(self, t: int, message: Message) -> None:
-        transforms = {item.child_frame_id: item.transform for item in message.transforms}
-        poses = {frame: arrays.transform(transform) for frame, transform in transforms.items()}
-        for link in poses.keys() & self._shapes.keys():
-            self._scene.link_shape(link, self._shapes.pop(link))
-        self._scene.link_poses(t, poses)
-        tool = transforms.get("indenter")
-        if tool is not None:
-            X_WI = transform_matrix(tool)
-            self._scene.tool(t, X_WI[:3, 3], self._in_contact)
-            self._scene.force(t, X_WI[:3, 3], -self._pressed_n * X_WI[:3, 2])
-
-    def _surface(self, t: int, message: Message) -> None:
-        self._scene.abdomen(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
+        self._scene.link_poses(t, message, self._in_contact, self._pressed_n)
 
     def _phantom(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
@@ -237,27 +199,11 @@ class DashboardService(Service):
         if self._X_WA_initial is None:
             self._X_WA_initial = X_WA
         self._scene.body(t, X_WA, message.excursion)
-        self._plots.true_patient(t, message.excursion, float(np.linalg.norm(X_WA[:3, 3] - self._X_WA_initial[:3, 3])))
-
-    def _tf_static(self, _t: int, message: Message) -> None:
-        for item in message.transforms:
-            if item.child_frame_id == CAMERA_FRAME:
-                self._scene.camera(transform_matrix(item.transform))
-
-    def _camera_info(self, _t: int, message: Message) -> None:
-        self._scene.lens(np.asarray(message.k).reshape(3, 3), message.width, message.height)
-
-    def _depth(self, t: int, message: Message) -> None:
-        self._scene.depth(t, depth_in_metres("camera/depth/image_raw", message))
-
-    def _points(self, t: int, message: Message) -> None:
-        self._scene.cloud(t, arrays.cloud(message))
-
-    def _perceived(self, t: int, message: Message) -> None:
-        self._scene.perceived(t, arrays.triples(message.vertices), arrays.triples(message.triangles))
+        self._plots.add(t, "truth/breath", 1e3 * message.excursion)
+        self._plots.add(t, "truth/moved", 1e3 * float(np.linalg.norm(X_WA[:3, 3] - self._X_WA_initial[:3, 3])))
 
     def _targets(self, t: int, message: Message) -> None:
-        self._scene.targets(t, arrays.points(message.positions), arrays.points(message.normals))
+        self._scene.targets(t, message)
         count, frames = len(message.positions), message.frames_fused
         self._plots.log(t, "log/perception", message.message or f"{count} targets from {frames} frames")
 
@@ -265,10 +211,8 @@ class DashboardService(Service):
         if message.state != SurfaceMotion.LOST:
             exposed = nanoseconds(message.header.stamp)
             ahead = FORECAST_INDEX * SurfaceMotion.FORECAST_STEP_MS * MS
-            self._plots.wall(exposed, message.displacement, float(message.forecast[FORECAST_INDEX]), ahead)
-
-    def _path_planned(self, t: int, message: Message) -> None:
-        self._scene.planned(t, arrays.points(pose.pose.position for pose in message.poses))
+            self._plots.add(exposed, "wall/displacement", 1e3 * message.displacement)
+            self._plots.add(exposed + ahead, "wall/forecast", 1e3 * float(message.forecast[FORECAST_INDEX]))
 
     def _exam(self, t: int, message: Message) -> None:
         phase = plots.PHASES[message.phase][0]
@@ -279,20 +223,27 @@ class DashboardService(Service):
         self._in_contact = bool(message.in_contact)
         self._plots.log(t, "log/exam", message.message, "ERROR" if phase == "aborted" else "INFO")
         self._pressed_n = message.normal_force if message.depth > text.FREE_M else 0.0
-        self._plots.force(t, message.normal_force)
-        self._force_depth.add(t, message.depth, message.normal_force, self._in_contact)
-        self._plots.depth(t, message.depth, message.depth_setpoint)
-        self._plots.progress(t, message.target_index, message.target_count)
+        if self._in_contact:
+            self._force_depth.add(t, message.depth, message.normal_force)
+        for path, value in (
+            ("force/measured", message.normal_force),
+            ("force/limit", self._limit_n),
+            ("depth/measured", depth_mm(message.depth)),
+            ("depth/setpoint", depth_mm(message.depth_setpoint)),
+            ("progress/targets", 100.0 * message.target_index / max(message.target_count, 1)),
+        ):
+            self._plots.add(t, path, value)
         if not self._is_due("text", t, PERIODS.text_ns):
             return
         self._due["text"] = t + PERIODS.text_ns
         self._plots.document(t, "text/status", text.status(self._name, phase, message, self._robot, self._speed))
 
     def _indentation(self, t: int, message: Message) -> None:
-        self._plots.true_contact(t, message.depth, message.normal_force)
+        self._plots.add(t, "force/true", message.normal_force)
+        self._plots.add(t, "depth/true", depth_mm(message.depth))
 
     def _robot_status(self, t: int, message: Message) -> None:
-        self._plots.torques(t, np.asarray(message.applied_torque) / self._torque_nm)
+        self._plots.add(t, "torque/joints", *(100.0 * np.asarray(message.applied_torque) / self._torque_nm))
         mode = plots.MODES[message.mode][0]
         self._robot = f"{mode}: {message.reason}" if message.reason else mode
         level = "ERROR" if message.mode == RobotStatus.MODE_SAFE_HOLD else "INFO"
@@ -335,7 +286,7 @@ class DashboardService(Service):
             self._count_wait(row.values.get("waiting_for", ""))
             self._plots.health(t, row)
         share = self._waits / max(1.0, self._waits.sum())
-        self._plots.waits(t, share)
+        self._plots.add(t, "waits/roles", *(100.0 * share))
         self._plots.document(t, "text/services", text.services(rows, zip(plots.AWAITED, share, strict=True)))
 
     def _count_wait(self, what: str) -> None:

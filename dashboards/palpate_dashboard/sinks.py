@@ -132,12 +132,18 @@ def arrows(rows: Sequence[tuple[Array, Array]]) -> Any:
     return rr.Arrows3D.columns(origins=np.stack(origins), vectors=np.stack(vectors))
 
 
-class Columns:
-    """Collects rows by entity; `send` writes them to the recording."""
+class Canvas:
+    """Draws into a recording, at once or in columns: rows are collected by entity until `send`."""
 
     def __init__(self, recording: rr.RecordingStream) -> None:
-        self._recording = recording
+        self.recording = recording
         self._rows: dict[str, tuple[Kind, list[int], list[Row]]] = {}
+
+    def log(self, path: str, shape: Any, t: int | None = None) -> None:
+        """Draw an entity at simulated time `t` [ns]; without it, for all time."""
+        if t is not None:
+            self.recording.set_time(TIMELINE, duration=np.timedelta64(t, "ns"))
+        self.recording.log(path, shape, static=t is None)
 
     def add(self, entity: str, kind: Kind, t: int, row: Row) -> None:
         """Add a row of `entity` at simulated time `t` [ns]. An entity has one kind."""
@@ -153,6 +159,6 @@ class Columns:
         for entity, (kind, times, rows) in self._rows.items():
             if times:
                 index = rr.TimeColumn(TIMELINE, duration=np.array(times, dtype="timedelta64[ns]"))
-                self._recording.send_columns(entity, [index], kind(rows))
+                self.recording.send_columns(entity, [index], kind(rows))
                 times.clear()
                 rows.clear()

@@ -1,20 +1,18 @@
 """The fault campaign: its faults, its cases, and the judgement of a case."""
 
 import signal
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import CaseOver, _conclude, _Watch
+from palpate_benchmarks.campaign import drawn, judge, prepared, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
-from palpate_benchmarks.struck import CONDUCTOR, ROLES, Struck
-from palpate_benchmarks.whole_cases import _judge, drawn
+from palpate_benchmarks.struck import CONDUCTOR, ROLES, CaseOver, Struck, StruckRun, Watch, Watched
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -96,10 +94,11 @@ def test_an_unknown_fault_is_answered_with_the_allowed_ones(topic: str, kind: st
         InjectedFault(topic, kind, at=at)
 
 
-def watch(where: str = "planning/setpoint", target: str = "planning") -> _Watch:
-    struck = FaultFinding("nan", where, "lockstep", injected_s=0.0)
-    local: Any = SimpleNamespace(running={})
-    return _Watch(FaultCase("nan", where, False), local, target, struck, since=1e12)
+def watch(**options: Any) -> Watch:
+    """Return the watch of a run whose fault was due long ago."""
+    due = Watch(StruckRun(Path(), **{"early": True, **options}))
+    due.since = 0.0
+    return due
 
 
 def in_phase(phase: int, culprit: str = "") -> RunProgress:
@@ -107,6 +106,12 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
     last = messages.exam_states[-1]
     messages.exam_states = [*messages.exam_states, ExamState(**{**vars(last), "phase": phase, "culprit": culprit})]
     return RunProgress(0, 1.0, messages)
+
+
+def judged(watched: Watched | None, folder: Path, kind: str, where: str, status: int = 0) -> FaultFinding:
+    finding = FaultFinding(kind, where, "lockstep")
+    judge(finding, Struck(folder, folder / "gone", status, watched, 8.0, 1.0), where.split("+"))
+    return finding
 
 
 @pytest.mark.parametrize(
@@ -117,26 +122,37 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
         (ExamState.PHASE_ABORTED, CaseOutcome.ENDED),
     ],
 )
-def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: CaseOutcome) -> None:
+def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: CaseOutcome, tmp_path: Path) -> None:
     progress = in_phase(phase, "planning/setpoint")
     case = watch()
     with pytest.raises(CaseOver) as over:
         case.on_progress(progress)
-    _conclude(case.finding, case, replace(result(progress.collected), failure=over.value.failure))
-    assert case.finding.outcome is outcome
-    assert case.finding.good
-    assert (case.finding.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
+    watched = case.finished(replace(result(progress.collected), failure=over.value.failure))
+    finding = judged(watched, tmp_path, "nan", "planning/setpoint")
+    assert finding.outcome is outcome
+    assert finding.good
+    assert (finding.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
 
 
-def test_a_fault_of_the_assessment_shows_after_the_scan() -> None:
-    watch("assessment/map", "assessment").on_progress(in_phase(ExamState.PHASE_RETURN))
+def test_a_fault_of_the_assessment_shows_after_the_scan(tmp_path: Path) -> None:
+    assert not prepared(FaultCase("nan", "assessment/map", False), tmp_path, 1.0)[0].early
+    assert prepared(FaultCase("nan", "planning/setpoint", False), tmp_path, 1.0)[0].early
+    watch(early=False).on_progress(in_phase(ExamState.PHASE_RETURN))
     watch().on_progress(in_phase(ExamState.PHASE_SCAN))
 
 
-def test_an_end_that_names_no_role_is_bad() -> None:
-    case = watch()
-    _conclude(case.finding, case, replace(result(collected()), failure=Failure(FailureCode.BLOCKED, "something went wrong")))
-    assert not case.finding.good
+def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> None:
+    case = Watch(StruckRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
+    for t, phase in ((6.0, ExamState.PHASE_INDENT), (7.0, ExamState.PHASE_SCAN), (7.4, ExamState.PHASE_SCAN)):
+        case.on_progress(replace(in_phase(phase), t=round(t * NS)))
+    assert not capsys.readouterr().out
+    case.on_progress(replace(in_phase(ExamState.PHASE_SCAN), t=round(7.5 * NS)))
+    assert capsys.readouterr().out == "the fault is due at 7.5\n"
+
+
+def test_an_end_that_names_no_role_is_bad(tmp_path: Path) -> None:
+    failed = replace(result(collected()), failure=Failure(FailureCode.BLOCKED, "something went wrong"))
+    assert not judged(watch().finished(failed), tmp_path, "nan", "planning/setpoint").good
 
 
 def found(where: str, detected_ms: float, peak_force_n: float) -> FaultFinding:
@@ -183,21 +199,24 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
 
 @pytest.mark.parametrize("named", [True, False])
 def test_the_failure_of_the_run_is_judged(named: bool, tmp_path: Path) -> None:
-    failure = asdict(Failure(FailureCode.ROLE_LOST, "something failed", ("control",) if named else ()))
-    said = {"failure": failure, "lost": ["control"] if named else [], "forces": [[int(7e9), 5.0], [int(8.1e9), 5.5]]}
-    struck = Struck(tmp_path, tmp_path / "gone", 0, said, 8.0, 1.0)
-    finding = FaultFinding("kill", "control+recorder", "lockstep")
-    _judge(finding, struck, ["control", "recorder"])
+    failure = Failure(FailureCode.ROLE_LOST, "something failed", ("control",) if named else ())
+    finding = judged(Watched(replace(result(collected()), failure=failure)), tmp_path, "kill", "control+recorder")
     assert finding.good == named
-    assert (finding.peak_force_before_n, finding.peak_force_n, finding.ended) == (5.0, 5.5, "something failed")
+    assert finding.ended == "something failed"
 
 
 def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "planning.log").write_text(f"2026 planning WARNING {CONDUCTOR_LOST_LOG % 'gone'}\n", encoding="utf-8")
-    finding = FaultFinding("kill", CONDUCTOR, "lockstep")
-    _judge(finding, Struck(tmp_path, tmp_path / "gone", -9, {}, 8.0, 1.0), [CONDUCTOR])
+    finding = judged(None, tmp_path, "kill", CONDUCTOR, -9)
     assert finding.sign == "planning: conductor lost: gone"
     assert finding.named
     assert not finding.kept
-    assert not FaultCase("kill", CONDUCTOR, False).wallclock
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("kind", "where"), [("kill", "control"), ("nan", "planning/setpoint"), ("kill", CONDUCTOR)])
+def test_a_case_is_run_and_judged(kind: str, where: str, tmp_path: Path) -> None:
+    finding = run_case(FaultCase(kind, where, wallclock=False), tmp_path)
+    assert finding.good, finding
+    assert finding.outcome is CaseOutcome.ENDED

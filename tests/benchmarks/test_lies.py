@@ -1,16 +1,18 @@
 """The campaign of lies: what a liar sends, which cases there are, and the judgement of a case."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
-from conductor_messages import collected
+from conductor_messages import collected, result
 from toy_runs import toy_services
 
 from palpate_benchmarks.fault_cases import LIE, FaultFinding, LieVerdict
 from palpate_benchmarks.liar import KINDS, Liar, Lie
-from palpate_benchmarks.lies import Healthy, LieOutcome, _judged, cases, cells, left_out, run_lies
+from palpate_benchmarks.lies import Healthy, cases, cells, judged, left_out, run_lies
+from palpate_benchmarks.struck import Watched
 from palpate_bus.contract import MS, Edge, contract
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
@@ -70,7 +72,7 @@ def test_every_topic_that_a_service_reads_has_cases_or_a_reason() -> None:
 
 
 @pytest.mark.parametrize(
-    ("lost", "force", "failure", "judged"),
+    ("lost", "force", "failure", "verdict"),
     [
         (0, 9.0, None, LieVerdict.HARMLESS),
         (1, 9.0, None, LieVerdict.BAD),
@@ -79,17 +81,17 @@ def test_every_topic_that_a_service_reads_has_cases_or_a_reason() -> None:
         (0, 15.1, "ft/wrench", LieVerdict.BAD),
     ],
 )
-def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float, failure: str | None, judged: str) -> None:
+def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float, failure: str | None, verdict: str) -> None:
     seen = collected()
     seen.exam.targets_skipped = lost * seen.exam.target_count
     for message in seen.indentation:
         message.normal_force, message.tangential_force, message.peak_force = force, 0.0, force
-    outcome = LieOutcome(seen, None, 10 * NS, [])
+    watched = Watched(result(seen))
     twin = Healthy({}, int(seen.exam.target_count), len(seen.findings.findings), float(seen.stiffness_map.background), 10.0)
     if failure is not None:
-        outcome.failure = Failure(FailureCode.GAVE_UP, "held", topics=(failure,))
+        watched.result = replace(watched.result, failure=Failure(FailureCode.GAVE_UP, "held", topics=(failure,)))
     finding = FaultFinding(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
-    assert _judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), outcome, twin).lie_verdict is judged
+    assert judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), watched, twin).lie_verdict is verdict
 
 
 @pytest.mark.slow
