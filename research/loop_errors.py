@@ -26,9 +26,14 @@ from palpate.quick.errors import Drawn, LoopErrors, Normal, known_loops, setting
 from palpate.quick.patient import PERIOD_S
 from palpate.report import archive
 from palpate.report.archive import read_evidence
+from palpate.report.evidence import points
 from palpate.truth.pressed import TrueBody, TrueSurface
+from palpate_assessment.messages import SEEN, skin_of
+from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.messages import ExamState
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages.geometry import vectors
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import build_phantom
@@ -86,13 +91,13 @@ def runs_in(folders: Sequence[Path]) -> list[Path]:
 def trace_of(folder: Path) -> Trace:
     """Return the trace of a run. Raises EvidenceError or ScenarioError for any other folder."""
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
-    stamps, true_stamps = (np.round(a * NS).astype(np.int64) for a in (evidence.time, evidence.true_time))
-    there = evidence.steady & np.isin(stamps, true_stamps)
-    time = evidence.time[there]
-    true_depth = evidence.true_depth[np.searchsorted(true_stamps, stamps[there])]
-    descents = np.cumsum(
-        np.diff(evidence.phase == ExamState.PHASE_INDENT, prepend=False) & (evidence.phase == ExamState.PHASE_INDENT)
-    )
+    states, contacts = evidence.states, evidence.contacts
+    stamps, true_stamps = (np.round(a * NS).astype(np.int64) for a in (states.time, contacts.time))
+    there = states.steady & np.isin(stamps, true_stamps)
+    time, (depth, sd) = states.time[there], _depth_known(evidence.collected)
+    true_depth = contacts.depth[np.searchsorted(true_stamps, stamps[there])]
+    indents = states.phase == ExamState.PHASE_INDENT
+    descents = np.cumsum(np.diff(indents, prepend=False) & indents)
     strokes = np.unique(descents[there], return_inverse=True)[1]
     X_WA, X_WT = np.array(exam_input(scenario).X_WA), matrix(true_pose(scenario))
     touched = evidence.touched
@@ -103,16 +108,34 @@ def trace_of(folder: Path) -> Trace:
     excursion = np.array([curve.excursion(t) for t in time.tolist()])
     return Trace(
         scenario=scenario,
-        begin_s=_began(evidence.time, evidence.phase),
+        begin_s=_began(states.time, states.phase),
         stroke=strokes,
         time=time,
         place=touched.believed[:, :2] - scenario.exam.centre_m,
         aside=(off_W @ X_WA[:3, :3])[:, :2],
-        depth_error=evidence.depth_known[there] - true_depth,
-        uncertainty=evidence.uncertainty[there],
+        depth_error=depth[there] - true_depth,
+        uncertainty=sd[there],
         breathing=skin.between(model.breathing)(touched.true[:, :2]) * (excursion - curve.mean_m),
-        regulation=evidence.depth[there] - evidence.setpoint[there],
+        regulation=states.depth[there] - states.setpoint[there],
     )
+
+
+def _depth_known(c: Collected) -> tuple[Array, Array]:
+    """Return final depths of the exam states, by observed breathing and corrected surface, and their SD [m], shapes (n,)."""
+    depth, sd = np.array([(s.depth, s.depth_uncertainty) for s in c.exam_states]).reshape(-1, 2).T
+    if c.surface is None:
+        return depth, sd
+    time = np.array([nanoseconds(s.header.stamp) / NS for s in c.exam_states])
+    place, normal = (vectors(getattr(s, name) for s in c.exam_states) for name in ("surface_point", "surface_normal"))
+    if motions := [m for m in c.motions if m.state in SEEN]:
+        shares = BreathingShares(points(c.surface), np.asarray(c.surface.breathing))
+        seen = np.array([(nanoseconds(m.header.stamp) / NS, m.displacement) for m in motions]).T
+        depth = depth_seen(time, depth, np.array([s.wall_displacement for s in c.exam_states]), shares(place), tuple(seen))
+    skin = None if c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
+    if skin is not None:
+        deeper, own = skin.deeper(time, place, normal)
+        depth, sd = depth + np.nan_to_num(deeper), np.where(np.isnan(own), sd, own)
+    return depth, sd
 
 
 def _began(time: Array, phase: NDArray[np.uint8]) -> float:

@@ -46,13 +46,13 @@ def noticed(folder: Path) -> Noticed:
     scenario, evidence = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder)
     at_s = BodyMotion(scenario.phantom.motion, scenario.seed).at_s
     detected, looked = _reported(folder)
-    during = (evidence.true_time >= at_s) & (evidence.true_time < at_s + LIFTED_S)
-    over = at_s > evidence.time[-1]
+    during = (evidence.contacts.time >= at_s) & (evidence.contacts.time < at_s + LIFTED_S)
+    over = at_s > evidence.states.time[-1]
     return Noticed(
         at_s=at_s,
         after_s=float("nan") if over else float(np.min(detected[detected >= at_s], initial=np.inf)) - at_s,
         early=int((detected < at_s).sum()),
-        peak_force_n=float(np.max(evidence.true_force[during], initial=0.0)),
+        peak_force_n=float(np.max(evidence.contacts.force[during], initial=0.0)),
         looked_s=float(np.min(looked[looked >= at_s], initial=np.inf)) - at_s,
     )
 

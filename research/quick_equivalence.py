@@ -105,7 +105,7 @@ def pair(folder: Path, paired: bool) -> tuple[Scenario, Tier, Tier, float]:
     felt = known.felt.felt
     report = Report.model_validate_json((folder / "report.json").read_text(encoding="utf-8"))
     quick = figures_of(case.report, map_of(case.collected.stiffness_map), felt, known.felt.touched)
-    whole = figures_of(report, map_of(evidence.stiffness_map), felt, evidence.touched)
+    whole = figures_of(report, map_of(evidence.collected.stiffness_map), felt, evidence.touched)
     return scenario, quick, whole, case.simulate_s
 
 

@@ -113,7 +113,7 @@ def phases(path: Path, stage: Stage, shown: Sequence[tuple[str, Moment, bool]]) 
 
 def force_map(path: Path, evidence: Evidence, samples_xy: NDArray[np.float64]) -> None:
     """Draw figure 7, normal force over the surface, in the plane and in 3-D."""
-    drawing = Drawing(evidence.stiffness_map, evidence.findings, None)
+    drawing = Drawing(evidence.collected.stiffness_map, evidence.collected.findings, None)
     layer = drawing.force_layer
     figure = _figure(10.5, 4.6)
     grid = figure.add_gridspec(1, 2)
@@ -133,7 +133,7 @@ def correlation(path: Path, evidence: Evidence, truth: Truth | None) -> float:
 
     The correlation is that of the logarithms of true and estimated apparent stiffness over the scanned surface.
     """
-    drawing = Drawing(evidence.stiffness_map, evidence.findings, truth)
+    drawing = Drawing(evidence.collected.stiffness_map, evidence.collected.findings, truth)
     if drawing.true is None:
         raise ValueError("the run has no truth to compare with")
     figure = _figure(10.5, 4.6)
@@ -152,8 +152,9 @@ def coverage(path: Path, names: Sequence[str], evidence: Sequence[Evidence]) -> 
     figure = _figure(7.5, 3.4)
     axes = figure.subplots()
     for name, record in zip(names, evidence, strict=True):
-        begin = record.time[np.argmax(record.in_contact)]
-        axes.plot(record.time - begin, 100 * record.visited / max(record.target_count, 1), lw=1.6, label=name)
+        states = record.states
+        begin = states.time[np.argmax(states.in_contact)]
+        axes.plot(states.time - begin, 100 * states.visited / max(record.target_count, 1), lw=1.6, label=name)
     axes.set_xlabel("simulated time since first contact [s]", fontsize=9, color=INK)
     axes.set_ylabel("targets reached [%]", fontsize=9, color=INK)
     axes.set_xlim(0, None)

@@ -41,7 +41,8 @@ class MeasuredWay:
 def measure(case: ReproductionCase, folder: Path) -> tuple[MeasuredWay, Evidence]:
     """Return the figures and the evidence of a finished run. Raises ReproductionError if there was no contact."""
     report, evidence = read_report(folder), read_evidence(folder)
-    held = np.flatnonzero(evidence.in_contact)
+    states = evidence.states
+    held = np.flatnonzero(states.in_contact)
     if not len(held):
         raise ReproductionError(f"{folder}: the tool was never in contact")
     first, last = held[0], held[-1]
@@ -50,8 +51,8 @@ def measure(case: ReproductionCase, folder: Path) -> tuple[MeasuredWay, Evidence
     return MeasuredWay(
         name=f"{case.pattern}, {case.mode}",
         total_s=report.sim_time_s,
-        covering_s=float(evidence.time[last] - evidence.time[first]),
-        contact=float(evidence.in_contact[first : last + 1].mean()),
+        covering_s=float(states.time[last] - states.time[first]),
+        contact=float(states.in_contact[first : last + 1].mean()),
         findings=found,
         dice=dice,
     ), evidence
@@ -75,7 +76,7 @@ def chosen_moments(evidence: Evidence) -> list[tuple[str, float, bool]]:
         if phase not in spans:
             continue
         begin, end = spans[phase]
-        time = float(evidence.time[np.argmax(evidence.force)]) if share is None else begin + share * (end - begin)
+        time = float(evidence.states.time[np.argmax(evidence.states.force)]) if share is None else begin + share * (end - begin)
         chosen.append((title, time, close))
     return chosen
 
@@ -147,7 +148,7 @@ def write_page(
 
 def _forces(evidence: Evidence) -> tuple[float, float, float]:
     """Return the median force at depth in and outside findings [N], and the largest over median apparent stiffness [1]."""
-    message: Any = evidence.stiffness_map
+    message: Any = evidence.collected.stiffness_map
     scanned, member = np.asarray(message.scanned, dtype=np.bool_), np.asarray(message.finding) >= 0
     force, apparent = np.asarray(message.force), np.asarray(message.apparent)[scanned]
     inside = force[scanned & member]

@@ -60,7 +60,7 @@ def started(command: str | None, role: str, settings: RigSettings, endpoint: str
 def _shown(rig: Rig) -> TimeLeft:
     """Return a bar that follows the clock of a rig."""
     role, report = rig.role.name, rig.report
-    return TimeLeft(lambda: f"{role}: {report.group}, {len(report.results)} checks", lambda: rig.t / NS, 0.0, SUITES[role][1])
+    return TimeLeft(lambda: f"{role}: {report.group}, {len(report.results)} checks", lambda: rig.t / NS, 0.0, SUITES[role])
 
 
 _COLOURS = {Verdict.PASSED: "green", Verdict.FAILED: "bold red", Verdict.SKIPPED: "dim"}

@@ -73,7 +73,7 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
     faults: tuple[str, ...] = ()
     table: Any
     if (path / FILE).is_file():
-        message = read_evidence(path).stiffness_map
+        message = read_evidence(path).collected.stiffness_map
         table = np.genfromtxt(path / "samples.csv", delimiter=",", names=True, encoding="utf-8", ndmin=1)
     else:
         recording = read_recording(path, mapping)

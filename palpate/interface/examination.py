@@ -70,12 +70,12 @@ class Examination:
     @cached_property
     def states(self) -> pd.DataFrame:
         """Measurements over time, one row per state: time [s], phase, depth and set-point [m], force [N], flags."""
-        return pd.DataFrame({name: getattr(self._evidence, name) for name in _STATE_COLUMNS})
+        return pd.DataFrame({name: self._evidence.states[name] for name in _STATE_COLUMNS})
 
     @cached_property
     def map(self) -> StiffnessMap | None:
         """The stiffness map; None if the examination produced none."""
-        message = self._evidence.stiffness_map
+        message = self._evidence.collected.stiffness_map
         return None if message is None else StiffnessMap.of(message)
 
     @property

@@ -10,11 +10,10 @@ import pandas as pd
 import yaml
 from matplotlib.figure import Figure
 
-from palpate.recording.clean import cleaned
 from palpate.recording.mapping import SCALES, ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
 from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
 from palpate.recording.probes import probes
-from palpate.recording.read import LEAST_ROWS, recording_of
+from palpate.recording.read import LIMITS, cleaned, recording_of
 from palpate.recording.readings import (
     KINDS,
     TABLES,
@@ -204,8 +203,8 @@ def _frames(bag: Any) -> tuple[list[str], list[str]]:
 
 def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapping, Axis]:
     """Return the mapping with axes, sign, weight and delay of the force as the data say, and the pressing axis."""
-    if len(raw.position) < LEAST_ROWS:
-        raise ReadingError(f"{len(raw.position)} usable rows; want at least {LEAST_ROWS}")
+    if len(raw.position) < LIMITS.rows:
+        raise ReadingError(f"{len(raw.position)} usable rows; want at least {LIMITS.rows}")
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
         candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})

@@ -1,35 +1,262 @@
 """Files to a `Recording`: reads, cleans, aligns, tares, cuts, finds the skin, and says what was wrong."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from operator import attrgetter
 from pathlib import Path
 from typing import Final
 
 import numpy as np
+from scipy.ndimage import find_objects, label, median_filter
+from scipy.spatial import cKDTree
 
-from palpate.recording.clean import cleaned
 from palpate.recording.faults import Fault, FaultCode, Remedy
 from palpate.recording.mapping import Mapping, MappingError, read_mapping
-from palpate.recording.motion import Axis, blocks, pressing_axis
-from palpate.recording.own import is_own, own_recording
+from palpate.recording.motion import Axis, Mask, blocks, pressing_axis
 from palpate.recording.probes import contacts_of_probes, probes
 from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
-from palpate.recording.recording import Contact, PalpationRecording, implied_young
+from palpate.recording.recording import Contact, ContactKind, PalpationRecording, implied_young, loading, width
 from palpate.recording.timed import contacts_over_time
-from palpate.recording.usable import usable
-from palpate_models.numerics.frames import Array, inverse, matrix
+from palpate.report.archive import FILE, read_evidence
+from palpate.report.evidence import columns_of, points, xyz
+from palpate_assessment.calibration import learned
+from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_models.numerics.frames import Array, apply, inverse, matrix
+from palpate_models.scenario.load import exam_input, load_scenario
 
-LEAST_ROWS: Final = 10
-_UPRIGHT: Final = 0.7
-"""Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
-_RISEN: Final = 0.5
-"""Mean way of probes along their normals, over its size, from which the normals point inward."""
-_WRONG_FRAME_DEG: Final = 40.0
-_FORCE_N: Final = (0.01, 200.0)
-"""Plausible change of the force in a recording."""
-_YOUNG_PA: Final = (50.0, 3e6)
-"""Plausible modulus of the body."""
-_STEP_S: Final = (2e-5, 2.0)
-"""Plausible time between rows."""
+
+@dataclass(frozen=True)
+class ReadingLimits:
+    """Limits of plausible readings and contacts."""
+
+    frozen: int = 10
+    """A value that repeats this much longer than usual is frozen."""
+    fewest: int = 5
+    """Least number of readings of a clipped or frozen stretch."""
+    clipped: float = 0.2
+    """Least end of a sensor's range, as a share of the greatest force."""
+    clipped_count: float = 3.0
+    """A force at the end of the range is at least this many times as frequent as the next one."""
+    coarse: float = 0.2
+    """Share of rows with the time of another one from which the clock is too coarse for the rows."""
+    disagree: float = 0.35
+    """Log ratio of forces at one place that is reported."""
+    sure: float = 4.0
+    """Least depth, in SD of its zero; least force, in SD of its noise."""
+    share: float = 0.3
+    """Least depth, as a share of the usual one."""
+    line: float = 0.1
+    """Least width of the places, over the radius of the footprint, from which on there is a map."""
+    rows: int = 10
+    risen: float = 0.5
+    """Mean way of probes along their normals, over its size, from which the normals point inward."""
+    upright: float = 0.7
+    """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
+    wrong_frame_deg: float = 40.0
+    force_n: tuple[float, float] = (0.01, 200.0)
+    """Change of the force in a recording."""
+    young_pa: tuple[float, float] = (50.0, 3e6)
+    """Modulus of the body."""
+    step_s: tuple[float, float] = (2e-5, 2.0)
+    """Time between rows."""
+
+
+LIMITS: Final = ReadingLimits()
+
+
+def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
+    """Return the readings without invalid, repeated, frozen and displaced ones, clipped ones marked, and the faults."""
+    faults: list[Fault] = []
+    if readings.probe is not None and 2 * len(np.unique(readings.probe)) < np.count_nonzero(np.diff(readings.probe)):
+        readings = readings.part(np.argsort(readings.probe, kind="stable"))  # rows of one probe are apart
+
+    def drop(code: FaultCode, wrong: Mask, value: float = 0.0) -> None:
+        nonlocal readings
+        if wrong.any():
+            faults.append(Fault(code, int(wrong.sum()), len(wrong), Remedy.LEFT_OUT, value))
+            readings = readings.part(~wrong)
+
+    known = [readings.position, readings.force, readings.normal, readings.touch, readings.time, readings.probe]
+    valid = np.all([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in known if v is not None], axis=0)
+    if readings.normal is not None:
+        valid &= np.linalg.norm(readings.normal, axis=1) > 0.5
+    drop(FaultCode.INVALID, ~valid)
+    if readings.normal is not None:
+        readings = replace(readings, normal=readings.normal / np.linalg.norm(readings.normal, axis=1)[:, None])
+    if readings.time is None:
+        rows = np.column_stack((readings.position, readings.force))
+        drop(FaultCode.REPEATED, np.append(False, (np.diff(rows, axis=0) == 0).all(axis=1)))
+    else:
+        late = readings.time < np.maximum.accumulate(readings.time)
+        if late.any():
+            faults.append(Fault(FaultCode.BACKWARD, int(late.sum()), len(late), Remedy.CORRECTED))
+            readings = readings.part(np.argsort(readings.time, kind="stable"))
+        assert readings.time is not None
+        if (coarse := _unlike_at_once(readings)) > LIMITS.coarse * len(late):
+            faults.append(Fault(FaultCode.COARSE, coarse, len(late), Remedy.CORRECTED))
+            readings = replace(readings, time=_spread(readings.time))
+        assert readings.time is not None
+        drop(FaultCode.REPEATED, np.append(False, np.diff(readings.time) == 0))
+        drop(FaultCode.FROZEN, _frozen(readings.force, readings.position))
+        away = np.linalg.norm(readings.position - median_filter(readings.position, (5, 1), mode="nearest"), axis=1)
+        p = readings.position
+        usual, second = (float(np.median(np.linalg.norm(p[k:] - p[:-k], axis=1))) if len(p) > k else 0.0 for k in (1, 2))
+        if usual > max(radius, 3 * second):  # every other row is of another tool
+            faults.append(Fault(FaultCode.TWO_TOOLS, len(p), len(p), Remedy.REFUSED, usual))
+        drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * usual), float(away.max(initial=0.0)))
+    clipped, limit = _clipped(readings.force, readings.position)
+    if clipped.any():
+        faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
+    return replace(readings, clipped=clipped), faults
+
+
+def _unlike_at_once(readings: Readings) -> int:
+    """Return the number of rows that have the time of the row before, but not its values."""
+    assert readings.time is not None
+    rows = np.column_stack((readings.position, readings.force))
+    return int(np.count_nonzero((np.diff(readings.time) == 0) & (np.diff(rows, axis=0) != 0).any(axis=1)))
+
+
+def _spread(time: Array) -> Array:
+    """Return times [s] with rows of equal time spread evenly up to the next one, shape (n,)."""
+    known, first = np.unique(time, return_index=True)
+    end = known[-1] + (float(np.median(np.diff(known))) if len(known) > 1 else 1.0)
+    return np.asarray(np.interp(np.arange(len(time)), [*first, len(time)], [*known, end]))
+
+
+def _runs(same: Mask) -> list[slice]:
+    """Return the stretches of equal neighbours, each with the reading that it repeats."""
+    found: list[slice] = [one[0] for one in find_objects(label(same)[0])]
+    return [slice(one.start - 1, one.stop) for one in found]
+
+
+def _frozen(values: Array, others: Array) -> Mask:
+    """Return True where a value repeats much longer than usual while the other one changes, shape (n,)."""
+    runs = _runs(np.append(False, (np.diff(values, axis=0) == 0).all(axis=1)))
+    frozen = np.zeros(len(values), bool)
+    if not runs:
+        return frozen
+    lengths = np.array([one.stop - one.start for one in runs])
+    usual = float(np.median(lengths)) if lengths.sum() > 0.5 * len(values) else 1.0  # slower than the rows
+    for one in runs:
+        changes = (np.diff(others[one], axis=0) != 0).any(axis=1).mean()
+        frozen[one] = one.stop - one.start > max(LIMITS.frozen * usual, LIMITS.fewest) and changes > 0.5
+    return frozen
+
+
+def _clipped(force: Array, position: Array) -> tuple[Mask, float]:
+    """Return True where a component stays at an extreme while the tool moves, shape (n,), and that force [N].
+
+    An extreme near zero is none, and neither is one that is about as frequent as the next value: that is the sensor's resolution.
+    """
+    clipped, limit = np.zeros(len(force), bool), 0.0
+    still = np.append(False, (np.diff(position, axis=0) == 0).all(axis=1))
+    for column in force.T:
+        values, counts = np.unique(column, return_counts=True)
+        for end, following in ((-1, -2), (0, 1)) if len(values) > 1 else ():
+            value = float(values[end])
+            if abs(value) < LIMITS.clipped * np.abs(force).max() or counts[end] < LIMITS.clipped_count * counts[following]:
+                continue
+            runs = _runs(np.append(False, (np.diff(column) == 0) & (column[1:] == value)))
+            if any((~still[one]).sum() >= LIMITS.fewest for one in runs):
+                clipped[column == value] = True
+                limit = abs(value)
+    return clipped, limit
+
+
+_COLUMNS = np.dtype(
+    [("time", "f8"), ("place", "f8", 3), ("normal", "f8", 3), ("depth", "f8"), ("force", "f8"), ("sd", "f8"), ("stroke", "i8")]
+)
+_values = attrgetter("depth", "normal_force", "depth_uncertainty", "stroke")
+
+
+def is_own(path: Path) -> bool:
+    """Return True for the results folder of a run."""
+    return (path / FILE).is_file() and (path / "scenario.yaml").is_file()
+
+
+def own_recording(folder: Path) -> PalpationRecording:
+    """Return the recording of a run: its strokes at depth. Raises UserError."""
+    scenario, collected = load_scenario(str(folder / "scenario.yaml")), read_evidence(folder).collected
+    X_AW = inverse(np.array(exam_input(scenario).X_WA))
+    rows = columns_of(
+        (
+            (nanoseconds(s.header.stamp) / NS, xyz(s.surface_point), xyz(s.surface_normal), *_values(s))
+            for s in collected.exam_states
+            if s.steady
+        ),
+        _COLUMNS,
+    )
+    place, normal = apply(X_AW, rows["place"]), rows["normal"] @ X_AW[:3, :3].T
+    kind = ContactKind.SLIDE if scenario.exam.mode.value == "continuous" else ContactKind.PRESS
+    touches = [
+        Contact(
+            kind=kind,
+            position=place[one],
+            normal=normal[one],
+            depth=rows["depth"][one],
+            force=rows["force"][one],
+            depth_uncertainty=float(rows["sd"][one].max()),
+            force_noise=0.0,
+            time=rows["time"][one],
+        )
+        for stroke in np.unique(rows["stroke"])
+        if (one := np.flatnonzero(rows["stroke"] == stroke)).size >= 3
+    ]
+    surface = np.empty((0, 3)) if collected.surface is None else apply(X_AW, points(collected.surface))
+    normals = np.empty((0, 3)) if collected.surface is None else points(collected.surface, "normals") @ X_AW[:3, :3].T
+    return PalpationRecording(
+        name=scenario.name,
+        indenter_radius_m=scenario.robot.indenter_radius_m,
+        touches=tuple(touches),
+        surface=surface,
+        normals=normals,
+        X_WA=inverse(X_AW),
+        abdomen=True,
+        exponent=learned().exponent,
+    )
+
+
+def usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
+    """Return the contacts that can be assessed; adds faults. `undeep_ones`: contacts that are left out already."""
+    usual = float(np.median([contact.depth.max() for contact in contacts])) if contacts else 0.0
+
+    def is_deep(contact: Contact) -> bool:
+        least = max(LIMITS.sure * contact.depth_uncertainty, LIMITS.share * usual)
+        return bool(contact.depth.max() > least and contact.force.max() > LIMITS.sure * contact.force_noise)
+
+    deep_ones = [contact for contact in contacts if is_deep(contact)]
+    shallow = undeep_ones + len(contacts) - len(deep_ones)
+    if shallow:
+        faults.append(Fault(FaultCode.SHALLOW, shallow, undeep_ones + len(contacts), Remedy.LEFT_OUT))
+    wrong = _disagreeing(deep_ones, usual, radius)
+    if wrong:
+        faults.append(Fault(FaultCode.DISAGREE, len(wrong), len(deep_ones), Remedy.LEFT_OUT))
+    good = [contact for k, contact in enumerate(deep_ones) if k not in wrong]
+    if not good:
+        return []
+    places = np.concatenate([contact.position[0 if contact.kind is ContactKind.SLIDE else -1 :] for contact in good])
+    wide = width(places) / float(np.sqrt(radius * usual))
+    if wide < 1:
+        faults.append(Fault(FaultCode.LINE, len(good), len(good), Remedy.KEPT if wide > LIMITS.line else Remedy.REFUSED))
+    return good if wide > LIMITS.line else []
+
+
+def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[int]:
+    """Return the contacts whose force differs from that of others at the same place: all of two, the odd ones of more."""
+    still = [k for k, contact in enumerate(contacts) if contact.kind is not ContactKind.SLIDE]
+    if len(still) < 2:
+        return set()
+    places = np.array([contacts[k].position[-1, :2] for k in still])
+    presses = [contacts[k] for k in still]
+    loads = loading(presses, [min(depth, float(press.depth.max())) for press in presses])
+    force = np.log(np.maximum(loads.force, 1e-9))
+    wrong: set[int] = set()
+    for k, near in enumerate(cKDTree(places).query_ball_point(places, 0.3 * np.sqrt(radius * depth))):
+        if len(near) > 1 and abs(force[k] - np.median(force[near])) > (
+            LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree
+        ):
+            wrong.add(still[k])
+    return wrong
 
 
 def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None) -> PalpationRecording:
@@ -65,8 +292,8 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     """Return the recording of readings as a file has them. Raises UserError."""
     readings, faults = cleaned(raw, mapping.tool.radius_m)
     readings = moved(readings, mapping)
-    if len(readings.position) < LEAST_ROWS:
-        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LEAST_ROWS}")
+    if len(readings.position) < LIMITS.rows:
+        raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LIMITS.rows}")
     faults += _implausible(readings)
     if any(fault.remedy is Remedy.REFUSED for fault in faults):
         return _refused(name, mapping, faults)
@@ -80,7 +307,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         raise ReadingError(
             f"{name}: the force does not change with the motion of the tool; check the columns of position and force"
         )
-    if axis.angle_deg > _WRONG_FRAME_DEG:
+    if axis.angle_deg > LIMITS.wrong_frame_deg:
         return _refused(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
     if axis.flipped:
         faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
@@ -128,26 +355,26 @@ def _inward(readings: Readings, parts: list[slice]) -> bool:
     assert n is not None
     start = p if readings.touch is None else readings.touch
     risen = [float(((p[one] - start[one][0]) @ n[one][0]).mean()) for one in parts]
-    return readings.time is None and float(np.median(risen)) > _RISEN * float(np.median(np.abs(risen)))
+    return readings.time is None and float(np.median(risen)) > LIMITS.risen * float(np.median(np.abs(risen)))
 
 
 def _implausible(readings: Readings) -> list[Fault]:
     """Return faults of the units of force and time."""
     faults: list[Fault] = []
-    low, high = _FORCE_N
+    low, high = LIMITS.force_n
     force = float(np.quantile(np.linalg.norm(readings.force - np.median(readings.force, axis=0), axis=1), 0.99))
     if not low < force < high:
         faults.append(Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force))
     if readings.time is not None:
         step = float(np.median(np.diff(readings.time)))
-        if not _STEP_S[0] < step < _STEP_S[1]:
+        if not LIMITS.step_s[0] < step < LIMITS.step_s[1]:
             faults.append(Fault(FaultCode.TIME_UNIT, 1, 1, Remedy.REFUSED, step))
     return faults
 
 
 def _implausible_force(contacts: list[Contact], radius: float) -> list[Fault]:
     """Return the fault of forces in another unit."""
-    (low, high), (young, force) = _YOUNG_PA, implied_young(contacts, radius)
+    (low, high), (young, force) = LIMITS.young_pa, implied_young(contacts, radius)
     return [] if low < young < high else [Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force)]
 
 
@@ -158,7 +385,7 @@ def _body_frame(mapping: Mapping, axis: Axis, position: Array) -> Array:
         X = matrix(mapping.body.pose)
         if X[:3, 2] @ axis.outward <= 0:
             raise MappingError(f"body.pose: its z axis points into the body; outward is {np.round(axis.outward, 2).tolist()}")
-    elif axis.outward[2] < _UPRIGHT:
+    elif axis.outward[2] < LIMITS.upright:
         side = np.eye(3)[np.argmin(np.abs(axis.outward))]
         y = np.cross(axis.outward, side)
         y /= np.linalg.norm(y)

@@ -11,15 +11,14 @@ import numpy as np
 
 from palpate.recording.cutting import FOOTPRINT_SHARE, windows
 from palpate.recording.faults import Fault
-from palpate.recording.loading import Loading, loading
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_models.numerics.frames import Array
 
-PROBES_APART_S: Final = 10.0
-"""Time given between probes without time: their errors of one moment are unrelated."""
+ANY_BODY: Final = (1.4, 1.0)
+"""Mean and SD of the exponents of force over depth."""
 LOADING_SHARE: Final = 0.5
-"""Readings from this share of the depth on are fitted by a line, whose end is the force at the depth."""
+"""Readings from this share of the depth on count."""
 
 
 class ContactKind(StrEnum):
@@ -74,6 +73,59 @@ class Palpated:
         return cls([], np.empty((0, 3)), np.empty((0, 3)), 1.5, 0)
 
 
+@dataclass(frozen=True)
+class Loading:
+    """Presses of one body; k of them."""
+
+    force: Array
+    """At the depth of each [N], shape (k,)."""
+    noise: Array
+    """SE of it [N], shape (k,)."""
+    exponent: float
+    """Median of n."""
+    exponent_sd: float
+    """Spread of n from press to press."""
+
+
+def loading(presses: Sequence[Contact], ends: Sequence[float]) -> Loading:
+    """Return the forces of presses at the depths `ends` [m].
+
+    F = F_D (d / D)^n, with exponents n that scatter about the body's own: each press has its force F_D and exponent n_i by
+    non-linear least squares, with the prior n_i ~ N(n, s^2). n and s are those of the body: median and spread of the exponents
+    that presses have of their own, less what noise adds to the spread (empirical Bayes).
+    """
+    rows = []
+    for press, end in zip(presses, ends, strict=True):
+        depth, force = press.depth, press.force
+        near = (depth >= LOADING_SHARE * end) & (depth <= 1.1 * end)
+        near = near if near.any() else np.abs(depth - end) == np.abs(depth - end).min()
+        rows.append((np.log(np.maximum(depth[near], 1e-6) / end), force[near], press.force_noise))
+    own = [_fit(*row, *ANY_BODY) for row in rows if len(row[0]) > 2]
+    mean, spread = ANY_BODY
+    if own:
+        exponents, variances = np.array([(found[1], found[3]) for found in own]).T
+        mean = float(np.median(exponents))
+        scatter = 1.4826 * float(np.median(np.abs(exponents - mean)))
+        spread = float(np.sqrt(max(scatter**2 - float(np.median(variances)), 1e-4)))
+    found = np.array([_fit(*row, mean, spread) for row in rows]).reshape(-1, 4)
+    return Loading(found[:, 0], found[:, 2], mean, spread)
+
+
+def _fit(log_depth: Array, force: Array, noise: float, mean: float, spread: float) -> tuple[float, float, float, float]:
+    """Return force at the depth [N] and exponent of a press, the SE of the force [N], and the exponent's variance."""
+    level, exponent = float(force[np.argmax(log_depth)]), mean
+    weight = 1.0 / max(noise, 1e-6) ** 2
+    for _ in range(8):
+        shape = np.exp(exponent * log_depth)
+        slopes = np.column_stack((shape, level * shape * log_depth))
+        information = weight * slopes.T @ slopes + np.diag((1e-12, 1.0 / spread**2))
+        pull = weight * slopes.T @ (force - level * shape) + np.array((0.0, (mean - exponent) / spread**2))
+        change = np.linalg.solve(information, pull)
+        level, exponent = level + float(change[0]), exponent + float(np.clip(change[1], -0.5, 0.5))
+    covariance = np.linalg.inv(information)
+    return level, exponent, float(np.sqrt(covariance[0, 0])), float(covariance[1, 1])
+
+
 @dataclass(frozen=True, eq=False)
 class PalpationRecording:
     """Contacts of one body."""
@@ -108,7 +160,7 @@ class PalpationRecording:
         nominal = self.depth_m if depth_m is None else depth_m
         presses = self._presses
         ends = [min(nominal, float(touch.depth.max())) for touch in presses.values()]
-        loads = self._loading(tuple(ends))
+        loads = loading(list(presses.values()), ends)
         samples = [
             _pressed(touch, number, *load)
             for (number, touch), load in zip(presses.items(), zip(loads.force, loads.noise, ends, strict=True), strict=True)
@@ -123,8 +175,9 @@ class PalpationRecording:
         """The press that the map is of: the abdomen's, or of another body the recorded ones at their nominal depth."""
         if self.abdomen:
             return USUAL
-        loads = self._loading(tuple(min(self.depth_m, float(touch.depth.max())) for touch in self._presses.values()))
-        exponent, spread = (loads.exponent, loads.exponent_sd) if self._presses else (self.exponent, 0.0)
+        presses = list(self._presses.values())
+        loads = loading(presses, [min(self.depth_m, float(touch.depth.max())) for touch in presses])
+        exponent, spread = (loads.exponent, loads.exponent_sd) if presses else (self.exponent, 0.0)
         return PressStandard.of(self.samples(), self.indenter_radius_m, exponent, spread)
 
     @property
@@ -132,10 +185,6 @@ class PalpationRecording:
         """Presses and probes that reached any depth, by number."""
         touches = enumerate(self.touches, start=1)
         return {number: touch for number, touch in touches if touch.kind is not ContactKind.SLIDE and touch.depth.max() > 0}
-
-    def _loading(self, ends: tuple[float, ...]) -> Loading:
-        touches = list(self._presses.values())
-        return loading([t.depth for t in touches], [t.force for t in touches], ends, [t.force_noise for t in touches])
 
 
 def width(places: Array) -> float:
@@ -151,22 +200,11 @@ def implied_young(touches: Sequence[Contact], radius: float) -> tuple[float, flo
     return float(np.median(moduli)), float(np.median([force for _, force in most]))
 
 
-def force_at(touch: Contact, nominal: float) -> tuple[float, float, float, int]:
-    """Return the force of a press or probe [N] at a depth, its SE [N], that depth [m], and the index of its last reading.
-
-    The depth is the nominal one, or the greatest if that is smaller.
-    """
-    depth = min(nominal, float(touch.depth.max()))
-    near = np.flatnonzero((touch.depth >= LOADING_SHARE * depth) & (touch.depth <= 1.1 * depth))
-    near = near if len(near) else np.array([np.argmin(np.abs(touch.depth - depth))])
-    weights = np.linalg.pinv(np.column_stack((np.ones(len(near)), touch.depth[near] - depth)))[0]
-    return float(weights @ touch.force[near]), touch.force_noise * float(np.linalg.norm(weights)), depth, int(near[-1])
-
-
 def _pressed(touch: Contact, number: int, force: float, noise: float, depth: float) -> ForceSample:
     """Return the sample of a press or probe."""
     last = int(np.flatnonzero(touch.depth >= 0.95 * depth)[0])
-    time = PROBES_APART_S * number if touch.time is None else float(touch.time[last])
+    # probes without time are 10 s apart: their errors of one moment are unrelated
+    time = 10.0 * number if touch.time is None else float(touch.time[last])
     return ForceSample(
         time=time,
         position=touch.position[last],

@@ -6,10 +6,11 @@ are read from its recording.
 """
 
 import io
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from itertools import pairwise
+from functools import cached_property
+from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
 from time import sleep, time
@@ -20,10 +21,7 @@ from mcap.reader import make_reader
 from numpy.typing import NDArray
 
 from palpate.replay.golden import rerun, write_recording
-from palpate.report.evidence import columns_of, xyz
 from palpate.truth.pressed import Pressed, Touched
-from palpate_assessment.messages import SEEN, skin_of
-from palpate_assessment.seen_breath import BreathingShares, depth_seen
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import NS, nanoseconds
@@ -34,7 +32,6 @@ from palpate_bus.settings import RECORDING
 from palpate_conductor.collector import Collected, Collector
 from palpate_errors import UserError
 from palpate_inputs import InputFile, read_arrays, read_json
-from palpate_models.numerics.frames import Array
 from palpate_models.scenario.load import ScenarioError, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_recorder.recover import salvage
@@ -86,41 +83,9 @@ class Event:
 
 @dataclass(frozen=True)
 class Evidence:
-    """The columns of a run for its report; n exam states and m true contacts, in order of time."""
+    """The collected messages of a run and its truth, for its report; n exam states and m true contacts, in order of time."""
 
-    time: Array
-    """Times of the exam states [s], shape (n,)."""
-    phase: NDArray[np.uint8]
-    """ExamState.PHASE_*, shape (n,)."""
-    depth: Array
-    """Measured [m], along the inward normal from the perceived rest surface; negative before contact."""
-    depth_known: Array
-    """Final estimate of the assessment [m]: with the observed breathing, from the corrected surface."""
-    uncertainty: Array
-    """Its reported standard deviation [m]."""
-    setpoint: Array
-    """[m]"""
-    force: Array
-    """Measured normal force, tared [N]."""
-    in_contact: Mask
-    steady: Mask
-    force_limited: Mask
-    visited: NDArray[np.uint32]
-    """Targets reached."""
-    skipped: NDArray[np.uint32]
-    """Targets skipped."""
-    target_count: int
-    true_time: Array
-    """Times of the true contact [s], shape (m,)."""
-    true_depth: Array
-    """[m]"""
-    true_force: Array
-    """Normal force [N]."""
-    events: tuple[Event, ...]
-    stiffness_map: Any | None
-    findings: Any | None
-    phantom: Any | None
-    targets: Any | None
+    collected: Collected
     touched: Touched
     """Estimated and true places on the skin under the indenter."""
     pressed: Pressed | None
@@ -128,10 +93,56 @@ class Evidence:
     run: str = ""
     """Name of the run."""
 
+    @cached_property
+    def states(self) -> Any:
+        """The exam states as a record array, shape (n,): time [s], phase (ExamState.PHASE_*), depth and setpoint [m], tared
+        normal force [N], flags, targets visited, skipped and in all.
+        """
+        rows = ((nanoseconds(s.header.stamp) / NS, *_values(s)) for s in self.collected.exam_states)
+        return np.fromiter(rows, [("time", "f8"), *((name, kind) for name, _, kind in _STATE)]).view(np.recarray)
+
+    @cached_property
+    def contacts(self) -> Any:
+        """The true contact as a record array, shape (m,): time [s], depth [m], normal force [N]."""
+        rows = ((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in self.collected.indentation)
+        return np.fromiter(rows, [("time", "f8"), ("depth", "f8"), ("force", "f8")]).view(np.recarray)
+
+    @property
+    def target_count(self) -> int:
+        """Number of targets."""
+        return int(self.states.target_count.max(initial=0))
+
+    @cached_property
+    def events(self) -> list[Event]:
+        """Every new message of the examination and every change of the driver, in order of time."""
+        events = []
+        for text, states in groupby(self.collected.exam_states, key=attrgetter("message")):
+            if text:
+                events.append(Event(nanoseconds(next(states).header.stamp) / NS, "exam", text))
+        for status in self.collected.status_changes:
+            text = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
+            events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", text))
+        return sorted(events, key=attrgetter("time_s"))
+
     def phases(self) -> list[tuple[int, float, float]]:
         """Return phase, begin and end [s] of each phase, in order."""
-        starts = [0, *(np.flatnonzero(np.diff(self.phase.astype(int))) + 1), len(self.phase)]
-        return [(int(self.phase[a]), float(self.time[a]), float(self.time[b - 1])) for a, b in pairwise(starts) if b > a]
+        time, phase = self.states.time, self.states.phase
+        starts = [0, *(np.flatnonzero(np.diff(phase.astype(int))) + 1), len(phase)]
+        return [(int(phase[a]), float(time[a]), float(time[b - 1])) for a, b in pairwise(starts) if b > a]
+
+
+_STATE: Final = (
+    ("phase", "phase", "u1"),
+    ("depth", "depth", "f8"),
+    ("setpoint", "depth_setpoint", "f8"),
+    ("force", "normal_force", "f8"),
+    *((flag, flag, "?") for flag in ("in_contact", "steady", "force_limited")),
+    ("visited", "target_index", "u4"),
+    ("skipped", "targets_skipped", "u4"),
+    ("target_count", "target_count", "u4"),
+)
+"""Columns of the exam states: name, field and type."""
+_values: Final = attrgetter(*(field for _, field, _ in _STATE))
 
 
 def write_evidence(
@@ -204,16 +215,6 @@ def inputs(recording: Recording, role: str) -> Iterator[RecordedMessage]:
 
 def read_evidence(folder: Path) -> Evidence:
     """Return the evidence of the run in `folder`. Raises EvidenceError."""
-    return evidence_of(*_read(folder))
-
-
-def read_collected(folder: Path) -> Collected:
-    """Return the messages of the run in `folder` that the conductor collected. Raises EvidenceError."""
-    return _read(folder)[0]
-
-
-def _read(folder: Path) -> tuple[Collected, Touched, Pressed | None, str]:
-    """Return messages, truth and name of a run."""
     path = folder / FILE
     if not path.is_file():
         raise EvidenceError(
@@ -229,93 +230,11 @@ def _read(folder: Path) -> tuple[Collected, Touched, Pressed | None, str]:
         nowhere = np.empty((0, 3))
         touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
         named = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
-        return collected, touched, Pressed(**named) if named else None, str(known["run"])
+        return Evidence(collected, touched, Pressed(**named) if named else None, str(known["run"]))
     except (KeyError, TypeError) as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error
     except (OSError, *BROKEN) as error:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
-
-
-def evidence_of(c: Collected, touched: Touched, pressed: Pressed | None, run: str) -> Evidence:
-    """Return the collected messages of the run named `run` as columns."""
-    states = _columns(c.exam_states)
-    contacts = columns_of(((nanoseconds(m.header.stamp) / NS, m.depth, m.normal_force) for m in c.indentation), _CONTACT)
-    known, uncertainty = _depth_known(c, states)
-    reported: dict[str, Any] = {
-        name: states[name] for name in ("time", "phase", "depth", "setpoint", "force", *_FLAGS, "visited", "skipped")
-    }
-    return Evidence(
-        **reported,
-        **contacts,
-        depth_known=known,
-        uncertainty=uncertainty,
-        target_count=int(states["target_count"].max(initial=0)),
-        events=tuple(_events(c)),
-        **{name: getattr(c, name) for name in ("stiffness_map", "findings", "phantom", "targets")},
-        touched=touched,
-        pressed=pressed,
-        run=run,
-    )
-
-
-def _events(c: Collected) -> list[Event]:
-    """Return every new message of the examination and every change of the driver, in order of time."""
-    events = []
-    before = ""
-    for state in c.exam_states:
-        if state.message and state.message != before:
-            before = state.message
-            events.append(Event(nanoseconds(state.header.stamp) / NS, "exam", state.message))
-    for status in c.status_changes:
-        text = status.reason or ("idle", "follows commands", "safe hold")[status.mode]
-        events.append(Event(nanoseconds(status.header.stamp) / NS, "driver", text))
-    return sorted(events, key=lambda event: event.time_s)
-
-
-_FLAGS: Final = ("in_contact", "steady", "force_limited")
-_FIELDS: Final = {
-    "phase": ("phase", "u1"),
-    "depth": ("depth", "f8"),
-    "uncertainty": ("depth_uncertainty", "f8"),
-    "followed": ("wall_displacement", "f8"),
-    "setpoint": ("depth_setpoint", "f8"),
-    "force": ("normal_force", "f8"),
-    **{flag: (flag, "?") for flag in _FLAGS},
-    "visited": ("target_index", "u4"),
-    "skipped": ("targets_skipped", "u4"),
-    "target_count": ("target_count", "u4"),
-}
-"""Columns of the exam states: field and type."""
-_values: Final = attrgetter(*(field for field, _ in _FIELDS.values()))
-_CONTACT: Final = np.dtype([("true_time", "f8"), ("true_depth", "f8"), ("true_force", "f8")])
-
-
-def _columns(exam_states: Iterable[Any]) -> dict[str, Array]:
-    """Return the columns `_FIELDS`, time [s], and point and normal of the skin under the indenter in world, shape (n, 3)."""
-    kinds = [("time", "f8"), *((name, kind) for name, (_, kind) in _FIELDS.items()), ("place", "f8", 3), ("normal", "f8", 3)]
-    rows = ((nanoseconds(s.header.stamp) / NS, *_values(s), xyz(s.surface_point), xyz(s.surface_normal)) for s in exam_states)
-    return columns_of(rows, np.dtype(kinds))
-
-
-def _depth_known(c: Collected, states: dict[str, Array]) -> tuple[Array, Array]:
-    """Return the final depths of the exam states and their standard deviations [m], shape (n,) each."""
-    depth, reported = _depth_seen(c, states), states["uncertainty"]
-    skin = None if c.surface is None or c.correction is None else skin_of(c.surface, c.correction, np.eye(4))
-    if skin is None:
-        return depth, reported
-    deeper, sigma = skin.deeper(states["time"], states["place"], states["normal"])
-    return depth + np.nan_to_num(deeper), np.where(np.isnan(sigma), reported, sigma)
-
-
-def _depth_seen(c: Collected, states: dict[str, Array]) -> Array:
-    """Return the depths of the exam states corrected by the observed breathing [m], shape (n,)."""
-    time, depth, followed, places = (states[name] for name in ("time", "depth", "followed", "place"))
-    motions = [m for m in c.motions if m.state in SEEN]
-    if c.surface is None or not motions:
-        return depth
-    shares = BreathingShares(np.asarray(c.surface.vertices, dtype=float).reshape(-1, 3), np.asarray(c.surface.breathing))
-    exposed, displacement = np.array([(nanoseconds(m.header.stamp) / NS, m.displacement) for m in motions]).T
-    return depth_seen(time, depth, followed, shares(places), (exposed, displacement))
 
 
 def read_figures(folder: Path) -> dict[str, Any]:

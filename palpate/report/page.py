@@ -86,7 +86,11 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
     environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
     skipped = _skipped(scenario, report, evidence)
     places = np.array([row["place"] for row in skipped if row["place"] is not None], dtype=np.float64).reshape(-1, 2)
-    solid = None if evidence.stiffness_map is None else page_figures.surface(evidence.stiffness_map, report.abdomen)
+    solid = (
+        None
+        if evidence.collected.stiffness_map is None
+        else page_figures.surface(evidence.collected.stiffness_map, report.abdomen)
+    )
     template = environment.get_template("report.html.j2")
     return template.render(
         scenario=scenario,
@@ -113,9 +117,9 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
 
 def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
     """Return the truth of a run; None if unknown."""
-    if evidence.phantom is None or evidence.pressed is None:
+    if evidence.collected.phantom is None or evidence.pressed is None:
         return None
-    return felt_truth(scenario, body_of(evidence.phantom), evidence.pressed, evidence.touched)
+    return felt_truth(scenario, body_of(evidence.collected.phantom), evidence.pressed, evidence.touched)
 
 
 def verdict(report: Report) -> str:
@@ -135,7 +139,7 @@ def _reached(report: Report, evidence: Evidence) -> int:
     """Return the number of targets that the indenter reached."""
     if not report.failure:
         return evidence.target_count - report.skipped_targets
-    return int(evidence.visited[-1]) if evidence.visited.size else 0
+    return int(evidence.states.visited[-1]) if len(evidence.states) else 0
 
 
 def _finding_text(f: FindingRow) -> str:
@@ -158,7 +162,7 @@ def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dic
     """Return the skipped targets: number, reason, and position in A if known."""
     reasons = report.services.get("planning", {}).get("facts", {}).get("skipped_targets", {})
     X_AW = inverse(np.array(exam_input(scenario).X_WA))
-    known = [] if evidence.targets is None else evidence.targets.positions
+    known = [] if evidence.collected.targets is None else evidence.collected.targets.positions
     rows = []
     for number, why in sorted(reasons.items(), key=lambda item: int(item[0])):
         i = int(number)

@@ -69,10 +69,10 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool
 
     None if there is no map.
     """
-    message = evidence.stiffness_map
+    message = evidence.collected.stiffness_map
     if message is None or not figures.drawable(message):
         return None
-    drawing = figures.Drawing(message, evidence.findings, None, abdomen)
+    drawing = figures.Drawing(message, evidence.collected.findings, None, abdomen)
     figure = _figure(15.5, 5.0)
     left, middle, right = figure.subplots(1, 3)
     left.plot(samples_xy[:, 0] * 1e3, samples_xy[:, 1] * 1e3, ".", ms=1.6, color="white", alpha=0.55)
@@ -95,7 +95,8 @@ def _ratio_layer(drawing: figures.Drawing) -> figures.MapQuantity:
 
 def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
     """Return force and depth over simulated time with the phases in the background; None without exam states."""
-    if not len(evidence.time):
+    states = evidence.states
+    if not len(states):
         return None
     figure = _figure(15.5, 5.2)
     force, depth = figure.subplots(2, 1, sharex=True)
@@ -106,35 +107,34 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
             for axes in (force, depth):
                 axes.axvspan(begin, end, color=tint, lw=0, label="_" if name in labelled or axes is depth else name)
             labelled.add(name)
-    force.plot(evidence.time, evidence.force, color=MEASURED, lw=0.7, label="measured force")
+    force.plot(states.time, states.force, color=MEASURED, lw=0.7, label="measured force")
     if limit_n is not None:
         force.axhline(limit_n, color=LIMIT, lw=1, ls="--", label=f"working limit {limit_n:g} N")
-    if evidence.force_limited.any():
-        at = evidence.force_limited
-        force.plot(evidence.time[at], evidence.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
+    if states.force_limited.any():
+        at = states.force_limited
+        force.plot(states.time[at], states.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
     plain(force, "normal force [N]")
-    measured = np.where(evidence.depth * 1e3 > _FREE_MM, evidence.depth * 1e3, np.nan)
-    wanted = np.where(evidence.setpoint * 1e3 > _FREE_MM, evidence.setpoint * 1e3, np.nan)
-    depth.plot(evidence.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
-    depth.plot(evidence.time, measured, color=MEASURED, lw=0.7, label="measured depth")
+    measured = np.where(states.depth * 1e3 > _FREE_MM, states.depth * 1e3, np.nan)
+    wanted = np.where(states.setpoint * 1e3 > _FREE_MM, states.setpoint * 1e3, np.nan)
+    depth.plot(states.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
+    depth.plot(states.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
     depth.set_ylim(_SHOWN_MM, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
-    force.set_xlim(evidence.time[0], evidence.time[-1])
+    force.set_xlim(states.time[0], states.time[-1])
     return _png(figure)
 
 
 def force_depth(evidence: Evidence) -> bytes | None:
     """Return force against depth in contact, coloured by time; None without contact."""
-    held = evidence.in_contact & (evidence.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet reports contact in the air
+    states = evidence.states
+    held = states.in_contact & (states.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet reports contact in the air
     if not held.any():
         return None
     figure = _figure(5.6, 4.4)
     axes = figure.subplots()
-    image = axes.scatter(
-        evidence.depth[held] * 1e3, evidence.force[held], c=evidence.time[held], s=2, cmap="viridis", rasterized=True
-    )
+    image = axes.scatter(states.depth[held] * 1e3, states.force[held], c=states.time[held], s=2, cmap="viridis", rasterized=True)
     plain(axes, "measured normal force [N]", "measured depth [mm]")
     figures.colour_bar(image, axes, "simulated time [s]")
     return _png(figure)
@@ -142,10 +142,10 @@ def force_depth(evidence: Evidence) -> bytes | None:
 
 def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
     """Return true apparent stiffness with outlines of findings, and the depth error; None if either is unknown."""
-    message = evidence.stiffness_map
+    message = evidence.collected.stiffness_map
     if known is None or message is None or not figures.drawable(message):
         return None
-    drawing = figures.Drawing(message, evidence.findings, known)
+    drawing = figures.Drawing(message, evidence.collected.findings, known)
     if drawing.true is None:
         return None
     figure = _figure(15.5, 5.0)
@@ -161,12 +161,13 @@ def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
 
 
 def _depth_errors(axes: Axes, evidence: Evidence) -> None:
-    true = np.interp(evidence.time, evidence.true_time, evidence.true_depth)
-    steady = evidence.steady
+    states, contacts = evidence.states, evidence.contacts
+    true = np.interp(states.time, contacts.time, contacts.depth)
+    steady = states.steady
     bins = np.linspace(-0.6, 0.6, 61)
     for values, color, label in (
-        (true - evidence.setpoint, TRUE, "true depth minus set-point"),
-        (evidence.depth - true, MEASURED, "measured minus true depth"),
+        (true - states.setpoint, TRUE, "true depth minus set-point"),
+        (states.depth - true, MEASURED, "measured minus true depth"),
     ):
         axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
     plain(axes, "readings in steady contact", "depth error [mm]")

@@ -11,8 +11,10 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from PIL import Image
 
+from palpate.exam_state import exam_state
 from palpate.report.archive import Evidence, completed, write_evidence
 from palpate.truth.pressed import Touched
+from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
 from palpate_reproduction import figures
 from palpate_reproduction.page import chosen_moments
@@ -54,17 +56,8 @@ def test_the_graph_counts_what_was_there(tmp_path: Path) -> None:
 
 
 def evidence(phase: list[int], force: list[float]) -> Evidence:
-    n = len(phase)
-    flat, none = np.zeros(n), np.zeros(n, dtype=bool)
-    return Evidence(
-        time=np.arange(n, dtype=float), phase=np.array(phase, dtype=np.uint8), depth=flat, depth_known=flat,
-        uncertainty=flat, setpoint=flat,
-        force=np.array(force),
-        in_contact=none, steady=none, force_limited=none, visited=np.zeros(n, np.uint32), skipped=np.zeros(n, np.uint32),
-        target_count=1, true_time=flat, true_depth=flat, true_force=flat, events=(), stiffness_map=None, findings=None,
-        touched=Touched(np.empty((0, 3)), np.empty((0, 3))), pressed=None,
-        phantom=None, targets=None,
-    )  # fmt: skip
+    states = [exam_state(k * NS, p, normal_force=f) for k, (p, f) in enumerate(zip(phase, force, strict=True))]
+    return Evidence(Collected(exam_states=states), Touched(np.empty((0, 3)), np.empty((0, 3))), None)
 
 
 def test_the_moments_are_of_their_phases() -> None:

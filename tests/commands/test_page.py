@@ -142,11 +142,11 @@ def test_evidence_comes_back_as_it_was(tmp_path: Path) -> None:
     c = collected(measured_error=0.0002)
     archive.write_evidence(tmp_path / archive.FILE, c)
     evidence = archive.read_evidence(tmp_path)
-    assert evidence.depth == pytest.approx([s.depth for s in c.exam_states])
-    assert evidence.true_force == pytest.approx([m.normal_force for m in c.indentation])
-    assert evidence.skipped[-1] == 2
-    assert [f.quadrant for f in evidence.findings.findings] == [f.quadrant for f in findings().findings]
-    assert np.array_equal(evidence.stiffness_map.stiffness, c.stiffness_map.stiffness)
+    assert evidence.states.depth == pytest.approx([s.depth for s in c.exam_states])
+    assert evidence.contacts.force == pytest.approx([m.normal_force for m in c.indentation])
+    assert evidence.states.skipped[-1] == 2
+    assert [f.quadrant for f in evidence.collected.findings.findings] == [f.quadrant for f in findings().findings]
+    assert np.array_equal(evidence.collected.stiffness_map.stiffness, c.stiffness_map.stiffness)
     assert evidence.phases() == [(5, 0.0, pytest.approx(0.99))]
 
 

@@ -10,9 +10,9 @@ from rosbags.rosbag2 import StoragePlugin, Writer
 from scipy.spatial.transform import Rotation
 
 from palpate.recording.cutting import cycles, onset
-from palpate.recording.loading import loading
 from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
+from palpate.recording.recording import Contact, ContactKind, loading
 from palpate_bus.messages import (
     JointState,
     Point,
@@ -91,13 +91,18 @@ def test_a_bag_gives_the_contacts_of_its_table(few: pd.DataFrame, tmp_path: Path
     assert abs(recording.depth_m - 0.010) < 0.0008
 
 
+def pressed(depth: np.ndarray, force: np.ndarray, noise: float) -> Contact:
+    nowhere = np.zeros((len(depth), 3))
+    return Contact(ContactKind.PRESS, nowhere, nowhere, depth, force, 0.0, noise)
+
+
 @pytest.mark.parametrize(("exponent", "spread"), [(1.1, 0.0), (2.9, 0.6)])
 def test_force_and_exponent_are_those_of_the_body(exponent: float, spread: float) -> None:
     rng = np.random.default_rng(0)
     depth, noise = np.linspace(0.0, 0.002, 10), 0.03
     level, own = 1.0 + 0.2 * rng.standard_normal(200), exponent + spread * rng.standard_normal(200)
     forces = [f * (depth / 0.002) ** n + noise * rng.standard_normal(10) for f, n in zip(level, own, strict=True)]
-    found = loading([depth] * 200, forces, [0.002] * 200, [noise] * 200)
+    found = loading([pressed(depth, force, noise) for force in forces], [0.002] * 200)
     assert found.exponent == pytest.approx(exponent, rel=0.05)
     assert found.exponent_sd == pytest.approx(spread, abs=0.15)
     z = (found.force - level) / found.noise
@@ -106,7 +111,7 @@ def test_force_and_exponent_are_those_of_the_body(exponent: float, spread: float
 
 
 def test_a_press_of_one_reading_keeps_it() -> None:
-    found = loading([np.array((0.002,))], [np.array((0.7,))], [0.002], [0.01])
+    found = loading([pressed(np.array((0.002,)), np.array((0.7,)), 0.01)], [0.002])
     assert found.force == pytest.approx((0.7,))
 
 
