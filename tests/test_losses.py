@@ -6,11 +6,13 @@ import sys
 import time
 from collections.abc import Mapping
 from pathlib import Path
+from typing import Any
 
 import psutil
 import pytest
 from examination import assert_held_and_no_harder, kill_in_contact
 
+from palpate.report.evidence import peak_force
 from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, StruckRun, calm_rate, strike
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState

@@ -3,14 +3,13 @@
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
-from time import monotonic
 from typing import Any, get_args
 
 import pandas as pd
 
 from palpate.interface.scenarios import paths
 from palpate.study.cases import Request, cases_of, command_of
-from palpate.study.folder import RunRecord, Session, default_folder, opened
+from palpate.study.folder import RunRecord, default_folder, opened
 from palpate.study.runner import cluster, cores, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
 from palpate.study.summary import PAGE, conclude
@@ -106,10 +105,8 @@ def study(
     cases = cases_of(chosen, request)
     path = default_folder(chosen.name, split) if out is None else Path(out)
     folder, manifest = opened(path, chosen.name, cases, command_of(str(source), request, methods or ()))
-    if todo := len(folder.missing(cases)):
-        begin, count = monotonic(), workers or cores()
-        with cluster(count) as client:
+    if folder.missing(cases):
+        with cluster(workers or cores()) as client:
             run_cases(folder, cases, client, lambda _: None)
-        folder.add_session(Session(workers=count, cases=todo, elapsed_s=round(monotonic() - begin, 1)))
     record, _ = conclude(folder, manifest)
     return StudyResult(path, record)

@@ -17,8 +17,6 @@ from threading import Thread
 from time import perf_counter, process_time, sleep
 from typing import Final
 
-from pydantic import BaseModel, ConfigDict
-
 from palpate.environment import FIXED
 from palpate.report.page import write_page
 from palpate.report.results import assemble, truth_of_run, write_results
@@ -26,7 +24,7 @@ from palpate.report.rows import Report
 from palpate.run.composed import run_composed
 from palpate.run.distributed import run_distributed
 from palpate.study.cases import Case, file_hash
-from palpate.study.folder import code_digest
+from palpate.study.folder import Attempt, code_digest
 from palpate_bus.settings import variable
 from palpate_conductor.outcome import Timing
 from palpate_errors import RunError
@@ -38,24 +36,6 @@ KEEP_MEMORY: Final = {"MALLOC_TRIM_THRESHOLD_": str(1 << 30), "MALLOC_MMAP_THRES
 """Makes glibc's malloc keep freed memory for the next arrays; page faults would cost a tenth of a quick case."""
 KIB: Final = 1024
 """Unit of `ru_maxrss` on Linux."""
-
-
-class Attempt(BaseModel):
-    """The result of one attempt at a case."""
-
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
-
-    case_id: str
-    report: Report | None
-    why: str | None
-    """Reason why there is no valid report; null if there is one."""
-    code: str = ""
-    peak_memory_bytes: int = 0
-    wall_time_s: float = 0.0
-    assess_time_s: float | None = None
-    core_s: float = 0.0
-    host: str = ""
-    loop_examinations: int | None = None
 
 
 def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
@@ -92,7 +72,7 @@ def run_batch(batch: Sequence[str], runs: str | None = None) -> list[str]:
     attempts = [line for line in output.splitlines(keepends=True) if line.endswith("\n")]
     if len(attempts) < len(cases):
         cause = f"{why}: {lines[-1]}" if lines else why
-        attempts.append(Attempt(case_id=cases[len(attempts)].case_id, report=None, why=cause).model_dump_json())
+        attempts.append(Attempt(why=cause).model_dump_json())
     return attempts
 
 
@@ -117,7 +97,6 @@ def examine(case: Case, runs: Path | None = None) -> Attempt:
     # a composed run is forked and shares memory
     peaks = [resource.getrusage(who).ru_maxrss for who in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     return Attempt(
-        case_id=case.case_id,
         report=report,
         why=report.failure if case.runtime == "wallclock" else None,  # in simulated time it would fail again in the same way
         code=code_digest(),
@@ -159,11 +138,10 @@ def _core_s() -> float:
 
 
 def _attempt(line: str, runs: Path | None) -> Attempt:
-    case = Case.model_validate_json(line)
     try:
-        return examine(case, runs)
+        return examine(Case.model_validate_json(line), runs)
     except Exception as error:  # any error is a failed attempt at this case
-        return Attempt(case_id=case.case_id, report=None, why=f"{type(error).__name__}: {error}", code=code_digest())
+        return Attempt(why=f"{type(error).__name__}: {error}", code=code_digest())
 
 
 def _end_with(parent: int) -> None:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import count
 from pathlib import Path
-from time import monotonic
 from typing import TYPE_CHECKING, Annotated, Any, cast
 
 import typer
@@ -178,7 +178,7 @@ def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | 
 
 def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tuple[int | None, str | None], runs: bool) -> None:
     """Run the cases without an outcome on a number of local workers or a scheduler. Ends the command if they cannot be run."""
-    from palpate.study.folder import Outcome, Session
+    from palpate.study.folder import Outcome
     from palpate.study.runner import StudyStopped, cluster, cores, run_cases
 
     todo = len(folder.missing(cases))
@@ -186,27 +186,22 @@ def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tup
         console.print(f"{len(cases) - todo} of {len(cases)} cases are done already", highlight=False)
     if not todo:
         return
-    begin, finished, count = monotonic(), 0, 0
+    finished = count(1)
     try:
         with cluster(where[0] or cores(), where[1]) as workers, CaseDisplay(console, console.quiet, "cases") as display:
-            count = workers.count
-            console.print(f"{todo} cases, {count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
+            console.print(f"{todo} cases, {workers.count} at a time, into {folder.path}", highlight=False, soft_wrap=True)
             if workers.client.dashboard_link:
                 console.print(f"workers: {workers.client.dashboard_link}", style="dim", highlight=False, soft_wrap=True)
             display.show(0, todo, "")
 
             def done(outcome: Outcome) -> None:
-                nonlocal finished
-                finished += 1
-                display.show(finished, todo, f"{outcome.case.label}{'' if outcome.completed else f': {outcome.why}'}")
+                why = "" if outcome.completed else f": {outcome.why}"
+                display.show(next(finished), todo, f"{outcome.case.label}{why}")
 
             run_cases(folder, cases, workers, done, runs=runs)
     except (StudyStopped, KeyboardInterrupt) as error:
         why = "stopped" if isinstance(error, KeyboardInterrupt) else error
         fail(f"{why}: {len(folder.missing(cases))} of {len(cases)} cases are left; run the same command to continue")
-    finally:
-        if finished:
-            folder.add_session(Session(workers=count, cases=finished, elapsed_s=round(monotonic() - begin, 1)))
 
 
 def _conclude(folder: Folder, manifest: Manifest) -> None:

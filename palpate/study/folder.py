@@ -76,31 +76,36 @@ class Manifest(BaseModel):
     """Runs the study again; may be empty."""
 
 
-class Outcome(BaseModel):
-    """cases/ID.json: the report of a case, or the reason why there is none."""
+class Attempt(BaseModel):
+    """The result of one attempt at a case."""
 
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+
+    report: Report | None = None
+    why: str | None
+    """Reason why there is no valid report, or why the examination was aborted; null for a completed one."""
+    code: str = ""
+    """SHA-256 over the code that made the result (`code_digest`)."""
+    peak_memory_bytes: int = 0
+    """Peak memory of the process that ran the case."""
+    wall_time_s: float = 0.0
+    """From the start of the case to its report."""
+    assess_time_s: float | None = None
+    """Part of it that the assessment took."""
+    core_s: float = 0.0
+    """Processor time."""
+    host: str = ""
+    loop_examinations: int | None = None
+    """Number of whole examinations that the error model of a quick case was fitted to; null for a whole one."""
+
+
+class Outcome(Attempt):
+    """cases/ID.json: the last attempt at a case."""
 
     case: Case
     status: Literal["done", "failed"]
     """`failed`: no report after three attempts. An examination that was aborted is done, and not completed."""
     attempts: int
-    why: str | None
-    """Reason of the failure or of the abort; null for a completed examination."""
-    code: str
-    """SHA-256 over the code that made the result (`code_digest`)."""
-    report: Report | None
-    peak_memory_bytes: int
-    """Peak memory of the process that ran the case."""
-    wall_time_s: float
-    """From the start of the case to its report."""
-    assess_time_s: float | None
-    """Part of it that the assessment took."""
-    core_s: float
-    """Processor time."""
-    host: str
-    loop_examinations: int | None = None
-    """Number of whole examinations that the error model of a quick case was fitted to; null for a whole one."""
 
     @property
     def completed(self) -> bool:
@@ -234,10 +239,6 @@ class Folder:
         except (OSError, ValueError) as error:
             raise StudyError(f"{path} is not a list of causes ({error}): remove it") from error
 
-    def add_failure(self, case_id: str, why: str) -> None:
-        """Append the cause of a failed attempt."""
-        self.write_failures(case_id, [*self.failures(case_id), why])
-
     def write_failures(self, case_id: str, causes: Sequence[str]) -> None:
         """Write the causes of all failed attempts at a case, atomically."""
         write_text(self._failures_file(case_id), json.dumps(causes) + "\n")
@@ -257,10 +258,6 @@ class Folder:
                 if number < len(lines):
                     raise StudyError(f"{path}, line {number} is not a session ({error}): remove it") from error
         return found
-
-    def add_session(self, session: Session) -> None:
-        """Append a call of the command."""
-        self.write_sessions([*self.sessions(), session])
 
     def write_sessions(self, sessions: Iterable[Session]) -> None:
         """Write all calls of the command, atomically."""

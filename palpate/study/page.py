@@ -72,23 +72,19 @@ MANY: Final = 400
 """Points from which a cloud is drawn as an image."""
 
 
-def _figure(width: float, height: float) -> Figure:
+def _figure(width: float, height: float, columns: int = 1) -> tuple[Figure, list[Axes]]:
     figure = Figure(figsize=(width, height), facecolor="none")
     figure.set_layout_engine("constrained", w_pad=0.08, h_pad=0.08)
-    return figure
-
-
-def _axes(figure: Figure, columns: int = 1) -> list[Axes]:
     axes = list(np.atleast_1d(figure.subplots(1, columns)))
     for each in axes:
         each.set_facecolor("none")
         for spine in each.spines.values():
             spine.set_color(QUIET)
-    return axes
+    return figure, axes
 
 
-def _svg(figure: Figure) -> str:
-    """Return the figure as an element of the page: text stays text, colours are the page's variables."""
+def _svg(figure: Figure) -> Markup:
+    """Return the figure as an element of the page: text, escaped by matplotlib, stays text; colours are the page's variables."""
     stream = io.StringIO()
     with rc_context({"svg.fonttype": "none", "svg.hashsalt": "palpate"}):
         figure.savefig(stream, format="svg", metadata={"Date": None, "Creator": None, "Type": None, "Format": None}, dpi=150)
@@ -96,7 +92,7 @@ def _svg(figure: Figure) -> str:
     text = text[text.index("<svg") :]
     for colour, variable in VARIABLES.items():
         text = text.replace(colour, f"var({variable})")
-    return text
+    return Markup(text)
 
 
 def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "best", below: bool = False) -> None:
@@ -122,13 +118,12 @@ def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: s
         axes.errorbar(at, value, yerr=bars, fmt="o", ms=4, lw=1.1, capsize=2, color=color, label=label)
 
 
-def roc(analyses: Sequence[Analysis]) -> str | None:
+def roc(analyses: Sequence[Analysis]) -> Markup | None:
     """Return the ROC per patient of the first MOST methods; None if none has a curve."""
     shown = [(a.name, a.roc) for a in analyses[:MOST] if a.roc is not None]
     if not shown:
         return None
-    figure = _figure(6.2, 5.2)
-    (axes,) = _axes(figure)
+    figure, (axes,) = _figure(6.2, 5.2)
     for color, (name, curve) in zip(COLOURS, shown, strict=False):
         axes.plot(curve.false_rate, curve.true_rate, color=color, lw=1.8, label=f"{name}: AUC {curve.auc.value:.3f}")
         axes.fill_between(ROC_GRID, curve.low, curve.high, color=color, alpha=0.13, lw=0)
@@ -144,13 +139,12 @@ def roc(analyses: Sequence[Analysis]) -> str | None:
     return _svg(figure)
 
 
-def froc(analyses: Sequence[Analysis]) -> str | None:
+def froc(analyses: Sequence[Analysis]) -> Markup | None:
     """Return the FROC of the first MOST methods; None if none has a curve."""
     shown = [(a.name, a.froc) for a in analyses[:MOST] if a.froc is not None]
     if not shown:
         return None
-    figure = _figure(7.4, 5.2)
-    (axes,) = _axes(figure)
+    figure, (axes,) = _figure(7.4, 5.2)
     least = RATES[0] / 2
     for color, (name, curve) in zip(COLOURS, shown, strict=False):
         x = np.maximum(curve.false_findings, least)
@@ -169,7 +163,7 @@ def froc(analyses: Sequence[Analysis]) -> str | None:
     return _svg(figure)
 
 
-def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
+def detectability(analysis: Analysis, names: Sequence[str]) -> Markup | None:
     """Return the probability of detection against each covariate: binned rates, and the surface at quartiles of another one.
 
     None where no lump is known.
@@ -177,8 +171,8 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> str | None:
     if not any(analysis.observed[name] for name in names):
         return None
     surface = analysis.felt if tuple(names) == FELT else analysis.made
-    figure = _figure(14.5, 5.6)
-    for axes, name in zip(_axes(figure, len(names)), names, strict=True):
+    figure, columns = _figure(14.5, 5.6, len(names))
+    for axes, name in zip(columns, names, strict=True):
         words, scale = COVARIATES[name]
         if surface is not None and name in surface.names:
             _sections(axes, surface, name)
@@ -215,34 +209,32 @@ def _sections(axes: Axes, surface: Surface, name: str) -> None:
         axes.fill_between(scale * x, low, high, color=COLOURS[i], alpha=0.12, lw=0)
 
 
-def errors(analysis: Analysis) -> str | None:
+def errors(analysis: Analysis) -> Markup | None:
     """Return place errors and the agreement of size and stiffness; None without a matched finding."""
     e = analysis.errors
-    if not len(e.place_m.values):
+    if not len(e.place_m):
         return None
-    figure = _figure(14.5, 4.4)
-    place, size, ratio = _axes(figure, 3)
-    x = np.sort(e.place_m.values) * 1e3
+    figure, (place, size, ratio) = _figure(14.5, 4.4, 3)
+    x = np.sort(e.place_m) * 1e3
     place.step(np.append(0, x), np.linspace(0, 1, len(x) + 1), where="post", color=COLOURS[0], lw=1.8)
     plain(place, "part of the matched findings", "error of place [mm]")
     _percent(place)
     _title(place, f"Place, n = {len(x)}")
-    _bland_altman(size, e.radius, 1e3)
+    _bland_altman(size, e.radius_m, 1e3)
     plain(size, "estimated less true radius [mm]", "mean of both [mm]")
-    _title(size, f"Size, n = {e.radius.figures.bias.n}")
+    _title(size, f"Size, n = {e.radius_m.bias.n}")
     _bland_altman(ratio, e.log_ratio, 1.0)
     plain(ratio, "estimated over true ratio", "geometric mean of both")
     for axis in (ratio.xaxis, ratio.yaxis):
         axis.set_major_formatter(FuncFormatter(lambda value, _: f"{np.exp(value):.2f}"))
-    _title(ratio, f"Stiffness ratio, n = {e.log_ratio.figures.bias.n}")
+    _title(ratio, f"Stiffness ratio, n = {e.log_ratio.bias.n}")
     return _svg(figure)
 
 
 def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
     many = len(agreement.mean) > MANY
     axes.plot(scale * agreement.mean, scale * agreement.difference, ".", ms=4, color=COLOURS[0], alpha=0.6, rasterized=many)
-    found = agreement.figures
-    for line, style in ((found.bias, "-"), (found.lower, "--"), (found.upper, "--")):
+    for line, style in ((agreement.bias, "-"), (agreement.lower, "--"), (agreement.upper, "--")):
         if line.value is not None:
             axes.axhline(scale * line.value, color=INK, lw=1.1, ls=style)
         if line.low is not None and line.high is not None:
@@ -250,15 +242,14 @@ def _bland_altman(axes: Axes, agreement: Agreement, scale: float) -> None:
     axes.axhline(0, color=QUIET, lw=0.7, ls=":")
 
 
-def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
+def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> Markup | None:
     """Return the reliability diagram of the first MOST methods; None without any."""
     if not rows:
         return None
-    figure = _figure(6.2, 5.2)
-    (axes,) = _axes(figure)
+    figure, (axes,) = _figure(6.2, 5.2)
     for color, (name, calibrated) in zip(COLOURS, rows, strict=False):
         x, parts = zip(*calibrated.bins, strict=True)
-        slope = calibrated.figures.slope.value
+        slope = calibrated.slope.value
         label = name if slope is None else f"{name}: slope {slope:.2f}"
         _errorbar(axes, x, parts, color, label)
         axes.plot(x, [part.value for part in parts], color=color, lw=1)
@@ -271,11 +262,11 @@ def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> str | None:
     return _svg(figure)
 
 
-def effort(analyses: Sequence[Analysis]) -> str:
+def effort(analyses: Sequence[Analysis]) -> Markup:
     """Return the distributions of greatest force and duration of the first MOST methods."""
-    figure = _figure(11, 4.2)
+    figure, columns = _figure(11, 4.2, 2)
     for axes, column, words in zip(
-        _axes(figure, 2), ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
+        columns, ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
     ):
         for color, analysis in zip(COLOURS, analyses, strict=False):
             x = np.sort(analysis.cases[column][~analysis.cases["failed"]].dropna().to_numpy(dtype=float))
@@ -286,7 +277,7 @@ def effort(analyses: Sequence[Analysis]) -> str:
     return _svg(figure)
 
 
-def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str | None:
+def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> Markup | None:
     """Return the paired differences of one quantity from the reference, greatest first; None if none is known.
 
     Levels of one error, `error=level`, share a row.
@@ -303,8 +294,7 @@ def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> str
     words, unit, margin = QUANTITIES[name]
     scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
     levels = list(dict.fromkeys(level for row in known.values() for level, _ in row))
-    figure = _figure(9.0, 1.6 + 0.34 * len(shown))
-    (axes,) = _axes(figure)
+    figure, (axes,) = _figure(9.0, 1.6 + 0.34 * len(shown))
     height = 0.7 / len(levels)
     for i, level in enumerate(levels):
         bars = [
@@ -352,20 +342,15 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
         methods=[summary["methods"][a.name] for a in shown],
         human=HUMANS,
         quantities=QUANTITIES,
-        roc=_safe(roc(analyses)),
-        froc=_safe(froc(analyses)),
-        felt={a.name: _safe(detectability(a, FELT)) for a in shown},
-        made={a.name: _safe(detectability(a, MADE)) for a in shown},
-        errors={a.name: _safe(errors(a)) for a in shown},
-        reliability=_safe(reliability(calibrated)),
-        effort=_safe(effort(analyses)),
-        tornadoes=[plot for name in TORNADOES if many and (plot := _safe(tornado(comparisons, name)))],
+        roc=roc(analyses),
+        froc=froc(analyses),
+        felt={a.name: detectability(a, FELT) for a in shown},
+        made={a.name: detectability(a, MADE) for a in shown},
+        errors={a.name: errors(a) for a in shown},
+        reliability=reliability(calibrated),
+        effort=effort(analyses),
+        tornadoes=[plot for name in TORNADOES if many and (plot := tornado(comparisons, name))],
     )
-
-
-def _safe(svg: str | None) -> Markup | None:
-    """Return an SVG of `plots`, in which matplotlib has escaped names."""
-    return None if svg is None else Markup(svg)
 
 
 def figure(estimate: Mapping[str, Any] | None, scale: float = 1.0, digits: int = 2, unit: str = "") -> Markup:

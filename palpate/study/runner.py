@@ -8,13 +8,14 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from typing import Any, Final
+from time import monotonic
+from typing import Any, Final, Literal
 
 import psutil
 
-from palpate.study.case import Attempt, run_batch
+from palpate.study.case import run_batch
 from palpate.study.cases import Case
-from palpate.study.folder import ATTEMPTS, Folder, Outcome
+from palpate.study.folder import ATTEMPTS, Attempt, Folder, Outcome, Session
 from palpate.study.spec import StudyError
 from palpate_errors import RunError
 
@@ -108,10 +109,26 @@ def part_of(cases: Sequence[Case], shard: str) -> list[Case]:
 def run_cases(
     folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], *, runs: bool = False
 ) -> None:
-    """Examine all cases without an outcome, in any order, and calls `done` after each. Raises StudyStopped.
+    """Examine all cases without an outcome, in any order, and calls `done` after each; note the session. Raises StudyStopped.
 
     `runs`: keep the results of whole examinations in the folder `runs`.
     """
+    begin, finished = monotonic(), 0
+
+    def count(outcome: Outcome) -> None:
+        nonlocal finished
+        finished += 1
+        done(outcome)
+
+    try:
+        _run(folder, cases, workers, count, runs)
+    finally:
+        if finished:
+            session = Session(workers=workers.count, cases=finished, elapsed_s=round(monotonic() - begin, 1))
+            folder.write_sessions([*folder.sessions(), session])
+
+
+def _run(folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], runs: bool) -> None:
     todo, kept = folder.missing(cases), str((folder.path / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
 
@@ -122,10 +139,10 @@ def run_cases(
     for batch in _batches(todo, size):
         submit(batch)
     while running:
-        finished, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
-        if not finished and not workers.alive:
+        ended, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+        if not ended and not workers.alive:
             raise StudyStopped("connection to the scheduler lost")
-        for future in finished:
+        for future in ended:
             batch = running.pop(future)
             attempts = _attempts(future, batch, workers)
             for case, attempt in zip(batch, attempts, strict=False):
@@ -159,24 +176,18 @@ def _attempts(future: Future[list[str]], batch: Sequence[Case], workers: Workers
     if error is None:
         return [Attempt.model_validate_json(text) for text in future.result()]
     if isinstance(error, workers.killed):
-        return [Attempt(case_id=case.case_id, report=None, why=f"its workers were lost: {error}") for case in batch]
+        return [Attempt(why=f"its workers were lost: {error}")] * len(batch)
     raise StudyStopped(f"a worker cannot examine: {type(error).__name__}: {error}") from error
 
 
 def _outcome(folder: Folder, case: Case, attempt: Attempt) -> Outcome | None:
     """Return the outcome of a case after an attempt; None if it is to be tried again."""
-    failed = len(folder.failures(case.case_id))
+    failures = folder.failures(case.case_id)
     if attempt.why is not None:
-        folder.add_failure(case.case_id, attempt.why)
-        failed += 1
-        if failed < ATTEMPTS:
+        failures.append(attempt.why)
+        folder.write_failures(case.case_id, failures)
+        if len(failures) < ATTEMPTS:
             return None
-    report = attempt.report
-    return Outcome(
-        case=case,
-        status="done" if attempt.why is None else "failed",
-        attempts=failed + (attempt.why is None),
-        why=attempt.why if report is None else report.failure,
-        **attempt.model_dump(exclude={"case_id", "why", "report"}),
-        report=report,
-    )
+    told = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
+    status: Literal["done", "failed"] = "done" if attempt.why is None else "failed"
+    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), **told)

@@ -3,7 +3,7 @@
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from importlib.metadata import version
-from math import nan, pi, sqrt
+from math import pi, sqrt
 from pathlib import Path
 from typing import Any, Final
 
@@ -12,12 +12,10 @@ from pyarrow import parquet
 
 from palpate.quick.errors import LEAST_EXAMINATIONS
 from palpate.report.files import write_text
-from palpate.report.rows import FindingRow
-from palpate.report.scoring import FindingScore
 from palpate.study.folder import RUN, Folder, Manifest, Outcome, RunRecord, record
 from palpate.study.page import HUMANS, render
 from palpate.study.real_time import write_real_time
-from palpate.study.statistics.accuracy import COVERED, MEASURED, CalibrationRow, ErrorsRow, Spread, coverage, spread
+from palpate.study.statistics.accuracy import COVERED, MEASURED, FindingCalibration, FindingErrors, Spread, coverage, spread
 from palpate.study.statistics.analysis import Analysis, analyse
 from palpate.study.statistics.comparison import Comparison, compare
 from palpate.study.statistics.detectability import Surface
@@ -43,7 +41,7 @@ CASES: Final = _schema(
     " core_s",
     "completed",
 )
-"""One row per case. Counts are null and figures NaN for a case without a report.
+"""One row per case. What is not known, as for a case without a report, is null.
 
 `score`: greatest confidence of any finding or candidate, 0 without one. `exam_time_s`: simulated time. `sim_time_s`: wall time of
 the simulation, in whole examinations with the assessment. `assess_time_s`: wall time of the assessment (processor time in quick
@@ -80,38 +78,28 @@ def write_tables(folder: Path, study: str, outcomes: Iterable[Outcome]) -> None:
 
 
 def _case(study: str, outcome: Outcome, hits: Sequence[Record]) -> Record:
-    case, report = outcome.case, outcome.report
-    row: Record = dict.fromkeys((field.name for field in CASES if pa.types.is_floating(field.type)), nan)
-    row |= case.model_dump(include={"case_id", "population", "method", "split", "number", "seed", "tier", "errors"})
-    row |= {"study": study, "status": outcome.status, "attempts": outcome.attempts, "why": outcome.why}
-    row |= {"completed": outcome.completed, "peak_memory_bytes": outcome.peak_memory_bytes, "core_s": outcome.core_s}
-    row |= {"loop_examinations": outcome.loop_examinations}
-    row |= {"wall_time_s": outcome.wall_time_s, "assess_time_s": _number(outcome.assess_time_s)}
+    report = outcome.report
+    row: Record = outcome.case.model_dump(
+        include={"case_id", "population", "method", "split", "number", "seed", "tier", "errors"}
+    )
+    row |= outcome.model_dump(include=columns, exclude={"report", "case"})
+    row |= {"study": study, "completed": outcome.completed}
     if report is None:
         return row
     row |= {
         "run_hash": report.run_hash,
-        "depth_rms_m": _number(report.depth_rms_error_m),
-        "peak_force_n": _number(report.max_force_N),
+        "depth_rms_m": report.depth_rms_error_m,
+        "peak_force_n": report.max_force_N,
         "exam_time_s": report.sim_time_s,
         "sim_time_s": report.wall_time_s,
     }
     if outcome.completed:
         row["score"] = max((hit["confidence"] for hit in hits), default=0.0)
-    scores = report.scores
-    if scores is not None:
-        row |= {
-            "palpable": scores.matched + scores.missed,
-            "not_palpable": scores.not_palpable,
-            "matched": scores.matched,
-            "missed": scores.missed,
-            "false_findings": scores.false_findings,
-            "on_guarding": scores.on_guarding,
-            "on_structure": scores.on_structure,
-            "coverage_area": _number(scores.coverage_90),
-            "coverage_lumps": _number(scores.coverage_90_in_lumps),
-            "coverage_ratio": _number(scores.ratio_coverage_90),
-        }
+    if (scores := report.scores) is not None:
+        counts = ("not_palpable", "matched", "missed", "false_findings", "on_guarding", "on_structure")
+        row |= {name: getattr(scores, name) for name in counts} | {"palpable": scores.matched + scores.missed}
+        row |= {"coverage_area": scores.coverage_90, "coverage_lumps": scores.coverage_90_in_lumps}
+        row["coverage_ratio"] = scores.ratio_coverage_90
     return row
 
 
@@ -119,43 +107,22 @@ def _findings(outcome: Outcome) -> Iterator[Record]:
     report = outcome.report
     if report is None:
         return
-    scores = report.scores
-    findings = _scored(report.findings, () if scores is None else scores.findings)
-    candidates = _scored(report.candidates, () if scores is None else scores.candidates)
-    for index, (finding, score) in enumerate((*findings, *candidates)):
-        yield _finding(outcome, index, (finding, index < len(report.findings)), score)
-
-
-def _scored(rows: Sequence[FindingRow], scores: Sequence[FindingScore]) -> list[tuple[FindingRow, FindingScore | None]]:
-    """Return each row with its score; None without scores."""
-    return list(zip(rows, scores or (None,) * len(rows), strict=True))
-
-
-def _finding(outcome: Outcome, index: int, found: tuple[FindingRow, bool], score: FindingScore | None) -> Record:
-    finding, reported = found
-    lump = None if score is None else score.lump
-    truth = None if outcome.report is None else outcome.report.truth
-    x, y, z = finding.centroid_m
-    return {
-        "case_id": outcome.case.case_id,
-        "index": index,
-        "reported": reported,
-        "x_m": x,
-        "y_m": y,
-        "z_m": z,
-        "area_m2": finding.area_m2,
-        "ratio": finding.ratio,
-        "ratio_lower": finding.ratio_90[0],
-        "ratio_upper": finding.ratio_90[1],
-        "confidence": finding.confidence,
-        "guarding": finding.guarding,
-        "lump": -1 if lump is None else lump,
-        "place_error_m": nan if score is None else _number(score.place_error_m),
-        "area_true_m2": nan if lump is None or truth is None else truth.lumps[lump].area_m2,
-        "ratio_true": nan if score is None else _number(score.true_ratio),
-        "on_guarding": None if score is None else score.on_guarding,
-        "on_structure": None if score is None else score.on_structure,
-    }
+    rows, scores = [*report.findings, *report.candidates], report.scores
+    scored = [None] * len(rows) if scores is None else [*scores.findings, *scores.candidates]
+    for index, (finding, score) in enumerate(zip(rows, scored, strict=True)):
+        lump = None if score is None else score.lump
+        row = finding.model_dump(include={"area_m2", "ratio", "confidence", "guarding"})
+        row |= dict(
+            zip(("x_m", "y_m", "z_m", "ratio_lower", "ratio_upper"), (*finding.centroid_m, *finding.ratio_90), strict=True)
+        )
+        row |= {"case_id": outcome.case.case_id, "index": index, "reported": index < len(report.findings)}
+        row["lump"] = -1 if lump is None else lump
+        if lump is not None and report.truth is not None:
+            row["area_true_m2"] = report.truth.lumps[lump].area_m2
+        if score is not None:
+            row |= {"place_error_m": score.place_error_m, "ratio_true": score.true_ratio}
+            row |= {"on_guarding": score.on_guarding, "on_structure": score.on_structure}
+        yield row
 
 
 def _lumps(outcome: Outcome, hits: Sequence[Record]) -> Iterator[Record]:
@@ -168,20 +135,16 @@ def _lumps(outcome: Outcome, hits: Sequence[Record]) -> Iterator[Record]:
         yield {
             "case_id": outcome.case.case_id,
             "lump": index,
-            "felt_contrast": nan if lump is None else lump.felt_contrast,
-            "felt_radius_m": nan if lump is None else sqrt(lump.area_m2 / pi),
+            "felt_contrast": None if lump is None else lump.felt_contrast,
+            "felt_radius_m": None if lump is None else sqrt(lump.area_m2 / pi),
             "depth_m": lesion.depth_m or 0.0,
             "radius_m": sqrt(lesion.radii_m[0] * lesion.radii_m[1]),
             "contrast": lesion.contrast,
             "palpable": None if lump is None else lump.palpable,
             "found": bool(reported),
             "confidence": max((hit["confidence"] for hit in own), default=0.0),
-            "place_error_m": min((hit["place_error_m"] for hit in reported), default=nan),
+            "place_error_m": min((hit["place_error_m"] for hit in reported), default=None),
         }
-
-
-def _number(value: float | None) -> float:
-    return nan if value is None else value
 
 
 JSON: Final = "study.json"
@@ -226,9 +189,9 @@ class MethodRow(Row):
     """Detectability by the effect on the surface."""
     made: SurfaceRow | None
     """Detectability by the lumps themselves."""
-    errors: ErrorsRow
-    calibration: CalibrationRow | None
-    guarding: CalibrationRow | None = None
+    errors: FindingErrors
+    calibration: FindingCalibration | None
+    guarding: FindingCalibration | None = None
     """Calibration of the probabilities of a tensed muscle; None without an area on one."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
@@ -321,9 +284,9 @@ def _method(variant: Variant, a: Analysis, bootstrap: Bootstrap) -> MethodRow:
         sensitivity_at_zero=None if a.froc is None else a.froc.at_zero,
         felt=None if a.felt is None else _surface(a.felt, "felt_contrast", "felt_radius_m"),
         made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
-        errors=a.errors.figures,
-        calibration=None if a.calibration is None else a.calibration.figures,
-        guarding=None if a.guarding is None else a.guarding.figures,
+        errors=a.errors,
+        calibration=a.calibration,
+        guarding=a.guarding,
         effort={name: spread(variant, name, bootstrap) for name in MEASURED},
         coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
     )

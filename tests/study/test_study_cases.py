@@ -8,7 +8,6 @@ import pytest
 import yaml
 from synthetic import TOY, study
 
-from palpate.study.case import Attempt
 from palpate.study.cases import Case, Request, cases_of, command_of, patient_seeds, secret_of
 from palpate.study.folder import SESSIONS, Folder, Outcome, Session, manifest_of, merge
 from palpate.study.spec import Grid, Lumps, StudyError, load_study, study_names
@@ -210,9 +209,7 @@ def folder_of(path: Path, cases: list[Case]) -> Folder:
     folder = Folder(path)
     folder.open(manifest_of("toy", cases))
     for case in cases:
-        attempt = Attempt(case_id=case.case_id, report=None, why="killed", code="c")
-        rest = attempt.model_dump(exclude={"case_id"})
-        folder.write(Outcome(case=case, status="done", attempts=1, **rest))
+        folder.write(Outcome(case=case, status="done", attempts=1, why="killed", code="c"))
     return folder
 
 
@@ -257,7 +254,7 @@ def test_a_session_that_was_cut_is_left_out(tmp_path: Path, cases: list[Case]) -
     folder.write_sessions(sessions[:2])
     path = tmp_path / SESSIONS
     path.write_text(path.read_text()[:-9])
-    folder.add_session(sessions[2])
+    folder.write_sessions([*folder.sessions(), sessions[2]])
     assert folder.sessions() == [sessions[0], sessions[2]]
     path.write_text("{}\n" + path.read_text())
     with pytest.raises(StudyError, match="line 1"):

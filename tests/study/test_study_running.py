@@ -91,8 +91,8 @@ def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Pa
         Folder(part).open(manifest_of("toy", CASES, f"palpate study {part}/toy.yaml"))
         for case in own:  # the work of another machine
             Folder(part).case_file(case.case_id).write_bytes(Folder(folder).case_file(case.case_id).read_bytes())
-        Folder(part).add_session(Session(workers=index, cases=len(own), elapsed_s=60.0))
-    Folder(parts[0]).add_failure(CASES[0].case_id, "killed")
+        Folder(part).write_sessions([Session(workers=index, cases=len(own), elapsed_s=60.0)])
+    Folder(parts[0]).write_failures(CASES[0].case_id, ["killed"])
     for _again in range(2):
         whole, manifest = merge(parts, tmp_path / "whole")
         assert manifest == manifest_of("toy", CASES, f"palpate study {parts[0]}/toy.yaml")

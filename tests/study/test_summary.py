@@ -213,7 +213,7 @@ def _matched(n: int, seed: int = 0) -> Tables:
 
 def test_bias_and_limits_of_agreement() -> None:
     tables = _matched(400)
-    errors = finding_errors(tables.variants[0], tables.bootstrap).figures
+    errors = finding_errors(tables.variants[0], tables.bootstrap)
     for line, true in ((errors.radius_m.bias, 1e-3), (errors.radius_m.lower, 1e-3 - 0.98e-3), (errors.radius_m.upper, 1.98e-3)):
         assert line.value == pytest.approx(true, abs=1e-4)
         assert line.low <= true <= line.high
@@ -228,7 +228,7 @@ def test_candidates_and_false_findings_are_no_matched_findings() -> None:
     findings = tables.variants[0].findings.copy()
     findings.loc[findings.index[:10], "reported"] = False
     findings.loc[findings.index[10:15], "lump"] = -1
-    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap).figures
+    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap)
     assert errors.place_mean_m.n == 15
 
 
@@ -248,7 +248,7 @@ def _areas(n: int, power: float, seed: int = 0) -> Tables:
 
 def test_confidences_that_are_too_sure() -> None:
     calibrated = calibration(_areas(600, 2.0).variants[0], Bootstrap.draw(["lumps"] * 600, 80))
-    found = calibrated.figures
+    found = calibrated
     assert found.slope.value == pytest.approx(0.5, abs=0.08)
     assert found.slope.high < 0.8
     assert (found.expected_error.value or 0) > 2 * found.expected_error_by_chance
@@ -263,8 +263,8 @@ def test_probabilities_of_a_tensed_muscle_are_judged_by_the_areas_on_muscles() -
         findings.append(synthetic.finding(case["case_id"], 0.1, -1, guarding=stated, on_guarding=bool(rng.random() < stated)))
     tables = synthetic.tables(cases, findings, [])
     calibrated = guarding(tables.variants[0], Bootstrap.draw(["guarding"] * 400, 80))
-    assert calibrated.figures.slope.value == pytest.approx(1.0, abs=0.2)
-    assert abs(calibrated.figures.in_the_large.value or 0) < 0.05
+    assert calibrated.slope.value == pytest.approx(1.0, abs=0.2)
+    assert abs(calibrated.in_the_large.value or 0) < 0.05
 
 
 def test_without_muscles_or_in_an_older_table_there_is_no_such_calibration() -> None:

@@ -11,7 +11,7 @@ from scipy.special import logit
 from sklearn.metrics import brier_score_loss
 
 from palpate.study.statistics.detectability import fit
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Drawn, Estimate, Row, bounded, estimate
 from palpate.study.statistics.reading import Variant
 
 NORMAL: Final = 1.959964
@@ -43,17 +43,21 @@ class Sample:
         return estimate(value, bootstrap.quantile(self.values, self.patient, q), len(self.values), "findings")
 
 
-class AgreementRow(Row):
-    """Agreement of estimated and true values."""
+class Agreement(Row):
+    """Agreement of estimated and true values (Bland and Altman, Lancet 1986;1:307)."""
 
     bias: Estimate
     """Mean difference."""
     lower: Estimate
     """Limits of agreement: bias plus and minus 1.96 standard deviations, 95 % of normal differences."""
     upper: Estimate
+    mean: np.ndarray = Drawn
+    """Means of estimated and true values, shape (m,)."""
+    difference: np.ndarray = Drawn
+    """Estimated minus true values."""
 
 
-class ErrorsRow(Row):
+class FindingErrors(Row):
     """Errors of the reported findings that match a lump."""
 
     place_mean_m: Estimate
@@ -65,36 +69,14 @@ class ErrorsRow(Row):
     """Area divided by the true area, minus one."""
     ratio_mean: Estimate
     """Stiffness ratio divided by the true ratio, minus one."""
-    radius_m: AgreementRow
+    radius_m: Agreement
     """Agreement of the radius of the circle of equal area."""
-    log_ratio: AgreementRow
+    log_ratio: Agreement
     """Agreement of the natural logarithm of the stiffness ratio."""
     ratio_held: Estimate
     """Share of findings whose 90 % band includes the true ratio."""
-
-
-@dataclass(frozen=True)
-class Agreement:
-    """Estimated against true (Bland and Altman, Lancet 1986;1:307): differences against means."""
-
-    mean: Array
-    """Means of estimated and true values, shape (m,)."""
-    difference: Array
-    """Estimated minus true values."""
-    figures: AgreementRow
-
-
-@dataclass(frozen=True)
-class FindingErrors:
-    """Errors of the reported findings that match a lump."""
-
-    place_m: Sample
-    """Distance of the centres."""
-    radius: Agreement
-    """Radius of the circle of the finding's area [m]."""
-    log_ratio: Agreement
-    """Natural logarithm of the stiffness ratio."""
-    figures: ErrorsRow
+    place_m: np.ndarray = Drawn
+    """Distances of the centres, shape (m,)."""
 
 
 def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
@@ -119,19 +101,17 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
     held, place = sample(inside), sample(column("place_error_m"))
     patients = len(np.unique(held.patient))
     share = float(held.values.mean()) if len(held.values) else np.nan
-    radius = agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap)
-    log_ratio = agreement(*logs, patient, bootstrap)
-    figures = ErrorsRow(
+    return FindingErrors(
         place_mean_m=place.mean(bootstrap),
         place_median_m=place.quantile(0.5, bootstrap),
         place_p95_m=place.quantile(0.95, bootstrap),
         size_mean=sample(size).mean(bootstrap),
         ratio_mean=sample(stiffness).mean(bootstrap),
-        radius_m=radius.figures,
-        log_ratio=log_ratio.figures,
+        radius_m=agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap),
+        log_ratio=agreement(*logs, patient, bootstrap),
         ratio_held=bounded(share, held.mean_replicates(bootstrap), len(held.values), "findings", patients),
+        place_m=place.values,
     )
-    return FindingErrors(place, radius, log_ratio, figures)
 
 
 def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstrap: Bootstrap) -> Agreement:
@@ -145,7 +125,7 @@ def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstra
     spreads = np.sqrt(np.maximum(second - first**2, 0) * n / max(n - 1, 1))
     middle = float(difference.mean()) if n else np.nan
     lower, upper = (estimate(middle + side * NORMAL * spread, first + side * NORMAL * spreads, n, "findings") for side in (-1, 1))
-    return Agreement(mean, difference, AgreementRow(bias=bias.mean(bootstrap), lower=lower, upper=upper))
+    return Agreement(bias=bias.mean(bootstrap), lower=lower, upper=upper, mean=mean, difference=difference)
 
 
 MEASURED: Final = ("peak_force_n", "exam_time_s", "depth_rms_m")
@@ -188,7 +168,7 @@ LEAST: Final = 1e-6
 """Confidences are clipped to this distance from 0 and 1 before their log odds are taken."""
 
 
-class CalibrationRow(Row):
+class FindingCalibration(Row):
     """Calibration of findings and candidates, or of the reported findings if a method publishes no candidates."""
 
     slope: Estimate
@@ -203,14 +183,7 @@ class CalibrationRow(Row):
     """95 % quantile over studies with calibrated confidences (Broecker and Smith, Weather Forecast 2007;22:651)."""
     brier: Estimate
     """Mean square of confidence minus hit (Brier 1950)."""
-
-
-@dataclass(frozen=True)
-class FindingCalibration:
-    """The calibration of one method's confidences."""
-
-    figures: CalibrationRow
-    bins: tuple[tuple[float, Estimate], ...]
+    bins: tuple[tuple[float, Estimate], ...] = Drawn
     """Mean confidence and share of hits of each bin, for the reliability diagram."""
 
 
@@ -246,15 +219,14 @@ def _calibration(areas: pd.DataFrame, column: str, hit: NDArray[np.bool_], boots
     error = float(_expected_error(p, hit, label, np.ones((1, len(p))))[0])
     errors = _expected_error(p, hit, label, drawn)
     errors = np.maximum(errors - np.nanmean(errors) + error, 0)
-    figures = CalibrationRow(
+    return FindingCalibration(
         slope=estimate(slope, slopes, len(p), "areas"),
         in_the_large=estimate(float(np.mean(hit - p)), gaps, len(p), "areas"),
         expected_error=estimate(error, errors, len(p), "areas"),
         expected_error_by_chance=_by_chance(p, label),
         brier=estimate(float(brier_score_loss(hit, p, labels=[False, True])), squares, len(p), "areas"),
+        bins=tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label)),
     )
-    bins = tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label))
-    return FindingCalibration(figures, bins)
 
 
 def _bins(p: Array) -> NDArray[np.intp]:

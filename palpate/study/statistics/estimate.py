@@ -10,7 +10,7 @@ from zlib import crc32
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 from statsmodels.stats.proportion import proportion_confint
 
 Array = NDArray[np.float64]
@@ -24,7 +24,11 @@ FOLDS: Final = 1000
 class Row(BaseModel):
     """A part of study.json."""
 
-    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, arbitrary_types_allowed=True)
+
+
+Drawn = Field(exclude=True)
+"""A field for plots, which is not in study.json."""
 
 
 class Estimate(Row):
