@@ -79,9 +79,8 @@ def write_tables(folder: Path, study: str, outcomes: Iterable[Outcome]) -> None:
 
 def _case(study: str, outcome: Outcome, hits: Sequence[Record]) -> Record:
     report = outcome.report
-    row: Record = outcome.case.model_dump(
-        include={"case_id", "population", "method", "split", "number", "seed", "tier", "errors"}
-    )
+    columns = set(CASES.names)
+    row: Record = outcome.case.model_dump(include=columns)
     row |= outcome.model_dump(include=columns, exclude={"report", "case"})
     row |= {"study": study, "completed": outcome.completed}
     if report is None:
