@@ -9,17 +9,18 @@ import numpy as np
 import pytest
 
 from palpate.fuzz.bus_readers import Broken, FuzzTarget
-from palpate.fuzz.fuzz import Find, FuzzPlan, all_targets, attempt, campaign, choose
+from palpate.fuzz.fuzz import Find, FuzzPlan, attempt, campaign, choose
 from palpate_bus.messages import RecordChunk, codec
 from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
+from palpate_errors import UserError
 from palpate_models.scenario.load import ScenarioError, load_scenario
 
 
-@pytest.mark.parametrize("target", all_targets(), ids=lambda target: target.name)
+@pytest.mark.parametrize("target", choose([]), ids=lambda target: target.name)
 def test_no_input_of_a_small_campaign_breaks_anything(target: FuzzTarget) -> None:
-    done = campaign([target], FuzzPlan(30, seed=20, slow_s=math.inf))
+    done = campaign([target], FuzzPlan(30, seed=20, slow_s=math.inf))[target.name]
     assert not done.finds, [(find.error, find.data.hex()) for find in done.finds]
-    assert done.targets[target.name].refused < 30, "valid inputs are accepted"
+    assert done.refused < 30, "valid inputs are accepted"
 
 
 def test_a_broken_target_is_found() -> None:
@@ -28,7 +29,7 @@ def test_a_broken_target_is_found() -> None:
             raise Broken("too long")
         return True
 
-    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], FuzzPlan(500))
+    done = campaign([FuzzTarget("long", check, lambda _: [b"12345678"])], FuzzPlan(500))["long"]
     assert [find.error for find in done.finds] == ["Broken: too long"]
     assert len(done.finds[0].data) > 8
 
@@ -50,13 +51,15 @@ def _ending(_: bytes) -> bool:
     ("check", "sign"), [(_outside, "opens for writing"), (_large, "MemoryError"), (_ending, "the process left with status 7")]
 )
 def test_what_leaves_its_confines_is_found(check: Callable[[bytes], bool], sign: str) -> None:
-    done = campaign([FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, most=1))
+    done = campaign([FuzzTarget("wrong", lambda data: data != b"0" and check(data), lambda _: [b"0"])], FuzzPlan(40, most=1))[
+        "wrong"
+    ]
     assert [sign in find.error for find in done.finds] == [True]
 
 
 def test_choosing_targets() -> None:
     assert {target.name for target in choose(["key", "tok*"])} == {"key", "token"}
-    with pytest.raises(ValueError, match="no target 'nothing'"):
+    with pytest.raises(UserError, match="no target 'nothing'"):
         choose(["nothing"])
 
 

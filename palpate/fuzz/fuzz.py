@@ -20,12 +20,13 @@ from dataclasses import dataclass, field
 from fnmatch import fnmatch
 from pathlib import Path
 from time import perf_counter, process_time, thread_time
-from typing import TYPE_CHECKING, Annotated, Any, Final
+from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 
 import typer
 
 from palpate.apart import ChildLost, TimeLimit, run_apart, shared_numbers
-from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, refuse, table, wide_console
+from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, table, wide_console
+from palpate_errors import UserError
 
 if TYPE_CHECKING:
     from palpate.fuzz.bus_readers import FuzzTarget
@@ -56,8 +57,7 @@ class FuzzPlan:
     slow_s: float = SLOW_S
 
 
-@dataclass
-class Find:
+class Find(NamedTuple):
     """An input that broke a target."""
 
     target: str
@@ -79,19 +79,9 @@ class TargetResult:
     peak_mb: int = 0
     """Greatest resident memory of the process."""
 
-
-@dataclass
-class FuzzCampaign:
-    """Results of a campaign by target."""
-
-    seed: int
-    targets: dict[str, TargetResult] = field(default_factory=dict)
-    seconds: float = 0.0
-
-    @property
-    def finds(self) -> list[Find]:
-        """All finds."""
-        return [find for result in self.targets.values() for find in result.finds]
+    def __str__(self) -> str:
+        figures = f"{self.inputs} inputs, {self.refused} refused, {self.found} finds"
+        return f"{figures}, {self.seconds:.0f} s, {self.peak_mb} MB"
 
 
 def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
@@ -180,14 +170,13 @@ def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> Ta
 
 def campaign(
     chosen: Sequence[FuzzTarget], plan: FuzzPlan, progress: Callable[[int, int, str], None] = lambda *_: None
-) -> FuzzCampaign:
-    """Run each target in a child process. A target stops after `plan.most` finds.
+) -> dict[str, TargetResult]:
+    """Run each target in a child process; return the results by target. A target stops after `plan.most` finds.
 
     Calls `progress` after each target with the number of finished targets, the number of all, and the result as text.
     """
-    done = FuzzCampaign(plan.seed)
-    begin = perf_counter()
-    for index, target in enumerate(chosen):
+    done: dict[str, TargetResult] = {}
+    for target in chosen:
         place = shared_numbers()
 
         def work(_: object, target: FuzzTarget = target, place: MutableSequence[int] = place) -> TargetResult:
@@ -203,31 +192,20 @@ def campaign(
         except ChildLost as lost:
             find = Find(target.name, b"", f"input {place[0]} of seed {plan.seed}: the process {lost}")
             result = TargetResult(place[0] + 1, finds=[find], found=1)
-        done.targets[target.name] = result
-        progress(index + 1, len(chosen), f"{target.name}: {summary(result)}")
-    done.seconds = perf_counter() - begin
+        done[target.name] = result
+        progress(len(done), len(chosen), f"{target.name}: {result}")
     return done
 
 
-def summary(result: TargetResult) -> str:
-    """Return the figures of a target as text."""
-    return f"{result.inputs} inputs, {result.refused} refused, {result.found} finds, {result.seconds:.0f} s, {result.peak_mb} MB"
-
-
-def all_targets() -> list[FuzzTarget]:
-    """Return all targets."""
+def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
+    """Return the targets whose names match a pattern, all without patterns. Raises UserError for one without a match."""
     from palpate.fuzz.bus_readers import bus_targets  # noqa: PLC0415 - the help of the command needs no readers
     from palpate.fuzz.file_readers import file_targets  # noqa: PLC0415
 
-    return [*bus_targets(), *file_targets()]
-
-
-def choose(patterns: Sequence[str]) -> list[FuzzTarget]:
-    """Return the targets whose names match a pattern, all without patterns. Raises ValueError for one without a match."""
-    known = all_targets()
+    known = [*bus_targets(), *file_targets()]
     for pattern in patterns:
         if not any(fnmatch(target.name, pattern) for target in known):
-            raise ValueError(f"no target {pattern!r}; targets are {', '.join(target.name for target in known)}")
+            raise UserError(f"no target {pattern!r}; targets are {', '.join(target.name for target in known)}")
     return [target for target in known if not patterns or any(fnmatch(target.name, p) for p in patterns)]
 
 
@@ -238,20 +216,18 @@ def fuzz(
     seed: Annotated[int, typer.Option(min=0, help="The same seed gives the same inputs.")] = 0,
 ) -> None:
     """Feed invalid bytes to everything that reads from the bus or from files, and check that all are refused."""
-    console = SteadyConsole(stderr=True)
-    try:
-        chosen = choose(names or [])
-    except ValueError as error:
-        refuse(error)
+    console, begin, chosen = SteadyConsole(stderr=True), perf_counter(), choose(names or [])
     with CaseDisplay(console, False, "targets") as display:
         done = campaign(chosen, FuzzPlan(inputs, seed, seconds), display.show)
-    for find in done.finds:
+    finds = [find for result in done.values() for find in result.finds]
+    for find in finds:
         console.print(f"{find.target} {find.error}\n  {find.data.hex()}", highlight=False, soft_wrap=True)
     figures = table("target", ">inputs", ">refused", ">finds", ">processor s", ">peak MB")
-    for name, result in done.targets.items():
+    for name, result in done.items():
         rest = (result.inputs, result.refused, result.found, round(result.seconds), result.peak_mb)
         figures.add_row(name, *map(str, rest))
     wide_console().print(figures)
-    total = sum(result.inputs for result in done.targets.values())
-    print(f"{total} inputs, {len(chosen)} targets, seed {seed}: {len(done.finds)} kinds of finds, {done.seconds:.0f} s")
-    raise typer.Exit(EXIT_FAILED if done.finds else 0)
+    total = sum(result.inputs for result in done.values())
+    took_s = perf_counter() - begin
+    print(f"{total} inputs, {len(chosen)} targets, seed {seed}: {len(finds)} kinds of finds, {took_s:.0f} s")
+    raise typer.Exit(EXIT_FAILED if finds else 0)

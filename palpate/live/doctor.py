@@ -2,11 +2,12 @@
 
 import os
 import platform
-from dataclasses import asdict, dataclass, field
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Annotated, Any, NoReturn
+from typing import Annotated, Any, NamedTuple, NoReturn
 
 import typer
 from rich.text import Text
@@ -39,8 +40,7 @@ class Severity(StrEnum):
     BAD = "trouble"
 
 
-@dataclass(frozen=True)
-class Remark:
+class Remark(NamedTuple):
     """The result of one check."""
 
     about: str
@@ -50,12 +50,11 @@ class Remark:
 
 @dataclass
 class Diagnosis:
-    """All remarks, the health of each topic and the violations of the contract."""
+    """All remarks, the health of each topic and the violations of the contract, each with its count."""
 
-    findings: list[Remark] = field(default_factory=list)
-    topics: list[TopicHealth] = field(default_factory=list)
-    violations: list[tuple[Violation, int]] = field(default_factory=list)
-    """Each with its count."""
+    findings: list[Remark]
+    topics: list[TopicHealth]
+    violations: list[tuple[Violation, int]]
 
     @property
     def healthy(self) -> bool:
@@ -66,7 +65,7 @@ class Diagnosis:
         """Return the output of `--json`."""
         topics = [{**asdict(row), "topic": row.topic.name} for row in self.topics]
         violations = [{**asdict(violation), "count": count} for violation, count in self.violations]
-        findings = [asdict(finding) for finding in self.findings]
+        findings = [finding._asdict() for finding in self.findings]
         return {"healthy": self.healthy, "findings": findings, "topics": topics, "violations": violations}
 
 
@@ -79,124 +78,115 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
             live.poll()
             sleep(POLL_S)
         live.poll()
-        return diagnose(bus, live)
+        parts = (
+            _versions(bus),
+            _endpoints(bus, live),
+            _shared_memory(bus),
+            _clock(live),
+            _who(bus, live),
+            _progress(live),
+            _types(live),
+        )
+        seen = [(s.violation, s.count) for s in live.monitor.active.values()]
+        return Diagnosis([remark for part in parts for remark in part], live.monitor.health(), seen)
     finally:
         live.close()
 
 
-def diagnose(bus: Joined, live: LiveMonitor) -> Diagnosis:
-    """Return the diagnosis from what the monitor has received so far."""
-    findings = [
-        *_versions(bus), *_endpoints(bus, live), *_shared_memory(bus), *_clock(live), *_who(bus, live), *_processes(live),
-        *_waiting(live),
-    ]  # fmt: skip
+def _types(live: LiveMonitor) -> Iterator[Remark]:
     differing = mismatches(live.graph.alive.values())
-    findings += [Remark("types", Severity.BAD, sentence) for sentence in differing]
+    yield from (Remark("types", Severity.BAD, sentence) for sentence in differing)
     if not differing:
-        findings.append(Remark("types", Severity.OK, "all nodes have the same message definitions"))
-    seen = [(s.violation, s.count) for s in live.monitor.active.values()]
-    return Diagnosis(findings, live.monitor.health(), seen)
+        yield Remark("types", Severity.OK, "all nodes have the same message definitions")
 
 
-def _versions(bus: Joined) -> list[Remark]:
-    ours = versions()
+def _versions(bus: Joined) -> Iterator[Remark]:
+    ours, run = versions(), bus.target.run
     text = f"python {platform.python_version()}, " + ", ".join(f"{name} {number}" for name, number in ours.items())
-    run = bus.target.run
-    if run is None:
-        return [Remark("versions", Severity.OK, text)]
-    other = [f"{name} {number} there, {ours.get(name)} here" for name, number in run.versions.items() if ours.get(name) != number]
-    if other:
-        return [Remark("versions", Severity.WARN, f"{text}; the run has {'; '.join(other)}")]
-    return [Remark("versions", Severity.OK, f"{text}; the run has the same")]
+    theirs = {} if run is None else run.versions
+    other = [f"{name} {number} there, {ours.get(name)} here" for name, number in theirs.items() if ours.get(name) != number]
+    if run is not None:
+        text += f"; the run has {'; '.join(other) or 'the same'}"
+    yield Remark("versions", Severity.WARN if other else Severity.OK, text)
 
 
-def _endpoints(bus: Joined, live: LiveMonitor) -> list[Remark]:
+def _endpoints(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
     run, options = bus.target.run, bus.target.options
     links = {str(zid) for zid in (*bus.session.info.peers_zid(), *bus.session.info.routers_zid())}
     there = {entity.node: entity.zid for entity in live.graph.alive.values()}
     if run is None or options.mode == "client":
         where = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        return [Remark("endpoints", Severity.OK if links else Severity.BAD, f"{where}: {len(links)} links, domain {bus.domain}")]
-    findings = []
+        yield Remark("endpoints", Severity.OK if links else Severity.BAD, f"{where}: {len(links)} links, domain {bus.domain}")
+        return
     silent = [role for role in run.endpoints if there.get(role) not in links]
-    reached = len(run.endpoints) - len(silent)
-    text = (
-        f"{run.name}, process {run.pid}, {run.runtime}, domain {bus.domain}: {reached} of {len(run.endpoints)} endpoints answer"
-    )
-    findings.append(Remark("endpoints", Severity.WARN if silent else Severity.OK, text))
-    findings += [Remark("endpoints", Severity.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in silent]
-    return findings
+    count, reached = len(run.endpoints), len(run.endpoints) - len(silent)
+    text = f"{run.name}, process {run.pid}, {run.runtime}, domain {bus.domain}: {reached} of {count} endpoints answer"
+    yield Remark("endpoints", Severity.WARN if silent else Severity.OK, text)
+    yield from (Remark("endpoints", Severity.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in silent)
 
 
-def _shared_memory(bus: Joined) -> list[Remark]:
+def _shared_memory(bus: Joined) -> Iterator[Remark]:
     if not bus.target.options.shared_memory:
-        return [Remark("shared memory", Severity.OK, "off (PALPATE_SHARED_MEMORY=0): large messages go over the network")]
-    if not SHARED_MEMORY.is_dir():
-        return [Remark("shared memory", Severity.WARN, f"no {SHARED_MEMORY}: large messages go over the network")]
-    state = os.statvfs(SHARED_MEMORY)
-    free, size = state.f_bavail * state.f_frsize / 1e6, state.f_blocks * state.f_frsize / 1e6
-    level = Severity.WARN if free < MIN_SHARED_MEMORY_MB else Severity.OK
-    hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if level is Severity.WARN else ""
-    return [Remark("shared memory", level, f"{SHARED_MEMORY}: {free:.0f} MB of {size:.0f} MB free{hint}")]
+        yield Remark("shared memory", Severity.OK, "off (PALPATE_SHARED_MEMORY=0): large messages go over the network")
+    elif not SHARED_MEMORY.is_dir():
+        yield Remark("shared memory", Severity.WARN, f"no {SHARED_MEMORY}: large messages go over the network")
+    else:
+        state = os.statvfs(SHARED_MEMORY)
+        free, size = state.f_bavail * state.f_frsize / 1e6, state.f_blocks * state.f_frsize / 1e6
+        few = free < MIN_SHARED_MEMORY_MB
+        hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if few else ""
+        text = f"{SHARED_MEMORY}: {free:.0f} MB of {size:.0f} MB free{hint}"
+        yield Remark("shared memory", Severity.WARN if few else Severity.OK, text)
 
 
-def _clock(live: LiveMonitor) -> list[Remark]:
-    findings = []
+def _clock(live: LiveMonitor) -> Iterator[Remark]:
     time, progress = live.monitor.time.now, live.monitor.time.progress
+    text = "no time: no stamped message received"
     if time is not None:
         kind = "wall-clock" if live.monitor.rate == 1.0 else "simulated"
         moves = f"at {progress:.2f} x real time" if progress else "stands still (paused, or a service holds it up)"
-        findings.append(Remark("clock", Severity.OK if progress else Severity.WARN, f"{kind} time {time / 1e9:.2f} s, {moves}"))
-    else:
-        findings.append(Remark("clock", Severity.WARN, "no time: no stamped message received"))
+        text = f"{kind} time {time / 1e9:.2f} s, {moves}"
+    yield Remark("clock", Severity.OK if time is not None and progress else Severity.WARN, text)
     for name, age in live.offsets.items():
         if age < MIN_MESSAGE_AGE_MS:
             sender = live.monitor.rules.topics[name].producer
             text = f"the clock of {sender}'s host is at least {-age:.1f} ms ahead of ours ({name}); synchronise them (NTP, PTP)"
-            findings.append(Remark("clock", Severity.WARN, text))
-    return findings
+            yield Remark("clock", Severity.WARN, text)
 
 
-def _who(bus: Joined, live: LiveMonitor) -> list[Remark]:
-    rules = contract()
-    absent = graph.missing(rules, live.graph.alive.values(), bus.target.run)
+def _who(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
+    """Report missing and unknown roles, and which share a process."""
+    rules, alive = contract(), live.graph.alive.values()
+    absent = graph.missing(rules, alive, bus.target.run)
     workers = [role for role in absent if not rules.roles[role].observer]
-    others = [role for role in absent if rules.roles[role].observer]
-    strangers = sorted(live.graph.roles() - rules.roles.keys())
-    findings = [Remark("roles", Severity.BAD, f"{role} is missing: {rules.roles[role].doc}") for role in workers]
+    yield from (Remark("roles", Severity.BAD, f"{role} is missing: {rules.roles[role].doc}") for role in workers)
     if not workers:
-        findings.append(Remark("roles", Severity.OK, "all required roles are there"))
-    if others:
-        findings.append(Remark("roles", Severity.OK, f"without {', '.join(others)} (observers)"))
-    if strangers:
-        findings.append(Remark("roles", Severity.OK, f"also there: {', '.join(strangers)}"))
+        yield Remark("roles", Severity.OK, "all required roles are there")
+    if others := [role for role in absent if role not in workers]:
+        yield Remark("roles", Severity.OK, f"without {', '.join(others)} (observers)")
+    if strangers := sorted(live.graph.roles() - rules.roles.keys()):
+        yield Remark("roles", Severity.OK, f"also there: {', '.join(strangers)}")
     if live.graph.garbage:
-        findings.append(Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's"))
-    return findings
+        yield Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's")
+    shared = [f"{', '.join(names)} share one" for names in graph.processes(alive) if len(names) > 1]
+    text = "; ".join([*shared, "every other role has its own"]) if shared else "one per role"
+    yield Remark("processes", Severity.OK, text)
 
 
-def _processes(live: LiveMonitor) -> list[Remark]:
-    """Report which roles share a process."""
-    shared = [f"{', '.join(names)} share one" for names in graph.processes(live.graph.alive.values()) if len(names) > 1]
-    return [Remark("processes", Severity.OK, "; ".join([*shared, "every other role has its own"]) if shared else "one per role")]
-
-
-def _waiting(live: LiveMonitor) -> list[Remark]:
+def _progress(live: LiveMonitor) -> Iterator[Remark]:
     """Report which service waits for which, from the services' own reports."""
-    findings = []
     now = monotonic()
     for role, (_, received) in sorted(live.reports.items()):
         if now - received > SILENT_S:
-            findings.append(Remark("progress", Severity.WARN, f"{role} has not reported for {now - received:.0f} s"))
+            yield Remark("progress", Severity.WARN, f"{role} has not reported for {now - received:.0f} s")
     if live.reports and live.monitor.time.progress == 0:
         for role, (report, _) in sorted(live.reports.items()):
             wait = f"waits for {report.waiting_for}" if report.waiting_for else "waits for no service"
-            findings.append(Remark("progress", Severity.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}"))
+            yield Remark("progress", Severity.WARN, f"{role} is at {report.tick / 1e9:.3f} s and {wait}")
     elif live.reports:
         slowest = min((report for report, _ in live.reports.values()), key=lambda report: report.tick)
         text = f"{len(live.reports)} services report; the last of them, {slowest.role}, is at {slowest.tick / 1e9:.2f} s"
-        findings.append(Remark("progress", Severity.OK, text))
-    return findings
+        yield Remark("progress", Severity.OK, text)
 
 
 _COLOURS = {Severity.OK: "green", Severity.WARN: "yellow", Severity.BAD: "bold red"}

@@ -1,8 +1,10 @@
 """Topics and nodes of a live bus, from its liveliness tokens; `palpate node list`."""
 
 from collections.abc import Iterable
-from dataclasses import dataclass, field
+from itertools import groupby
+from operator import attrgetter
 from time import monotonic
+from typing import Any
 
 import typer
 from rich.text import Text
@@ -11,30 +13,7 @@ from palpate.console import print_json, table, wide_console
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import Contract, contract
 from palpate_bus.runs.announcement import Run
-from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
-
-
-@dataclass
-class LiveTopic:
-    """A topic on the bus."""
-
-    name: str
-    types: set[tuple[str, str]] = field(default_factory=set)
-    """(type, hash) of its endpoints; more than one is a mismatch."""
-    publishers: list[str] = field(default_factory=list)
-    subscribers: list[str] = field(default_factory=list)
-
-
-@dataclass
-class LiveNode:
-    """A node on the bus."""
-
-    name: str
-    zids: set[str] = field(default_factory=set)
-    publishes: list[str] = field(default_factory=list)
-    subscribes: list[str] = field(default_factory=list)
-    services: list[str] = field(default_factory=list)
-
+from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, GraphWatch
 
 QUIET_S = 0.3
 """Tokens arrive in a burst; after this long without a new one the list is taken as complete."""
@@ -58,31 +37,9 @@ def present(bus: Joined) -> list[Entity]:
         watch.close()
 
 
-def topics(found: Iterable[Entity]) -> dict[str, LiveTopic]:
-    """Return topics by name, sorted."""
-    by_name: dict[str, LiveTopic] = {}
-    for entity in found:
-        end = entity.endpoint
-        if end is None or entity.kind not in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION):
-            continue
-        topic = by_name.setdefault(end.topic, LiveTopic(end.topic))
-        topic.types.add((end.type, end.type_hash))
-        (topic.publishers if entity.kind is EntityKind.PUBLISHER else topic.subscribers).append(entity.node)
-    return dict(sorted(by_name.items()))
-
-
-def nodes(found: Iterable[Entity]) -> dict[str, LiveNode]:
-    """Return nodes by name, sorted."""
-    by_name: dict[str, LiveNode] = {}
-    for entity in found:
-        node = by_name.setdefault(entity.node, LiveNode(entity.node))
-        node.zids.add(entity.zid)
-        end = entity.endpoint
-        if end is None:
-            continue
-        kept = {EntityKind.PUBLISHER: node.publishes, EntityKind.SUBSCRIPTION: node.subscribes}.get(entity.kind, node.services)
-        kept.append(end.topic)
-    return dict(sorted(by_name.items()))
+def ends(found: Iterable[Entity], *kinds: EntityKind) -> list[tuple[str, Endpoint]]:
+    """Return node and endpoint of the entities of some kinds."""
+    return [(entity.node, entity.endpoint) for entity in found if entity.kind in kinds and entity.endpoint is not None]
 
 
 def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
@@ -122,20 +79,21 @@ def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = 
         found = present(bus)
         rules = contract()
         absent = missing(rules, found, bus.target.run)
-    rows = nodes(found).values()
+    listed: list[dict[str, Any]] = []
+    for name, own in groupby(sorted(found, key=attrgetter("node")), key=attrgetter("node")):
+        mine = list(own)
+        kinds = {"publishes": [EntityKind.PUBLISHER], "subscribes": [EntityKind.SUBSCRIPTION]}
+        kinds["services"] = [kind for kind in EntityKind if [kind] not in kinds.values()]
+        topics = {what: sorted(end.topic for _, end in ends(mine, *chosen)) for what, chosen in kinds.items()}
+        listed.append({"node": name, "role": name in rules.roles, "sessions": sorted({one.zid for one in mine}), **topics})
     if as_json:
-        listed = [
-            {"node": n.name, "role": n.name in rules.roles, "sessions": sorted(n.zids), "publishes": sorted(n.publishes),
-             "subscribes": sorted(n.subscribes), "services": sorted(n.services)}
-            for n in rows
-        ]  # fmt: skip
         print_json({"nodes": listed, "missing": absent})
         return
     out = table("node", "what", ">publishes", ">subscribes", "session")
-    for node in rows:
-        role = rules.roles.get(node.name)
+    for node in listed:
+        role = rules.roles.get(node["node"])
         what = role.doc if role is not None else Text("not a role of the contract", "dim")
-        out.add_row(node.name, what, str(len(node.publishes)), str(len(node.subscribes)), " ".join(sorted(node.zids)))
+        out.add_row(node["node"], what, *(str(len(node[key])) for key in ("publishes", "subscribes")), " ".join(node["sessions"]))
     wide_console().print(out)
     if absent:
         wide_console().print(f"not there: {', '.join(absent)}", style="dim")

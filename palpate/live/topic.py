@@ -1,8 +1,8 @@
 """`palpate topic list|info|echo|hz|bw`: topics on a live bus."""
 
 from collections import deque
-from collections.abc import Collection, Iterator
-from contextlib import contextmanager
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import fields, is_dataclass
 from math import inf
 from queue import Empty, SimpleQueue
@@ -22,6 +22,7 @@ from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.announcement import NoBus
+from palpate_bus.wire.liveliness import Entity, EntityKind
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
 from palpate_bus.wire.transport import subscribe
 
@@ -44,21 +45,36 @@ Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop af
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
     with joined(connect, run, domain) as bus:
-        found = graph.topics(graph.present(bus))
+        rows = _topic_rows(graph.present(bus))
     if as_json:
-        print_json([_topic_row(topic) for topic in found.values()])
+        print_json(rows)
         return
-    rules = contract().topics
     out = table("topic", "type", "published by", "subscribed by", "in the contract")
-    for topic in found.values():
-        row = rules.get(topic.name)
+    for topic in rows:
+        row = contract().topics.get(topic["topic"])
         known = Text("no", "yellow") if row is None else Text(_period(row))
-        if row is not None and {(row.type, row.type_hash)} != topic.types:
+        if row is not None and not topic["matches_contract"]:
             known = Text("other type or hash", "bold red")
-        types = ", ".join(sorted(name.replace("/msg/", "/") for name, _ in topic.types))
-        publishers = ", ".join(sorted(topic.publishers)) or Text("none", "yellow")
-        out.add_row(topic.name, types, publishers, ", ".join(sorted(topic.subscribers)), known)
+        types = ", ".join(one["type"].replace("/msg/", "/") for one in topic["types"])
+        publishers = ", ".join(topic["publishers"]) or Text("none", "yellow")
+        out.add_row(topic["topic"], types, publishers, ", ".join(topic["subscribers"]), known)
     wide_console().print(out)
+
+
+def _topic_rows(found: Sequence[Entity]) -> list[dict[str, Any]]:
+    """Return a row per topic, sorted: its types with their hashes, of which more than one is a mismatch, and its nodes."""
+    rows: dict[str, dict[str, Any]] = {}
+    for side, kind in (("publishers", EntityKind.PUBLISHER), ("subscribers", EntityKind.SUBSCRIPTION)):
+        for node, end in graph.ends(found, kind):
+            row = rows.setdefault(end.topic, {"topic": end.topic, "types": set(), "publishers": [], "subscribers": []})
+            row["types"].add((end.type, end.type_hash))
+            row[side] = sorted([*row[side], node])
+    for name, row in rows.items():
+        known = contract().topics.get(name)
+        row["in_contract"] = known is not None
+        row["matches_contract"] = known is not None and {(known.type, known.type_hash)} == row["types"]
+        row["types"] = [{"type": kind, "hash": digest} for kind, digest in sorted(row["types"])]
+    return [rows[name] for name in sorted(rows)]
 
 
 @app.command()
@@ -129,13 +145,12 @@ def hz(
 ) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
     with _subscribed(name, connect, run, domain) as (topic, reader):
-        spacing = Spacing()
+        rows: deque[tuple[int, int | None]] = deque(maxlen=SPACING_MESSAGES)
         for received in _each_period(reader, seconds):
-            for message in received:
-                spacing.add(message.sent_ns, _stamp_ns(message, topic))
-            _print_rate(spacing, topic, as_json)
-        if spacing.messages > 1:
-            _print_rate(spacing, topic, as_json, whole=True)
+            rows.extend((message.sent_ns, _stamp_ns(message, topic)) for message in received)
+            _print_rate(list(rows)[-len(received) - 1 :], topic, as_json)
+        if len(rows) > 1:
+            _print_rate(list(rows), topic, as_json, whole=True)
 
 
 @app.command()
@@ -152,7 +167,15 @@ def bw(
         window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
         for received in _each_period(reader, seconds):
             window.append([len(message.payload) for message in received])
-            _print_bandwidth(window, topic, as_json)
+            sizes = [size for period in window for size in period]
+            rate, mean = sum(sizes) / (len(window) * REPORT_PERIOD_S), sum(sizes) / max(len(sizes), 1)
+            if as_json:
+                print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
+            elif not sizes:
+                _print_none()
+            else:
+                size = f"{mean:.0f} B per message, {min(sizes)} to {max(sizes)}"
+                print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
 
 
 class Received(NamedTuple):
@@ -161,7 +184,6 @@ class Received(NamedTuple):
     sequence: int
     sent_ns: int
     """Source time, wall clock."""
-    gid: bytes
     payload: bytes
 
 
@@ -171,8 +193,6 @@ class TopicReader:
     def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
         self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
         self.name = topic.name
-        self.invalid = 0
-        """Messages without a valid attachment."""
         key = topic_key(topic, domain)
         handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
         self._subscriber = subscribe(session, key, handler, history=topic.latched)
@@ -184,53 +204,32 @@ class TopicReader:
                 sample = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
             except Empty:
                 return None
-            try:
+            with suppress(WireError, AttributeError):  # without a valid attachment
                 attachment: Any = sample.attachment
-                sequence, sent_ns, gid = unpack(attachment.to_bytes())
-            except (WireError, AttributeError):
-                self.invalid += 1
-                continue
-            return Received(sequence, sent_ns, gid, sample.payload.to_bytes())
+                sequence, sent_ns, _ = unpack(attachment.to_bytes())
+                return Received(sequence, sent_ns, sample.payload.to_bytes())
 
     def close(self) -> None:
         """Unsubscribes."""
         self._subscriber.undeclare()
 
 
-class Spacing:
-    """Source times and stamps of the last messages of a stream."""
-
-    def __init__(self) -> None:
-        self._sent_ns: deque[int] = deque(maxlen=SPACING_MESSAGES)
-        self._stamps_ns: deque[int | None] = deque(maxlen=SPACING_MESSAGES)
-        self.messages = 0
-        self._reported = 0
-
-    def add(self, sent_ns: int, stamp_ns: int | None) -> None:
-        """Add a message by its source time (wall clock) and its stamp."""
-        self._sent_ns.append(sent_ns)
-        self._stamps_ns.append(stamp_ns)
-        self.messages += 1
-
-    def summary(self, whole: bool = False) -> dict[str, Any]:
-        """Return rates and spacing since the last summary, or over all messages that are kept; by the sender's clocks."""
-        new = len(self._sent_ns) if whole else min(self.messages - self._reported + 1, len(self._sent_ns))
-        self._reported = self.messages
-        sent = np.array(list(self._sent_ns)[-new:], dtype=np.int64)
-        stamps = [stamp for stamp in list(self._stamps_ns)[-new:] if stamp is not None]
-        steps_ms = np.diff(sent) / 1e6
-        if steps_ms.size == 0 or not sent[-1] > sent[0]:
-            return {"messages": max(new - 1, 0), "wall_hz": None, "simulated_hz": None}
-        passed_ns = stamps[-1] - stamps[0] if len(stamps) > 1 else 0
-        return {
-            "messages": new if whole else new - 1,
-            "wall_hz": 1e3 * steps_ms.size / steps_ms.sum(),
-            "simulated_hz": 1e9 * (len(stamps) - 1) / passed_ns if passed_ns > 0 else None,
-            "mean_ms": float(steps_ms.mean()),
-            "least_ms": float(steps_ms.min()),
-            "most_ms": float(steps_ms.max()),
-            "std_ms": float(steps_ms.std()),
-        }
+def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
+    """Return rates and spacing of messages, given by source time and stamp [ns], by the sender's clocks."""
+    sent = np.array([source for source, _ in rows], dtype=np.int64)
+    stamps = [stamp for _, stamp in rows if stamp is not None]
+    steps_ms = np.diff(sent) / 1e6
+    if steps_ms.size == 0 or not sent[-1] > sent[0]:
+        return {"wall_hz": None, "simulated_hz": None}
+    passed_ns = stamps[-1] - stamps[0] if len(stamps) > 1 else 0
+    return {
+        "wall_hz": 1e3 * steps_ms.size / steps_ms.sum(),
+        "simulated_hz": 1e9 * (len(stamps) - 1) / passed_ns if passed_ns > 0 else None,
+        "mean_ms": float(steps_ms.mean()),
+        "least_ms": float(steps_ms.min()),
+        "most_ms": float(steps_ms.max()),
+        "std_ms": float(steps_ms.std()),
+    }
 
 
 @contextmanager
@@ -240,10 +239,14 @@ def _subscribed(name: str, connect: list[str] | None, run: str | None, domain: i
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:
-            live = graph.topics(graph.present(bus)).get(name)
-            if live is None:
+            live = [
+                end.type
+                for _, end in graph.ends(graph.present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+                if end.topic == name
+            ]
+            if not live:
                 raise _unknown(name)
-            kind = min(kind for kind, _ in live.types)
+            kind = min(live)
             try:
                 codec.message_type(kind)
             except codec.CodecError as error:
@@ -318,14 +321,19 @@ def _plain(value: Any, full: bool) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _print_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = False) -> None:
-    facts = spacing.summary(whole)
+def _print_none() -> None:
+    SteadyConsole(highlight=False).print("no messages", style="dim")
+
+
+def _print_rate(rows: Sequence[tuple[int, int | None]], topic: Topic, as_json: bool, whole: bool = False) -> None:
+    """Print the rate of the new messages, which follow the first of `rows`, or of the `whole` stream."""
+    facts = {"messages": max(len(rows) - (not whole), 0), **spacing(rows)}
     contract_hz = None if topic.latched or topic.event else 1000 / topic.period_ms
     if as_json:
         print_line({"topic": topic.name, "contract_hz": contract_hz, **facts})
         return
     if facts["messages"] < 2:
-        SteadyConsole(highlight=False).print("no messages", style="dim")
+        _print_none()
         return
     text = "in all: " if whole else ""
     text += f"{facts['wall_hz']:.4g} Hz"
@@ -333,19 +341,6 @@ def _print_rate(spacing: Spacing, topic: Topic, as_json: bool, whole: bool = Fal
     text += f" (contract {contract_hz:g} Hz)" if contract_hz else ""
     text += f"; spacing {facts['mean_ms']:.3g} ms mean, {facts['least_ms']:.3g} to {facts['most_ms']:.3g}"
     print(f"{text}, std {facts['std_ms']:.2g}; {facts['messages']} messages", flush=True)
-
-
-def _print_bandwidth(window: Collection[list[int]], topic: Topic, as_json: bool) -> None:
-    """`window`: the message sizes of the last periods."""
-    sizes = [size for period in window for size in period]
-    rate, mean = sum(sizes) / (len(window) * REPORT_PERIOD_S), sum(sizes) / max(len(sizes), 1)
-    if as_json:
-        print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
-    elif not sizes:
-        SteadyConsole(highlight=False).print("no messages", style="dim")
-    else:
-        size = f"{mean:.0f} B per message, {min(sizes)} to {max(sizes)}"
-        print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
 
 
 def _period(row: Topic) -> str:
@@ -365,15 +360,3 @@ def _contract_rows(row: Topic | None) -> list[tuple[str, str]]:
     facts += [("stale after", f"{row.max_age_ms} ms")] if row.max_age_ms else []
     facts += [("expires after", f"{row.expiry_ms} ms")] if row.expiry_ms else []
     return facts
-
-
-def _topic_row(topic: graph.LiveTopic) -> dict[str, Any]:
-    row = contract().topics.get(topic.name)
-    return {
-        "topic": topic.name,
-        "types": [{"type": name, "hash": digest} for name, digest in sorted(topic.types)],
-        "publishers": sorted(topic.publishers),
-        "subscribers": sorted(topic.subscribers),
-        "in_contract": row is not None,
-        "matches_contract": row is not None and {(row.type, row.type_hash)} == topic.types,
-    }
