@@ -1,5 +1,6 @@
 """Runs the conformance suite of a role, in this process or on a bus, with a progress bar, and prints the result."""
 
+import gc
 import os
 import shlex
 import subprocess
@@ -7,22 +8,249 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from pathlib import Path
+from time import monotonic, sleep, time_ns
+from typing import Any
 
 import typer
+import zenoh
 from rich.text import Text
 
 from palpate.apart import guarded, shared_numbers
-from palpate.check.live_rig import LiveRig
-from palpate.check.rig import ConformanceReport, Rig, RigSettings, ServiceRig, Verdict
+from palpate.check.rig import ConformanceReport, Feed, ReceivedMessage, Rig, RigSettings, ServiceRig, Verdict
 from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
+from palpate.live.topic import TopicReader
 from palpate_bus import implementations
+from palpate_bus.contract import MS
+from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runs.announcement import NoBus
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
+from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings
+from palpate_bus.wire.liveliness import EntityKind, GraphWatch, gid
+from palpate_bus.wire.rmw import AttachmentWriter, topic_key
+from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, session
+from palpate_inputs import parse_json
 from palpate_models.scenario.load import dump_scenario, view_of
+
+
+@dataclass(frozen=True)
+class ProtocolTiming:
+    """Intervals and limits of the run protocol."""
+
+    hello_s: float = 0.05
+    ready_s: float = 20.0
+    """For an implementation on the bus to answer on every edge."""
+    lead_ns: int = 200 * MS
+    """From the grant to the common start."""
+    control_s: float = 0.4
+    """Between control messages."""
+    finish_s: float = 10.0
+
+
+TIMING = ProtocolTiming()
+
+
+class LiveRig(Rig):
+    """One implementation of a role on the bus of `session`."""
+
+    live = True
+
+    def __init__(self, session: zenoh.Session, role: str, settings: RigSettings, domain: int = 0) -> None:
+        super().__init__(role, settings)
+        self._session = session
+        self._domain = domain
+        self.graph = GraphWatch(session, domain)
+        producers = {"conductor", *(topic.producer for topic, _ in self.rules.inputs(role))}
+        transport = Transport(session)
+        self._members = {name: Member(session, name, self.rules, domain, transport) for name in sorted(producers)}
+        self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.rules.inputs(role)}
+        self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL_TYPE, "event")
+        self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
+        self._readers = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
+        self._epoch = 0
+        self._last_control = 0.0
+        self.ready = False
+        self.finished = False
+        self.facts: dict[str, Any] = {}
+        """Facts that the implementation reported at its end."""
+        self.error = ""
+        """Error that it reported if it failed."""
+
+    # -- protocol
+
+    def await_implementation(self, seconds: float) -> None:
+        """Wait for the role to appear, send hello and start it. Raises NoBus if it does not appear within `seconds`."""
+        self.section("protocol")
+        gc.freeze()  # a full collection during a check would delay commands beyond their validity
+        end = monotonic() + seconds
+        while self.role.name not in self._others():
+            if monotonic() > end:
+                raise NoBus(
+                    f"no node {self.role.name!r} appeared within {seconds:.0f} s; it needs a liveliness token of that name"
+                )
+            self._say(RunControl.HELLO)
+            sleep(TIMING.hello_s)
+        self.expect("joins as a node of its role", True, self.role.name, self.role.name)
+        self._greet()
+        self._check_graph()
+        self._epoch = time_ns() + TIMING.lead_ns
+        self._say(RunControl.GRANT, self._epoch)
+        while time_ns() < self._epoch:
+            sleep(0.002)
+
+    def _others(self) -> set[str]:
+        self.graph.changes()
+        ours = str(self._session.zid())
+        return {entity.node for entity in self.graph.alive.values() if entity.zid != ours}
+
+    def _greet(self) -> None:
+        end = monotonic() + TIMING.ready_s
+        missing: list[str] | None = None
+        while missing != [] and monotonic() < end:
+            self._say(RunControl.HELLO)
+            for publisher in self._publishers.values():
+                publisher.hello()
+            sleep(TIMING.hello_s)
+            for message in self._received_reports():
+                if message.state == ServiceReport.READY:
+                    missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
+        self.ready = missing == []
+        got = (
+            "READY" if self.ready else "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
+        )
+        self.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
+
+    def _check_graph(self) -> None:
+        self.graph.changes()
+        ours = str(self._session.zid())
+        ends = [e for e in self.graph.alive.values() if e.node == self.role.name and e.zid != ours and e.endpoint is not None]
+        sent = {e.endpoint.topic: e.endpoint for e in ends if e.kind is EntityKind.PUBLISHER and e.endpoint is not None}
+        for topic in self.rules.outputs(self.role.name):
+            end = sent.pop(topic.name, None)
+            wanted = f"{topic.type} {topic.type_hash[:15]}"
+            got = "no publisher's token" if end is None else f"{end.type} {end.type_hash[:15]}"
+            if end is None and topic.name.startswith("sim/"):
+                self.skip(f"publishes {topic.name}", "hardware has no such sensor")
+                continue
+            self.equal(f"publishes {topic.name}", got, wanted)
+        self.expect("publishes nothing else", not sent, "the topics of its role only", ", ".join(sent) or "nothing else")
+
+    def finish(self) -> None:
+        """Send garbage to it, end it, and check its reactions."""
+        self.section("garbage")
+        self._disturb()
+        self.section("end")
+        self._say(RunControl.GRANT, self.t + 100 * MS, last=True)
+        end = monotonic() + TIMING.finish_s
+        while not self.finished and monotonic() < end:
+            self._received_reports()
+            self._drain()
+            sleep(0.02)
+        got = "FINISHED" if self.finished else f"FAILED: {self.error}" if self.error else "nothing"
+        self.expect("reports FINISHED at the end", self.finished, f"within {TIMING.finish_s:.0f} s", got)
+        self._say(RunControl.END)
+
+    def close(self) -> None:
+        """Abort an implementation that still runs, and leave the bus."""
+        self._say(RunControl.ABORT, reason="the conformance check is over")
+        for member in self._members.values():
+            member.leave()
+        self.graph.close()
+        for reader in self._readers.values():
+            reader.close()
+        self._reports.close()
+
+    def _disturb(self) -> None:
+        """Send undecodable bytes and messages of an unknown sender on every input."""
+        stranger = AttachmentWriter(gid("a stranger")).pack
+        for name in self._publishers:
+            topic = self.rules.topics[name]
+            key = topic_key(topic, self._domain)
+            self._session.put(key, b"\xff" * 40)
+            self._session.put(key, b"\xff" * 40, attachment=b"no attachment")
+            self._session.put(key, b"\xff" * 40, attachment=stranger(1, time_ns()))
+            self._next(name, b"\x00\x01\x00\x00\xff")
+        after = self.run(0.6, {})
+        self._received_reports()
+        silent = [t.name for t in self.rules.outputs(self.role.name) if t.periodic and self.log[t.name] and not after[t.name]]
+        there = self.role.name in self._others()
+        states = {"gone": not there, f"silent on {', '.join(silent)}": silent, f"failed: {self.error}": self.error}
+        got = next((text for text, so in states.items() if so), "continues")
+        self.equal("garbage on its inputs does not stop it", got, "continues")
+
+    def _received_reports(self) -> list[Any]:
+        received = []
+        while (sample := self._reports.get(0)) is not None:
+            try:
+                message = codec.decode(sample.payload, REPORT_TYPE)
+            except codec.CodecError as error:
+                self.undecodable.append(f"palpate/report: {error}")
+                continue
+            received.append(message)
+            if message.state == ServiceReport.FINISHED:
+                self.finished = True
+                self.facts = parse_json(message.detail or "{}", "the detail of palpate/report")
+            elif message.state == ServiceReport.FAILED:
+                self.error = message.detail
+        return received
+
+    def _say(self, command: int, tick: int = 0, last: bool = False, role: str = "", reason: str = "") -> None:
+        self._last_control = monotonic()
+        self._sequences["control"] += 1
+        message = RunControl(command, tick, last, role, reason)
+        self._control.put(codec.encode(message, CONTROL_TYPE), self._sequences["control"])
+
+    # -- the rig
+
+    def _advance(self, end: int, feed: Feed) -> None:
+        last = {name: (self.t - 1) // self.rules.topics[name].period for name in feed}
+        while True:
+            now = max(time_ns() - self._epoch, 0)
+            for name, source in feed.items():
+                period = self.rules.topics[name].period
+                if now // period > last[name]:
+                    last[name] = now // period
+                    message = source(last[name] * period)
+                    if message is not None:
+                        self.send(name, message)
+            self.t = now
+            self._drain()
+            if monotonic() - self._last_control > TIMING.control_s:
+                self._say(RunControl.GRANT, self._epoch)
+                self._received_reports()
+            if now >= end:
+                return
+            sleep(max(0.0, (MS - (time_ns() - self._epoch) % MS) / NS))
+
+    def send(self, topic: str, message: Message) -> None:
+        """Publish a message as its producer."""
+        self._next(topic, codec.encode(message, self.rules.topics[topic].type))
+
+    def lose(self, role: str) -> None:
+        """Report a role as lost, as a conductor does."""
+        self._say(RunControl.LOST, self.t, role=role, reason="conformance check")
+
+    def _next(self, topic: str, payload: bytes) -> None:
+        self._sequences[topic] += 1
+        self._publishers[topic].put(payload, self._sequences[topic])
+
+    def _drain(self) -> None:
+        for name, reader in self._readers.items():
+            kind = self.rules.topics[name].type
+            while (received := reader.get()) is not None:
+                try:
+                    message = codec.decode(received.payload, kind)
+                except codec.CodecError as error:
+                    self.undecodable.append(f"{name}: {error}")
+                    continue
+                self.log[name].append(ReceivedMessage(self.t, message, received.sequence, received.sent_ns))
 
 
 @contextmanager

@@ -1,6 +1,6 @@
 """Rigs that a conformance suite drives: one implementation of a role, with the suite in place of all other roles.
 
-`ServiceRig` runs a service in this process, in simulated time. `LiveRig` in `live_rig` connects to an unknown implementation on
+`ServiceRig` runs a service in this process, in simulated time. `LiveRig` in `perform` connects to an unknown implementation on
 a bus, in wall-clock mode. The same suites run on both.
 """
 

@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.check.live_rig import LiveRig
-from palpate.check.perform import started
+from palpate.check.perform import LiveRig, started
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import SUITES, check
 from palpate.check.suites.tissue import STILL

@@ -14,8 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.check.live_rig import LiveRig
-from palpate.check.perform import started
+from palpate.check.perform import LiveRig, started
 from palpate.check.rig import RigSettings
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet

@@ -239,7 +239,7 @@ def _case_process() -> psutil.Process | None:
     """Return a process of this test or its workers that examines a case."""
     for process in psutil.process_iter(["cmdline"]):
         words = process.info["cmdline"] or []
-        if "palpate.study.case" in words and psutil.Process() in process.parents():
+        if "palpate.study.runner" in words and psutil.Process() in process.parents():
             return process
     return None
 
