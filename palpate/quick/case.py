@@ -40,7 +40,7 @@ def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected
     """Return what a conductor would have collected before the assessment. The last state is in phase ASSESS."""
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model
-    sigma = examination.uncertainty_m
+    sigma = examination.loop.uncertainty_m
     phases = {stage: int(PHASE_OF[stage]) for stage in {row.stage for row in rows}}
     states = [_state(row, phases[row.stage], row.time, sigma) for row in rows]
     states.append(_state(rows[-1], ExamState.PHASE_ASSESS, rows[-1].time + LEAVES_S, sigma))

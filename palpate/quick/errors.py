@@ -179,9 +179,11 @@ class Loop:
         """Fraction of the breathing excursion that is followed."""
         self._centre = np.array(scenario.exam.centre_m)
         self._field = _field(scenario.exam, errors.field_m, errors.field_length_m, rng)
-        self._regulation = _Smooth(errors.regulation_m, errors.regulation_s, rng)
-        self._wander = _Smooth(errors.wander_m, errors.wander_s, rng)
-        self._sensor = _TaredSensor(scenario, self.begin_s)
+        self.regulation = _Smooth(errors.regulation_m, errors.regulation_s, rng)
+        """Measured depth less set-point [m]."""
+        self.wander = _Smooth(errors.wander_m, errors.wander_s, rng)
+        """Remaining error of depth [m]."""
+        self.sensor = _TaredSensor(scenario, self.begin_s)
 
     def wrong(self, xy: Array) -> Array:
         """Return the height of the perceived above the true surface at points [m], shape (p, 2) -> (p,)."""
@@ -190,30 +192,6 @@ class Loop:
     def zero(self, stroke: int) -> float:
         """Return the error of the zero of a stroke, counted from 1 [m]."""
         return float(self._drawn.zeros_m[(stroke - 1) % len(self._drawn.zeros_m)])
-
-    def regulation(self, k: int) -> float:
-        """Return measured depth less set-point in the k-th period [m]."""
-        return self._regulation.at(k)
-
-    def wander(self, k: int) -> float:
-        """Return the remaining error of depth in the k-th period [m]."""
-        return self._wander.at(k)
-
-    def gains(self, outward: Array) -> Array:
-        """Return rows that map a force to the measured normal force, for outward normals, both of shape (p, 3)."""
-        return self._sensor.gains(outward)
-
-    def lagging(self, force: float) -> float:
-        """Return what the sensor reads of a normal force [N] at the end of a period; called once per period."""
-        return self._sensor.lagging(force)
-
-    def tare(self, k: int) -> None:
-        """Tare the sensor by its readings in air just before the k-th period."""
-        self._sensor.tare(k)
-
-    def tared(self, k: int) -> float:
-        """Return the reading in the k-th period without a force, along the outward normal [N]."""
-        return self._sensor.tared(k)
 
 
 def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> RectBivariateSpline:
@@ -254,6 +232,7 @@ class _Smooth:
         return np.asarray(values)
 
     def at(self, k: int) -> float:
+        """Return the value in the k-th period."""
         while k >= len(self._values):
             self._values += self._next(self._BLOCK).tolist()
         return self._values[k]
@@ -286,6 +265,7 @@ class _TaredSensor:
             self._normal += (-self._sensor.block()[:, 2]).tolist()
 
     def gains(self, outward: Array) -> Array:
+        """Return rows that map a force to the measured normal force, for outward normals, both of shape (p, 3)."""
         z = -outward
         x = np.array((1.0, 0.0, 0.0)) - z[:, :1] * z
         x /= np.linalg.norm(x, axis=1, keepdims=True)
@@ -293,14 +273,17 @@ class _TaredSensor:
         return np.asarray(-np.einsum("i,pij->pj", self._row, axes))
 
     def lagging(self, force: float) -> float:
+        """Return what the sensor reads of a normal force [N] at the end of a period; called once per period."""
         self._felt = force + self._lag * (self._felt - force)
         return self._felt
 
     def tare(self, k: int) -> None:
+        """Tare the sensor by its readings in air just before the k-th period."""
         self._read(self._begin + k)
         now = self._begin + k
         self._tare = float(np.mean(self._normal[max(now - round(TOUCH.tare_s / PERIOD_S), 0) : now]))
 
     def tared(self, k: int) -> float:
+        """Return the reading in the k-th period without a force, along the outward normal [N]."""
         self._read(self._begin + k)
         return self._normal[self._begin + k] - self._tare

@@ -129,7 +129,8 @@ class QuickExamination:
 
     def __init__(self, scenario: Scenario, loop: Loop) -> None:
         """`loop`: errors of arm, camera and force sensor in this examination."""
-        self._scenario, self._loop = scenario, loop
+        self.loop = loop
+        """Errors of arm, camera and force sensor."""
         self._exam = scenario.exam
         self._X_WA = np.array(exam_input(scenario).X_WA)
         self.patient = Patient(scenario, time=loop.begin_s)
@@ -194,18 +195,13 @@ class QuickExamination:
         p, n = self._skin.points(seen_lattice(self._exam))
         seen = np.isfinite(p).all(axis=1)
         p, n = p[seen], n[seen]
-        p = p + n * self._loop.wrong(p[:, :2])[:, None]
+        p = p + n * self.loop.wrong(p[:, :2])[:, None]
         return apply(self._X_WA, p), n @ self._X_WA[:3, :3].T
 
     @property
     def shares(self) -> Array:
         """True share of the breathing excursion at each of these points, shape (n,)."""
         return np.asarray(self._breathing(apply(inverse(self._X_WA), self.perceived[0])[:, :2]))
-
-    @property
-    def uncertainty_m(self) -> float:
-        """Standard deviation of depth that the examination reports [m]."""
-        return self._loop.uncertainty_m
 
     def _lay(self, xy: Array, targets: Ints, visits: Ints | None = None, *, contact: bool = True) -> SkinPath:
         s, p, n, R = frames_along(self._believed, xy, _DOWN)
@@ -215,7 +211,7 @@ class QuickExamination:
         at = np.linspace(0.0, path.length, count + 1)
         dense = np.column_stack([np.interp(at, s, xy[:, k]) for k in (0, 1)])
         believed, outward = self._believed.at(dense)
-        place, normal = self._skin.points(dense + self._loop.aside_m)
+        place, normal = self._skin.points(dense + self.loop.aside_m)
         return SkinPath(
             segment=Segment(path, contact=contact),
             per_m=count / path.length if path.length else 0.0,
@@ -223,38 +219,38 @@ class QuickExamination:
             outward_W=outward.tolist(),
             place=apply(self._X_AtA, place),
             normal=normal @ self._X_AtA[:3, :3].T,
-            breathing=self._breathing(dense + self._loop.aside_m).tolist(),
-            error_m=self._loop.wrong(dense).tolist(),
+            breathing=self._breathing(dense + self.loop.aside_m).tolist(),
+            error_m=self.loop.wrong(dense).tolist(),
             target=targets[np.maximum(np.searchsorted(path.visits, at, side="right") - 1, 0)].tolist(),
-            gains=self._loop.gains(outward @ self._R_AtW.T),
+            gains=self.loop.sensor.gains(outward @ self._R_AtW.T),
         )
 
     # --- one period ---------------------------------------------------------------------------------------------------
 
     def _tare(self, stroke: int) -> None:
         """Tare the force sensor, and draw the error of the stroke's zero."""
-        self._loop.tare(self._count)
-        self._zero_m = self._loop.zero(stroke)
+        self.loop.sensor.tare(self._count)
+        self._zero_m = self.loop.zero(stroke)
 
     def _measured(self) -> ContactMeasurement:
         """Return the contact as measured at the end of the latest period."""
         measured = (self._depth, self._force, self._load, (_NOWHERE, _NOWHERE), self._touching)
-        return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallEstimate(0.0, 0.0, self.uncertainty_m), *measured)
+        return ContactMeasurement(_NO_ARM, _NOWHERE, _NOWHERE, _FOOT, WallEstimate(0.0, 0.0, self.loop.uncertainty_m), *measured)
 
     def _period(self, stage: StrokeStage, contact: ContactMeasurement) -> PeriodRow:
         """Move the indenter for a period, with the errors of this examination."""
-        motion, loop, patient, path, k = self._motion, self._loop, self.patient, self._path, self._count
+        motion, loop, patient, path, k = self._motion, self.loop, self.patient, self._path, self._count
         self._count += 1
         motion.regulate(contact, in_contact=self._touching and stage is not StrokeStage.LIFT, pushing=stage in PUSHING)
         at = int(motion.along.position * path.per_m + 0.5)
-        self._depth = motion.regulation.reference + loop.regulation(k)
+        self._depth = motion.regulation.reference + loop.regulation.at(k)
         share = path.breathing[at]
         excursion = patient.tissue.excursion(patient.time + PERIOD_S)
         unseen = (1.0 - loop.followed) * share * (excursion - self._mean_excursion)
-        depth = self._depth - path.error_m[at] - self._zero_m - loop.wander(k) + unseen
+        depth = self._depth - path.error_m[at] - self._zero_m - loop.wander.at(k) + unseen
         height = patient.radius - depth + share * excursion
         force = patient.move(path.place[at] + height * path.normal[at])
-        self._force = loop.lagging(float(path.gains[at] @ force)) + loop.tared(k)
+        self._force = loop.sensor.lagging(float(path.gains[at] @ force)) + loop.sensor.tared(k)
         along = float(path.normal[at] @ force)
         self._load = sqrt(self._force**2 + max(float(force @ force) - along**2, 0.0))
         self._touching = self._force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)

@@ -71,9 +71,9 @@ def test_the_depth_error_is_the_drawn_one() -> None:
 def test_a_tare_takes_the_bias_away() -> None:
     chosen = scenario(2, settings=SMALL)
     loop = Loop(chosen, loop_errors(chosen))
-    loop.tare(100)
-    assert abs(np.mean([loop.tared(k) for k in range(75, 100)])) < 1e-9
-    assert 0.0 < np.std([loop.tared(k) for k in range(100, 400)]) < 0.2
+    loop.sensor.tare(100)
+    assert abs(np.mean([loop.sensor.tared(k) for k in range(75, 100)])) < 1e-9
+    assert 0.0 < np.std([loop.sensor.tared(k) for k in range(100, 400)]) < 0.2
 
 
 @pytest.mark.parametrize(("name", "time"), [("regulation_m", "regulation_s"), ("wander_m", "wander_s")])
