@@ -85,10 +85,10 @@ class PatientHand(_Timed):
         patient, loop = self.patient, self._loop
         idle = self._begin(xy, depth) - depth / DESCENT_MPS - HOLD_S
         patient.rest(max(idle, 0.0))
-        loop.tare(self._period)
+        loop.sensor.tare(self._period)
         places, normals = patient.surface.points((xy + loop.aside_m)[None])
         place, normal = places[0], normals[0]
-        gain = loop.gains(normals)[0]
+        gain = loop.sensor.gains(normals)[0]
         share, wrong = float(self._breathing((xy + loop.aside_m)[None])[0]), self._depth_error(xy)
         measured, force, limited, held = 0.0, 0.0, False, 0
         depths: list[float] = []
@@ -101,9 +101,9 @@ class PatientHand(_Timed):
             measured = measured if at_depth else min(measured + DESCENT_MPS * PERIOD_S, depth)
             excursion = patient.tissue.excursion(patient.time + PERIOD_S)
             unseen = (1.0 - loop.followed) * share * (excursion - self._mean)
-            true = measured - wrong - loop.wander(self._period) + unseen
+            true = measured - wrong - loop.wander.at(self._period) + unseen
             felt = patient.move(place + (patient.radius - true + share * excursion) * normal)
-            force = float(gain @ felt) + loop.tared(self._period)
+            force = float(gain @ felt) + loop.sensor.tared(self._period)
             if at_depth:
                 depths.append(measured)
                 forces.append(force)

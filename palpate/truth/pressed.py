@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Final
+from typing import TYPE_CHECKING, Any, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,7 +22,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
 from palpate_models.patient.motion import Motion
-from palpate_models.patient.schema import Lesion, Phantom, Structure
+from palpate_models.patient.schema import Lesion, Structure
 from palpate_models.scenario.schema import Exam, Scenario
 
 
@@ -134,34 +134,6 @@ class Pressed:
     """Without structures [N], shape (p,)."""
 
 
-class Copies:
-    """Creates variants of a scenario's tissue."""
-
-    def __init__(self, scenario: Scenario) -> None:
-        self._scenario = scenario
-        self.phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none")})
-        """The patient without breathing."""
-
-    def with_lesions(self, lesions: Sequence[Lesion]) -> TissueBackend | None:
-        """Return the patient with exactly these lesions; None if the tissue cannot be copied."""
-        return self._copy(self.phantom.model_copy(update={"lesions": tuple(lesions)}))
-
-    def relaxed(self) -> TissueBackend | None:
-        """Return the patient without guarding; None if there is none."""
-        if not self.phantom.guarding:
-            return None
-        return self._copy(self.phantom.model_copy(update={"guarding": ()}))
-
-    def plain(self) -> TissueBackend | None:
-        """Return the patient without structures; None if there are none."""
-        if not self.phantom.structures:
-            return None
-        return self._copy(self.phantom.model_copy(update={"structures": ()}))
-
-    def _copy(self, phantom: Phantom) -> TissueBackend | None:
-        return true_tissue(self._scenario.model_copy(update={"phantom": phantom}))
-
-
 def true_tissue(scenario: Scenario) -> TissueBackend | None:
     """Return the tissue of a scenario, of any implementation, at rest, on a body that does not move.
 
@@ -179,21 +151,27 @@ def true_tissue(scenario: Scenario) -> TissueBackend | None:
     return service.backend if isinstance(service, TissueService) else None
 
 
+def resting_tissue(scenario: Scenario, **changes: Any) -> TissueBackend | None:
+    """Return the tissue of a patient who does not breathe, with other fields of the phantom; None if it cannot be copied."""
+    phantom = scenario.phantom.model_copy(update={"breathing": Breathing(kind="none"), **changes})
+    return true_tissue(scenario.model_copy(update={"phantom": phantom}))
+
+
 def press_patient(scenario: Scenario) -> Pressed | None:
     """Press the patient of a scenario over the examined region; return None if the tissue cannot be copied.
 
     Takes seconds; cached in the user's cache folder by patient, tier and indenter.
     """
-    copies, radius = Copies(scenario), scenario.robot.indenter_radius_m
-    lesions, structures = copies.phantom.lesions, copies.phantom.structures
-    body = copies.with_lesions(lesions)
+    phantom, radius = scenario.phantom, scenario.robot.indenter_radius_m
+    lesions, structures = phantom.lesions, phantom.structures
+    body = resting_tissue(scenario)
     if body is None:
         return None
     model = body.model
     skin = TrueSurface(TrueBody(model.vertices, model.triangles, np.eye(4)))
     places, normals = _places(skin, scenario.exam, (*lesions, *structures))
     arrays = (model.vertices, model.areas, model.stiffness, model.background, model.stiffening, model.tension)
-    words = (copies.phantom, scenario.services.tissue, radius)
+    words = (phantom.model_copy(update={"breathing": Breathing(kind="none")}), scenario.services.tissue, radius)
     key = content_key("pressed", _code(scenario), *arrays, places, *words)
 
     def press(tissue: TissueBackend, where: NDArray[np.bool_], otherwise: Array) -> Array:
@@ -206,17 +184,18 @@ def press_patient(scenario: Scenario) -> Pressed | None:
         force, limited = body.press(places, normals, radius)
         near = _near(places, lesions)
         healthy = force
-        if near.any() and (without := copies.with_lesions(())) is not None:
+        if near.any() and (without := resting_tissue(scenario, lesions=())) is not None:
             healthy = press(without, np.asarray(near.any(axis=0)), force)
         alone = []
         for i, mine in enumerate(near):
             felt = np.where(mine, healthy, force)
             shared = mine & np.delete(near, i, axis=0).any(axis=0)
-            others = copies.with_lesions([*lesions[:i], *lesions[i + 1 :]]) if shared.any() else None
+            rest = (*lesions[:i], *lesions[i + 1 :])
+            others = resting_tissue(scenario, lesions=rest) if shared.any() else None
             alone.append(felt if others is None else press(others, shared, felt))
-        slack = copies.relaxed()
+        slack = resting_tissue(scenario, guarding=()) if phantom.guarding else None
         relaxed = force if slack is None else press(slack, np.ones(len(places), dtype=bool), force)
-        bare = copies.plain()
+        bare = resting_tissue(scenario, structures=()) if structures else None
         plain = force if bare is None else press(bare, np.asarray(_near(places, structures).any(axis=0)), force)
         return np.stack((force, limited, healthy, relaxed, plain, *alone))
 

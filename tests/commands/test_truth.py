@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from palpate.truth.felt import Felt
-from palpate.truth.pressed import Copies, Pressed, Touched, TrueBody, TrueSurface, press_patient
+from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface, press_patient, resting_tissue
 from palpate_models.patient.phantom import flat_phantom
 from palpate_models.patient.schema import Lesion
 from palpate_models.scenario.load import load_scenario
@@ -47,7 +47,7 @@ def flat(folder: Path, *lesions: Lesion, k_w: float = 1.7e5) -> Scenario:
 
 def felt(scenario: Scenario) -> tuple[Pressed, Felt]:
     found = press_patient(scenario)
-    tissue = Copies(scenario).with_lesions(())
+    tissue = resting_tissue(scenario, lesions=())
     surface = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4)))
     return found, Felt(found, surface, scenario.exam)
 
@@ -121,7 +121,7 @@ def test_the_truth_of_guarding_is_that_of_a_slow_press(tmp_path: Path) -> None:
         guarding = f"{{centre_m: {middle.tolist()}, radii_m: [0.04, 0.04], ratio: 2.6, kind: {kind}}}"
         scenario = load_scenario("clean", [REGION, "phantom.lesions=[]", f"phantom.guarding=[{guarding}]"])
         found = press_patient(scenario)
-        tissue = Copies(scenario).with_lesions(())
+        tissue = resting_tissue(scenario, lesions=())
         at = np.linalg.norm(found.places[:, :2] - middle, axis=1).argsort()[:2]
         normals = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4))).points(found.places[at, :2])[1]
         slow, _ = TissueBackend.press(tissue, found.places[at], normals, scenario.robot.indenter_radius_m)
