@@ -1,11 +1,10 @@
-"""Arrays for drawing: messages as arrays, and mesh geometry (vertex normals, shading, transfer of values between meshes)."""
+"""Arrays for drawing: messages as arrays, and mesh geometry (shading, transfer of values between meshes)."""
 
 from typing import Any
 
 import numpy as np
 import trimesh
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
 from palpate_bus.messages import Transform
@@ -14,11 +13,6 @@ from palpate_models.numerics.frames import Array
 
 Floats = NDArray[np.floating[Any]]
 Indices = NDArray[np.integer[Any]]
-
-
-def points(items: Any) -> Array:
-    """Return Points or Vector3s as an array, shape (n, 3)."""
-    return np.array([(p.x, p.y, p.z) for p in items], dtype=np.float64).reshape(-1, 3)
 
 
 def transform(message: Transform) -> Array:
@@ -44,24 +38,6 @@ def cloud(message: Message) -> NDArray[np.float32]:
     rows = np.frombuffer(np.ascontiguousarray(message.data), dtype=layout, count=message.width * message.height)
     xyz = np.stack((rows["x"], rows["y"], rows["z"]), axis=1).astype(np.float32)
     return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])
-
-
-class VertexNormals:
-    """Computes outward unit normals of a deforming mesh with fixed triangles."""
-
-    def __init__(self, triangles: Indices, vertices: int) -> None:
-        """`triangles`: shape (m, 3), counter-clockwise seen from outside; `vertices`: their number."""
-        self._triangles = triangles
-        columns = np.repeat(np.arange(len(triangles)), 3)
-        ones = np.ones(columns.size, dtype=np.float32)
-        self._sum = csr_array((ones, (triangles.ravel(), columns)), shape=(vertices, len(triangles)))
-
-    def __call__(self, positions: Floats) -> NDArray[np.float32]:
-        """Return area-weighted normals, shape (n, 3), at `positions` [m], shape (n, 3)."""
-        a, b, c = (positions[self._triangles[:, i]] for i in range(3))
-        normals = np.asarray(self._sum @ np.cross(b - a, c - a).astype(np.float32))
-        length = np.sqrt(np.einsum("ij,ij->i", normals, normals))
-        return np.asarray(normals / np.maximum(length, 1e-20)[:, None], dtype=np.float32)
 
 
 def shaded(

@@ -13,10 +13,11 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_in_metres, quaternion, transform_matrix
+from palpate_bus.messages.geometry import depth_in_metres, quaternion, transform_matrix, vectors
 from palpate_dashboard import palette
-from palpate_dashboard.arrays import Carry, Floats, Indices, VertexNormals, cloud, points, shaded, transform, triples
+from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, shaded, transform, triples
 from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
+from palpate_models.patient.mesh import vertex_normals
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Camera, Robot
@@ -59,7 +60,7 @@ class SceneView:
         self._canvas = canvas
         self._shapes = dict(_link_shapes(robot))
         self._poses: dict[str, Floats] = {}
-        self._normals: VertexNormals | None = None
+        self._triangles: Indices | None = None
         self._rest: NDArray[np.float32] | None = None
         self._drawn: NDArray[np.float32] | None = None
         self._map_vertices: NDArray[np.float32] | None = None
@@ -95,19 +96,17 @@ class SceneView:
     def abdomen(self, t: int, message: Message) -> None:
         """Draw the deformed surface; its triangles come with the first message only."""
         vertices = triples(message.vertices)
-        if self._normals is None:
-            triangles = triples(message.triangles)
-            self._normals = VertexNormals(triangles, len(vertices))
-            self._rest = vertices
+        if self._triangles is None:
+            self._triangles, self._rest = triples(message.triangles), vertices
             skin = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
-            self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=triangles))
+            self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=self._triangles))
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=skin), t)
             self._canvas.recording.flush()  # a live viewer must receive the triangles before the vertices
         rounded = np.round(vertices / RESOLUTION_M).astype(np.float32) * np.float32(RESOLUTION_M)
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
-        normals = np.round(self._normals(rounded) * 64.0) / np.float32(64.0)
+        normals = np.round(vertex_normals(rounded, self._triangles) * 64.0).astype(np.float32) / np.float32(64.0)
         self._canvas.add("world/abdomen", deformations, t, (rounded, normals))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Floats, scanned: NDArray[np.bool_]) -> None:
@@ -187,7 +186,7 @@ class SceneView:
     def perceived(self, t: int, message: Message) -> None:
         """Draw the perceived rest surface."""
         vertices, triangles = triples(message.vertices), triples(message.triangles)
-        normals = VertexNormals(triangles, len(vertices))(vertices)
+        normals = vertex_normals(vertices, triangles)
         shape = rr.Mesh3D(
             vertex_positions=vertices, triangle_indices=triangles, vertex_normals=normals, albedo_factor=palette.POINTS
         )
@@ -195,15 +194,17 @@ class SceneView:
 
     def targets(self, t: int, message: Message) -> None:
         """Draw palpation targets and outward normals."""
-        positions = points(message.positions)
+        positions = vectors(message.positions)
         dots = rr.Points3D(positions, colors=[palette.TARGETS], radii=[0.001])
         self._canvas.log("world/perception/targets", dots, t)
-        needles = rr.Arrows3D(origins=positions, vectors=0.02 * points(message.normals), colors=[palette.TARGETS], radii=[0.0004])
+        needles = rr.Arrows3D(
+            origins=positions, vectors=0.02 * vectors(message.normals), colors=[palette.TARGETS], radii=[0.0004]
+        )
         self._canvas.log("world/perception/normals", needles, t)
 
     def planned(self, t: int, message: Message) -> None:
         """Draw the planned path of the tool."""
-        positions = points(pose.pose.position for pose in message.poses)
+        positions = vectors(pose.pose.position for pose in message.poses)
         shape = rr.LineStrips3D([positions], colors=[palette.PLANNED], radii=[rr.Radius.ui_points(0.5)])
         self._canvas.log("world/plan/path", shape, t)
 

@@ -15,19 +15,19 @@ from numpy.typing import NDArray
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import RobotStatus, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_matrix
+from palpate_bus.messages.geometry import pose_matrix, vectors
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_dashboard import arrays, plots, text
-from palpate_dashboard.arrays import VertexNormals
 from palpate_dashboard.layout import blueprint
 from palpate_dashboard.plots import ForceDepth, ForceDepthPlane, Plots, depth_mm
 from palpate_dashboard.scene import MapView, SceneView
 from palpate_dashboard.sinks import Canvas, Live, open_recording
 from palpate_models.numerics.frames import apply
 from palpate_models.numerics.maps import half_width, level_lines
+from palpate_models.patient.mesh import vertex_normals
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -180,7 +180,7 @@ class DashboardService(Service):
     def _phantom(self, t: int, message: Message) -> None:
         vertices = arrays.triples(message.surface.vertices)
         triangles = arrays.triples(message.surface.triangles)
-        raised = vertices + ABOVE_SKIN_M * VertexNormals(triangles, len(vertices))(vertices)
+        raised = vertices + ABOVE_SKIN_M * vertex_normals(vertices, triangles)
         ratio = np.asarray(message.stiffness) / np.asarray(message.background)
         lesion = np.asarray(message.lesion)
         outlines = []
@@ -268,7 +268,7 @@ class DashboardService(Service):
         lines = [text.finding(f) for f in message.findings]
         if lines != self._found:
             self._found = lines
-            centroids = arrays.points(f.centroid for f in message.findings)
+            centroids = vectors(f.centroid for f in message.findings)
             labels = [f"{f.quadrant} {f.ratio:.1f} x" for f in message.findings]
             self._map.findings(t, centroids, labels)
             self._scene.findings(t, apply(self._X_WA, centroids), labels)

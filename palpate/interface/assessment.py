@@ -30,16 +30,14 @@ from palpate.report.rows import FindingRow
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
 from palpate.run.roles import foreign_roles
-from palpate_bus.messages import ExamState, SurfaceMesh
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.numerics.maps import half_width
 from palpate_models.scenario.load import exam_input
 from palpate_planning.contact import THRESHOLDS
-
-_NO_TRIANGLES = np.empty(0, np.uint32)
-_NO_SHARES = np.empty(0, np.float32)
 
 DEPTH_SD_M = 0.0003
 """Published SD of depth [m]: indenter and skin are known exactly except between the points of the mesh (assumed)."""
@@ -193,8 +191,8 @@ def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
     states = list(chain.from_iterable(_states(touch, X_WA, stroke) for stroke, touch in enumerate(touches, start=1)))
     over = round((float(touches[-1].time[-1]) + 2 * PERIOD_S) * NS)
     states.append(_state(over, ExamState.PHASE_ASSESS, X_WA[:3, 3], R_WA[:, 2], len(touches)))
-    places, normals = ((a.astype(np.float32).ravel()) for a in (apply(X_WA, seen.places), seen.normals @ R_WA.T))
-    return Collected(exam_states=states, surface=SurfaceMesh(header(0, "world"), places, normals, _NO_TRIANGLES, _NO_SHARES))
+    surface = mesh_message(header(0, "world"), apply(X_WA, seen.places), seen.normals @ R_WA.T)
+    return Collected(exam_states=states, surface=surface)
 
 
 def _states(touch: Touch, X_WA: Array, stroke: int) -> list[Any]:

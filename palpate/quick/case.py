@@ -18,9 +18,9 @@ from palpate.report.results import assemble, truth_of_run
 from palpate.report.rows import Report
 from palpate.run.composed import load_services
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, SurfaceMesh, codec
+from palpate_bus.messages import ExamState, IndentationTruth, PhantomTruth, Point, codec
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import pose_message
+from palpate_bus.messages.geometry import mesh_message, pose_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.service import Service
@@ -32,8 +32,6 @@ from palpate_planning.status import PHASE_OF
 
 LEAVES_S: Final = 1.0
 """Time from the last stroke to the request for findings."""
-_NO_TRIANGLES: Final = np.empty(0, np.uint32)
-_NO_SHARES: Final = np.empty(0, np.float32)
 
 
 def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected:
@@ -44,18 +42,14 @@ def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected
     phases = {stage: int(PHASE_OF[stage]) for stage in {row.stage for row in rows}}
     states = [_state(row, phases[row.stage], row.time, sigma) for row in rows]
     states.append(_state(rows[-1], ExamState.PHASE_ASSESS, rows[-1].time + LEAVES_S, sigma))
-    skin, normals = (a.astype(np.float32).ravel() for a in (model.vertices, model.normals))
-    rest = SurfaceMesh(header(0, "abdomen"), skin, normals, model.triangles.astype(np.uint32).ravel(), _NO_SHARES)
+    rest = mesh_message(header(0, "abdomen"), model.vertices, model.normals, model.triangles)
     pose = pose_message(X_WA[:3, :3], X_WA[:3, 3])
-    seen_vertices, seen_normals = (a.astype(np.float32).ravel() for a in examination.perceived)
     return Collected(
         exam_states=states,
         indentation=_indentations(examination.patient, rows),
         exam_time=round(rows[-1].time * NS),
         phantom=PhantomTruth(rest, model.stiffness, model.background, model.lesion, pose),
-        surface=SurfaceMesh(
-            header(0, "world"), seen_vertices, seen_normals, _NO_TRIANGLES, examination.shares.astype(np.float32)
-        ),
+        surface=mesh_message(header(0, "world"), *examination.perceived, breathing=examination.shares),
     )
 
 

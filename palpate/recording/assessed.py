@@ -12,7 +12,8 @@ from palpate_assessment.grid import map_grid
 from palpate_assessment.places import places_of
 from palpate_assessment.sampling import ForceSample
 from palpate_assessment.service import findings_message, map_message, sample_message
-from palpate_bus.messages import ExamState, SurfaceMesh
+from palpate_bus.messages import ExamState
+from palpate_bus.messages.geometry import mesh_message
 from palpate_bus.messages.stamps import NS, header
 from palpate_conductor.collector import Collected
 from palpate_models.scenario.schema import Exam
@@ -26,13 +27,7 @@ def collected(recording: PalpationRecording) -> Collected:
     """Return samples, map and findings of a recording, and its readings, as a conductor collects them."""
     samples = recording.samples()
     gathered = Collected(exam_states=_states(recording), samples=[sample_message(sample) for sample in samples])
-    gathered.surface = SurfaceMesh(
-        header(0, "abdomen"),
-        recording.surface.astype(np.float32).ravel(),
-        recording.normals.astype(np.float32).ravel(),
-        np.empty(0, np.uint32),
-        np.empty(0, np.float32),
-    )
+    gathered.surface = mesh_message(header(0, "abdomen"), recording.surface, recording.normals)
     gathered.findings = findings_message(0, [], [])
     if not samples:
         return gathered
