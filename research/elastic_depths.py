@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate.report.evidence import found_of, map_of
+from palpate.report.evidence import map_of
+from palpate.report.rows import finding_rows
 from palpate.report.scoring import score
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Stiffness
@@ -32,7 +33,7 @@ def measure(depth_mm: float, seed: int = 0, settings: tuple[str, ...] = ()) -> d
 
     data, truth = scans.scan(scenario, tissue_of=tissue), scans.truth_of(scenario)
     stiffness_map, findings, _ = scans.examine(data)
-    found = found_of(findings.findings)
+    found = finding_rows(findings.findings)
     s = score(found, map_of(stiffness_map), truth)
     lesion = np.asarray(scenario.phantom.lesions[0].centre_m)
     return {
@@ -44,7 +45,7 @@ def measure(depth_mm: float, seed: int = 0, settings: tuple[str, ...] = ()) -> d
         "false": s.false_findings,
         "ratio": [round(f.ratio, 2) for f in found],
         "place_mm": None if s.place_error_m is None else 1e3 * s.place_error_m,
-        "from_lump_axis_mm": [round(1e3 * float(np.linalg.norm(f.centroid[:2] - lesion)), 1) for f in found],
+        "from_lump_axis_mm": [round(1e3 * float(np.linalg.norm(f.centroid_m[:2] - lesion)), 1) for f in found],
         "dice": s.dice,
         "coverage_90": s.coverage_90,
     }

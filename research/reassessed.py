@@ -21,8 +21,9 @@ from scipy.stats import binomtest, bootstrap
 
 from palpate.quick.case import assess
 from palpate.report.archive import collect
-from palpate.report.evidence import found_of, map_of
+from palpate.report.evidence import map_of
 from palpate.report.results import Known, truth_of_run
+from palpate.report.rows import finding_rows
 from palpate.report.scoring import Scores, score
 from palpate.run.composed import load_services
 from palpate_bus.messages.stamps import NS, nanoseconds
@@ -84,7 +85,7 @@ def again(scenario: Scenario, collected: Collected, known: Known, row: str) -> S
     assess(service, gathered)
     assert known.felt is not None
     assert gathered.findings is not None
-    return score(found_of(gathered.findings.findings), map_of(gathered.stiffness_map), known.felt)
+    return score(finding_rows(gathered.findings.findings), map_of(gathered.stiffness_map), known.felt)
 
 
 def line(name: str, scores: Sequence[Scores]) -> str:

@@ -13,7 +13,8 @@ import numpy as np
 from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
 
-from palpate.report.evidence import felt_truth, found_of, map_of
+from palpate.report.evidence import felt_truth, map_of
+from palpate.report.rows import finding_rows
 from palpate.report.scoring import Scores, Truth, score
 from palpate.truth.pressed import Touched, TrueBody, press_patient
 from palpate_assessment.service import AssessmentService
@@ -221,7 +222,9 @@ def examine(data: Scan) -> tuple[Any | None, Any, list[Any]]:
 def scored(data: Scan) -> Scores:
     """Return the scores of the service on a scan."""
     stiffness_map, findings, _ = examine(data)
-    return score(found_of(findings.findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario))
+    return score(
+        finding_rows(findings.findings), None if stiffness_map is None else map_of(stiffness_map), truth_of(data.scenario)
+    )
 
 
 def scenario_with(lesions: tuple[Lesion, ...], seed: int) -> Scenario:

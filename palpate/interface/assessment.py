@@ -25,8 +25,7 @@ from palpate.quick.patient import PERIOD_S, Seen, Touch
 from palpate.recording.assessed import collected
 from palpate.recording.recording import PalpationRecording
 from palpate.report.evidence import map_of, sample_columns
-from palpate.report.results import finding_row
-from palpate.report.rows import FindingRow
+from palpate.report.rows import FindingRow, finding_rows
 from palpate.report.scoring import Map
 from palpate.run.composed import load_services
 from palpate.run.roles import foreign_roles
@@ -179,7 +178,7 @@ def _assessment(gathered: Collected, facts: dict[str, Any]) -> Assessment:
     return Assessment(
         samples=samples_frame(gathered.samples),
         map=None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map),
-        findings=findings_frame([finding_row(f) for f in ([] if gathered.findings is None else gathered.findings.findings)]),
+        findings=findings_frame([] if gathered.findings is None else finding_rows(gathered.findings.findings)),
         facts=facts,
     )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 from dataclasses import dataclass
 from math import hypot
 from operator import attrgetter
@@ -11,7 +11,7 @@ from typing import Any, Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.report.scoring import Found, Map, Truth
+from palpate.report.scoring import Map, Truth
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
 from palpate_bus.messages import StiffnessMap
@@ -98,14 +98,6 @@ def unassessed_of(message: Any) -> dict[str, float]:
     codes = np.asarray(message.unassessed)
     reasons = {"contradicted": StiffnessMap.CONTRADICTED, "yielded": StiffnessMap.YIELDED}
     return {reason: float(area[codes == code].sum()) for reason, code in reasons.items() if (codes == code).any()}
-
-
-def found_of(areas: Sequence[Any]) -> list[Found]:
-    """Return findings or candidates from their `palpation_msgs/Finding`."""
-    return [
-        Found(np.array((f.centroid.x, f.centroid.y, f.centroid.z)), f.area, f.ratio, (f.ratio_lower, f.ratio_upper))
-        for f in areas
-    ]
 
 
 def sample_columns(messages: Iterable[Any]) -> dict[str, NDArray[Any]]:

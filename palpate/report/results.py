@@ -16,7 +16,7 @@ from rich.table import Table
 from palpate.apart import guarded
 from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
-from palpate.report.rows import DepthRow, FindingRow, LumpRow, RecordedRow, Report, TruthRow
+from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, TruthRow
 from palpate.truth.pressed import Pressed, TrueBody, press_patient
 from palpate_bus import implementations
 from palpate_bus.runs.run_folder import run_of
@@ -78,10 +78,12 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
     c = result.collected
     found = None if c.stiffness_map is None else evidence.map_of(c.stiffness_map)
     final = c.findings if c.findings is not None and c.findings.final else None
+    findings = [] if final is None else rows.finding_rows(final.findings)
+    candidates = [] if final is None else rows.finding_rows(final.candidates)
     depth = _depth(known)
     scores = None
     if known.felt is not None and final is not None:
-        scores = scoring.score(evidence.found_of(final.findings), found, known.felt, evidence.found_of(final.candidates))
+        scores = scoring.score(findings, found, known.felt, candidates)
     steady = np.array([s.normal_force for s in c.exam_states if s.steady])
     runs = (*result.earlier, c)
     forces = [evidence.peak_force(m) for run in runs for m in run.indentation]
@@ -111,8 +113,8 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
         assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
         prevalence=None if final is None else scenario.exam.prevalence,
-        findings=[finding_row(f) for f in ([] if final is None else final.findings)],
-        candidates=[finding_row(f) for f in ([] if final is None else final.candidates)],
+        findings=findings,
+        candidates=candidates,
         unassessed_m2=_unfelt(scenario, result) | ({} if c.stiffness_map is None else evidence.unassessed_of(c.stiffness_map)),
         background_N=None if c.stiffness_map is None else float(c.stiffness_map.background),
         truth=None if known.body is None else _truth(known.felt),
@@ -271,23 +273,6 @@ def _beyond_bands(s: scoring.Scores) -> str:
     if not outside:
         return ""
     return ", outside its 90 % band" if s.matched == 1 else f", {outside} of {s.matched} outside their 90 % bands"
-
-
-def finding_row(f: Any) -> FindingRow:
-    """Return the row of a `palpation_msgs/Finding`."""
-    return FindingRow(
-        centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
-        quadrant=f.quadrant,
-        area_m2=f.area,
-        ratio=f.ratio,
-        ratio_90=(f.ratio_lower, f.ratio_upper),
-        confidence=f.confidence,
-        guarding=f.guarding,
-        ridge=f.ridge,
-        bone=f.bone,
-        soft=f.soft,
-        kind=rows.KINDS[f.kind],
-    )
 
 
 def _truth(truth: scoring.Truth | None) -> TruthRow:

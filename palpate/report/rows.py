@@ -45,6 +45,26 @@ class FindingRow(_Row):
     """The most probable of lump, muscle, ridge, bone and soft_defect."""
 
 
+def finding_rows(areas: Iterable[Any]) -> list[FindingRow]:
+    """Return the rows of findings or candidates, `palpation_msgs/Finding`."""
+    return [
+        FindingRow(
+            centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
+            quadrant=f.quadrant,
+            area_m2=f.area,
+            ratio=f.ratio,
+            ratio_90=(f.ratio_lower, f.ratio_upper),
+            confidence=f.confidence,
+            guarding=f.guarding,
+            ridge=f.ridge,
+            bone=f.bone,
+            soft=f.soft,
+            kind=KINDS[f.kind],
+        )
+        for f in areas
+    ]
+
+
 class LumpRow(_Row):
     """Palpable truth of a lump."""
 

@@ -6,9 +6,11 @@ matches by its centroid, and only a lump that no finding matches. Places are tho
 of the abdomen frame A; areas are on the skin.
 """
 
+from __future__ import annotations
+
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import TYPE_CHECKING, Final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,6 +21,9 @@ from scipy.spatial import Delaunay
 from palpate.truth.felt import Felt, Lump
 from palpate.truth.pressed import Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array, apply
+
+if TYPE_CHECKING:
+    from palpate.report.rows import FindingRow
 
 Mask = NDArray[np.bool_]
 
@@ -40,20 +45,6 @@ class Map:
     """Within reach of a sample."""
     finding: NDArray[np.int32]
     """Index of the finding of each vertex, -1 if none."""
-
-
-@dataclass(frozen=True)
-class Found:
-    """A finding as reported by the examination."""
-
-    centroid: Array
-    """[m], shape (3,), in A as registered."""
-    area: float
-    """On the surface [m^2]."""
-    ratio: float
-    """Apparent stiffness relative to the surroundings [1]."""
-    band: tuple[float, float]
-    """Its 90 % band."""
 
 
 @dataclass(frozen=True)
@@ -125,7 +116,7 @@ class Scores:
     """Scores of candidates, which do not count in the fields above."""
 
 
-def score(found: Sequence[Found], found_map: Map | None, truth: Truth, candidates: Sequence[Found] = ()) -> Scores:
+def score(found: Sequence[FindingRow], found_map: Map | None, truth: Truth, candidates: Sequence[FindingRow] = ()) -> Scores:
     """Return the scores of findings, of the map with their areas, and of candidates, the most probable first.
 
     Without a map a finding has only a place, like a candidate.
@@ -200,23 +191,23 @@ def _dice(felt: Felt, mask: Mask, places: Array, lump: Lump) -> float:
     return 2 * both / (float(felt.cells[mask].sum()) + lump.area)
 
 
-def _within(found: Sequence[Found], truth: Truth) -> Mask:
+def _within(found: Sequence[FindingRow], truth: Truth) -> Mask:
     """Return True where the centroid of an area lies in the area of a lump, shape (findings, lumps)."""
     lumps = truth.felt.lumps
     if not found or not lumps:
         return np.zeros((len(found), len(lumps)), dtype=bool)
-    centroids = truth.touched.places(np.array([f.centroid[:2] for f in found]))
+    centroids = truth.touched.places(np.array([f.centroid_m[:2] for f in found]))
     return np.stack([truth.felt.inside(lump.inside, centroids) for lump in lumps], axis=1)
 
 
-def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth) -> tuple[FindingScore, ...]:
+def _candidate_scores(candidates: Sequence[FindingRow], taken: set[int], truth: Truth) -> tuple[FindingScore, ...]:
     """Return the scores of candidates. Each matches the first lump around its centroid that is not matched yet."""
     rows = []
     felt = truth.felt
     for candidate, within in zip(candidates, _within(candidates, truth), strict=True):
         lump = next((int(j) for j in np.flatnonzero(within) if int(j) not in taken), None)
         taken = taken | {lump} if lump is not None else taken
-        centroid = truth.touched.places(candidate.centroid[None, :2])
+        centroid = truth.touched.places(np.array([candidate.centroid_m[:2]]))
         on_structure, on_guarding = (
             lump is None and bool(felt.inside(area, centroid)[0]) for area in (felt.structured, felt.guarded)
         )
@@ -224,7 +215,7 @@ def _candidate_scores(candidates: Sequence[Found], taken: set[int], truth: Truth
     return tuple(rows)
 
 
-def _match(found: Sequence[Found], dice: Array, within: Mask) -> dict[int, int]:
+def _match(found: Sequence[FindingRow], dice: Array, within: Mask) -> dict[int, int]:
     """Return the lump of each matched finding."""
     if not within.size:
         return {}
@@ -234,16 +225,16 @@ def _match(found: Sequence[Found], dice: Array, within: Mask) -> dict[int, int]:
 
 
 def _finding_score(
-    finding: Found, index: int | None, dice: float | None, true_ratio: float | None, over: tuple[bool, bool], truth: Truth
+    finding: FindingRow, index: int | None, dice: float | None, true_ratio: float | None, over: tuple[bool, bool], truth: Truth
 ) -> FindingScore:
     """Return the score of a finding that matches the lump `index`; `over`: it is false on guarding, it is on a structure."""
     place = absolute = size = None
     if index is not None:
         lump = truth.felt.lumps[index]
-        place = float(np.linalg.norm(truth.touched.places(finding.centroid[None, :2])[0] - lump.centroid))
-        size = finding.area / lump.area - 1
+        place = float(np.linalg.norm(truth.touched.places(np.array([finding.centroid_m[:2]]))[0] - lump.centroid))
+        size = finding.area_m2 / lump.area - 1
         p_AL = np.append(lump.centroid, truth.felt.surface.height(lump.centroid[None])[0])
-        off = apply(truth.X_WA, finding.centroid[None])[0] - apply(truth.body.X_WA, p_AL[None])[0]
+        off = apply(truth.X_WA, np.array([finding.centroid_m]))[0] - apply(truth.body.X_WA, p_AL[None])[0]
         outward = truth.body.X_WA[:3, 2]
         absolute = float(np.linalg.norm(off - (off @ outward) * outward))
     return FindingScore(
@@ -254,7 +245,7 @@ def _finding_score(
         size_error=size,
         true_ratio=true_ratio,
         ratio_error=None if true_ratio is None else finding.ratio / true_ratio - 1,
-        ratio_held=None if true_ratio is None else finding.band[0] <= true_ratio <= finding.band[1],
+        ratio_held=None if true_ratio is None else finding.ratio_90[0] <= true_ratio <= finding.ratio_90[1],
         on_guarding=over[0],
         on_structure=over[1],
     )

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.report import scoring
-from palpate.report.scoring import Found, Map, Scores, Truth
+from palpate.report.rows import FindingRow
+from palpate.report.scoring import Map, Scores, Truth
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array
@@ -76,8 +77,12 @@ def found_map(findings: Sequence[Disc], off: float = 1.0, scanned: float = 0.10)
     return Map(vertices, apparent, 0.9 * apparent, 1.1 * apparent, reached, finding)
 
 
-def found(findings: Sequence[Disc], ratio: float = 2.6) -> list[Found]:
-    return [Found(np.append(c, 0.0), np.pi * r**2, ratio, (0.9 * ratio, 1.1 * ratio)) for c, r in findings]
+def found(findings: Sequence[Disc], ratio: float = 2.6) -> list[FindingRow]:
+    band = (0.9 * ratio, 1.1 * ratio)
+    return [
+        FindingRow(centroid_m=(*c, 0.0), quadrant="", area_m2=np.pi * r**2, ratio=ratio, ratio_90=band, confidence=1, guarding=0)
+        for c, r in findings
+    ]
 
 
 def score(findings: Sequence[Disc], true: Truth) -> Scores:
