@@ -2,7 +2,6 @@
 
 import base64
 import io
-from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -184,19 +183,11 @@ AXIS_M = 0.05
 """Length of the axes of the abdomen frame."""
 
 
-@dataclass(frozen=True)
-class Layer:
-    """A colouring of the surface."""
+def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], dict[str, Any]] | None:
+    """Return scales and data of the viewer for a `palpation_msgs/StiffnessMap`; None if there is nothing to show.
 
-    name: str
-    colors: tuple[str, ...]
-    """Colours of the scale, from low to high, as #rrggbb."""
-    ticks: tuple[str, ...]
-    """Labels of the scale, evenly spaced from low to high."""
-
-
-def surface(message: Any, abdomen: bool = True) -> tuple[list[Layer], dict[str, Any]] | None:
-    """Return layers and data of the viewer for a `palpation_msgs/StiffnessMap`; None if there is nothing to show."""
+    A scale has the name of a colouring of the surface, its colours from low to high as #rrggbb, and evenly spaced ticks.
+    """
     mapped = map_of(message)
     triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
     whole = mapped.scanned[triangles].all(axis=1)
@@ -213,14 +204,23 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[Layer], dict[str, 
     low, high = float(np.quantile(ratio[known], 0.01)), max(2.0, float(np.quantile(ratio[known], 0.99)))
     relief = np.column_stack((shape[:, :2], np.where(known, force, 0.0) * (0.7 * radius / max(force[known].max(), 1e-9))))
     relief[:, 2] -= relief[known, 2].mean()
-    layers: list[tuple[Layer, Array, Array, bool]] = []
+    scales: list[dict[str, Any]] = []
+    layers: list[dict[str, Any]] = []
 
     def add(name: str, positions: Array, values: Array, norm: Normalize, cmap: str, form: str, outlined: bool) -> None:
         scale = colormaps[cmap]
         colors = np.where(known[:, None], scale(norm(values))[:, :3], _UNKNOWN)
-        stops = tuple(to_hex(scale(x)) for x in np.linspace(0, 1, 9))
-        ticks = tuple(form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5))
-        layers.append((Layer(name, stops, ticks), positions, colors, outlined))
+        stops = [to_hex(scale(x)) for x in np.linspace(0, 1, 9)]
+        ticks = [form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5)]
+        shown = triangles if outlined else triangles[: whole.sum()]
+        scales.append({"name": name, "colors": stops, "ticks": ticks})
+        layers.append({
+            "positions": _text(positions.astype(np.float32)),
+            "normals": _text(vertex_normals(positions, shown).astype(np.float32)),
+            "colors": _text(np.round(255 * colors).astype(np.uint8)),
+            "outlined": outlined,
+            "corners": 3 * len(shown),
+        })  # fmt: skip
 
     add("stiffness on the skin", shape, ratio, LogNorm(low, high, clip=True), figures.STIFFNESS_COLOURS, "{:.1f} ×", True)
     force_norm = Normalize(0.0, float(force[known].max()), clip=True)
@@ -233,18 +233,9 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[Layer], dict[str, 
         "triangles": _text(triangles.astype(np.uint16)),
         **_labels(shape, known, middle, abdomen),
         "outline": _text((outline + ABOVE_SURFACE_M).astype(np.float32)),
-        "layers": [
-            {
-                "positions": _text(positions.astype(np.float32)),
-                "normals": _text(vertex_normals(positions, triangles[: None if outlined else whole.sum()]).astype(np.float32)),
-                "colors": _text(np.round(255 * colors).astype(np.uint8)),
-                "outlined": outlined,
-                "corners": 3 * (len(triangles) if outlined else int(whole.sum())),
-            }
-            for _, positions, colors, outlined in layers
-        ],
+        "layers": layers,
     }
-    return [layer for layer, *_ in layers], data
+    return scales, data
 
 
 def _labels(shape: Array, known: NDArray[np.bool_], middle: Array, abdomen: bool) -> dict[str, Any]:
