@@ -174,7 +174,7 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> Markup | None:
     figure, columns = _figure(14.5, 5.6, len(names))
     for axes, name in zip(columns, names, strict=True):
         words, scale = COVARIATES[name]
-        if surface is not None and name in surface.names:
+        if surface is not None and name in surface.covariates:
             _sections(axes, surface, name)
         x, rows = zip(*analysis.observed[name], strict=True) if analysis.observed[name] else ((), ())
         _errorbar(axes, [scale * at for at in x], rows, INK, "found, in bins of equal number")
@@ -197,7 +197,7 @@ def detectability(analysis: Analysis, names: Sequence[str]) -> Markup | None:
 
 def _sections(axes: Axes, surface: Surface, name: str) -> None:
     """Draw the surface along one covariate, at the quartiles of another one, with the rest at their medians."""
-    second = next((other for other in surface.names if other != name), None)
+    second = next((other for other in surface.covariates if other != name), None)
     _, scale = COVARIATES[name]
     x = np.geomspace(*surface.range[name], 60) if name in LOGARITHMIC else np.linspace(*surface.range[name], 60)
     for i, level in enumerate(surface.quartiles[second] if second else (0.0,)):

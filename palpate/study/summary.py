@@ -150,28 +150,6 @@ JSON: Final = "study.json"
 PAGE: Final = "study.html"
 
 
-class SurfaceRow(Row, allow_inf_nan=False):
-    """A psychometric surface over standardised covariates."""
-
-    covariates: tuple[str, ...]
-    """Contrasts in logarithms."""
-    left_out: tuple[str, ...]
-    """Covariates that all lumps share."""
-    n: int
-    """Lumps."""
-    found: int
-    weights: tuple[float, ...]
-    """Intercept, then one per covariate: log odds per standard deviation."""
-    centre: tuple[float, ...]
-    scale: tuple[float, ...]
-    lapse: float
-    quartiles: dict[str, tuple[float, float, float]]
-    threshold_90: dict[str, Estimate]
-    """Value of each covariate from which 90 % of lumps are found, the others at their medians."""
-    smallest_90: dict[str, Estimate]
-    """Radius [m] from which 90 % of lumps are found, by quartile of contrast, depth at its median."""
-
-
 class MethodRow(Row):
     """All figures of one method."""
 
@@ -184,9 +162,9 @@ class MethodRow(Row):
     froc: dict[str, Estimate]
     """Sensitivity by false findings per examination."""
     sensitivity_at_zero: Estimate | None
-    felt: SurfaceRow | None
+    felt: Surface | None
     """Detectability by the effect on the surface."""
-    made: SurfaceRow | None
+    made: Surface | None
     """Detectability by the lumps themselves."""
     errors: FindingErrors
     calibration: FindingCalibration | None
@@ -281,31 +259,11 @@ def _method(variant: Variant, a: Analysis, bootstrap: Bootstrap) -> MethodRow:
         froc_mean=None if a.froc is None else a.froc.mean,
         froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},
         sensitivity_at_zero=None if a.froc is None else a.froc.at_zero,
-        felt=None if a.felt is None else _surface(a.felt, "felt_contrast", "felt_radius_m"),
-        made=None if a.made is None else _surface(a.made, "contrast", "radius_m"),
+        felt=a.felt,
+        made=a.made,
         errors=a.errors,
         calibration=a.calibration,
         guarding=a.guarding,
         effort={name: spread(variant, name, bootstrap) for name in MEASURED},
         coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
-    )
-
-
-def _surface(s: Surface, contrast: str, radius: str) -> SurfaceRow:
-    smallest = {}
-    if radius in s.names:
-        levels = s.quartiles.get(contrast, ())
-        smallest = {f"{contrast} {level:.3g}": s.threshold(radius, **{contrast: level}) for level in levels}
-    return SurfaceRow(
-        covariates=s.names,
-        left_out=s.left_out,
-        n=s.n,
-        found=s.found,
-        weights=tuple(map(float, s.weights)),
-        centre=tuple(map(float, s.centre)),
-        scale=tuple(map(float, s.scale)),
-        lapse=s.lapse,
-        quartiles=s.quartiles,
-        threshold_90={name: s.threshold(name) for name in s.names},
-        smallest_90=smallest,
     )

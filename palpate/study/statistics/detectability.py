@@ -5,16 +5,16 @@ Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
 import pandas as pd
 from numpy.typing import NDArray
+from pydantic import computed_field
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
-from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, bounded, percentiles
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Drawn, Estimate, Row, bounded, percentiles
 from palpate.study.statistics.reading import Variant
 
 FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
@@ -31,27 +31,44 @@ FEWEST: Final = 10
 """Least numbers of found and of missed lumps for a fit."""
 
 
-@dataclass(frozen=True)
-class Surface:
-    """A fitted psychometric surface over lumps with the covariates `names`."""
+class Surface(Row, allow_inf_nan=False):
+    """A fitted psychometric surface over standardised covariates."""
 
-    names: tuple[str, ...]
+    covariates: tuple[str, ...]
+    """Contrasts in logarithms."""
     left_out: tuple[str, ...]
     """Covariates that all lumps share."""
-    centre: Array
-    """Means of the covariates, contrasts in logarithms; shape (k,)."""
-    scale: Array
-    range: dict[str, tuple[float, float]]
-    """Quartiles of each covariate, in its own unit."""
-    quartiles: dict[str, tuple[float, float, float]]
-    """Least and greatest value of each covariate."""
-    weights: Array
-    """b_0 and b_i, shape (k + 1,)."""
-    lapse: float
-    replicates: Array
-    """Replicates of weights and lapse, shape (folds, k + 2)."""
     n: int
+    """Lumps."""
     found: int
+    weights: tuple[float, ...]
+    """Intercept, then one per covariate: log odds per standard deviation."""
+    centre: tuple[float, ...]
+    """Means of the covariates."""
+    scale: tuple[float, ...]
+    lapse: float
+    quartiles: dict[str, tuple[float, float, float]]
+    """Of each covariate, in its own unit."""
+    range: dict[str, tuple[float, float]] = Drawn
+    """Least and greatest value of each covariate."""
+    replicates: np.ndarray = Drawn
+    """Replicates of weights and lapse, shape (folds, k + 2)."""
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def threshold_90(self) -> dict[str, Estimate]:
+        """Value of each covariate from which 90 % of lumps are found, the others at their medians."""
+        return {name: self.threshold(name) for name in self.covariates}
+
+    @computed_field  # type: ignore[prop-decorator]
+    @property
+    def smallest_90(self) -> dict[str, Estimate]:
+        """Radius [m] from which 90 % of lumps are found, by quartile of contrast, depth at its median."""
+        radius = next((name for name in self.covariates if name.endswith("radius_m")), None)
+        contrast = next((name for name in self.covariates if name in LOGARITHMIC), None)
+        if radius is None or contrast is None:
+            return {}
+        return {f"{contrast} {level:.3g}": self.threshold(radius, **{contrast: level}) for level in self.quartiles[contrast]}
 
     def typical(self, name: str) -> float:
         """Return the median of a covariate."""
@@ -60,7 +77,7 @@ class Surface:
     def probability(self, lumps: dict[str, Array]) -> tuple[Array, Array, Array]:
         """Return P(found) and its pointwise interval for these covariates, each of shape (m,); medians if not given."""
         m = max(map(len, lumps.values()))
-        z = self._z({name: lumps.get(name, np.full(m, self.typical(name))) for name in self.names})
+        z = self._z({name: lumps.get(name, np.full(m, self.typical(name))) for name in self.covariates})
         replicates = (1 - self.replicates[:, -1:]) * expit(self.replicates[:, :-1] @ z.T)
         low, high = np.array([percentiles(column) or (np.nan, np.nan) for column in replicates.T]).T
         return (1 - self.lapse) * expit(z @ self.weights), low, high
@@ -71,8 +88,8 @@ class Surface:
         It is the least such value where more of the covariate helps, and the greatest where it hinders. None where that is
         not within the range of the lumps: a surface says nothing of lumps that it has not seen.
         """
-        i = self.names.index(name)
-        z = self._z({key: np.array([others.get(key, self.typical(key))]) for key in self.names})[0]
+        i = self.covariates.index(name)
+        z = self._z({key: np.array([others.get(key, self.typical(key))]) for key in self.covariates})[0]
         parameters = np.vstack((np.append(self.weights, self.lapse), self.replicates))
         rest = parameters[:, :-1] @ np.where(np.arange(len(z)) == i + 1, 0, z)
         direction = np.sign(self.weights[i + 1])
@@ -90,7 +107,7 @@ class Surface:
         return Estimate(value=float(values[0]), low=float(low), high=float(high), n=self.n, of="lumps")
 
     def _z(self, lumps: dict[str, Array]) -> Array:
-        x = np.column_stack([np.log(lumps[name]) if name in LOGARITHMIC else lumps[name] for name in self.names])
+        x = np.column_stack([np.log(lumps[name]) if name in LOGARITHMIC else lumps[name] for name in self.covariates])
         return np.column_stack((np.ones(len(x)), (x - self.centre) / self.scale))
 
 
@@ -115,15 +132,15 @@ def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Sur
     replicates = np.array([fit(z, found, drawn[patient], with_lapse, best)[0] for drawn in bootstrap.counts])
     values = {name: lumps[name].to_numpy(dtype=np.float64) for name in varied}
     return Surface(
-        names=varied,
+        covariates=varied,
         left_out=tuple(name for name in names if name not in varied),
-        centre=centre,
-        scale=scale,
+        centre=tuple(centre.tolist()),
+        scale=tuple(scale.tolist()),
         range={name: (float(v.min()), float(v.max())) for name, v in values.items()},
         quartiles={
             name: (float(q[0]), float(q[1]), float(q[2])) for name, v in values.items() for q in [np.quantile(v, QUARTILES)]
         },
-        weights=best[:-1],
+        weights=tuple(best[:-1].tolist()),
         lapse=float(best[-1]),
         replicates=replicates,
         n=len(lumps),

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from math import isfinite
-from typing import Final
+from typing import Any, Final
 from zlib import crc32
 
 import numpy as np
@@ -27,7 +27,7 @@ class Row(BaseModel):
     model_config = ConfigDict(frozen=True, use_attribute_docstrings=True, arbitrary_types_allowed=True)
 
 
-Drawn = Field(exclude=True)
+Drawn: Any = Field(default=None, exclude=True)
 """A field for plots, which is not in study.json."""
 
 
