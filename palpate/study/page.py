@@ -16,7 +16,7 @@ from matplotlib.ticker import FuncFormatter, NullLocator, PercentFormatter
 from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
 from palpate.study.statistics.accuracy import Agreement, FindingCalibration
-from palpate.study.statistics.analysis import Analysis
+from palpate.study.statistics.analysis import MethodRow
 from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, MADE, Surface
 from palpate.study.statistics.detection import GRID as ROC_GRID
@@ -118,9 +118,9 @@ def _errorbar(axes: Axes, x: Sequence[float], rows: Sequence[Estimate], color: s
         axes.errorbar(at, value, yerr=bars, fmt="o", ms=4, lw=1.1, capsize=2, color=color, label=label)
 
 
-def roc(analyses: Sequence[Analysis]) -> Markup | None:
+def roc(methods: Sequence[MethodRow]) -> Markup | None:
     """Return the ROC per patient of the first MOST methods; None if none has a curve."""
-    shown = [(a.name, a.roc) for a in analyses[:MOST] if a.roc is not None]
+    shown = [(a.name, a.roc) for a in methods[:MOST] if a.roc is not None]
     if not shown:
         return None
     figure, (axes,) = _figure(6.2, 5.2)
@@ -139,9 +139,9 @@ def roc(analyses: Sequence[Analysis]) -> Markup | None:
     return _svg(figure)
 
 
-def froc(analyses: Sequence[Analysis]) -> Markup | None:
+def froc(methods: Sequence[MethodRow]) -> Markup | None:
     """Return the FROC of the first MOST methods; None if none has a curve."""
-    shown = [(a.name, a.froc) for a in analyses[:MOST] if a.froc is not None]
+    shown = [(a.name, a.froc_curve) for a in methods[:MOST] if a.froc_curve is not None]
     if not shown:
         return None
     figure, (axes,) = _figure(7.4, 5.2)
@@ -163,20 +163,20 @@ def froc(analyses: Sequence[Analysis]) -> Markup | None:
     return _svg(figure)
 
 
-def detectability(analysis: Analysis, names: Sequence[str]) -> Markup | None:
+def detectability(method: MethodRow, names: Sequence[str]) -> Markup | None:
     """Return the probability of detection against each covariate: binned rates, and the surface at quartiles of another one.
 
     None where no lump is known.
     """
-    if not any(analysis.observed[name] for name in names):
+    if not any(method.observed[name] for name in names):
         return None
-    surface = analysis.felt if tuple(names) == FELT else analysis.made
+    surface = method.felt if tuple(names) == FELT else method.made
     figure, columns = _figure(14.5, 5.6, len(names))
     for axes, name in zip(columns, names, strict=True):
         words, scale = COVARIATES[name]
         if surface is not None and name in surface.covariates:
             _sections(axes, surface, name)
-        x, rows = zip(*analysis.observed[name], strict=True) if analysis.observed[name] else ((), ())
+        x, rows = zip(*method.observed[name], strict=True) if method.observed[name] else ((), ())
         _errorbar(axes, [scale * at for at in x], rows, INK, "found, in bins of equal number")
         _human(axes)
         if name == "radius_m":
@@ -209,9 +209,9 @@ def _sections(axes: Axes, surface: Surface, name: str) -> None:
         axes.fill_between(scale * x, low, high, color=COLOURS[i], alpha=0.12, lw=0)
 
 
-def errors(analysis: Analysis) -> Markup | None:
+def errors(method: MethodRow) -> Markup | None:
     """Return place errors and the agreement of size and stiffness; None without a matched finding."""
-    e = analysis.errors
+    e = method.errors
     if not len(e.place_m):
         return None
     figure, (place, size, ratio) = _figure(14.5, 4.4, 3)
@@ -262,15 +262,15 @@ def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> Markup | None
     return _svg(figure)
 
 
-def effort(analyses: Sequence[Analysis]) -> Markup:
+def effort(methods: Sequence[MethodRow]) -> Markup:
     """Return the distributions of greatest force and duration of the first MOST methods."""
     figure, columns = _figure(11, 4.2, 2)
     for axes, column, words in zip(
         columns, ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
     ):
-        for color, analysis in zip(COLOURS, analyses, strict=False):
-            x = np.sort(analysis.cases[column][~analysis.cases["failed"]].dropna().to_numpy(dtype=float))
-            axes.step(x, np.arange(1, len(x) + 1) / max(len(x), 1), where="post", color=color, lw=1.6, label=analysis.name)
+        for color, method in zip(COLOURS, methods, strict=False):
+            x = np.sort(method.cases[column][~method.cases["failed"]].dropna().to_numpy(dtype=float))
+            axes.step(x, np.arange(1, len(x) + 1) / max(len(x), 1), where="post", color=color, lw=1.6, label=method.name)
         plain(axes, "part of the examinations", words)
         _percent(axes)
         _legend(axes, "lower right")
@@ -328,12 +328,12 @@ FEWEST_FOR_TORNADO = 2
 """Number of compared methods from which differences are drawn as a tornado plot."""
 
 
-def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons: Sequence[Comparison]) -> str:
+def render(summary: Mapping[str, Any], methods: Sequence[MethodRow], comparisons: Sequence[Comparison]) -> str:
     """Return the page as HTML. `summary` has the content of study.json."""
     loader = ChoiceLoader([PackageLoader("palpate.study"), PackageLoader("palpate.report")])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
     environment.filters |= {"figure": figure, "percent": percent, "mm": millimetres, "p": p_value, "words": covariate_words}
-    shown = analyses[:MOST]
+    shown = methods[:MOST]
     calibrated = [(a.name, a.calibration) for a in shown if a.calibration is not None]
     many = len(comparisons) >= FEWEST_FOR_TORNADO
     return environment.get_template("study.html.j2").render(
@@ -342,13 +342,13 @@ def render(summary: Mapping[str, Any], analyses: Sequence[Analysis], comparisons
         methods=[summary["methods"][a.name] for a in shown],
         human=HUMANS,
         quantities=QUANTITIES,
-        roc=roc(analyses),
-        froc=froc(analyses),
+        roc=roc(methods),
+        froc=froc(methods),
         felt={a.name: detectability(a, FELT) for a in shown},
         made={a.name: detectability(a, MADE) for a in shown},
         errors={a.name: errors(a) for a in shown},
         reliability=reliability(calibrated),
-        effort=effort(analyses),
+        effort=effort(methods),
         tornadoes=[plot for name in TORNADOES if many and (plot := tornado(comparisons, name))],
     )
 

@@ -15,13 +15,10 @@ from palpate.report.files import write_text
 from palpate.study.folder import RUN, Folder, Manifest, Outcome, RunRecord, record
 from palpate.study.page import HUMANS, render
 from palpate.study.real_time import write_real_time
-from palpate.study.statistics.accuracy import COVERED, MEASURED, FindingCalibration, FindingErrors, Spread, coverage, spread
-from palpate.study.statistics.analysis import Analysis, analyse
+from palpate.study.statistics.analysis import MethodRow, analyse
 from palpate.study.statistics.comparison import Comparison, compare
-from palpate.study.statistics.detectability import Surface
-from palpate.study.statistics.detection import ContrastRow, Rates, by_contrast, by_population, rates
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Bootstrap, Estimate, Row
-from palpate.study.statistics.reading import Tables, Variant, read_tables
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Row
+from palpate.study.statistics.reading import Tables, read_tables
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Scenario
 
@@ -150,30 +147,6 @@ JSON: Final = "study.json"
 PAGE: Final = "study.html"
 
 
-class MethodRow(Row):
-    """All figures of one method."""
-
-    rates: Rates
-    populations: dict[str, Rates]
-    contrasts: dict[str, ContrastRow]
-    """By class of felt contrast."""
-    auc: Estimate | None
-    froc_mean: Estimate | None
-    froc: dict[str, Estimate]
-    """Sensitivity by false findings per examination."""
-    sensitivity_at_zero: Estimate | None
-    felt: Surface | None
-    """Detectability by the effect on the surface."""
-    made: Surface | None
-    """Detectability by the lumps themselves."""
-    errors: FindingErrors
-    calibration: FindingCalibration | None
-    guarding: FindingCalibration | None = None
-    """Calibration of the probabilities of a tensed muscle; None without an area on one."""
-    effort: dict[str, Spread]
-    coverage: dict[str, Estimate]
-
-
 class StudySummary(Row):
     """study.json."""
 
@@ -221,13 +194,12 @@ def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
         folds: resamplings of the bootstrap.
     """
     tables = read_tables(folder, folds)
-    analyses = tuple(analyse(variant, tables.bootstrap) for variant in tables.variants)
-    summary = _summary(tables, analyses, command)
+    summary = _summary(tables, command)
     write_text(folder / JSON, summary.model_dump_json(indent=1) + "\n")
-    write_text(folder / PAGE, render(summary.model_dump(), analyses, summary.comparisons))
+    write_text(folder / PAGE, render(summary.model_dump(), tuple(summary.methods.values()), summary.comparisons))
 
 
-def _summary(tables: Tables, analyses: Sequence[Analysis], command: str) -> StudySummary:
+def _summary(tables: Tables, command: str) -> StudySummary:
     reference, *others = tables.variants
     return StudySummary(
         study=tables.study,
@@ -236,7 +208,7 @@ def _summary(tables: Tables, analyses: Sequence[Analysis], command: str) -> Stud
         command=command,
         patients=_patients(tables),
         reference=reference.name,
-        methods={own.name: _method(own, a, tables.bootstrap) for own, a in zip(tables.variants, analyses, strict=True)},
+        methods={own.name: analyse(own, tables.bootstrap) for own in tables.variants},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
         assumed=any((variant.cases["loop_examinations"] < LEAST_EXAMINATIONS).any() for variant in tables.variants),
         level=LEVEL,
@@ -248,22 +220,3 @@ def _summary(tables: Tables, analyses: Sequence[Analysis], command: str) -> Stud
 def _patients(tables: Tables) -> dict[str, int]:
     """Return the number of patients by population."""
     return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
-
-
-def _method(variant: Variant, a: Analysis, bootstrap: Bootstrap) -> MethodRow:
-    return MethodRow(
-        rates=rates(variant, bootstrap),
-        populations=by_population(variant, bootstrap),
-        contrasts=by_contrast(variant, bootstrap),
-        auc=None if a.roc is None else a.roc.auc,
-        froc_mean=None if a.froc is None else a.froc.mean,
-        froc={} if a.froc is None else {f"{rate:g}": value for rate, value in a.froc.at.items()},
-        sensitivity_at_zero=None if a.froc is None else a.froc.at_zero,
-        felt=a.felt,
-        made=a.made,
-        errors=a.errors,
-        calibration=a.calibration,
-        guarding=a.guarding,
-        effort={name: spread(variant, name, bootstrap) for name in MEASURED},
-        coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
-    )
