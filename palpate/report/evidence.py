@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from math import hypot
 from operator import attrgetter
 from typing import Any, Final
@@ -25,33 +24,6 @@ from palpate_models.scenario.schema import Scenario
 Mask = NDArray[np.bool_]
 xyz: Final = attrgetter("x", "y", "z")
 """Coordinates of a point or vector of a message."""
-
-
-@dataclass(frozen=True)
-class ContactRecord:
-    """Measured and true contact at m equal stamps while the contact is reported steady."""
-
-    measured: Array
-    """Measured depth [m]."""
-    true: Array
-    """True depth [m]."""
-    wanted: Array
-    """Depth set-point [m]."""
-    force: Array
-    """Measured normal force [N]."""
-    touched: Touched
-    """Rest surface points under the indenter."""
-    limited: Mask
-    """True where depth yields to the force limit."""
-
-    def then(self, later: ContactRecord) -> ContactRecord:
-        """Return this record followed by that of the examination that continued this one."""
-        both = {
-            name: np.concatenate((getattr(self, name), getattr(later, name)))
-            for name in ("measured", "true", "wanted", "force", "limited")
-        }
-        places = (np.concatenate((getattr(self.touched, k), getattr(later.touched, k))) for k in ("believed", "true"))
-        return ContactRecord(**both, touched=Touched(*places))
 
 
 def columns_of(rows: Iterable[tuple[Any, ...]], kinds: np.dtype[Any]) -> dict[str, NDArray[Any]]:
@@ -126,8 +98,8 @@ def peak_force(message: Any) -> float:
 
 def steady_contact(
     exam_states: Iterable[Any], indentation: Iterable[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
-) -> ContactRecord:
-    """Return the steady exam states with the true contact at the same stamp, in order of time.
+) -> NDArray[np.void]:
+    """Return measured and true contact at equal stamps while the contact is reported steady, as `_CONTACT`, in order of time.
 
     Args:
         exam_states: `exam/state`; of several with one stamp the first counts.
@@ -140,22 +112,21 @@ def steady_contact(
     def shared(m: Any) -> tuple[Any, ...]:
         return nanoseconds(m.header.stamp), m.depth, xyz(m.surface_point)
 
-    reported = columns_of(
-        ((*shared(s), s.depth_setpoint, s.normal_force, s.force_limited) for s in exam_states if s.steady), _STEADY
-    )
+    reported = columns_of(((*shared(s), s.depth_setpoint, s.force_limited) for s in exam_states if s.steady), _STEADY)
     true = columns_of(map(shared, indentation), _SHARED)
     stamps, at, truly = np.intersect1d(reported["stamp"], true["stamp"], return_indices=True)
-    believed = apply(inverse(registered_X_WA), reported["place"][at])
-    touched = motion.on_body(stamps / NS, apply(inverse(X_WA), true["place"][truly]))
-    return ContactRecord(
-        measured=reported["depth"][at],
-        true=true["depth"][truly],
-        wanted=reported["wanted"][at],
-        force=reported["force"][at],
-        touched=Touched(believed, touched),
-        limited=reported["limited"][at],
-    )
+    contact = np.zeros(len(stamps), _CONTACT)
+    contact["measured"], contact["true"] = reported["depth"][at], true["depth"][truly]
+    contact["wanted"], contact["limited"] = reported["wanted"][at], reported["limited"][at]
+    contact["believed"] = apply(inverse(registered_X_WA), reported["place"][at])
+    contact["touched"] = motion.on_body(stamps / NS, apply(inverse(X_WA), true["place"][truly]))
+    return contact
 
 
 _SHARED: Final = np.dtype([("stamp", "i8"), ("depth", "f8"), ("place", "f8", 3)])
-_STEADY: Final = np.dtype([*_SHARED.descr, ("wanted", "f8"), ("force", "f8"), ("limited", "?")])
+_STEADY: Final = np.dtype([*_SHARED.descr, ("wanted", "f8"), ("limited", "?")])
+_CONTACT: Final = np.dtype([
+    *((name, "f8") for name in ("measured", "true", "wanted")), ("limited", "?"), ("believed", "f8", 3), ("touched", "f8", 3)
+])  # fmt: skip
+"""Measured, true and wanted depth [m]; whether depth yields to the force limit; estimated and true place on the rest surface
+under the indenter [m], in the registered and in the true A."""

@@ -4,7 +4,6 @@ import csv
 import logging
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from functools import reduce
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +16,7 @@ from palpate.apart import guarded
 from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, TruthRow
-from palpate.truth.pressed import Pressed, TrueBody, press_patient
+from palpate.truth.pressed import Pressed, Touched, TrueBody, press_patient
 from palpate_bus import implementations
 from palpate_bus.runs.run_folder import run_of
 from palpate_bus.settings import Settings
@@ -38,7 +37,8 @@ class Known:
     """Known parts of the truth of a run; None if unknown."""
 
     body: TrueBody | None
-    contact: evidence.ContactRecord | None
+    contact: Any
+    """Record array of steady contacts, see `evidence.steady_contact`."""
     felt: scoring.Truth | None
 
 
@@ -50,13 +50,14 @@ def truth_of_run(scenario: Scenario, c: Collected, earlier: Sequence[Collected] 
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     registered = np.array(exam_input(scenario).X_WA)
     runs = [evidence.steady_contact(run.exam_states, run.indentation, body.X_WA, motion, registered) for run in (*earlier, c)]
-    contact = reduce(evidence.ContactRecord.then, runs)
+    contact = np.concatenate(runs).view(np.recarray)
+    touched = Touched(contact.believed, contact.touched)
     try:
         pressed = _pressed(scenario)
     except Exception:  # a user-defined tissue that was changed during the run, or that can be created only once
         log.exception("palpable truth unknown: the patient cannot be pressed")
         pressed = None
-    return Known(body, contact, None if pressed is None else evidence.felt_truth(scenario, body, pressed, contact.touched))
+    return Known(body, contact, None if pressed is None else evidence.felt_truth(scenario, body, pressed, touched))
 
 
 def _pressed(scenario: Scenario) -> Pressed | None:
@@ -152,8 +153,8 @@ def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded:
     report = assemble(scenario, result, known).model_copy(update={"run": run, "recorded": recorded})
     samples = evidence.sample_columns(c.samples)
     write_samples(folder / "samples.csv", samples, run)
-    touched, felt = None if known.contact is None else known.contact.touched, known.felt
-    archive.write_evidence(folder / archive.FILE, c, touched, None if felt is None else felt.felt.pressed, run)
+    touched = None if known.contact is None else Touched(known.contact.believed, known.contact.touched)
+    archive.write_evidence(folder / archive.FILE, c, touched, None if known.felt is None else known.felt.felt.pressed, run)
     write_text(folder / "report.json", report.model_dump_json(indent=2) + "\n")
     if c.stiffness_map is not None:
         title = f"{scenario.name}, seed {scenario.seed}" if recorded is None else scenario.name
@@ -291,11 +292,11 @@ def _truth(truth: scoring.Truth | None) -> TruthRow:
 
 def _depth(known: Known) -> DepthRow:
     contact = known.contact
-    if contact is None or not len(contact.true):
+    if contact is None or not len(contact):
         return DepthRow(**dict.fromkeys(DepthRow.model_fields))
-    in_lump = np.zeros(len(contact.true), dtype=bool)
+    in_lump = np.zeros(len(contact), dtype=bool)
     if known.felt is not None:
-        in_lump = known.felt.felt.in_lump(contact.touched.true[:, :2])
+        in_lump = known.felt.felt.in_lump(contact.touched[:, :2])
     regulation = scoring.depth_errors(contact.true, contact.wanted, in_lump)
     perception = scoring.depth_errors(contact.measured, contact.true, in_lump)
     return DepthRow(
