@@ -23,8 +23,8 @@ from palpate.quick.case import assess
 from palpate.report.archive import collect
 from palpate.report.evidence import map_of
 from palpate.report.results import Known, truth_of_run
-from palpate.report.rows import finding_rows
-from palpate.report.scoring import Scores, score
+from palpate.report.rows import Scores, finding_rows
+from palpate.report.scoring import score
 from palpate.run.composed import load_services
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.recordings import open_recording

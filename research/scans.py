@@ -14,8 +14,8 @@ from scipy.interpolate import CloughTocher2DInterpolator
 from scipy.ndimage import gaussian_filter1d
 
 from palpate.report.evidence import felt_truth, map_of
-from palpate.report.rows import finding_rows
-from palpate.report.scoring import Scores, Truth, score
+from palpate.report.rows import Scores, finding_rows
+from palpate.report.scoring import Truth, score
 from palpate.truth.pressed import Touched, TrueBody, press_patient
 from palpate_assessment.service import AssessmentService
 from palpate_bus.messages import ExamState, Point, SurfaceMesh, Vector3

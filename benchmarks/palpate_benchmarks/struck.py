@@ -111,7 +111,7 @@ class Sign:
 
 @dataclass
 class Watched:
-    """What the conductor saw of a run with a fault."""
+    """Observations of the conductor in a run with a fault."""
 
     result: RunResult
     before: list[Sign] = field(default_factory=list)

@@ -15,7 +15,7 @@ from rich.table import Table
 from palpate.apart import guarded
 from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
-from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, TruthRow
+from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, Scores, TruthRow
 from palpate.truth.pressed import Pressed, Touched, TrueBody, press_patient
 from palpate_bus import implementations
 from palpate_bus.runs.run_folder import run_of
@@ -251,7 +251,7 @@ def clean_world_note(report: Report) -> str:
     return " of a clean world" if report.clean_world else ""
 
 
-def scores_text(s: scoring.Scores) -> str:
+def scores_text(s: Scores) -> str:
     """Return the scores as a line."""
     parts = [f"{s.matched} matched, {s.missed} missed"]
     parts += [f"{s.not_palpable} not palpable in the region"] if s.not_palpable else []
@@ -268,7 +268,7 @@ def scores_text(s: scoring.Scores) -> str:
     return ", ".join(parts)
 
 
-def _beyond_bands(s: scoring.Scores) -> str:
+def _beyond_bands(s: Scores) -> str:
     """Return how many ratios lie outside their bands, as text."""
     outside = sum(finding.ratio_held is False for finding in s.findings)
     if not outside:

@@ -1,11 +1,11 @@
 """Models of report.json."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import Any, Final, Protocol
 
 from pydantic import BaseModel, ConfigDict
 
-from palpate.report.scoring import Scores
 from palpate_bus.runtime.failure import FailureCode
 
 Point = tuple[float, ...]
@@ -63,6 +63,64 @@ def finding_rows(areas: Iterable[Any]) -> list[FindingRow]:
         )
         for f in areas
     ]
+
+
+@dataclass(frozen=True)
+class FindingScore:
+    """A finding against the truth."""
+
+    lump: int | None
+    """The matched lump."""
+    dice: float | None
+    """Overlap with it."""
+    place_error_m: float | None
+    """Distance of its centroid, at the place truly touched, from the lump's, in xy of A."""
+    absolute_error_m: float | None
+    """The same in world, perpendicular to the outward direction: includes the errors of kinematics and registration."""
+    size_error: float | None
+    """Its area divided by the lump's, minus one."""
+    true_ratio: float | None
+    """Felt contrast of all lumps over its area, mean of the logarithm; None without a map."""
+    ratio_error: float | None
+    """Its ratio divided by the true one, minus one."""
+    ratio_held: bool | None
+    """True if its band includes the true ratio."""
+    on_guarding: bool
+    """True if it is false and overlaps guarded muscle; for a candidate, if its centroid lies on it."""
+    on_structure: bool = False
+    """True if it matches no lump and overlaps a structure of the wall; for a candidate, if its centroid lies on it. Not false."""
+
+
+@dataclass(frozen=True)
+class Scores:
+    """Quality of findings and map. Means are over matched findings, None without any."""
+
+    matched: int
+    missed: int
+    not_palpable: int
+    """Lumps that the standard press cannot feel: neither matched nor missed."""
+    false_findings: int
+    on_guarding: int
+    """False findings that overlap guarded muscle."""
+    place_error_m: float | None
+    absolute_error_m: float | None
+    dice: float | None
+    size_error: float | None
+    ratio_error: float | None
+    """Mean magnitude, as for size."""
+    ratio_coverage_90: float | None
+    """Share of the matched findings whose band includes their true ratio."""
+    coverage_90: float | None
+    """Share of the scanned area on which the map's 90 % band includes the true apparent stiffness; None without a map."""
+    coverage_90_in_lumps: float | None
+    """The same within the areas of lumps."""
+    findings: tuple[FindingScore, ...]
+    on_structure: int = 0
+    """Findings on structures of the wall, such as scars: neither matched nor false."""
+    coverage_90_on_guarding: float | None = None
+    """The same on guarded muscle."""
+    candidates: tuple[FindingScore, ...] = ()
+    """Scores of candidates, which do not count in the fields above."""
 
 
 class LumpRow(_Row):

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from palpate.report import scoring
-from palpate.report.rows import FindingRow
-from palpate.report.scoring import Map, Scores, Truth
+from palpate.report.rows import FindingRow, Scores
+from palpate.report.scoring import Map, Truth
 from palpate.truth.felt import Felt
 from palpate.truth.pressed import Pressed, Touched, TrueBody, TrueSurface
 from palpate_models.numerics.frames import Array

@@ -18,8 +18,7 @@ import pytest
 import yaml
 from synthetic import TOY, study
 
-from palpate.report.rows import FindingRow
-from palpate.report.scoring import FindingScore
+from palpate.report.rows import FindingRow, FindingScore
 from palpate.study.cases import Case, cases_of
 from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, opened
 from palpate.study.runner import StudyStopped, cluster, part_of, run_cases
