@@ -37,10 +37,8 @@ from palpate_bus.run import chosen, run_service
 from palpate_bus.wire.transport import Sender, Transport
 from palpate_models.scenario.load import load_scenario
 
-DELAY_S: Final = 0.5
 PAST_S: Final = 3600
 JUMP_NS: Final = 3600 * NS
-CORRUPTED_BYTES: Final = 16
 
 
 @dataclass(frozen=True)
@@ -116,7 +114,7 @@ class FaultySender:
         if kind == "drop":
             return
         if kind == "delay":
-            sleep(DELAY_S)
+            sleep(0.5)
         if kind in CHANGES:
             payload = CHANGES[kind](payload, self._topic)
         self._sender.put(payload, sequence)
@@ -134,7 +132,7 @@ class FaultySender:
 
 def _corrupt(payload: bytes, topic: Topic) -> bytes:
     begin = len(payload) // 2
-    end = begin + CORRUPTED_BYTES
+    end = begin + 16
     return payload[:begin] + bytes(byte ^ 0xFF for byte in payload[begin:end]) + payload[end:]
 
 

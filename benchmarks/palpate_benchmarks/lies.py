@@ -61,7 +61,6 @@ FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0
 DELAYS_MS: Final = (20, 50, 200)
 LIVE_KINDS: Final = ("zero", "stale")
 """Further kinds of the cases in wall-clock mode."""
-REST_S: Final = 0.5
 LEAST_SHARE: Final = 0.9
 """Share of the twin's targets that a complete examination has felt."""
 SAME_BACKGROUND: Final = 0.25
@@ -73,7 +72,6 @@ CASE_S: Final = 900.0
 HANGS: Final = "the examination did not end"
 BEFORE_S: Final = 0.25
 """A case of old messages is forked this long before its lie, so that the liar has some."""
-SIGNS_EVERY: Final = 10 * MS
 NEVER_NS: Final = 10**18
 LEFT_OUT: Final = {
     "assessment/samples": "only a search reads it",
@@ -259,7 +257,7 @@ class Lockstep:
             stepper.service = liar.Liar(stepper.service, lie)
 
         def end() -> int | None:
-            if run.t >= since and not run.t % SIGNS_EVERY:
+            if run.t >= since and not run.t % (10 * MS):
                 watched.add(RunProgress(run.t, 1.0, collected), (run.t - since) / 1e6)
             return collected.end_tick
 
@@ -307,7 +305,7 @@ def moments_of(exam_states: Sequence[Any]) -> dict[str, float]:
 
     touched = next(t for t, state in states if state.in_contact)
     return {
-        "rest": REST_S,
+        "rest": 0.5,
         "descent": (begin(ExamState.PHASE_INDENT) + touched) / 2,
         "depth": begin(ExamState.PHASE_SCAN) + LIMITS.at_depth_s,
         "transfer": begin(ExamState.PHASE_RETRACT) + LIMITS.at_depth_s,

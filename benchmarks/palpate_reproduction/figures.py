@@ -18,7 +18,6 @@ from palpate_reproduction.scene import Moment, Stage, Viewpoint, draw
 from palpate_validation import drop
 from palpate_validation.check import PageSection
 
-DPI: Final = 100
 COLOURS: Final = 192
 """Size of the colour palette, which keeps the files small."""
 ROOM: Final = Viewpoint((1.60, -1.50, 1.95), (0.36, 0.02, 1.22), 40.0)
@@ -26,7 +25,7 @@ CLOSE: Final = Viewpoint((1.10, -0.62, 1.32), (0.54, -0.02, 0.96), 30.0)
 
 
 def _figure(width: float, height: float) -> Figure:
-    figure = Figure(figsize=(width, height), dpi=DPI, facecolor="white")
+    figure = Figure(figsize=(width, height), dpi=100, facecolor="white")
     FigureCanvasAgg(figure)
     figure.set_layout_engine("constrained", w_pad=0.06, h_pad=0.06)
     return figure

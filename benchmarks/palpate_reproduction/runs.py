@@ -20,7 +20,6 @@ GRAPH: Final = "graph.json"
 SCENARIO: Final = "clean"
 LISTEN_S: Final = 3.0
 """Observation time of the graph of a running examination."""
-POLL_S: Final = 0.5
 STOP_S: Final = 30.0
 """Time for a run to end after SIGINT."""
 
@@ -74,7 +73,7 @@ def record_graph(folder: Path) -> None:
                 if {row["node"] for row in rows} >= set(run.endpoints) and _has_started(folder):
                     (folder / GRAPH).write_text(json.dumps(rows, indent=1), encoding="utf-8")
                     return
-            sleep(POLL_S)
+            sleep(0.5)
         raise ReproductionError(f"the run on the bus ended with status {process.returncode}: {_last_line(folder)} ({folder})")
     finally:
         _stop(process)

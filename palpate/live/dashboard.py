@@ -24,7 +24,6 @@ from palpate_plugins import needs
 if TYPE_CHECKING:
     from palpate_bus.runs.announcement import Run
 
-DEFAULT_PORT = 9876
 PICTURE_PX = (1500, 940)
 
 
@@ -34,7 +33,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
     ] = None,
     port: Annotated[
         int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next port.")
-    ] = DEFAULT_PORT,
+    ] = 9876,
     native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
     show: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = False,
     chosen: ChosenRun = None,

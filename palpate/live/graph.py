@@ -17,7 +17,6 @@ from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, GraphWatch
 
 QUIET_S = 0.3
 """Tokens arrive in a burst; after this long without a new one the list is taken as complete."""
-DISCOVERY_TIMEOUT_S = 3.0
 
 
 def present(bus: Joined) -> list[Entity]:
@@ -25,7 +24,7 @@ def present(bus: Joined) -> list[Entity]:
     expected = set(bus.target.run.endpoints) if bus.target.run is not None else set()
     watch = GraphWatch(bus.session, bus.domain)
     try:
-        end = monotonic() + DISCOVERY_TIMEOUT_S
+        end = monotonic() + 3.0
         quiet = monotonic()
         while monotonic() < end:
             if watch.changes(timeout=0.05):

@@ -13,8 +13,6 @@ from palpate_bus.runs.operator import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
 from palpate_errors import PalpateError
 
-DISCOVERY_TIMEOUT_S = 1.0
-
 
 def stop(
     reason: Annotated[str, typer.Argument(help="Reason, for the record.")] = "palpate stop",
@@ -79,6 +77,6 @@ def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: i
         try:
             return ask(joined, bus.domain, word, reason, ms, key)
         except NoConductorError:
-            if monotonic() - begin > DISCOVERY_TIMEOUT_S:
+            if monotonic() - begin > 1.0:
                 raise
             sleep(0.05)

@@ -264,7 +264,6 @@ OTHERS: Final = {
     "soft": "a soft defect of the wall",
 }
 """Causes of an area other than a lump, by the field of their probability."""
-_LIKELY: Final = 0.5
 
 
 class Probable(Protocol):
@@ -295,7 +294,7 @@ def other_causes(candidates: Iterable[FindingRow]) -> str:
         f"in {f.quadrant}, is probably {text} ({percent(getattr(f, name))}) and no lump ({percent(f.confidence)}). "
         for f in candidates
         for name, text in OTHERS.items()
-        if getattr(f, name) > _LIKELY
+        if getattr(f, name) > 0.5
     )
 
 

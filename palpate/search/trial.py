@@ -22,7 +22,6 @@ BORDER_M: Final = 0.030
 PRESSES: Final = 100
 _MODULI: Final = (1.2, 30.0)
 """Search interval of the modulus contrast."""
-_ROUNDS: Final = 5
 
 
 @dataclass(frozen=True)
@@ -47,7 +46,7 @@ def case(seed: int, errors: str = "typical") -> SearchCase:
     half = 0.5 * np.array(region.region_m) - BORDER_M
     centre = generator(seed, "search lump").uniform(-half, half) + region.centre_m
     low, high = np.log(_MODULI)
-    for _ in range(_ROUNDS):  # log felt contrast is nearly linear in log modulus
+    for _ in range(5):  # log felt contrast is nearly linear in log modulus
         middle = 0.5 * (low + high)
         lump = f"{{centre_m: {centre.tolist()}, radii_m: [{RADIUS_M}, {RADIUS_M}], contrast: {np.exp(middle):.4f}}}"
         scenario = load_scenario("person", [*settings, f"phantom.lesions=[{lump}]"], seed)

@@ -24,7 +24,6 @@ from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Section
 from palpate_plugins import PluginError, is_file
 
-ID_DIGITS: Final = 16
 TUNE_SEEDS: Final = 1000
 """Seeds below this are for tuning only."""
 MOST_SEEDS: Final = 2**31
@@ -245,7 +244,7 @@ def content_id(
         "runtime": runtime,
         "periods": periods,
     }
-    return hashlib.sha256(canonical(content)).hexdigest()[:ID_DIGITS]
+    return hashlib.sha256(canonical(content)).hexdigest()[:16]
 
 
 def _by_content(value: Any, files: Mapping[str, str]) -> Any:

@@ -277,7 +277,6 @@ def _varying(correlation_m: tuple[float, float], natural_m: tuple[float, float])
 # --- equipment ------------------------------------------------------------------------------------------------------------
 
 _GAIN: Final = 0.08
-_LAG_S: Final = 0.040
 _ASKEW_RAD: Final = float(np.radians(3.0))
 _LEVER_M: Final = 0.15
 """From the flange to the indenter, about."""
@@ -337,7 +336,7 @@ _FAMILIES: Final[Mapping[Family, Mapping[str, Callable[..., Settings]]]] = {
     Family.EQUIPMENT: {
         "gain-high": _chosen(force_gain=_GAIN),
         "gain-low": _chosen(force_gain=-_GAIN),
-        "lag": _chosen(force_lag_s=_LAG_S),
+        "lag": _chosen(force_lag_s=0.040),
         "askew": _askew,
     },
 }

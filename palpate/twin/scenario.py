@@ -26,7 +26,6 @@ from palpate_tissue.backends.elastic.service import create as elastic_service
 from palpate_tissue.service import TissueService
 
 GRID: Final = "twin.csv"
-DEFAULT_THICKNESS_M: Final = 0.05
 ELASTIC_PRESSES: Final = 20
 """Presses from which the scale of Young's modulus is found."""
 ELASTIC_STEPS: Final = 8
@@ -80,11 +79,7 @@ def centred(recording: PalpationRecording) -> tuple[PalpationRecording, Array]:
 
 
 def write_twin(
-    recording: PalpationRecording,
-    folder: Path,
-    found: Map | None = None,
-    elastic: bool = False,
-    thickness_m: float = DEFAULT_THICKNESS_M,
+    recording: PalpationRecording, folder: Path, found: Map | None = None, elastic: bool = False, thickness_m: float = 0.05
 ) -> Quality:
     """Fit a twin to a recording, whose findings become its lumps, and write it into a folder. Raises UserError."""
     own, origin = centred(recording)

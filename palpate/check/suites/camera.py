@@ -20,7 +20,6 @@ FRAMES = 5
 HALF_M = 0.15
 """Half the side of the plane."""
 PITCH_M = 0.01
-TOLERANCE_M = 0.01
 
 
 def pose_of(message: Any) -> Array | None:
@@ -117,4 +116,4 @@ def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> 
     on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF_M) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF_M) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
     most = error.size > 0.5 * max(int(on.sum()), 1)
-    rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, TOLERANCE_M, "mm off", 1e3)
+    rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, 0.01, "mm off", 1e3)
