@@ -98,8 +98,8 @@ def peak_force(message: Any) -> float:
 
 def steady_contact(
     exam_states: Iterable[Any], indentation: Iterable[Any], X_WA: Array, motion: BodyMotion, registered_X_WA: Array
-) -> NDArray[np.void]:
-    """Return measured and true contact at equal stamps while the contact is reported steady, as `_CONTACT`, in order of time.
+) -> Any:
+    """Return measured and true contact at equal stamps while the contact is reported steady: `_CONTACT` records by time.
 
     Args:
         exam_states: `exam/state`; of several with one stamp the first counts.
@@ -115,7 +115,7 @@ def steady_contact(
     reported = columns_of(((*shared(s), s.depth_setpoint, s.force_limited) for s in exam_states if s.steady), _STEADY)
     true = columns_of(map(shared, indentation), _SHARED)
     stamps, at, truly = np.intersect1d(reported["stamp"], true["stamp"], return_indices=True)
-    contact = np.zeros(len(stamps), _CONTACT)
+    contact = np.zeros(len(stamps), _CONTACT).view(np.recarray)
     contact["measured"], contact["true"] = reported["depth"][at], true["depth"][truly]
     contact["wanted"], contact["limited"] = reported["wanted"][at], reported["limited"][at]
     contact["believed"] = apply(inverse(registered_X_WA), reported["place"][at])
