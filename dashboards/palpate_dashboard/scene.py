@@ -5,7 +5,7 @@ Messages in, rerun entities out.
 
 from collections.abc import Iterable
 from functools import cache
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 import rerun as rr
@@ -60,7 +60,7 @@ class SceneView:
         self._canvas = canvas
         self._shapes = dict(_link_shapes(robot))
         self._poses: dict[str, Floats] = {}
-        self._triangles: Indices | None = None
+        self._triangles: NDArray[Any] | None = None
         self._rest: NDArray[np.float32] | None = None
         self._drawn: NDArray[np.float32] | None = None
         self._map_vertices: NDArray[np.float32] | None = None
@@ -106,7 +106,9 @@ class SceneView:
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
-        normals = np.round(vertex_normals(rounded, self._triangles) * 64.0).astype(np.float32) / np.float32(64.0)
+        normals = np.round(vertex_normals(rounded.astype(np.float64), self._triangles) * 64.0).astype(np.float32) / np.float32(
+            64.0
+        )
         self._canvas.add("world/abdomen", deformations, t, (rounded, normals))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Floats, scanned: NDArray[np.bool_]) -> None:
