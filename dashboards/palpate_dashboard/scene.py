@@ -106,10 +106,8 @@ class SceneView:
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
-        normals = np.round(vertex_normals(rounded.astype(np.float64), self._triangles) * 64.0).astype(np.float32) / np.float32(
-            64.0
-        )
-        self._canvas.add("world/abdomen", deformations, t, (rounded, normals))
+        normals = np.round(64.0 * vertex_normals(rounded.astype(np.float64), self._triangles)) / 64.0
+        self._canvas.add("world/abdomen", deformations, t, (rounded, normals.astype(np.float32)))
 
     def stiffness(self, t: int, vertices: NDArray[np.float32], ratio: Floats, scanned: NDArray[np.bool_]) -> None:
         """Colours the abdomen by the map: vertices, shape (k, 3), stiffness over background [1], and a mask of assessed ones."""
