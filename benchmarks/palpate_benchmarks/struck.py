@@ -243,7 +243,7 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
     return Struck(run.folder, own, None if hung.is_set() else code, watched, struck_s, left, stuck)
 
 
-class Watch:
+class FaultWatch:
     """Says when the fault is due, collects its signs and ends a run early."""
 
     def __init__(self, run: StruckRun) -> None:
@@ -328,7 +328,7 @@ def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
         local.start(*(processes[role] for role in group))
     pids = {role: child.pid for role, child in local.running.items()}
     print(f"{PROCESSES}{TypeAdapter(tuple[Path, dict[str, int]]).dump_json((local.folder, pids)).decode()}", flush=True)
-    watch = Watch(run)
+    watch = FaultWatch(run)
     with local.as_conductor():
         result = conduct(session, roles, watch.on_progress, local.ended, timing, PATIENCE)
     (run.folder / FILE).write_bytes(pickle.dumps(watch.finished(result)))

@@ -12,7 +12,7 @@ from conductor_messages import collected, result
 from palpate_benchmarks.campaign import drawn, judge, prepared, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
-from palpate_benchmarks.struck import CONDUCTOR, ROLES, CaseOver, Struck, StruckRun, Watch, Watched
+from palpate_benchmarks.struck import CONDUCTOR, ROLES, CaseOver, FaultWatch, Struck, StruckRun, Watched
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -94,9 +94,9 @@ def test_an_unknown_fault_is_answered_with_the_allowed_ones(topic: str, kind: st
         InjectedFault(topic, kind, at=at)
 
 
-def watch(**options: Any) -> Watch:
+def watch(**options: Any) -> FaultWatch:
     """Return the watch of a run whose fault was due long ago."""
-    due = Watch(StruckRun(Path(), **{"early": True, **options}))
+    due = FaultWatch(StruckRun(Path(), **{"early": True, **options}))
     due.since = 0.0
     return due
 
@@ -142,7 +142,7 @@ def test_a_fault_of_the_assessment_shows_after_the_scan(tmp_path: Path) -> None:
 
 
 def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> None:
-    case = Watch(StruckRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
+    case = FaultWatch(StruckRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
     for t, phase in ((6.0, ExamState.PHASE_INDENT), (7.0, ExamState.PHASE_SCAN), (7.4, ExamState.PHASE_SCAN)):
         case.on_progress(replace(in_phase(phase), t=round(t * NS)))
     assert not capsys.readouterr().out
