@@ -57,7 +57,7 @@ class ComparedPalpation:
     force: Array
     """Measured there [N], shape (k,): at the depth of the map, or of the comparison if the recording has its curve."""
     faults: tuple[str, ...] = ()
-    """What is wrong with the recording."""
+    """Faults of the recording, for messages."""
 
     def moved(self, X: Array) -> ComparedPalpation:
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
