@@ -81,7 +81,7 @@ def test_smooth_errors_have_their_size_and_time_constant(name: str, time: str) -
     given: LoopErrors = known_loops()[0].model_copy(update={name: 1e-3, time: 0.1})
     loop = Loop(scenario(5), given)
     draw = loop.regulation if name == "regulation_m" else loop.wander
-    values = np.array([draw(k) for k in range(60_000)])
+    values = np.array([draw.at(k) for k in range(60_000)])
     assert values.std() == pytest.approx(1e-3, rel=0.05)
     lag = round(1.678 * 0.1 / 0.01)
     assert np.corrcoef(values[lag:], values[:-lag])[0, 1] == pytest.approx(0.5, abs=0.06)
