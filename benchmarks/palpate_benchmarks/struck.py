@@ -294,7 +294,9 @@ class FaultWatch:
     def finished(self, result: RunResult) -> Watched:
         """Return what was seen, with the result of the run."""
         watched = self.watched
-        columns = {name: list(kept) if isinstance(kept, Sequence) else kept for name, kept in vars(result.collected).items()}
+        columns: dict[str, Any] = {
+            name: list(kept) if isinstance(kept, Sequence) else kept for name, kept in vars(result.collected).items()
+        }
         watched.result = replace(result, collected=Collected(**columns))
         if self.since is not None:
             watched.add(RunProgress(0, 0.0, result.collected), self._after_ms)
