@@ -86,12 +86,6 @@ def small_of(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, 
     return small(t, depth[k // 2 :: k, k // 2 :: k], pinhole.every(k))
 
 
-def pinhole_of(info: Message) -> Pinhole:
-    """Return the camera of a `sensor_msgs/CameraInfo` without distortion."""
-    K = np.asarray(info.k, np.float64).reshape(3, 3)
-    return Pinhole(int(info.width), int(info.height), *(float(x) for x in (K[0, 0], K[1, 1], K[0, 2], K[1, 2])))
-
-
 def camera_info(t: int, pinhole: Pinhole) -> Message:
     """Return the `sensor_msgs/CameraInfo`, without distortion, at `t` [ns]."""
     K = pinhole.matrix

@@ -24,7 +24,7 @@ from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
-from palpate_camera.backends.ros import CameraPort, RosCameraService, ZenohCamera
+from palpate_camera.backends.ros import CameraPort, RosCameraService
 from palpate_camera.inputs import CameraError
 from palpate_models.scenario.schema import RosCamera
 
@@ -192,7 +192,7 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     tf.publish(TFMessage(TREE))  # before anyone subscribes
     images = node.publisher("camera/depth/image_rect_raw", "sensor_msgs/msg/Image")
     infos = node.publisher("camera/depth/camera_info", "sensor_msgs/msg/CameraInfo")
-    camera = ZenohCamera(RosCamera(router=endpoint))
+    camera = CameraPort(RosCamera(router=endpoint))
     assert camera.rectified
     service = RosCameraService(camera)
     inbox = asked(1)

@@ -1,9 +1,9 @@
 """The camera as a service that passes on the images of a ROS 2 depth camera."""
 
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from time import monotonic, sleep, time_ns
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Final
 
 from palpate_bus.messages import TFMessage, Transform, TransformStamped
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -16,35 +16,27 @@ from palpate_camera.inputs import CameraError, CameraInput, StaticTransforms
 from palpate_camera.messages import FRAME
 from palpate_models.scenario.schema import RosCamera, Scenario
 
-POSE_WAIT_S = 20.0
-"""Time limit for the camera pose before the run."""
-FRAME_WAIT_S = 2.0
-"""Time limit for the first image and its intrinsics, which are checked before the run."""
-OLDEST_NS = 300_000_000
-"""An image that seems older than this has a stamp of another clock."""
+
+@dataclass(frozen=True)
+class RosCameraTuning:
+    """Times to wait for the camera, and the age of an image."""
+
+    pose_wait_s: float = 20.0
+    """Time limit for the camera pose before the run."""
+    frame_wait_s: float = 2.0
+    """Time limit for the first image and its intrinsics, which are checked before the run."""
+    oldest_ns: int = 300_000_000
+    """An image that seems older than this has a stamp of another clock."""
 
 
-class CameraPort(ABC):
-    """The ROS side, as the bridge sees it."""
+TUNING: Final = RosCameraTuning()
+
+
+class CameraPort:
+    """The ROS side: subscriptions over zenoh, as rmw_zenoh makes them."""
 
     rectified: bool = False
     """True if images are rectified: they use `camera_info`'s P, otherwise its K and distortion."""
-
-    @abstractmethod
-    def images(self) -> list[Any]:
-        """Return the sensor_msgs/Image received since the last call, oldest first."""
-
-    @abstractmethod
-    def info(self) -> Any | None:
-        """Return the newest sensor_msgs/CameraInfo; None before the first."""
-
-    @abstractmethod
-    def transforms(self) -> list[Any]:
-        """Return the geometry_msgs/TransformStamped of tf_static received since the last call."""
-
-
-class ZenohCamera(CameraPort):
-    """Subscribes over zenoh, as rmw_zenoh does."""
 
     def __init__(self, ros: RosCamera) -> None:
         """Join the ROS side. Raises BusConfigError."""
@@ -57,16 +49,16 @@ class ZenohCamera(CameraPort):
         self._info: Any | None = None
 
     def images(self) -> list[Any]:
-        """See `CameraPort.images`."""
+        """Return the sensor_msgs/Image received since the last call, oldest first."""
         return self._images.take()
 
     def info(self) -> Any | None:
-        """See `CameraPort.info`."""
+        """Return the newest sensor_msgs/CameraInfo; None before the first."""
         self._info = self._infos.newest() or self._info
         return self._info
 
     def transforms(self) -> list[Any]:
-        """See `CameraPort.transforms`."""
+        """Return the geometry_msgs/TransformStamped of tf_static received since the last call."""
         return [item for message in self._tf.take() for item in message.transforms]
 
 
@@ -80,7 +72,7 @@ class RosCameraService(Service):
         port: CameraPort,
         frame: str = FRAME,
         world: str = "world",
-        wait_s: float = POSE_WAIT_S,
+        wait_s: float = TUNING.pose_wait_s,
         now: Callable[[], int] = time_ns,
     ) -> None:
         """Wait for the camera's pose, up to `wait_s` [s], and its first image; `now` returns the time of ROS [ns].
@@ -98,7 +90,7 @@ class RosCameraService(Service):
         )
         self._transforms = StaticTransforms()
         self._pose = _await_pose(port, self._transforms, frame, world, wait_s)
-        _check_first(port, self._input, min(wait_s, FRAME_WAIT_S))
+        _check_first(port, self._input, min(wait_s, TUNING.frame_wait_s))
         self._wanted = self._asked = 0
         self._stamp = 0
         """Header stamp of the newest image, by the driver's clock [ns]; 0 without an image or a stamp."""
@@ -143,7 +135,7 @@ class RosCameraService(Service):
     def _exposed(self, t: int, stamp: int) -> int:
         """Return the time of exposure [ns] in the run's time, now `t`, of an image with ROS time `stamp`; `t` if unknown."""
         age = self._now() - stamp
-        return max(t - age, 0) if 0 <= age <= OLDEST_NS else t
+        return max(t - age, 0) if 0 <= age <= TUNING.oldest_ns else t
 
     def finish(self) -> Mapping[str, Any]:
         """Return the numbers of forwarded, repeated and rejected messages, with reasons, and the transforms left out."""
@@ -180,4 +172,4 @@ def create(scenario: Scenario) -> RosCameraService:
     if Settings.read().runtime != "wallclock":
         raise CameraError("services.camera = ros takes a real camera, which does not wait: run with --wallclock")
     ros = scenario.camera.ros
-    return RosCameraService(ZenohCamera(ros), ros.frame.strip("/"), ros.world.strip("/"))
+    return RosCameraService(CameraPort(ros), ros.frame.strip("/"), ros.world.strip("/"))
