@@ -108,6 +108,14 @@ def _parameter(
     return Variable(vr, name, f"parameters.{member or name}", doc, unit, **fields)
 
 
+def _array(
+    vr: int, name: str, doc: str, unit: str | None, shape: tuple[int | str, ...] = ("vertices",), member: str = "", **more: Any
+) -> Variable:
+    """An array of FMI 3.0 alone, calculated from the parameters unless `more` fields say otherwise."""
+    fields: dict[str, Any] = {"role": VariableRole.CALCULATED, "versions": (3,)} | more
+    return Variable(vr, name, f"arrays.{member or name}", doc, unit, shape, **fields)
+
+
 def _state(
     vr: int, rate_vr: int, name: str, member: str, doc: str, shape: tuple[int | str, ...], unit: str = "m", **more: Any
 ) -> tuple[Variable, Variable]:
@@ -167,49 +175,26 @@ TABLE: tuple[Variable, ...] = (
         1500, "sample_position", "arrays.sample_position", "Rest position of sample vertices", "m", ("samples", 3),
         role=VariableRole.CALCULATED, versions=(2,),
     ),
-    Variable(
-        5000, "surface_displacement", "arrays.inward", "Inward displacement of every vertex", "m", ("vertices",),
-        group="INWARD", versions=(3,),
+    _array(
+        5000, "surface_displacement", "Inward displacement of every vertex", "m", member="inward",
+        role=VariableRole.OUTPUT, group="INWARD",
     ),
-    Variable(
-        5001, "deformed_position", "arrays.position", "Vertices of the deformed surface", "m", ("vertices", 3),
-        role=VariableRole.LOCAL, group="SHAPE", versions=(3,),
+    _array(
+        5001, "deformed_position", "Vertices of the deformed surface", "m", ("vertices", 3), "position",
+        role=VariableRole.LOCAL, group="SHAPE",
     ),
-    Variable(
-        5002, "deformed_normal", "arrays.normal", "Its outward normals", "1", ("vertices", 3),
-        role=VariableRole.LOCAL, group="SHAPE", versions=(3,),
+    _array(
+        5002, "deformed_normal", "Its outward normals", "1", ("vertices", 3), "normal", role=VariableRole.LOCAL, group="SHAPE",
     ),
-    Variable(
-        5003, "rest_position", "arrays.rest_position", "Vertices at rest", "m", ("vertices", 3),
-        role=VariableRole.CALCULATED, versions=(3,),
-    ),
-    Variable(
-        5004, "rest_normal", "arrays.rest_normal", "Outward normals at rest", "1", ("vertices", 3),
-        role=VariableRole.CALCULATED, versions=(3,),
-    ),
-    Variable(
-        5005, "stiffness", "arrays.stiffness", "k_w with lesions", "N/m3", ("vertices",),
-        role=VariableRole.CALCULATED, group="MATRICES", versions=(3,),
-    ),
-    Variable(
-        5006, "background", "arrays.background", "k_w without lesions", "N/m3", ("vertices",),
-        role=VariableRole.CALCULATED, group="MATRICES", versions=(3,),
-    ),
-    Variable(
-        5007, "lesion", "arrays.lesion", "Lesion in which a vertex lies, from 0; -1: none", None, ("vertices",),
-        role=VariableRole.CALCULATED, group="MATRICES", integer=True, versions=(3,),
-    ),
-    Variable(
-        5009, "stiffening", "arrays.stiffening", "How fast the modulus rises with depth", "1/m", ("vertices",),
-        role=VariableRole.CALCULATED, versions=(3,),
-    ),
-    Variable(
-        5010, "tension", "arrays.tension", "What contracted muscle adds to the modulus, over k_w", "1", ("vertices",),
-        role=VariableRole.CALCULATED, versions=(3,),
-    ),
-    Variable(
-        5008, "triangles", "arrays.triangles", "Vertex indices from 0, counter-clockwise seen from outside", None,
-        ("triangles", 3), role=VariableRole.CALCULATED, integer=True, versions=(3,),
+    _array(5003, "rest_position", "Vertices at rest", "m", ("vertices", 3)),
+    _array(5004, "rest_normal", "Outward normals at rest", "1", ("vertices", 3)),
+    _array(5005, "stiffness", "k_w with lesions", "N/m3", group="MATRICES"),
+    _array(5006, "background", "k_w without lesions", "N/m3", group="MATRICES"),
+    _array(5007, "lesion", "Lesion in which a vertex lies, from 0; -1: none", None, group="MATRICES", integer=True),
+    _array(5009, "stiffening", "How fast the modulus rises with depth", "1/m"),
+    _array(5010, "tension", "What contracted muscle adds to the modulus, over k_w", "1"),
+    _array(
+        5008, "triangles", "Vertex indices from 0, counter-clockwise seen from outside", None, ("triangles", 3), integer=True
     ),
     *_state(
         100_000_000, 200_000_000, "displacement", "displacement",
