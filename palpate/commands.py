@@ -203,7 +203,7 @@ def _exit_for_missing(name: str, error: ModuleNotFoundError) -> NoReturn:
 
 def _check_libraries(name: str) -> None:
     """Exit if a library of the command's extra is not installed, before anything is measured. Its help needs none."""
-    helps = len(sys.argv) == 2 or not {*HELP_OPTIONS}.isdisjoint(sys.argv)
+    helps = not {*HELP_OPTIONS}.isdisjoint(sys.argv)
     if name in EXTRAS and not helps and (missing := missing_libraries(EXTRAS[name])):
         _refuse_without(missing, name)
 

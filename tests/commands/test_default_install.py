@@ -15,14 +15,14 @@ CALLS = {
     "assess": ["recording.csv"],
     "compare": ["one.csv", "other.csv"],
     "fit": ["recording.csv"],
-    "dashboard": ["out"],
+    "dashboard": [],
     "fmu": ["build"],
     "study": ["smoke"],
-    "validate": ["--only", "drop"],
-    "reproduce": ["--quiet"],
-    "bench": ["lump"],
-    "faults": ["--limit", "1"],
-    "fuzz": ["codec:*"],
+    "validate": [],
+    "reproduce": [],
+    "bench": [],
+    "faults": [],
+    "fuzz": [],
 }
 """A call of each command that needs another extra."""
 HELPS = """
