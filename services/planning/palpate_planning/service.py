@@ -155,7 +155,7 @@ class PlanningService(Service):
 
     def _averaged(self, inbox: Inbox) -> Array | None:
         """Return the height of the wall averaged over all images, if it arrived and belongs to the present surface."""
-        heights = None
+        heights: Array | None = None
         for message in inbox.new("perception/correction"):
             if self._mesh is not None and len(message.outward) == len(self._mesh.vertices) // 3:
                 heights = np.asarray(message.outward, dtype=float)
@@ -163,7 +163,7 @@ class PlanningService(Service):
 
     def _request(self, inbox: Inbox) -> PressRequest | None:
         """Return the newest request of the search, if one arrived: the search waits for its execution before the next."""
-        received = inbox.new("exam/request") if self._known.exam.searched else []
+        received = list(inbox.new("exam/request")) if self._known.exam.searched else []
         if not received:
             return None
         message = received[-1]
