@@ -3,9 +3,11 @@
 import os
 import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+import pytest
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics import cache
@@ -49,6 +51,32 @@ def test_a_change_in_what_a_function_calls_is_not_missed(tmp_path: Path) -> None
     assert _run(tmp_path) == 5.0
 
 
+def flipped(whole: bytes) -> bytes:
+    """Return a file with one bit changed, after its header."""
+    at = len(whole) * 2 // 3
+    return whole[:at] + bytes([whole[at] ^ 4]) + whole[at + 1 :]
+
+
+def cut(whole: bytes) -> bytes:
+    return whole[: len(whole) // 2]
+
+
+@pytest.fixture(scope="module")
+def compiled_once(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("compiled")
+    (folder / "caller.py").write_text(CALLER)
+    (folder / "inner.py").write_text(INNER.format(factor=2.0))
+    assert _run(folder) == 3.0
+    return folder
+
+
+@pytest.mark.parametrize(("kind", "damage"), [("nbi", cut), ("nbc", flipped), ("stamp", lambda whole: b"\xff")])
+def test_damaged_compiled_code_is_made_again(compiled_once: Path, kind: str, damage: Callable[[bytes], bytes]) -> None:
+    for path in (compiled_once / "kept").rglob(f"*.{kind}"):
+        path.write_bytes(damage(path.read_bytes()))
+    assert _run(compiled_once) == 3.0
+
+
 def test_it_is_the_tree_s() -> None:
     rng = np.random.default_rng(2)
     vertices = rng.uniform(-0.2, 0.2, size=(3000, 3))
@@ -77,7 +105,7 @@ def test_the_cache_survives_a_broken_file_and_a_folder_that_cannot_be_written(tm
     assert key != content_key("test", (), np.arange(3.0), (1, "b"))
     assert set(remembered(key, lambda: np.ones(300))) == {1.0}
     path = cache.folder() / f"{key}.npy"
-    for number, damage in enumerate((lambda whole: b"broken", lambda whole: b"", lambda whole: whole[:-1]), start=2):
+    for number, damage in enumerate((lambda whole: b"broken", lambda whole: b"", flipped, lambda whole: whole[:-1]), start=2):
         path.write_bytes(damage(path.read_bytes()))
         assert set(remembered(key, lambda value=number: np.full(300, float(value)))) == {number}
         assert set(remembered(key, lambda: np.zeros(300))) == {number}

@@ -1,7 +1,11 @@
-"""Cache of slow computations in the user's cache folder, keyed by a hash of their inputs."""
+"""Cache of slow computations in the user's cache folder, keyed by a hash of their inputs.
+
+A file has the array in numpy's format, followed by the SHA-256 of it.
+"""
 
 import contextlib
 import hashlib
+import mmap
 import os
 import tempfile
 from collections.abc import Callable, Iterable
@@ -40,16 +44,17 @@ def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
 
 
 def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
-    """Return the array under `key`, memory-mapped and read-only; compute it if it is missing or cut off.
+    """Return the array under `key`, memory-mapped and read-only; compute it if it is missing or damaged.
 
     If the cache folder cannot be written, the array is computed each time.
     """
     path = folder() / f"{key}.npy"
     with contextlib.suppress(OSError, ValueError, EOFError):
-        found: NDArray[Any] = np.load(path, mmap_mode="r")
-        with contextlib.suppress(OSError):
-            os.utime(path)
-        return found
+        if _intact(path):
+            found: NDArray[Any] = np.load(path, mmap_mode="r")
+            with contextlib.suppress(OSError):
+                os.utime(path)
+            return found
     value = compute()
     with contextlib.suppress(OSError):
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -57,12 +62,24 @@ def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
             partial = Path(file.name)
             try:
                 np.save(file, value)
+                file.flush()
+                with mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content:
+                    digest = hashlib.sha256(content).digest()
+                file.write(digest)
                 file.close()
                 partial.replace(path)
             finally:
                 partial.unlink(missing_ok=True)
         _forget_oldest(path.parent)
     return value
+
+
+def _intact(path: Path) -> bool:
+    """Return True if a file ends with the SHA-256 of what precedes it. Raises OSError, ValueError."""
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as content, memoryview(content) as view:
+        end = len(view) - hashlib.sha256().digest_size
+        with view[: max(end, 0)] as array, view[max(end, 0) :] as stored:
+            return hashlib.sha256(array).digest() == stored
 
 
 def _forget_oldest(where: Path) -> None:

@@ -8,6 +8,7 @@ is cleared if any of its files has changed. A compiled function must not call on
 counts as a source of every package.
 """
 
+import pickle
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
@@ -16,10 +17,12 @@ from pathlib import Path
 from typing import Any, TypeVar, cast
 
 import numba
+from numba.core.caching import IndexDataCacheFile
 
 _F = TypeVar("_F", bound=Callable[..., Any])
 STAMP = "palpate.stamp"
 """File next to the compiled code with the digest of its sources."""
+DIGEST_BYTES = 32
 _SHARED = Path(__file__).with_name("vectors.py")
 
 
@@ -30,9 +33,36 @@ def compiled(function: _F) -> _F:
     except RuntimeError:  # numba found no writable cache folder
         return cast("_F", numba.njit(error_model="numpy")(function))
     if dispatcher is not function:  # the same object if NUMBA_DISABLE_JIT is set
+        cast("Any", dispatcher)._cache._cache_file.__class__ = _CheckedFile
         with suppress(OSError):
             _renew(_package(Path(function.__code__.co_filename)), Path(str(dispatcher.stats.cache_path)))
     return cast("_F", dispatcher)
+
+
+class _CheckedFile(IndexDataCacheFile):
+    """Index and code of a function on the disk, each with its SHA-256. A damaged file is compiled again."""
+
+    def _dump(self, obj: object) -> bytes:
+        content: bytes = super()._dump(obj)  # type: ignore[no-untyped-call]
+        return sha256(content).digest() + content
+
+    def _load_index(self) -> dict[Any, str]:
+        with suppress(Exception), Path(self._index_path).open("rb") as file:  # what a damaged pickle raises cannot be listed
+            if pickle.load(file) == self._version:
+                stamp, overloads = _loaded(file.read())
+                return dict(overloads) if stamp == self._source_stamp else {}
+        return {}
+
+    def _load_data(self, name: str) -> Any:
+        return _loaded(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
+
+
+def _loaded(stored: bytes) -> Any:
+    """Return the content of a file. Raises OSError, which numba takes for a missing file, if it is damaged."""
+    digest, content = stored[:DIGEST_BYTES], stored[DIGEST_BYTES:]
+    if sha256(content).digest() != digest:
+        raise OSError("damaged")
+    return pickle.loads(content)
 
 
 def _package(file: Path) -> Path:
