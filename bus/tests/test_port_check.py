@@ -13,7 +13,20 @@ from toy_services import TOYS, Robot
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.contract.port_check import Checker, PortCheck, RefusedMessage
-from palpate_bus.messages import RobotStatus, SurfaceMotion, Vector3, Wrench, codec
+from palpate_bus.messages import (
+    Duration,
+    ImpedanceSetpoint,
+    JointTorqueCommand,
+    Point,
+    Pose,
+    Quaternion,
+    RobotStatus,
+    SurfaceMotion,
+    Twist,
+    Vector3,
+    Wrench,
+    codec,
+)
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
@@ -173,6 +186,38 @@ def test_a_breath_that_repeats_is_refused_while_it_is_followed(state: int) -> No
             follow()
     else:
         follow()
+
+
+def setpoint(t: int, orientation: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 1e-9), first: float = 0.3) -> Any:
+    still, q = Vector3(0.0, 0.0, 0.0), np.array((first, *(0.9,) * 6))
+    pose = Pose(Point(0.0, 0.0, 1.0), Quaternion(*orientation))
+    ones, motion, force = np.ones(6), Twist(still, still), Wrench(still, still)
+    return ImpedanceSetpoint(header(t, "world"), 1, pose, motion, force, ones, ones, q, 0 * q, q, Duration(0, 0))
+
+
+def torque(t: int, first: float = 3.0, problem: str = "") -> Any:
+    return JointTorqueCommand(header(t), np.array((first, *(1.0,) * 6)), np.zeros(0), Duration(0, 0), problem, "")
+
+
+@pytest.mark.parametrize(
+    ("topic", "before", "after", "refused"),
+    [
+        ("planning/setpoint", setpoint, lambda t: setpoint(t, (-1.0, 0.0, 0.0, 1e-9)), ""),
+        ("planning/setpoint", setpoint, lambda t: setpoint(t, (1e-9, 1.0, 0.0, 0.0)), "pose.orientation = 3.14159 rad from"),
+        ("planning/setpoint", setpoint, lambda t: setpoint(t, first=0.9), "joint_position = 0.9 after 0.3"),
+        ("control/joint_torque", torque, lambda t: torque(t, 4.0), ""),
+        ("control/joint_torque", torque, lambda t: torque(t, -25.0), "torque = -25 after 3"),
+        ("control/joint_torque", torque, lambda t: torque(t, -25.0, "the last set-point expired"), ""),
+    ],
+)
+def test_a_leap_is_refused_where_messages_are_compared(topic: str, before: Any, after: Any, refused: str) -> None:
+    check = PortCheck(RULES.topics[topic])
+    check(before(10 * MS), 10 * MS)
+    if not refused:
+        check(after(20 * MS), 20 * MS)
+        return
+    with pytest.raises(RefusedMessage, match=refused):
+        check(after(20 * MS), 20 * MS)
 
 
 def test_a_refused_spike_leaves_the_messages_after_it_alone() -> None:

@@ -3,7 +3,8 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from math import inf
+from math import inf, sqrt
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -71,6 +72,12 @@ def repeats(message: Message, before: Message, path: str) -> bool:
     return bool(np.array_equal(numbers(message, path), numbers(before, path)))
 
 
+def turn(now: Message, before: Message) -> float:
+    """Return the angle between two orientations, `geometry_msgs/Quaternion` [rad]."""
+    a, b = (np.array((q.x, q.y, q.z, q.w)) for q in (now, before))
+    return float(2 * np.arccos(min(abs(a @ b) / sqrt((a @ a) * (b @ b)), 1.0)))
+
+
 def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> Iterator[MessageViolation]:
     """Yield how a message that is sent or received at `t` [ns] breaks the contract after those before it."""
     stamp, age = nanoseconds(message.header.stamp), topic.max_age_ms or inf
@@ -83,17 +90,28 @@ def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> I
         yield MessageViolation(ViolationKind.AGE, "header.stamp", f"at most {age:g} ms old", got)
     if stamp - t > AHEAD_NS:
         yield MessageViolation(ViolationKind.STAMP, "header.stamp", f"at most {AHEAD_NS / 1e6:g} ms ahead", got)
-    for path, rate in topic.rates.items() if past.message is not None else ():
-        now, before = numbers(message, path), numbers(past.message, path)
-        most, k = rate * (stamp - past.stamp) / 1e9, int(np.argmax(np.abs(now - before)))
-        if not abs(now[k] - before[k]) <= most:
-            text = f"{now[k]:g} after {before[k]:g}, {(stamp - past.stamp) / 1e6:g} ms apart"
-            yield MessageViolation(ViolationKind.CHANGE, path, f"a change of {rate:g} {topic.units[path]} per second", text)
+    compared = all(getattr(message, field) == value for field, value in topic.compared_while.items())
+    for path, rate in topic.rates.items() if past.message is not None and compared else ():
+        most = rate * (stamp - past.stamp) / 1e9
+        if text := _too_fast(message, past.message, path, most):
+            allowed = f"a change of {rate:g} {topic.units.get(path, 'rad')} per second"
+            got = f"{text}, {(stamp - past.stamp) / 1e6:g} ms apart"
+            yield MessageViolation(ViolationKind.CHANGE, path, allowed, got)
     for count, (path, most) in zip(past.repeats, topic.varies.items(), strict=True):
         if count >= most and repeats(message, past.message, path):
             values = numbers(message, path)
             text = f"{values.tolist() if values.size <= FEW else 'the same values'} in {count + 2} messages in a row"
             yield MessageViolation(ViolationKind.FROZEN, path, f"at most {most + 1} equal ones: a live sensor has noise", text)
+
+
+def _too_fast(message: Message, before: Message, path: str, most: float) -> str:
+    """Return the values of a field that changes by more than `most`, and those before; empty if it does not."""
+    if leaves(message.__msgtype__, path)[0].message == QUATERNION:
+        turned = turn(attrgetter(path)(message), attrgetter(path)(before))
+        return "" if turned <= most else f"{turned:g} rad from the one before"
+    now, then = numbers(message, path), numbers(before, path)
+    worst = int(np.argmax(np.abs(now - then))) if now.size else 0
+    return "" if not now.size or abs(now[worst] - then[worst]) <= most else f"{now[worst]:g} after {then[worst]:g}"
 
 
 @dataclass(frozen=True)

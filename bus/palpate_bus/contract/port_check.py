@@ -30,6 +30,7 @@ from palpate_bus.contract.conformance import (
     leaves,
     numbers,
     repeats,
+    turn,
 )
 from palpate_bus.contract.rows import Topic
 from palpate_bus.messages.codec import Message, message_type, store
@@ -174,6 +175,7 @@ def conforms(row: str, sends: bool, alone: bool = False) -> Callable[[Message, P
         "array": np.asarray,
         "frame": topic.frame,
         "repeats": repeats,
+        "turn": turn,
         "equal": np.array_equal,
     }
     exec(compile(text, f"<check of {topic.name}>", "exec"), names)
@@ -212,13 +214,20 @@ class _Source:
             yield f"if stamp != t and (stamp > t + {AHEAD_NS} or {old}): return False"
         lines = [*self._rates(), *self._varies()]
         if lines:
-            yield from ("before = past.message", "if before is not None:", *(f" {line}" for line in lines), "past.message = m")
+            same = "".join(f" and m.{field} == {value!r}" for field, value in topic.compared_while.items())
+            yield from ("before = past.message", f"if before is not None{same}:", *(f" {line}" for line in lines))
+            if same:
+                yield from ("else:", f" past.repeats = {[0] * len(topic.varies)}")
+            yield "past.message = m"
         yield "past.stamp = stamp"
 
     def _rates(self) -> Iterator[str]:
         """Yield the lines that compare fields with those of the message before."""
         for path, rate in self._topic.rates.items():
             yield f"most = {rate * 1e-9!r} * (stamp - past.stamp)"
+            if leaves(self._topic.type, path)[0].message == QUATERNION:
+                yield f"if not turn(m.{path}, before.{path}) <= most: return False"
+                continue
             for leaf in leaves(self._topic.type, path):
                 yield f"change = m.{leaf.path} - before.{leaf.path}"
                 if leaf.array:
@@ -230,13 +239,12 @@ class _Source:
 
     def _varies(self) -> Iterator[str]:
         """Yield the lines that count the messages in a row in which a field repeats. Mostly the first number shows a change."""
-        idle = "".join(f"m.{field} != {value} or " for field, value in self._topic.varies_while.items())
         for k, (path, most) in enumerate(self._topic.varies.items()):
             leaf = leaves(self._topic.type, path)[0]
             first = f"{leaf.path}.item(0)" if leaf.array else leaf.path
             same = f"equal(m.{leaf.path}, before.{leaf.path})" if leaf.path == path else f"repeats(m, before, {path!r})"
             none = f"not m.{leaf.path}.size or " if leaf.array else ""  # an arm without torque sensors reports no torques
-            yield f"if {idle}{none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
+            yield f"if {none}m.{first} != before.{first} or not {same}: past.repeats[{k}] = 0"
             yield f"elif past.repeats[{k}] < {most}: past.repeats[{k}] += 1"
             yield "else: return False"
 

@@ -94,11 +94,11 @@ class Topic(_Row):
     units: dict[str, str] = {}
     ranges: dict[str, tuple[float, float]] = {}
     rates: dict[str, float] = {}
-    """Greatest change per second of each number."""
+    """Greatest change per second of each number; of a quaternion, greatest rate of turning [rad/s]."""
     varies: dict[str, int] = {}
     """Number of messages in a row whose field may repeat exactly."""
-    varies_while: dict[str, int] = {}
-    """Values of other fields without which a field of `varies` may repeat."""
+    compared_while: dict[str, int | str] = {}
+    """Values of other fields without which a message is not compared with the one before by `rates` and `varies`."""
     max_age_ms: int | None = None
     expiry_ms: int | None = None
     record_ms: int = 0

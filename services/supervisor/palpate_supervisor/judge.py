@@ -1,14 +1,16 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Any, Final
 
 import numpy as np
 
+from palpate_bus.messages.geometry import vector
+from palpate_models.numerics.frames import Array
 from palpate_supervisor.senses import ForceComparison, Measurement
 from palpate_supervisor.watch import Breach, Level, StopCause
 
-FT, JOINTS, STATUS = "ft/wrench", "joint_states", "robot/status"
+FT, JOINTS, STATUS, EXAM = "ft/wrench", "joint_states", "robot/status", "exam/state"
 
 
 @dataclass(frozen=True)
@@ -92,10 +94,14 @@ class MotionAgreement:
     """Three times the error of a velocity that lags by 10 ms while it changes by 1 rad/s."""
     JUMP_RADPS: Final = 4.0
     """Faster than any joint: a jump, which other checks name."""
+    AGAINST_RAD: Final = 1e-3
+    """Least motion of a joint between two measurements whose velocity has the other sign: twice that of a velocity that lags by
+    20 ms in a reversal of 5 rad/s^2."""
 
     def __init__(self) -> None:
         self._before: Measurement | None = None
         self._gap = np.zeros(0)
+        self._against = 0
 
     def judge(self, measured: Measurement, since_s: float) -> list[Breach]:
         """Return the breaches at a measurement, `since_s` [s] after the one before."""
@@ -105,12 +111,43 @@ class MotionAgreement:
             self._gap = np.zeros_like(measured.q)
             return []
         turned = 0.5 * (measured.qd + before.qd) * since_s
+        against = (moved * turned < 0) & (np.minimum(np.abs(moved), np.abs(turned)) > self.AGAINST_RAD)
+        self._against = self._against + 1 if against.any() else 0
         gap = (self._gap + moved - turned) * np.exp(-since_s / self.WINDOW_S)
         self._gap = np.clip(gap, -2 * self.LIMIT_RAD, 2 * self.LIMIT_RAD)  # it is over within the window when they agree again
-        if (gap := float(np.abs(self._gap).max())) <= self.LIMIT_RAD:
+        if (gap := float(np.abs(self._gap).max())) > self.LIMIT_RAD:
+            reason = f"positions and velocities disagree by {gap:.2f} rad, limit {self.LIMIT_RAD:g} rad"
+        elif self._against > 1:
+            reason = "positions move against the velocities"
+        else:
             return []
-        reason = f"joint sensors: positions and velocities disagree by {gap:.2f} rad, limit {self.LIMIT_RAD:g} rad"
-        return [Breach(Level.EMERGENCY, StopCause.SENSOR, reason, culprit=STATUS)]
+        return [Breach(Level.EMERGENCY, StopCause.SENSOR, f"joint sensors: {reason}", culprit=STATUS)]
+
+
+class DepthAgreement:
+    """Compares the depth that planning states with that of the tool, by the joints, below the skin that planning states."""
+
+    LIMIT_M: Final = 0.003
+    """The tool moves by 0.5 mm between the two measurements."""
+    MOST: Final = 10
+    """Messages in a row beyond the limit."""
+
+    def __init__(self, radius: float) -> None:
+        """`radius` of the indenter [m]."""
+        self._radius = radius
+        self._wrong = 0
+        self._one_frame = True
+
+    def judge(self, state: Any, p_W: Array) -> list[Breach]:
+        """Return the breaches of an `exam/state`; `p_W`: centre of the sphere [m], shape (3,)."""
+        self._one_frame = self._one_frame and not state.patient_moved  # from then on the skin is given where it was before
+        height = vector(state.surface_normal) @ (p_W - vector(state.surface_point))
+        gap = float(state.depth - (self._radius + state.wall_displacement - height))
+        self._wrong = self._wrong + 1 if self._one_frame and state.in_contact and abs(gap) > self.LIMIT_M else 0
+        if self._wrong < self.MOST:
+            return []
+        reason = f"exam/state: depth = {1e3 * state.depth:.1f} mm, {1e3 * gap:.1f} mm more than the joints and its skin say"
+        return [Breach(Level.EMERGENCY, StopCause.INVALID, reason, culprit=EXAM)]
 
 
 def _ft(reason: str) -> list[Breach]:

@@ -15,7 +15,7 @@ from palpate_models.numerics.frames import inverse
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_supervisor.judge import MotionAgreement, SensorJudge
+from palpate_supervisor.judge import DepthAgreement, MotionAgreement, SensorJudge
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.tool import RestSurface, Tool, ToolSense
@@ -63,7 +63,7 @@ class SupervisorService(Service):
         RestSurface(np.zeros((1, 3)), np.zeros((1, 3)), self._radius).depth(np.zeros(3))  # compiles it before the first deadline
         self._max_age = contract().topics["planning/setpoint"].expiry
         """Age limit of watched topics [ns]: the expiry of set-points. Control and driver check their own inputs faster."""
-        self._judge, self._agreement = SensorJudge(), MotionAgreement()
+        self._judge, self._agreement, self._stated = SensorJudge(), MotionAgreement(), DepthAgreement(self._radius)
         self._disagreeing: list[Breach] = []
         self._latch = Latch()
         self._began: int | None = None
@@ -93,6 +93,7 @@ class SupervisorService(Service):
         if inbox.new("robot/status"):
             self._measured = self._measure(t, inbox.latest("robot/status"))
         breaches += self._measured  # valid until the next measurement
+        breaches += [breach for state in inbox.new("exam/state") for breach in self._stated.judge(state, self._tool.p_W)]
         self._latch.update(t, breaches, release)
         latch, tool = self._latch, self._tool
         state = SupervisorState(

@@ -7,11 +7,13 @@ import numpy as np
 import pinocchio as pin
 import pytest
 
+from palpate.exam_state import exam_state
+from palpate_bus.messages import ExamState
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
-from palpate_supervisor.judge import FT, JOINTS, MotionAgreement, SensorJudge
+from palpate_supervisor.judge import EXAM, FT, JOINTS, DepthAgreement, MotionAgreement, SensorJudge
 from palpate_supervisor.senses import BY_CURRENT, ForceComparison, ForceSenses, Measurement
 from palpate_supervisor.tool import ToolSense
 
@@ -127,12 +129,33 @@ def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_l
     assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
 
 
-@pytest.mark.parametrize(("lie", "seen"), [("", False), ("stuck", True), ("gain", True)])
+@pytest.mark.parametrize(("lie", "seen"), [("", False), ("stuck", True), ("gain", True), ("sign", True)])
 def test_positions_agree_with_velocities(lie: str, seen: bool) -> None:
     agreement, rng = MotionAgreement(), np.random.default_rng(2)
     found = []
     for measured in measurements():
         q = measured.q + rng.normal(0.0, 1e-5, 7)
-        q = {"": q, "stuck": measurements()[0].q + rng.normal(0.0, 1e-5, 7), "gain": 0.8 * q}[lie]
-        found += agreement.judge(measured._replace(q=q), DT)
+        q = {"": q, "stuck": measurements()[0].q + rng.normal(0.0, 1e-5, 7), "gain": 0.8 * q, "sign": q}[lie]
+        found += agreement.judge(measured._replace(q=q, qd=-measured.qd if lie == "sign" else measured.qd), DT)
+        if lie == "sign" and len(found) == 1:
+            assert found[0].reason == "joint sensors: positions move against the velocities"
     assert bool(found) == seen
+
+
+@pytest.mark.parametrize(
+    ("stated", "seen"),
+    [
+        ({}, False),
+        ({"depth": 0.038}, True),
+        ({"depth": 0.3 * 0.008}, True),
+        ({"depth": 0.009}, False),
+        ({"depth": 0.038, "in_contact": False}, False),
+        ({"depth": 0.038, "patient_moved": True}, False),
+    ],
+)
+def test_the_stated_depth_agrees_with_the_joints(stated: dict[str, float], seen: bool) -> None:
+    agreement, p_W = DepthAgreement(0.02), np.array((0.0, 0.0, 1.013))
+    true = {"depth": 0.008, "wall_displacement": 0.001, "in_contact": True} | stated
+    for k in range(12):
+        found = agreement.judge(exam_state(10_000_000 * k, ExamState.PHASE_SCAN, (0.0, 0.0, 1.0), **true), p_W)
+    assert [breach.culprit for breach in found] == [EXAM] * seen
