@@ -11,14 +11,18 @@ from numpy.typing import NDArray
 
 from palpate_bus.messages import Transform
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_in_metres, transform_matrix, transform_message
+from palpate_bus.messages.geometry import NO_DEPTH_M, depth_in_metres, transform_matrix, transform_message
 from palpate_camera.messages import Pinhole
 from palpate_errors import UserError
 
 log = logging.getLogger(__name__)
 
-LEAST_FOCAL: Final = 0.05
-"""Least focal length, as a share of the image's size: an angle of view of 169 degrees."""
+FOCAL: Final = (0.05, 1000.0)
+"""Focal lengths, as shares of the image's size: angles of view of 169 and 0.06 degrees."""
+ASPECT: Final = (0.5, 2.0)
+"""Ratio of the focal lengths."""
+OFF_CENTRE: Final = 0.2
+"""Distance of the principal point from the centre, as a share of the image's size; that of half the size is farther away."""
 LARGEST_DISTORTION: Final = 1e-9
 """Greatest distortion coefficient of an image that counts as undistorted."""
 
@@ -78,15 +82,26 @@ class CameraInput:
                 f"(ros2 run image_proc rectify_node --ros-args -p interpolation:=0) and {self.distorted}"
             )
         width, height = int(info.width), int(info.height)
+        parts = max(info.binning_x, info.binning_y) > 1 or (info.roi.width, info.roi.height) not in ((0, 0), (width, height))
+        if parts:
+            raise CameraError(f"{self.info}: binning or a region of interest: want the intrinsics of the image as it is sent")
         fx, fy, cx, cy = map(float, (K[0, 0], K[1, 1], K[0, 2], K[1, 2]))
         where = f"{self.info}: {name} = {K.ravel().tolist()}"
         if not (np.isfinite(K).all() and fx > 0 and fy > 0):
             raise CameraError(f"{where}: all must be finite, and the focal lengths positive")
-        if fx < LEAST_FOCAL * width or fy < LEAST_FOCAL * height:
+        if not np.array_equal(K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]):
+            raise CameraError(f"{where}: want fx, 0, cx, 0, fy, cy, 0, 0, 1")
+        sides = fx / width, fy / height
+        if not (FOCAL[0] < min(sides) and max(sides) < FOCAL[1] and ASPECT[0] < fx / fy < ASPECT[1]):
             raise CameraError(f"{where}: focal lengths of {fx:g} and {fy:g} px are not of an image of {width} x {height} px")
-        if not (0 < cx < width and 0 < cy < height):
-            raise CameraError(f"{where}: the principal point ({cx:g}, {cy:g}) is not in the image of {width} x {height} px")
+        if any(abs(centre - size / 2) > OFF_CENTRE * size + 0.5 for centre, size in ((cx, width), (cy, height))):
+            raise CameraError(f"{where}: the principal point ({cx:g}, {cy:g}) is not in the middle of {width} x {height} px")
         return Pinhole(width, height, fx, fy, cx, cy)
+
+    def check_seen(self, frames: Iterable[Frame]) -> None:
+        """Raise CameraError if no image measures anything."""
+        if not any(np.isfinite(frame.depth).any() for frame in frames):
+            raise CameraError(f"{self.image}: no pixel has a depth of 0 to {NO_DEPTH_M:g} m: want 32FC1 in m or 16UC1 in mm")
 
 
 class StaticTransforms:

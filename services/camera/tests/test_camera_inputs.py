@@ -50,13 +50,15 @@ class Seen:
         self.d = np.zeros(5)
         self.size = (HEIGHT, WIDTH)
         self.info_frame = FRAME
+        self.binning_x = 0
+        self.roi = RegionOfInterest(0, 0, 0, 0, False)
         self.transforms = [link("world", FRAME)]
 
     @property
     def info(self) -> Any:
         P = np.hstack((self.k.reshape(3, 3), np.zeros((3, 1)))).ravel()
-        whole = RegionOfInterest(0, 0, 0, 0, False)
-        return CameraInfo(header(5, self.info_frame), *self.size, "plumb_bob", self.d, self.k, np.eye(3).ravel(), P, 0, 0, whole)
+        crop = self.binning_x, 0, self.roi
+        return CameraInfo(header(5, self.info_frame), *self.size, "plumb_bob", self.d, self.k, np.eye(3).ravel(), P, *crop)
 
 
 class Port(CameraPort):
@@ -113,8 +115,15 @@ def shown(service: Service) -> Any:
                 (600.0, 600.0, NAN, 2.5),
                 (0.09, 0.11, 0.5, 0.5),  # as shares of the image
                 (600.0, 600.0, 319.5, 239.5),  # of another resolution
+                (600.0, 600.0, 1.5, 1.0),
+                (600.0, 200.0, 3.5, 2.5),
+                (1e7, 1e7, 3.5, 2.5),
             )
         ),
+        ("k", np.array([600.0, 3.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 1.0]), "k = .*want fx, 0, cx"),
+        ("k", np.array([600.0, 0.0, 3.5, 0.0, 600.0, 2.5, 0.0, 0.0, 2.0]), "k = .*want fx, 0, cx"),
+        ("binning_x", 2, "binning or a region of interest"),
+        ("roi", RegionOfInterest(0, 1, HEIGHT // 2, WIDTH // 2, False), "binning or a region of interest"),
         ("k", np.eye(3).ravel(), r"k = .*principal point|k = .*focal"),
         ("size", (HEIGHT // 2, WIDTH // 2), "is 8 x 6, .*camera_info says 4 x 3"),
         ("size", (WIDTH, HEIGHT), "is 8 x 6, .*camera_info says 6 x 8"),
@@ -138,6 +147,10 @@ def test_wrong_intrinsics_are_refused_at_the_start(camera: Camera, tmp_path: Pat
         ("encoding", "", "encoding = '', want"),
         ("data", np.zeros(3 * WIDTH, np.uint8), "24 bytes for 6 rows of 32"),
         ("step", 2 * WIDTH, "rows of 16"),
+        *(
+            ("data", np.full(WIDTH * HEIGHT, depth, "<f4").view(np.uint8), "no pixel has a depth of 0 to 65.5 m")
+            for depth in (0.0, NAN, 750.0, 65.535, -0.75, np.inf)
+        ),
     ],
 )
 def test_wrong_images_are_refused_at_the_start(camera: Camera, tmp_path: Path, field: str, value: Any, found: str) -> None:

@@ -149,6 +149,8 @@ def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str
         distorted=f"record that as {image}, with d = 0",
     )
     frames = [source.read(*pair) for pair in _pairs(images, infos)] if infos else []
+    if frames:
+        source.check_seen(frames)
     if len(sizes := {frame.pinhole for frame in frames}) > 1:
         first, second = list(sizes)[:2]
         raise CameraError(

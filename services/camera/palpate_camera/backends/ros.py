@@ -160,7 +160,7 @@ def _check_first(port: CameraPort, source: CameraInput, wait_s: float) -> None:
         images += port.images()
         info = port.info()
         if images and info is not None:
-            source.read(images[-1], info)
+            source.check_seen([source.read(images[-1], info)])
             return
         if monotonic() - begin > wait_s:
             return
