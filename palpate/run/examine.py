@@ -134,15 +134,17 @@ def _rate(scenario: Scenario) -> float:
 
     Raises UserError if there is none.
     """
-    real = scenario.services.tissue == NONE or scenario.robot.driver.emulated
-    rate = Settings.read().rate
+    real, emulated = scenario.services.tissue == NONE, scenario.robot.driver.emulated
+    given = rate = Settings.read().rate
     if rate is None:
         measured = measure(REAL_PROCESSES if scenario.services.tissue == NONE else SIMULATED_PROCESSES)
         rate = measured.rate
         if rate is None:
             raise UserError(f"this machine cannot keep {RATES[-1]:g} of real time now: {measured.summary}; run in lockstep")
-        if rate < 1.0 or real:
+        if rate < 1.0 or real or emulated:
             say(f"this machine keeps {rate:g} of real time now: {measured.summary}")
     if rate < 1.0 and real:
-        raise UserError("services.tissue = 'none' and robot.driver.emulated are in real time: hardware cannot be slowed down")
+        raise UserError("services.tissue = 'none' is in real time: hardware cannot be slowed down")
+    if rate < 1.0 and emulated and given is None:
+        raise UserError(f"the emulated arm is in real time: start it and the run with PALPATE_RATE={rate:g}")
     return rate

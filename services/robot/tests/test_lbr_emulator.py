@@ -17,9 +17,9 @@ PERIOD = 2 * MS
 WALL = 1_700_000_000_000_000_000
 
 
-def paced(busy: dict[int, int], cycles: int = 100) -> tuple[list[int], list[int]]:
+def paced(busy: dict[int, int], cycles: int = 100, rate: float = 1.0) -> tuple[list[int], list[int]]:
     """When cycles begin and their stamps [ns], with a machine that loses `busy[k]` [ns] before cycle k."""
-    metronome = Metronome(PERIOD, 0, WALL)
+    metronome = Metronome(PERIOD, 0, WALL, rate)
     now, began, stamps = 0, [], []
     for k in range(cycles):
         now += busy.get(k, 0)
@@ -29,10 +29,11 @@ def paced(busy: dict[int, int], cycles: int = 100) -> tuple[list[int], list[int]
     return began, stamps
 
 
-def test_undisturbed_it_keeps_the_period_without_drift() -> None:
-    began, stamps = paced(dict.fromkeys(range(100), 300000))
-    assert began == [PERIOD * (k + 1) for k in range(100)]
-    assert stamps == [WALL + t for t in began]
+@pytest.mark.parametrize("rate", [1.0, 0.25])
+def test_undisturbed_it_keeps_the_period_without_drift(rate: float) -> None:
+    began, stamps = paced(dict.fromkeys(range(100), 300000), rate=rate)
+    assert began == [PERIOD / rate * (k + 1) for k in range(100)]
+    assert stamps == [WALL + round(rate * t) for t in began]
 
 
 @pytest.mark.parametrize("late", [10 * MS, 90 * MS, 400 * MS])

@@ -27,6 +27,7 @@ from palpate_bus.messages import (
     WrenchStamped,
 )
 from palpate_bus.messages.stamps import header
+from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, link_names
@@ -120,10 +121,13 @@ class Metronome:
     A real arm does not catch up: a late cycle delays all that follow, and its own clock advances one period per cycle.
     """
 
-    def __init__(self, period: int, now: int, wall: int) -> None:
-        """Put the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns]."""
-        self._period = period
-        self._due = now + period
+    def __init__(self, period: int, now: int, wall: int, rate: float = 1.0) -> None:
+        """Put the first cycle one `period` [ns] after `now` [ns] (steady clock) at time of day `wall` [ns].
+
+        At a `rate` below 1 the arm's clock is slower.
+        """
+        self._period, self._pace = period, round(period / rate)
+        self._due = now + self._pace
         self._stamp = wall
 
     def wait(self, now: int) -> int:
@@ -132,15 +136,18 @@ class Metronome:
 
     def begin(self, now: int) -> int:
         """Begin a cycle; return its stamp [ns]."""
-        if now - self._due > self._period:
+        if now - self._due > self._pace:
             self._due = now
-        self._due += self._period
+        self._due += self._pace
         self._stamp += self._period
         return self._stamp
 
 
 def serve(arm: EmulatedArm, node: RosNode, cycle: Callable[[int], None]) -> None:
-    """Run cycles in wall-clock time until a signal; `cycle` takes the stamp [ns], exchanges messages and advances the arm."""
+    """Run cycles in wall-clock time, or at the rate of PALPATE_RATE, until a signal.
+
+    `cycle` takes the stamp [ns], exchanges messages and advances the arm.
+    """
     contacts = node.subscription(CONTACT_TOPIC, WRENCH)
     tools, links = node.publisher(TOOL_TOPIC, TOOL_STATE), node.publisher(LINKS_TOPIC, LINKS)
     running = [True]
@@ -151,7 +158,7 @@ def serve(arm: EmulatedArm, node: RosNode, cycle: Callable[[int], None]) -> None
     signal.signal(signal.SIGTERM, stop)
     signal.signal(signal.SIGINT, stop)
     gc.freeze()  # avoids garbage collections of 0.1 s
-    metronome = Metronome(arm.period_ms * 1_000_000, monotonic_ns(), time_ns())
+    metronome = Metronome(arm.period_ms * 1_000_000, monotonic_ns(), time_ns(), Settings.read().rate or 1.0)
     contact_at = cycles = 0
     try:
         while running[0]:
