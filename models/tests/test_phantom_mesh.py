@@ -210,6 +210,15 @@ def with_vertex(vertices, faces, vertex):
     return np.vstack((vertices, vertex)), np.vstack((faces, [*faces[0][:2], len(vertices)]))
 
 
+def mirrored(vertices, faces):
+    """The mesh and its mirror image, which touches it in the top vertex."""
+    top = int(np.argmin(np.linalg.norm(vertices, axis=1)))
+    index = np.arange(len(vertices)) + len(vertices)
+    index[top] = top
+    other = vertices * (1, 1, -1) + (0, 0, 2 * vertices[top, 2])
+    return np.vstack((vertices, other)), np.vstack((faces, index[faces][:, ::-1]))
+
+
 def with_two_holes(vertices, faces):
     middle = vertices[faces].mean(axis=1)
     holes = [np.argmin(np.linalg.norm(middle - at, axis=1)) for at in ((0.08, 0.08, -0.02), (-0.08, -0.08, -0.02))]
@@ -225,6 +234,7 @@ UNUSABLE = {
     ),
     "degenerate": (lambda v, f: with_vertex(v, f, v[f[0][:2]].mean(axis=0)), "1 degenerate triangles"),
     "three triangles on an edge": (lambda v, f: with_vertex(v, f, (0.0, 0.0, 0.05)), "non-manifold: 1 edges"),
+    "touch in a vertex": (mirrored, "touch in 1 single vertices"),
     "two pieces": (lambda v, f: (np.vstack((v, np.add(v, (0.6, 0, 0)))), np.vstack((f, f + len(v)))), "2 separate pieces"),
     "two holes": (with_two_holes, "it has 2 borders"),
     "umbilicus above": (lambda v, f: (np.add(v, (0, 0, 0.3)), f), "umbilicus must be at the origin"),

@@ -113,6 +113,7 @@ def check(vertices: Array, triangles: IntArray) -> None:
         )
     if pieces > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
+    _check_fans(vertices, triangles)
 
 
 def check_place(vertices: Array, triangles: IntArray) -> None:
@@ -238,6 +239,27 @@ def vertex_normals(vertices: Array, triangles: IntArray) -> Array:
         np.add.at(normals, triangles[:, k], cross)
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     return np.asarray(np.where(length > 0, normals / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)))
+
+
+def _check_fans(vertices: Array, triangles: IntArray) -> None:
+    """Raise MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
+    m = len(triangles)
+    half = np.sort(_half_edges(triangles), axis=1)
+    face = np.tile(np.arange(m), 3)
+    order = np.lexsort((half[:, 1], half[:, 0]))
+    same = np.flatnonzero((half[order][1:] == half[order][:-1]).all(axis=1))
+    f, g, edge = face[order[same]], face[order[same + 1]], half[order[same]]
+    rows, columns = [], []
+    for vertex in edge.T:  # corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge
+        rows.append(3 * f + np.argmax(triangles[f] == vertex[:, None], axis=1))
+        columns.append(3 * g + np.argmax(triangles[g] == vertex[:, None], axis=1))
+    graph = sparse.coo_array((np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m))
+    _, fan = connected_components(graph, directed=False)
+    fans = np.unique(np.column_stack((triangles.ravel(), fan)), axis=0)
+    touched, count = np.unique(fans[:, 0], return_counts=True)
+    if (count > 1).any():
+        where = _place(vertices[touched[count > 1][:1]])
+        raise MeshError(f"non-manifold: surfaces touch in {int((count > 1).sum())} single vertices, the first at {where}")
 
 
 def _half_edges(triangles: IntArray) -> IntArray:
