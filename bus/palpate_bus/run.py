@@ -13,7 +13,7 @@ import signal
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import zenoh
 
@@ -65,15 +65,7 @@ def in_background(role: Role, runtime: str) -> bool:
     return role.observer or (runtime == "lockstep" and role.period > MS)
 
 
-class NamesServices(Protocol):
-    """The part of a scenario that chooses services."""
-
-    @property
-    def services(self) -> Any:
-        """The chosen implementation of each role, as attributes."""
-
-
-def chosen(role: str, load: Callable[[str], NamesServices], words: Sequence[str] = ()) -> Service:
+def chosen(role: str, load: Callable[[str], Any], words: Sequence[str] = ()) -> Service:
     """Return the service of `role` that the first word names, or else the scenario that `load` reads.
 
     Raises BusConfigError, PluginError.

@@ -6,12 +6,11 @@ A choice is the name of an entry point in the group `palpate.<kind>`, or the pat
 import ast
 import re
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module, metadata
-from importlib.machinery import PathFinder
 from importlib.metadata import EntryPoint, EntryPoints, PackageNotFoundError, entry_points
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
@@ -143,9 +142,6 @@ class PluginKind:
             raise self._error(str(path), f"is not Python: {error}") from error
         if self.function not in _defined(tree):
             raise self._error(str(path), f"the file has no function {self.function}({self.arguments})")
-        for line, name in _imported(tree):
-            if not _importable(name, path.parent):
-                raise self._error(str(path), f"line {line}: the module {name} is not installed")
 
     def _load_file(self, choice: str) -> Callable[..., Any]:
         """Return the function of a user's file, which may import modules of its folder."""
@@ -193,20 +189,6 @@ def _installed(name: str) -> bool:
     except PackageNotFoundError:
         return find_spec(IMPORTED.get(name, name.replace("-", "_"))) is not None
     return True
-
-
-def _imported(tree: ast.Module) -> Iterator[tuple[int, str]]:
-    """Yield line and top-level package of each unconditional import at the top of a module."""
-    for node in tree.body:
-        if isinstance(node, ast.Import):
-            yield from ((node.lineno, alias.name.partition(".")[0]) for alias in node.names)
-        elif isinstance(node, ast.ImportFrom) and node.module and not node.level:
-            yield node.lineno, node.module.partition(".")[0]
-
-
-def _importable(name: str, folder: Path) -> bool:
-    """Return True if the package is installed or in `folder`. Imports nothing."""
-    return name in sys.modules or find_spec(name) is not None or PathFinder.find_spec(name, [str(folder)]) is not None
 
 
 def _defined(tree: ast.Module) -> set[str]:

@@ -63,13 +63,16 @@ def test_a_broken_configuration_file_is_named(tmp_path: Path) -> None:
     file = tmp_path / "bus.json5"
     file.write_text("{ mode: 'pee' }")
     with pytest.raises(BusConfigError, match=r"PALPATE_ZENOH_CONFIG is .*bus\.json5"):
-        zenoh_config(BusOptions(file=file))
+        zenoh_config(BusOptions(zenoh_config=file))
 
 
 def test_a_configuration_file_is_used(tmp_path: Path) -> None:
     file = tmp_path / "bus.json5"
     file.write_text(f"{{ mode: 'peer', listen: {{ endpoints: ['unixsock-stream/{tmp_path}/f.sock'] }} }}")
-    with session(BusOptions(file=file)) as ours, session(BusOptions(connect=(f"unixsock-stream/{tmp_path}/f.sock",))) as theirs:
+    with (
+        session(BusOptions(zenoh_config=file)) as ours,
+        session(BusOptions(connect=(f"unixsock-stream/{tmp_path}/f.sock",))) as theirs,
+    ):
         assert received(ours, theirs) == b"x"
 
 

@@ -194,7 +194,7 @@ def _options(listen: str | None) -> BusOptions:
     options = BusOptions.from_settings(Settings.read())
     if listen:
         return BusOptions(listen=(listen,), connect=options.connect, router=options.router)
-    if not (options.listen or options.connect or options.router or options.file):
+    if not (options.listen or options.connect or options.router or options.zenoh_config):
         return BusOptions(listen=(DEFAULT_LISTEN,))
     return options
 

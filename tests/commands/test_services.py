@@ -54,7 +54,6 @@ def test_an_unknown_implementation_is_refused_with_the_allowed_ones() -> None:
         ("", "no function create"),
         ("def create(:", "is not Python"),
         ("x = 1", "no function create"),
-        ("import os\nfrom nosuch.part import x\ndef create(scenario): ...\n", "line 2: the module nosuch is not installed"),
     ],
 )
 def test_a_file_without_a_service_is_refused(tmp_path: Path, text: str | None, said: str) -> None:

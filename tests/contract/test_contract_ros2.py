@@ -117,10 +117,12 @@ TYPES = ("sensor_msgs/msg/JointState", "geometry_msgs/msg/WrenchStamped", "senso
 def write_definitions(folder: Path) -> None:
     """Write the message definitions, which the client would clone otherwise."""
     for name in TYPES:
-        for file, text in codec.interface_files(name).items():
-            path = folder / file
+        first, *others = (part.strip() for part in codec.definition(name).split("=" * 80))
+        nested = [part.removeprefix("MSG: ").partition("\n") for part in others]
+        for kind, text in ((name, first), *((head.replace("/", "/msg/"), text) for head, _, text in nested)):
+            path = folder / f"{kind}.msg"
             path.parent.mkdir(parents=True, exist_ok=True)
-            path.write_text(text, encoding="utf-8")
+            path.write_text(text + "\n", encoding="utf-8")
 
 
 @pytest.mark.slow

@@ -1,7 +1,7 @@
 """Message classes: `from palpate_bus.messages import JointState`.
 
 They are created from .msg files when this module is imported. `typestore.py` lists them;
-`__init__.pyi`, written by `stubs.py`, declares their fields for type checkers.
+`__init__.pyi`, written by `bus/tests/message_stubs.py`, declares their fields for type checkers.
 """
 
 from palpate_bus.messages.typestore import TYPE_NAMES, message_type

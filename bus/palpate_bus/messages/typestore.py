@@ -82,17 +82,6 @@ def definition(name: str) -> str:
     return str(store.generate_msgdef(name, ros_version=2)[0])
 
 
-def interface_files(name: str) -> dict[str, str]:
-    """Return the .msg files that a ROS 2 client needs for a message type: text by path (`sensor_msgs/msg/JointState.msg`)."""
-    first, *others = (part.strip() for part in definition(name).split("=" * 80))
-    files = {f"{name}.msg": first + "\n"}
-    for part in others:
-        head, _, text = part.partition("\n")
-        package, kind = head.removeprefix("MSG: ").split("/")
-        files[f"{package}/msg/{kind}.msg"] = text + "\n"
-    return files
-
-
 @cache
 def type_hash(name: str) -> str:
     """Return the RIHS01 hash of a message type, `RIHS01_<64 hex digits>`, which is part of rmw_zenoh's key."""

@@ -14,7 +14,7 @@ topic of the contract under any type, to liveliness tokens and to service report
 Samples wait in channels until `poll`, which the owner calls often. Each producer of a 1 kHz topic gets one more subscriber.
 """
 
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 from time import monotonic, time_ns
 from typing import Any
@@ -38,7 +38,7 @@ from palpate_bus.monitor.health import (
 )  # fmt: skip
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
-from palpate_bus.wire.transport import subscribe
+from palpate_bus.wire.transport import decoded, subscribe
 
 
 class Monitor:
@@ -299,22 +299,21 @@ class LiveMonitor:
         self._control.undeclare()
 
     def _receive_control(self) -> None:
-        while (sample := self._control.handler.try_recv()) is not None:
-            try:
-                message = self._decode_control(sample.payload.to_bytes())
-            except codec.CodecError:
-                continue
+        for message in _decoded(self._control, self._decode_control):
             if message.command == RunControl.GRANT and message.tick > WALL_CLOCK_TICK:
                 self.monitor.rate = self.monitor.rate or 1.0
 
     def _receive_reports(self, now: float) -> None:
-        while (sample := self._reports.handler.try_recv()) is not None:
-            try:
-                message = self._decode_report(sample.payload.to_bytes())
-            except codec.CodecError:
-                continue
+        for message in _decoded(self._reports, self._decode_report):
             if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
                 self.reports[message.role] = message, now
+
+
+def _decoded(subscriber: Any, decode: Callable[[bytes], Any]) -> Iterator[Any]:
+    """Yield the messages that a subscriber has received, without those that cannot be decoded."""
+    while (sample := subscriber.handler.try_recv()) is not None:
+        if (message := decoded(decode, sample.payload.to_bytes())) is not None:
+            yield message
 
 
 class _Listener:

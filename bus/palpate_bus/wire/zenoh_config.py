@@ -44,7 +44,7 @@ import sys
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -92,13 +92,13 @@ class BusOptions:
     """Folder with `ca.pem`, `cert.pem` and `key.pem`: links are encrypted, and both ends show a certificate of that authority."""
     drop_wait_us: int = LOCKSTEP_DROP_WAIT_US
     """Time for which a put waits for room before it drops a message [us]."""
-    file: Path | None = None
+    zenoh_config: Path | None = None
     """A zenoh configuration file that is used as it is."""
 
     def __post_init__(self) -> None:
         if self.mode not in ("peer", "client", "router"):
             raise BusConfigError(f"PALPATE_MODE is {self.mode!r}; allowed: peer, client, router")
-        if self.mode == "client" and not (self.router or self.connect or self.file):
+        if self.mode == "client" and not (self.router or self.connect or self.zenoh_config):
             raise BusConfigError("PALPATE_MODE is client, but neither PALPATE_ROUTER nor PALPATE_CONNECT is set")
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
@@ -114,36 +114,19 @@ class BusOptions:
     def from_settings(cls, settings: Settings) -> BusOptions:
         """Return the options of the settings. Raises BusConfigError with the variable's name."""
         wallclock = settings.runtime == "wallclock"
-        return cls(
-            listen=settings.listen,
-            connect=settings.connect,
-            router=settings.router,
-            mode=settings.mode,
-            lowlatency=settings.lowlatency and not wallclock,
-            shared_memory=settings.shared_memory,
-            tls=settings.tls,
-            drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wallclock else LOCKSTEP_DROP_WAIT_US,
-            file=settings.zenoh_config,
-        )
+        given = {field.name: getattr(settings, field.name) for field in fields(cls) if field.name != "drop_wait_us"}
+        given["lowlatency"] = settings.lowlatency and not wallclock
+        return cls(**given, drop_wait_us=WALL_CLOCK_DROP_WAIT_US if wallclock else LOCKSTEP_DROP_WAIT_US)
 
     def settings(self) -> dict[str, Any]:
         """Return these options as fields for `Settings.replaced`, without `drop_wait_us`, which follows from the runtime."""
-        return {
-            "listen": self.listen,
-            "connect": self.connect,
-            "router": self.router,
-            "mode": self.mode,
-            "lowlatency": self.lowlatency,
-            "shared_memory": self.shared_memory,
-            "tls": self.tls,
-            "zenoh_config": self.file,
-        }
+        return {field.name: getattr(self, field.name) for field in fields(self) if field.name != "drop_wait_us"}
 
     def to_env(self) -> dict[str, str]:
         """Return the environment variables for another process with these options; empty ones override inherited ones."""
-        fields = self.settings()
-        environment = Settings.read({}).replaced(**fields).to_env()
-        return {variable(name): environment[variable(name)] for name in fields}
+        own = self.settings()
+        environment = Settings.read({}).replaced(**own).to_env()
+        return {variable(name): environment[variable(name)] for name in own}
 
 
 def _check_endpoint(endpoint: str) -> None:
@@ -158,11 +141,11 @@ def _check_endpoint(endpoint: str) -> None:
 
 def zenoh_config(options: BusOptions) -> zenoh.Config:
     """Return zenoh's configuration for these options. Raises BusConfigError if the configuration file cannot be used."""
-    if options.file is not None:
+    if options.zenoh_config is not None:
         try:
-            return zenoh.Config.from_file(options.file)
+            return zenoh.Config.from_file(options.zenoh_config)
         except zenoh.ZError as error:
-            raise BusConfigError(f"PALPATE_ZENOH_CONFIG is {options.file}: {error}") from error
+            raise BusConfigError(f"PALPATE_ZENOH_CONFIG is {options.zenoh_config}: {error}") from error
     config = zenoh.Config()
     for key, value in _zenoh_settings(options).items():
         config.insert_json5(key, json.dumps(value))
@@ -298,6 +281,18 @@ def session(options: BusOptions | None = None, access: Mapping[str, Any] | None 
         close_session(opened)
 
 
+@contextmanager
+def stopped_by_signals() -> Iterator[threading.Event]:
+    """Yield an event that SIGINT and SIGTERM set, for the main thread; in the end the handlers are as before."""
+    stop = threading.Event()
+    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
+    try:
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
+
+
 def free_port() -> int:
     """Return a free TCP port of this machine."""
     with socket.socket() as probe:
@@ -327,16 +322,10 @@ def serve(
 
     Raises BusConfigError if it cannot listen there.
     """
-    stop = threading.Event()
-    before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
-    try:
-        with session(BusOptions(mode="router", listen=tuple(listen), tls=tls), access) as router:
-            ready(f"router {router.zid()} listens on {', '.join(listen)}")
-            while not stop.wait(1.0):  # in slices, so that signals are handled on every platform
-                pass
-    finally:
-        for number, handler in before.items():
-            signal.signal(number, handler)
+    with stopped_by_signals() as stop, session(BusOptions(mode="router", listen=tuple(listen), tls=tls), access) as router:
+        ready(f"router {router.zid()} listens on {', '.join(listen)}")
+        while not stop.wait(1.0):  # in slices, so that signals are handled on every platform
+            pass
 
 
 def main(arguments: Sequence[str]) -> int:

@@ -15,13 +15,11 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Topic
 from palpate_bus.contract.conformance import LeafField, leaves, numbers
-from palpate_bus.messages.codec import CodecError, Message, message_type, store
-from palpate_bus.messages.stamps import NS, header
-from palpate_bus.messages.typestore import array_dtype
+from palpate_bus.messages.codec import CodecError, Message
+from palpate_bus.messages.stamps import NS, blank
 from palpate_fmu.instance import FmuInstance, Port
 from palpate_fmu.reading import FmuError, FmuVariable
 from palpate_models.numerics.frames import Array, inverse
@@ -103,24 +101,6 @@ def size(name: str, path: str) -> int | None:
     if any(leaf.base == "string" or leaf.repeated or (leaf.array and leaf.path != path) for leaf in found):
         raise MapError(f"{name}: field {path!r} is not numeric")
     return numbers(blank(name), path).size or None
-
-
-def blank(name: str, t: int = 0, frame: str = "") -> Message:
-    """Return a message of zeros, empty texts and empty lists; its headers are stamped `t` [ns], in `frame`."""
-    if name == "std_msgs/msg/Header":
-        return header(t, frame)
-    return message_type(name)(*(_zero(kind, detail, t, frame) for _, (kind, detail) in store.get_msgdef(name).fields))
-
-
-def _zero(kind: int, detail: Any, t: int, frame: str) -> Any:
-    if kind == Nodetype.NAME:
-        return blank(detail, t, frame)
-    if kind == Nodetype.BASE:
-        return "" if detail[0] == "string" else array_dtype(detail[0]).type(0).item()
-    (item_kind, item), length = detail
-    if item_kind == Nodetype.NAME or item[0] == "string":
-        return []
-    return np.zeros(length if kind == Nodetype.ARRAY else 0, array_dtype(item[0]))
 
 
 def fill(message: Message, paths: Sequence[str], value: Any) -> None:

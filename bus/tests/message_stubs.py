@@ -1,22 +1,20 @@
-"""Writes `__init__.pyi`, which declares the fields of the message classes for type checkers.
+"""Writes `__init__.pyi` of the messages, which declares the fields of their classes for type checkers.
 
-python -m palpate_bus.messages.stubs --write     after a change of a .msg file or of typestore.py
-python -m palpate_bus.messages.stubs --check     exits with 1 if the file is out of date; a test runs it
+python bus/tests/message_stubs.py     after a change of a .msg file or of typestore.py; a test says if it is out of date
 """
 
-import argparse
-import sys
 from pathlib import Path
 from typing import Any
 
 from rosbags.interfaces import Nodetype
 
+from palpate_bus import messages
 from palpate_bus.messages.typestore import TYPE_NAMES, array_dtype, store
 
-STUB = Path(__file__).with_name("__init__.pyi")
+STUB = Path(str(messages.__file__)).with_suffix(".pyi")
 
 _HEAD = '''\
-"""Written by `python -m palpate_bus.messages.stubs --write`; change the .msg files or typestore.py instead."""
+"""Written by `python bus/tests/message_stubs.py`; change the .msg files or typestore.py instead."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -57,20 +55,5 @@ def _type_of(description: Any) -> str:
     return f"NDArray[np.{array_dtype(item[0]).name}]"
 
 
-def main(arguments: list[str] | None = None) -> int:
-    """Run the command line; return the exit status."""
-    parser = argparse.ArgumentParser(prog="python -m palpate_bus.messages.stubs")
-    choice = parser.add_mutually_exclusive_group(required=True)
-    choice.add_argument("--write", action="store_true")
-    choice.add_argument("--check", action="store_true")
-    if parser.parse_args(arguments).write:
-        STUB.write_text(stub(), encoding="utf-8")
-        return 0
-    if STUB.read_text(encoding="utf-8") == stub():
-        return 0
-    print(f"{STUB} is out of date: run python -m palpate_bus.messages.stubs --write", file=sys.stderr)
-    return 1
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    STUB.write_text(stub(), encoding="utf-8")
