@@ -7,34 +7,18 @@ from zlib import crc32
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import (
-    Header,
-    JointState,
-    Point,
-    Pose,
-    Quaternion,
-    RobotStatus,
-    String,
-    TFMessage,
-    Time,
-    ToolState,
-    Transform,
-    TransformStamped,
-    Twist,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-)
+from palpate_bus.messages import Header, JointState, RobotStatus, String, Time, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages.geometry import wrench_message
+from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, link_names, urdf
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
-from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
-from palpate_robot.plant import DT, PlantFactory
+from palpate_robot.driver import Driver, DriverMode, HoldCause
+from palpate_robot.plant import DT, PlantFactory, link_poses, tool_state
 from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 from palpate_robot.stop_requests import StopRequests
@@ -69,8 +53,6 @@ class RobotService(Service):
         self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
-        self._command: Command | None = None
-        self._command_message: Message | None = None
         self._force_W = np.zeros(3)
         self._moment_W = np.zeros(3)
         self._pressed = False
@@ -100,34 +82,27 @@ class RobotService(Service):
         self._drive(t, inbox)
         stamp = Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
-        px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = self._plant.tool_motion().tolist()
-        pose = Pose(Point(px, py, pz), Quaternion(x, y, z, w))
-        twist = Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz))
-        yield {"sim/tool_state": ToolState(Header(stamp, "world"), pose, twist, self._robot.indenter_radius_m)}
+        motion = self._plant.tool_motion().tolist()
+        yield {"sim/tool_state": tool_state(Header(stamp, "world"), motion, self._robot.indenter_radius_m)}
+        x, y, z, w = motion[3:7]
         up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
             outbox["robot/status"] = self._status(stamp)
         if not t % _LINKS_PERIOD:
-            outbox["sim/link_poses"] = self._link_poses(stamp)
+            outbox["sim/link_poses"] = link_poses(Header(stamp, "world"), self._links, self._plant.link_poses())
         yield outbox
 
     def finish(self) -> Mapping[str, Any]:
         """Return safe holds, rejected commands, and the largest measured external force."""
-        driver = self._driver
-        return {
-            "mode": driver.mode.name,
-            "holds": [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in driver.holds],
-            "commands_rejected": driver.rejected,
-            "peak_external_force_N": self._peak_force,
-        }
+        return {**self._driver.facts(), "peak_external_force_N": self._peak_force}
 
     def _drive(self, t: int, inbox: Inbox) -> None:
         """Step driver and plant up to `t`. The first tick is the initial state."""
         plant, driver, joints = self._plant, self._driver, self._joints
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
-        command = self._newest_command(inbox)
+        command = driver.received(inbox.latest("control/joint_torque"))
         self._read_contact(t, inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()
@@ -150,16 +125,6 @@ class RobotService(Service):
             return values, self._driver.damping(self._joints.v, gravity)
         command = values if self._driver.mode is DriverMode.ACTIVE else None
         return self._loop.torque(command, self._joints.q, self._joints.v, gravity), self._loop.damping
-
-    def _newest_command(self, inbox: Inbox) -> Command | None:
-        message = inbox.latest("control/joint_torque")
-        if message is not None and message is not self._command_message:
-            stamp = nanoseconds(message.header.stamp)
-            expires = stamp + nanoseconds(message.valid_for)
-            values = message.torque if self._loop is None else message.position
-            self._command = Command(np.array(values), stamp, expires, message.problem, message.culprit)
-            self._command_message = message
-        return self._command
 
     def _read_contact(self, t: int, inbox: Inbox) -> None:
         """Read the tissue's wrench: zero before its first message and after the tissue is lost.
@@ -202,7 +167,7 @@ class RobotService(Service):
         driver = self._driver
         ticks = len(self._ft_readings)
         mean = np.add.reduce(np.concatenate(self._joint_readings).reshape(ticks, -1)) / ticks
-        fx, fy, fz, mx, my, mz = (np.add.reduce(self._ft_readings) / ticks).tolist()
+        wrench = np.add.reduce(self._ft_readings) / ticks
         if self._drive_torques:
             torque = (np.add.reduce(self._drive_torques) - np.add.reduce(self._friction_torques)) / len(self._drive_torques)
             self._measured_torque = self._torque_sensors.read(self._plant.q, self._plant.v, torque, len(self._drive_torques))
@@ -217,16 +182,9 @@ class RobotService(Service):
             driver.reason,
             mean[: len(self._names)],
             mean[len(self._names) :],
-            Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)),
+            wrench_message(wrench),
             self._applied,
             driver.rejected,
             driver.culprit,
             self._measured_torque,
         )
-
-    def _link_poses(self, stamp: Message) -> Message:
-        transforms, stamped = [], Header(stamp, "world")
-        for link, (px, py, pz, x, y, z, w) in zip(self._links, self._plant.link_poses().tolist(), strict=True):
-            pose = Transform(Vector3(px, py, pz), Quaternion(x, y, z, w))
-            transforms.append(TransformStamped(stamped, link, pose))
-        return TFMessage(transforms)

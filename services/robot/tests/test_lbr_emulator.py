@@ -9,7 +9,7 @@ from lbr_bench import MS
 
 from palpate_models.robot import lbr
 from palpate_robot.backends.emulated import Metronome
-from palpate_robot.backends.lbr.emulator import QUALITY_WINDOW, FriSession, main
+from palpate_robot.backends.lbr.emulator import SESSION, FriSession, main
 from palpate_robot.backends.lbr.port import ConnectionQuality, SessionState
 
 PERIOD = 2 * MS
@@ -124,7 +124,7 @@ def test_too_fast_a_joint_ends_it() -> None:
 def test_a_client_that_does_not_answer_loses_quality_then_the_session() -> None:
     session = active()
     seen = set()
-    for _ in range(QUALITY_WINDOW):
+    for _ in range(SESSION.quality_window):
         session.cycle(HOME, ZERO, answered=False)
         seen.add(session.quality)
         if session.ended:

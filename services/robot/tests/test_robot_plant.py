@@ -11,7 +11,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import FT_TO_INDENTER_M, link_names, urdf
 from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.schema import Robot
-from palpate_robot.backends.dart.plant import LEAST_CLEARANCE_RAD, DartPlant
+from palpate_robot.backends.dart.plant import CLEARANCE, DartPlant
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Plant
 
@@ -241,7 +241,7 @@ def test_the_same_to_the_bit(start: np.ndarray, carried: float, touches: bool) -
         force, damping = rng.normal(size=3), np.full(7, 3.0)
         quick.step(torque, force, NOTHING, damping)
         thorough.step(torque, force, NOTHING, damping)
-        free += quick._free_travel > LEAST_CLEARANCE_RAD
+        free += quick._free_travel > CLEARANCE.least_rad
         touched = touched or thorough.contacts() > 0
         assert quick.contacts() == thorough.contacts()
         np.testing.assert_array_equal(quick.q, thorough.q)

@@ -5,36 +5,26 @@ A subclass of `EmulatedArm` decides what the drives do in a cycle. Exact poses a
 """
 
 import gc
-import signal
 from collections.abc import Callable
+from contextlib import closing
 from time import monotonic_ns, sleep, time_ns
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages import (
-    Point,
-    Pose,
-    Quaternion,
-    TFMessage,
-    ToolState,
-    Transform,
-    TransformStamped,
-    Twist,
-    Vector3,
-    Wrench,
-    WrenchStamped,
-)
+from palpate_bus.messages import WrenchStamped
+from palpate_bus.messages.geometry import wrench_message
 from palpate_bus.messages.stamps import header
 from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
+from palpate_bus.wire.zenoh_config import stopped_by_signals
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, link_names
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
 from palpate_robot.backends.dart.plant import DartPlant
+from palpate_robot.plant import link_poses, tool_state
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 
 BRAKE_NMS: Final = 2000.0
@@ -97,22 +87,15 @@ class EmulatedArm:
 
     def wrench(self, now: int) -> Any:
         """Return the F/T reading as WrenchStamped."""
-        fx, fy, fz, mx, my, mz = self.read_wrench().tolist()
-        return WrenchStamped(header(now, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
+        return WrenchStamped(header(now, "ft_sensor"), wrench_message(self.read_wrench()))
 
     def tool(self, now: int) -> Any:
         """Return the exact palpation_msgs/ToolState."""
-        motion = self._plant.tool_motion().tolist()
-        pose = Pose(Point(*motion[:3]), Quaternion(*motion[3:7]))
-        return ToolState(header(now, "world"), pose, Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), self._radius)
+        return tool_state(header(now, "world"), self._plant.tool_motion().tolist(), self._radius)
 
     def links(self, now: int) -> Any:
         """Return the exact tf2_msgs/TFMessage of all links in world."""
-        found = []
-        for link, pose in zip(self._links, self._plant.link_poses().tolist(), strict=True):
-            transform = Transform(Vector3(*pose[:3]), Quaternion(*pose[3:]))
-            found.append(TransformStamped(header(now, "world"), link, transform))
-        return TFMessage(found)
+        return link_poses(header(now, "world"), self._links, self._plant.link_poses())
 
 
 class Metronome:
@@ -150,18 +133,11 @@ def serve(arm: EmulatedArm, node: RosNode, cycle: Callable[[int], None]) -> None
     """
     contacts = node.subscription(CONTACT_TOPIC, WRENCH)
     tools, links = node.publisher(TOOL_TOPIC, TOOL_STATE), node.publisher(LINKS_TOPIC, LINKS)
-    running = [True]
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        running[0] = False
-
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
     gc.freeze()  # avoids garbage collections of 0.1 s
     metronome = Metronome(arm.period_ms * 1_000_000, monotonic_ns(), time_ns(), Settings.read().rate or 1.0)
     contact_at = cycles = 0
-    try:
-        while running[0]:
+    with stopped_by_signals() as stop, closing(node):
+        while not stop.is_set():
             sleep(metronome.wait(monotonic_ns()) / 1e9)
             now = monotonic_ns()
             stamp = metronome.begin(now)
@@ -176,5 +152,3 @@ def serve(arm: EmulatedArm, node: RosNode, cycle: Callable[[int], None]) -> None
             if cycles % (50 // arm.period_ms or 1) == 0:
                 links.publish(arm.links(stamp))
             cycles += 1
-    finally:
-        node.close()

@@ -15,9 +15,10 @@ import pinocchio as pin
 
 from palpate_bus import implementations
 from palpate_bus.contract import contract
-from palpate_bus.messages import JointState, RobotStatus, String, Vector3, Wrench, WrenchStamped
+from palpate_bus.messages import JointState, RobotStatus, String, WrenchStamped
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.messages.geometry import wrench, wrench_message
+from palpate_bus.messages.stamps import header
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of, urdf
@@ -183,8 +184,6 @@ class HardwareService(Service):
         yaw = np.deg2rad(given.ft_yaw_deg)
         turn = np.array([[np.cos(yaw), -np.sin(yaw), 0.0], [np.sin(yaw), np.cos(yaw), 0.0], [0.0, 0.0, 1.0]])
         self._R_ST = ft_sign * turn
-        self._command: Command | None = None
-        self._command_message: Message | None = None
         self._commanding_since: int | None = None
         self._wrench = np.zeros(6)
         self._wrench_at: int | None = None
@@ -215,7 +214,7 @@ class HardwareService(Service):
             joints = JointState(header(self._arm.received), self._names, self._arm.q, self._arm.v, self._applied.copy())
             outbox[JOINTS] = joints  # on every tick: between two states the newest, with its stamp
             if self._wrench_at is not None and t - self._wrench_at <= FT_AGE_NS:
-                outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), _wrench(self._wrench))
+                outbox["ft/wrench"] = WrenchStamped(header(self._wrench_at, "ft_sensor"), wrench_message(self._wrench))
             if fresh:
                 self._drive(t, inbox, joints)
         if self._arm.received is not None:
@@ -233,12 +232,9 @@ class HardwareService(Service):
         """Return safe holds, counts, and the largest force and torques; leaves the arm without torque."""
         if self._arm.received is not None and not self._positions:
             self._relax()
-        driver = self._driver
         self._port.close()
         return {
-            "mode": driver.mode.name,
-            "holds": [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in driver.holds],
-            "commands_rejected": driver.rejected,
+            **self._driver.facts(),
             "peak_external_force_N": self._peak_force,
             "peak_torque_nm": [round(float(x), 3) for x in self._peak_torque],
             "states": self._states,
@@ -259,13 +255,11 @@ class HardwareService(Service):
         for state in self._port.states():
             fresh = self._arm.update(t, state) or fresh
         for reading in self._port.wrenches():
-            force, torque = reading.wrench.force, reading.wrench.torque
-            values = np.array((force.x, force.y, force.z, torque.x, torque.y, torque.z))
+            values = wrench(reading.wrench)
             if not np.isfinite(values).all():
                 self._driver.hold(t, HoldCause.DEVICE, f"F/T reading {values}: must be finite")
                 continue
-            self._wrench = self._corrected(values)
-            self._wrench_at = t
+            self._wrench, self._wrench_at = self._corrected(values), t
         if fresh:
             self._states += 1
             self._sums += np.concatenate((self._arm.q, self._arm.v, self._wrench, self._arm.torque))
@@ -293,7 +287,7 @@ class HardwareService(Service):
         self._external_S = self._wrench[:3] + weight * load.up_S
         self._force = float(np.linalg.norm(self._external_S))
         self._peak_force = max(self._peak_force, self._force)
-        command = self._newest_command(t, inbox, joints) if self._check_connection(t) else None
+        command = self._command(t, inbox, joints) if self._check_connection(t) else None
         lost = inbox.lost("control") and self._inner is None
         values = self._driver.update(t, arm.q, arm.v, load.gravity, self._force, command, lost=lost)
         active = self._driver.mode is DriverMode.ACTIVE
@@ -316,15 +310,9 @@ class HardwareService(Service):
         self._commanding_since = t if self._commanding_since is None else self._commanding_since
         self._commands += 1
 
-    def _newest_command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
+    def _command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
         message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
-        if message is not None and message is not self._command_message:
-            stamp = nanoseconds(message.header.stamp)
-            expires = stamp + nanoseconds(message.valid_for)
-            values = message.position if self._positions else message.torque
-            self._command = Command(np.array(values), stamp, expires, message.problem, message.culprit)
-            self._command_message = message
-        return self._command
+        return self._driver.received(message)
 
     def _status(self, t: int) -> Message:
         driver, measured, n = self._driver, t, len(self._names)
@@ -338,7 +326,7 @@ class HardwareService(Service):
         if not driver.held and fault is not None:
             cause, reason = HoldCause.DEVICE, fault
         return RobotStatus(
-            header(measured), int(driver.mode), int(cause), reason, q, v, _wrench(wrench),
+            header(measured), int(driver.mode), int(cause), reason, q, v, wrench_message(wrench),
             self._applied.copy(), driver.rejected, driver.culprit, torque,
         )  # fmt: skip
 
@@ -353,8 +341,3 @@ class HardwareService(Service):
         self._links = self._links if links is None else links
         if self._links is not None and not t % LINKS_PERIOD:
             outbox["sim/link_poses"] = self._links
-
-
-def _wrench(values: Array) -> Message:
-    fx, fy, fz, mx, my, mz = values.tolist()
-    return Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz))

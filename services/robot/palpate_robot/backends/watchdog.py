@@ -6,17 +6,17 @@ these commands and holds. Driver and watchdog share message parsing, but no deci
 """
 
 import logging
-import signal
 import sys
 from collections.abc import Callable
+from contextlib import closing
 from time import monotonic_ns, sleep
-from types import FrameType
 from typing import Any, Final
 
 import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.wire.ros_node import RosNode
+from palpate_bus.wire.zenoh_config import stopped_by_signals
 from palpate_models.numerics.frames import Array
 from palpate_robot.backends.hardware import STATE_AGE_NS, MeasuredArm
 
@@ -68,17 +68,10 @@ def watch(
 ) -> None:
     """Run until a signal; `state` and `command` are topics with their types, `message` makes a command of the latter."""
     logging.basicConfig(level="INFO", format="%(asctime)s watchdog %(levelname)s %(message)s", stream=sys.stderr)
-    running = [True]
-
-    def stop(number: int, frame: FrameType | None) -> None:
-        running[0] = False
-
-    signal.signal(signal.SIGTERM, stop)
-    signal.signal(signal.SIGINT, stop)
     states, commands, publisher = node.subscription(*state), node.subscription(*command), node.publisher(*command)
     reported = False
-    try:
-        while running[0]:
+    with stopped_by_signals() as stop, closing(node):
+        while not stop.is_set():
             now = monotonic_ns()
             for received in states.take():
                 watchdog.state(now, received)
@@ -91,5 +84,3 @@ def watch(
                 reported = watchdog.holding
                 log.warning("driver commands stopped: damping, no torque" if reported else "a driver has taken over")
             sleep(PERIOD_S)
-    finally:
-        node.close()

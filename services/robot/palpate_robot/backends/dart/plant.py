@@ -15,6 +15,7 @@ is identical to the bit.
 
 import tempfile
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Final
 
@@ -31,8 +32,20 @@ from palpate_models.scenario.schema import Robot
 from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal
 
-REACH_M: Final = 1.5
-"""Largest distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
+
+@dataclass(frozen=True)
+class ClearanceTuning:
+    """When the step skips collision detection."""
+
+    reach_m: float = 1.5
+    """Largest distance of any point of arm and tool from a joint axis: points move slower than this times sum |v|."""
+    least_rad: float = 0.01
+    """Clearance below which DART detects collisions: much more than the joints turn in a step."""
+    check_every: int = 20
+    """Steps between checks while the clearance is too small."""
+
+
+CLEARANCE: Final = ClearanceTuning()
 
 
 class Clearance:
@@ -63,13 +76,7 @@ class Clearance:
         # bounding boxes of the capsules, axis by axis
         gap = np.maximum(ends_B.min(axis=2), -ends_B.max(axis=2)) - self._half[:, None, :]
         distance = np.linalg.norm(np.maximum(gap, 0.0), axis=2) - self._radii
-        return min(float(distance.min()) / REACH_M, float(np.minimum(self._highest - q, q - self._lowest).min()))
-
-
-LEAST_CLEARANCE_RAD: Final = 0.01
-"""Clearance below which DART detects collisions: much more than the joints turn in a step."""
-CHECK_EVERY: Final = 20
-"""Steps between checks while the clearance is too small."""
+        return min(float(distance.min()) / CLEARANCE.reach_m, float(np.minimum(self._highest - q, q - self._lowest).min()))
 
 
 def _isometry(X: Array) -> Any:
@@ -224,14 +231,14 @@ class DartPlant:
     def _is_clear(self) -> bool:
         """Return True if no contact is possible during the coming step."""
         self._free_travel -= sum(map(abs, self.v.tolist())) * DT
-        if self._free_travel > LEAST_CLEARANCE_RAD:
+        if self._free_travel > CLEARANCE.least_rad:
             return True
         if self._check_in:
             self._check_in -= 1
             return False
         self._free_travel = self._clearance.angle(self.q)
-        clear = self._free_travel > LEAST_CLEARANCE_RAD
-        self._check_in = 0 if clear else CHECK_EVERY
+        clear = self._free_travel > CLEARANCE.least_rad
+        self._check_in = 0 if clear else CLEARANCE.check_every
         return clear
 
     def gravity_torque(self) -> Array:
@@ -271,4 +278,4 @@ class DartPlant:
 
     def contacts(self) -> int:
         """Return the number of contact points with table or base in the last step."""
-        return 0 if self._free_travel > LEAST_CLEARANCE_RAD else int(self._world.getLastCollisionResult().getNumContacts())
+        return 0 if self._free_travel > CLEARANCE.least_rad else int(self._world.getLastCollisionResult().getNumContacts())

@@ -49,12 +49,22 @@ from palpate_robot.backends.lbr.port import (
 )
 
 PERIODS_MS: Final = range(1, 101)
-MONITORING_S: Final = 0.2
-"""Time in each monitoring state (assumed); on the arm it lasts until the Sunrise application continues."""
-SYNC_S: Final = 0.1
-"""Time in COMMANDING_WAIT (assumed)."""
-QUALITY_WINDOW: Final = 100
-"""Answers over which connection quality is computed."""
+
+
+@dataclass(frozen=True)
+class SessionTuning:
+    """Times of an emulated session."""
+
+    monitoring_s: float = 0.2
+    """Time in each monitoring state (assumed); on the arm it lasts until the Sunrise application continues."""
+    sync_s: float = 0.1
+    """Time in COMMANDING_WAIT (assumed)."""
+    quality_window: int = 100
+    """Answers over which connection quality is computed."""
+
+
+SESSION: Final = SessionTuning()
+
 QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.GOOD), (0.30, ConnectionQuality.FAIR))
 """Largest fraction of lost answers per quality (assumed); above the last it is POOR."""
 
@@ -87,7 +97,7 @@ class FriSession:
         self.ended = ""
         """Message on the end of the session; empty while it runs."""
         self._in_state = 0.0
-        self._answers: deque[bool] = deque(maxlen=QUALITY_WINDOW)
+        self._answers: deque[bool] = deque(maxlen=SESSION.quality_window)
         self._target = Drive(q.copy(), np.zeros(7))
         self._position = q.copy()
         self._since_command: float | None = None
@@ -124,11 +134,15 @@ class FriSession:
         state = self.state
         if state is SessionState.IDLE:
             self._enter(SessionState.MONITORING_WAIT)
-        elif state is SessionState.MONITORING_WAIT and self._in_state > MONITORING_S and self.quality >= ConnectionQuality.GOOD:
+        elif (
+            state is SessionState.MONITORING_WAIT
+            and self._in_state > SESSION.monitoring_s
+            and self.quality >= ConnectionQuality.GOOD
+        ):
             self._enter(SessionState.MONITORING_READY)
-        elif state is SessionState.MONITORING_READY and self._in_state > MONITORING_S:
+        elif state is SessionState.MONITORING_READY and self._in_state > SESSION.monitoring_s:
             self._enter(SessionState.COMMANDING_WAIT)
-        elif state is SessionState.COMMANDING_WAIT and self._in_state > SYNC_S:
+        elif state is SessionState.COMMANDING_WAIT and self._in_state > SESSION.sync_s:
             self._enter(SessionState.COMMANDING_ACTIVE)
             self._target, self._position = Drive(q.copy(), np.zeros(7)), q.copy()
             self._since_command = None
