@@ -5,7 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.report.evidence import found_of, map_of
+from palpate.report.evidence import map_of
+from palpate.report.rows import finding_rows
 from palpate.report.scoring import Truth, score
 from palpate_assessment.assess import UnassessedReason
 from palpate_assessment.service import MAP, AssessmentService, create
@@ -43,7 +44,7 @@ def examined(small: Scan) -> Examined:
 
 def test_finds_the_lesion(truth: Truth, examined: Examined) -> None:
     stiffness_map, findings, samples = examined
-    s = score(found_of(findings.findings), map_of(stiffness_map), truth)
+    s = score(finding_rows(findings.findings), map_of(stiffness_map), truth)
     assert (s.matched, s.missed, s.false_findings) == (1, 0, 0)
     assert s.place_error_m is not None
     assert s.place_error_m < 0.005

@@ -89,7 +89,7 @@ class CameraInput:
         where = f"{self.info}: {name} = {K.ravel().tolist()}"
         if not (np.isfinite(K).all() and fx > 0 and fy > 0):
             raise CameraError(f"{where}: all must be finite, and the focal lengths positive")
-        if not np.array_equal(K, [[fx, 0, cx], [0, fy, cy], [0, 0, 1]]):
+        if not np.array_equal(K, np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]])):
             raise CameraError(f"{where}: want fx, 0, cx, 0, fy, cy, 0, 0, 1")
         sides = fx / width, fy / height
         if not (FOCAL[0] < min(sides) and max(sides) < FOCAL[1] and ASPECT[0] < fx / fy < ASPECT[1]):
