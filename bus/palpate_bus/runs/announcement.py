@@ -13,7 +13,7 @@ import tempfile
 import time
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
@@ -127,7 +127,8 @@ def live() -> list[Run]:
             try:
                 fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
             except BlockingIOError:
-                runs.append(Run(**json.load(file)))
+                known = {one.name for one in fields(Run)}  # another version may announce more
+                runs.append(Run(**{name: value for name, value in json.load(file).items() if name in known}))
             else:
                 path.unlink(missing_ok=True)
     return sorted(runs, key=lambda run: run.started)

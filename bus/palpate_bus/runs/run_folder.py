@@ -64,9 +64,10 @@ class RunFolder:
 
     def __init__(self) -> None:
         """Create the folder. Raises OSError."""
-        self.path = Path(tempfile.mkdtemp(prefix=PREFIX))
-        self.lock = os.open(self.path / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
+        new = Path(tempfile.mkdtemp(prefix="palpate-new-"))
+        self.lock = os.open(new / _LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o600)
         fcntl.flock(self.lock, fcntl.LOCK_EX)
+        self.path = new.rename(new.with_name(f"{PREFIX}{uuid4().hex[:_LENGTH]}"))  # locked before others can find it
 
     def remove(self) -> None:
         """Remove the folder. Further calls have no effect."""
@@ -80,7 +81,7 @@ def remove_leftovers() -> list[Path]:
     """Remove folders and shared memory of this user's ended runs; return their paths."""
     removed = [path for path in SHARED_MEMORY.glob("*.zenoh") if _removed(path)]
     for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
-        with suppress(OSError):  # another user's, just removed, or not locked yet
+        with suppress(OSError):  # another user's, just removed, or locked
             if path.stat().st_uid != os.getuid():
                 continue
             with (path / _LOCK).open("rb") as file:

@@ -356,8 +356,8 @@ class _Reader:
         try:
             vertices = np.array(_coal().MeshLoader().load(str(path), scale).vertices())
             hull = vertices[ConvexHull(vertices).vertices]
-        except (RuntimeError, ValueError, QhullError):
-            self.faults.append(f"link {link}: mesh {name} cannot be read")
+        except (RuntimeError, ValueError, QhullError) as error:
+            self.faults.append(f"link {link}: mesh {name} cannot be read: {str(error).partition(chr(10))[0]}")
             return np.zeros((0, 3))
         size = float(np.ptp(hull, axis=0).max())
         if not TUNING.smallest_link_m < size < TUNING.largest_link_m:
