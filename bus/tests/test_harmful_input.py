@@ -120,7 +120,7 @@ def test_an_fmu_that_reaches_out_is_refused(tmp_path: Path, monkeypatch: pytest.
     ("name", "content", "why"),
     [
         ("a.ply", b"ply\nformat ascii 1.0\nelement vertex 99999999999\nproperty float x\nend_header\n", "allowed are 2000000"),
-        ("a.stl", bytes(80) + b"\xff\xff\xff\xff", "allowed are 2000000"),
+        ("a.stl", bytes(80) + b"\xff\xff\xff\xff", "promises 4294967295 triangles, 0 are there"),
         ("a.obj", 300_000 * b"\n" + b"f 1 2 3\n", "names vertex 1"),
     ],
 )

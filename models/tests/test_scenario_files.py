@@ -267,7 +267,7 @@ def test_a_pattern_of_ones_own_is_a_file_with_a_function() -> None:
         (None, "there is no such file"),
         ("def scan(:", r"is not Python: .*line 1"),
         ("x = 1", r"has no function scan\(exam, surface\)"),
-        ("import nosuchthing\ndef scan(exam, surface): ...", "line 1: the module nosuchthing is not installed"),
+        ("import nosuchthing\ndef scan(exam, surface): ...", "the module nosuchthing is not installed"),
         ("def scan(exam, surface):\n    return exam.nosuch", "line 2: AttributeError"),
         ("def scan(exam, surface):\n    return [(0, 0)]", "returned list, want a Scan"),
         ("HEAD\ndef scan(exam, surface):\n    return Scan([np.zeros((3, 3))])", r"line 0 has the shape \(3, 3\)"),

@@ -1,4 +1,4 @@
-"""Written by `python -m palpate_bus.messages.stubs --write`; change the .msg files or typestore.py instead."""
+"""Written by `python bus/tests/message_stubs.py`; change the .msg files or typestore.py instead."""
 
 from dataclasses import dataclass
 from typing import ClassVar
