@@ -151,7 +151,7 @@ class Delayed(Service):
 
 DEPTH_M = 0.010
 ABOVE_M = 0.005
-BEGIN_S, PRESS_S, NUDGE_S, END_S = 0.05, 0.45, 0.8, 1.6
+BEGIN_S, PRESS_S, NUDGE_S, END_S = 0.08, 0.48, 0.8, 1.6
 NUDGE_M, NUDGE_FOR_S = 0.0005, 0.05
 WATCH_S = 0.3
 """The end of the run, over which ringing is measured [s]."""

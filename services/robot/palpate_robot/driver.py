@@ -12,7 +12,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
@@ -102,8 +101,6 @@ class Driver:
         """All safe holds: time [ns], cause, reason."""
         self._since = -1
         self._brake = 0
-        self._message: Any | None = None
-        self._newest: Command | None = None
         self._checked: Command | None = None
         self._before: Array | None = None
         """Values of the last checked command; None if no command was accepted since the driver was IDLE."""
@@ -130,19 +127,9 @@ class Driver:
             self._since = t
             self._before = None
 
-    def received(self, message: Any | None) -> Command | None:
-        """Return the command in the newest `JointTorqueCommand`, the same object for the same message; None before the first."""
-        if message is not None and message is not self._message:
-            stamp = nanoseconds(message.header.stamp)
-            expires = stamp + nanoseconds(message.valid_for)
-            values = message.position if self._positions else message.torque
-            self._message = message
-            self._newest = Command(np.array(values), stamp, expires, message.problem, message.culprit)
-        return self._newest
-
     def facts(self) -> dict[str, Any]:
         """Return mode, safe holds and the number of rejected commands, for the report."""
-        holds = [{"t_s": t / NS, "cause": cause.name, "reason": reason} for t, cause, reason in self.holds]
+        holds = [{"t_s": t / 1e9, "cause": cause.name, "reason": reason} for t, cause, reason in self.holds]
         return {"mode": self.mode.name, "holds": holds, "commands_rejected": self.rejected}
 
     def update(self, t: int, q: Array, v: Array, gravity: Array, force: float, command: Command | None, *, lost: bool) -> Array:

@@ -5,8 +5,6 @@ from typing import Final, Protocol
 
 import numpy as np
 
-from palpate_bus import messages
-from palpate_bus.messages import Header, Quaternion, TFMessage, ToolState, Vector3
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.scenario.errors import ArmErrors, DrawnArm, draw_arm
@@ -73,18 +71,6 @@ class Plant(Protocol):
     def contacts(self) -> int:
         """Return the number of contact points with table or base in the last step."""
         ...
-
-
-def tool_state(stamped: Header, motion: Sequence[float], radius: float) -> ToolState:
-    """Return the message of a `Plant.tool_motion` and the radius of the indenter [m]."""
-    pose = messages.Pose(messages.Point(*motion[:3]), Quaternion(*motion[3:7]))
-    return ToolState(stamped, pose, messages.Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), radius)
-
-
-def link_poses(stamped: Header, links: Sequence[str], poses: Array) -> TFMessage:
-    """Return the message of `Plant.link_poses`, by the names of the links."""
-    transforms = [messages.Transform(Vector3(*pose[:3]), Quaternion(*pose[3:])) for pose in poses.tolist()]
-    return TFMessage([messages.TransformStamped(stamped, *pair) for pair in zip(links, transforms, strict=True)])
 
 
 class PlantFactory(Protocol):

@@ -18,10 +18,11 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Driver, DriverMode, HoldCause
-from palpate_robot.plant import DT, PlantFactory, link_poses, tool_state
+from palpate_robot.messages import link_poses, tool_state
+from palpate_robot.plant import DT, PlantFactory
 from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
-from palpate_robot.stop_requests import StopRequests
+from palpate_robot.stop_requests import ReceivedCommands, StopRequests
 
 _TICK = round(DT * NS)
 _STATUS_PERIOD = contract().topics["robot/status"].period
@@ -50,6 +51,7 @@ class RobotService(Service):
         positions = robot.level is CommandLevel.POSITION
         self._driver = Driver(arm, known.limits.force_emergency_n, positions=positions)
         self._loop = PositionLoop(arm, self._joints.q) if positions else None
+        self._commands = ReceivedCommands(positions=positions)
         self._stop_requests = StopRequests(self._driver)
         self._weight = robot.tool_mass_kg * GRAVITY
         self._t: int | None = None
@@ -102,7 +104,7 @@ class RobotService(Service):
         plant, driver, joints = self._plant, self._driver, self._joints
         steps = 0 if self._t is None else min((t - self._t) // _TICK, _MOST_STEPS)
         self._t = t
-        command = driver.received(inbox.latest("control/joint_torque"))
+        command = self._commands.newest(inbox.latest("control/joint_torque"))
         self._read_contact(t, inbox)
         for _ in range(steps):
             gravity = plant.gravity_torque()

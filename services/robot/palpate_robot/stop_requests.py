@@ -1,12 +1,36 @@
-"""Stop and release requests of operator and supervisor, applied to a driver."""
+"""What a driver obeys: the commands of control, and stop and release requests of operator and supervisor."""
 
 from typing import Final
 
+import numpy as np
+
 from palpate_bus.messages import OperatorRequest, SupervisorState
+from palpate_bus.messages.codec import Message
+from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.service import Inbox
-from palpate_robot.driver import Driver, HoldCause
+from palpate_robot.driver import Command, Driver, HoldCause
 
 REQUESTS: Final = (OperatorRequest.STOP, OperatorRequest.RELEASE, OperatorRequest.END, OperatorRequest.SOFT_STOP)
+
+
+class ReceivedCommands:
+    """Commands of control from messages."""
+
+    def __init__(self, *, positions: bool) -> None:
+        """`positions`: commands are joint positions, else torques."""
+        self._positions = positions
+        self._message: Message | None = None
+        self._command: Command | None = None
+
+    def newest(self, message: Message | None) -> Command | None:
+        """Return the command in the newest `JointTorqueCommand`, the same object for the same message; None before the first."""
+        if message is not None and message is not self._message:
+            stamp = nanoseconds(message.header.stamp)
+            expires = stamp + nanoseconds(message.valid_for)
+            values = message.position if self._positions else message.torque
+            self._message = message
+            self._command = Command(np.array(values), stamp, expires, message.problem, message.culprit)
+        return self._command
 
 
 class StopRequests:

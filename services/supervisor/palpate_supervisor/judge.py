@@ -5,7 +5,6 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages.geometry import vector
 from palpate_models.numerics.frames import Array
 from palpate_supervisor.senses import ForceComparison, Measurement
 from palpate_supervisor.watch import Breach, Level, StopCause
@@ -138,10 +137,13 @@ class DepthAgreement:
         self._wrong = 0
         self._one_frame = True
 
-    def judge(self, state: Any, p_W: Array) -> list[Breach]:
-        """Return the breaches of an `exam/state`; `p_W`: centre of the sphere [m], shape (3,)."""
+    def judge(self, state: Any, skin_W: tuple[Array, Array], p_W: Array) -> list[Breach]:
+        """Return the breaches of an `exam/state`.
+
+        `skin_W`: its point of the skin [m] and normal; `p_W`: centre of the sphere [m]; shapes (3,).
+        """
         self._one_frame = self._one_frame and not state.patient_moved  # from then on the skin is given where it was before
-        height = vector(state.surface_normal) @ (p_W - vector(state.surface_point))
+        height = skin_W[1] @ (p_W - skin_W[0])
         gap = float(state.depth - (self._radius + state.wall_displacement - height))
         self._wrong = self._wrong + 1 if self._one_frame and state.in_contact and abs(gap) > self.LIMIT_M else 0
         if self._wrong < self.MOST:

@@ -8,7 +8,7 @@ import numpy as np
 
 from palpate_bus.contract import MS, contract
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
-from palpate_bus.messages.geometry import wrench
+from palpate_bus.messages.geometry import vector, wrench
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import inverse
@@ -93,7 +93,9 @@ class SupervisorService(Service):
         if inbox.new("robot/status"):
             self._measured = self._measure(t, inbox.latest("robot/status"))
         breaches += self._measured  # valid until the next measurement
-        breaches += [breach for state in inbox.new("exam/state") for breach in self._stated.judge(state, self._tool.p_W)]
+        for stated in inbox.new("exam/state"):
+            skin_W = vector(stated.surface_point), vector(stated.surface_normal)
+            breaches += self._stated.judge(stated, skin_W, self._tool.p_W)
         self._latch.update(t, breaches, release)
         latch, tool = self._latch, self._tool
         state = SupervisorState(

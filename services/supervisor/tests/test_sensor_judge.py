@@ -9,6 +9,7 @@ import pytest
 
 from palpate.exam_state import exam_state
 from palpate_bus.messages import ExamState
+from palpate_bus.messages.geometry import vector
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
@@ -157,5 +158,6 @@ def test_the_stated_depth_agrees_with_the_joints(stated: dict[str, float], seen:
     agreement, p_W = DepthAgreement(0.02), np.array((0.0, 0.0, 1.013))
     true = {"depth": 0.008, "wall_displacement": 0.001, "in_contact": True} | stated
     for k in range(12):
-        found = agreement.judge(exam_state(10_000_000 * k, ExamState.PHASE_SCAN, (0.0, 0.0, 1.0), **true), p_W)
+        state = exam_state(10_000_000 * k, ExamState.PHASE_SCAN, (0.0, 0.0, 1.0), **true)
+        found = agreement.judge(state, (vector(state.surface_point), vector(state.surface_normal)), p_W)
     assert [breach.culprit for breach in found] == [EXAM] * seen

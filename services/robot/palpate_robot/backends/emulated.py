@@ -24,7 +24,7 @@ from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
 from palpate_robot.backends.dart.plant import DartPlant
-from palpate_robot.plant import link_poses, tool_state
+from palpate_robot.messages import link_poses, tool_state
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 
 BRAKE_NMS: Final = 2000.0

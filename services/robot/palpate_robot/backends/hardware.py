@@ -26,7 +26,7 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
 from palpate_robot.backends.arm_port import ArmPort
 from palpate_robot.driver import Command, Driver, DriverMode, HoldCause
-from palpate_robot.stop_requests import StopRequests
+from palpate_robot.stop_requests import ReceivedCommands, StopRequests
 
 JOINTS: Final = "joint_states"
 SETPOINT: Final = "planning/setpoint"
@@ -179,6 +179,7 @@ class HardwareService(Service):
         self._model = GravityModel(exam.robot)
         self._positions = exam.robot.level is CommandLevel.POSITION
         self._driver = Driver(arm, exam.limits.force_emergency_n, positions=self._positions)
+        self._received = ReceivedCommands(positions=self._positions)
         self._stop_requests = StopRequests(self._driver)
         self._emulated = given.emulated
         yaw = np.deg2rad(given.ft_yaw_deg)
@@ -312,7 +313,7 @@ class HardwareService(Service):
 
     def _command(self, t: int, inbox: Inbox, joints: Message) -> Command | None:
         message = inbox.latest("control/joint_torque") if self._inner is None else self._inner.command(t, inbox, joints)
-        return self._driver.received(message)
+        return self._received.newest(message)
 
     def _status(self, t: int) -> Message:
         driver, measured, n = self._driver, t, len(self._names)
