@@ -86,6 +86,8 @@ class ControlService(Service):
         self._peak, self._last = self._still.copy(), self._still
         self._last_expires = -1
         """Expiry of the last command [ns]."""
+        self._began: int | None = None
+        """Time of the first step [ns]."""
         self._problem = ""
         self._refused: Problem | None = None  # of the newest set-point
         self._stop_reason: Problem | None = None  # None after a valid set-point
@@ -201,11 +203,15 @@ class ControlService(Service):
 
     def _wait(self, t: int, joints: Message | None) -> Outbox:
         """Return the command before the first set-point: zero torque, or the positions measured first."""
+        self._began = t if self._began is None else self._began
+        missing = "joint_states" if joints is None else TOPIC
+        late = t - self._began > self._setpoint_expiry
+        problem = Problem(missing, f"{missing}: none yet") if late else NO_PROBLEM
         if self._admittance is not None and self._last is self._still:
             if joints is None:
-                return self._command(t, self._still, self._no_validity)
+                return self._command(t, self._still, self._no_validity, problem)
             self._last = np.array(joints.position)
-        return self._command(t, self._last, self._full_validity)
+        return self._command(t, self._last, self._full_validity, problem)
 
     def _sense(self, admittance: AdmittanceController, t: int, inbox: Inbox) -> Problem | None:
         """Hand the newest F/T reading on; return a problem if it is stale."""

@@ -104,6 +104,14 @@ def test_joints_of_another_arm_end_commanding(rig: Rig, state: dict[str, Any]) -
     assert command.culprit == "joint_states"
 
 
+def test_a_long_wait_for_the_first_setpoint_is_stated(rig: Rig) -> None:
+    assert rig.tick(250).problem == ""
+    command = rig.tick(2)
+    assert command.culprit == "planning/setpoint"
+    assert valid_for(command) == EXPIRY
+    np.testing.assert_array_equal(command.torque, 0.0)
+
+
 def test_a_setpoint_for_another_arm_is_refused(rig: Rig) -> None:
     rig.tick()
     rig.send(setpoint(rig.t, joint_position=HOME[:6]))
