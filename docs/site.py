@@ -40,7 +40,7 @@ GENERATED = {
 STUDIES = {
     "detectability": "palpate study detectability --number 60",
     "guarding": "palpate study guarding",
-    "operating-point": "palpate study operating-point",
+    "operating-point": "palpate study operating-point --shard 1/2",
     "release": "palpate study release --number 8",
 }
 """Folders of docs/studies whose page study.html is generated from the tables, with the command that runs the study again."""
