@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import psutil
 import pytest
-from examination import SHORT, TINY, Finished, command, palpate_run, service_process
+from examination import SHORT, Finished, command, palpate_run, service_process
 from scipy.spatial import KDTree
 
 from palpate.report.recovery import FOLDER
@@ -19,8 +19,6 @@ from palpate_bus.recordings import open_recording
 from palpate_recorder.recover import recover
 
 SMALL = (*SHORT, "exam.region_m=[0.06, 0.045]", "camera.frames=4", "phantom.edge_m=0.01")
-TINY_SCAN = (*TINY, "exam.spacing_m=0.01")
-"""Four short lines on a coarse mesh."""
 Blow = Callable[[psutil.Process], None]
 
 
@@ -95,7 +93,7 @@ def check(folder: Path, resumed: Finished) -> None:
 def test_a_killed_examination_is_resumed_once(tmp_path: Path) -> None:
     """The whole command is killed, with its recorder."""
     folder = tmp_path / "broken"
-    interrupted(folder, kill, "--composed", settings=TINY_SCAN)
+    interrupted(folder, kill, "--composed")
     check(folder, resume(folder, "--composed"))
     again = resume(folder, "--composed")
     assert again.status == 2

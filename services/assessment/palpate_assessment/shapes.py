@@ -52,7 +52,8 @@ class Bump:
         corners = np.array(self.path)
         start, along = corners[:-1], np.diff(corners, axis=0)
         off = xy[:, None] - start
-        share = np.clip((off * along).sum(axis=2) / (along**2).sum(axis=1), 0.0, 1.0)
+        length2 = np.maximum((along**2).sum(axis=1), np.finfo(float).tiny)  # a search may bring both ends to one corner
+        share = np.clip((off * along).sum(axis=2) / length2, 0.0, 1.0)
         return np.asarray(np.linalg.norm(off - share[:, :, None] * along, axis=2).min(axis=1))
 
     def __call__(self, xy: Array, beyond: float = 0.0) -> Array:

@@ -153,3 +153,9 @@ def test_a_plain_body_has_no_finding_and_its_band_holds_what_a_press_feels() -> 
     again = np.array([sample.force for sample in presses(None, seed=1)])
     at = [int(np.argmin(np.hypot(*(result.grid.nodes[:, :2] - s.position[:2]).T))) for s in presses(None)]
     assert 0.8 < ((result.lower[at] <= again) & (again <= result.upper[at])).mean() <= 0.98
+
+
+def test_a_ridge_whose_ends_coincide_is_a_disc() -> None:
+    xy = np.array(((0.0, 0.0), (0.01, 0.0), (0.03, 0.02)))
+    band = ridge(np.zeros((2, 2)), 0.005, 0.007)
+    np.testing.assert_allclose(band(xy), Bump(0.0, 0.0, 0.005, 0.007)(xy))
