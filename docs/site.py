@@ -41,6 +41,7 @@ STUDIES = {
     "detectability": "palpate study detectability --number 60",
     "guarding": "palpate study guarding",
     "operating-point": "palpate study operating-point --shard 1/2",
+    "operating-point-shift": "palpate study operating-point --split shift --shard 1/2",
     "release": "palpate study release --number 8",
 }
 """Folders of docs/studies whose page study.html is generated from the tables, with the command that runs the study again."""
