@@ -1,4 +1,4 @@
-"""What a driver obeys: the commands of control, and stop and release requests of operator and supervisor."""
+"""Inputs of a driver: the commands of control, and stop and release requests of operator and supervisor."""
 
 from typing import Final
 
