@@ -330,9 +330,9 @@ def _outcome(folder: Folder, case: Case, attempt: Attempt) -> Outcome | None:
         folder.write_failures(case.case_id, failures)
         if len(failures) < ATTEMPTS:
             return None
-    told = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
+    stated = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
     status: Literal["done", "failed"] = "done" if attempt.why is None else "failed"
-    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), **told)
+    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), **stated)
 
 
 if __name__ == "__main__":

@@ -80,10 +80,10 @@ def test_probes_may_have_names_and_yaml_takes_on_for_true(tmp_path: Path) -> Non
 
 def test_forces_that_may_be_in_kgf_are_named(tmp_path: Path) -> None:
     table = probes().set_axis(list(HEADERS["plain"]), axis=1)
-    for scale, told in ((1.0, False), (1 / 9.80665, True)):
+    for scale, printed in ((1.0, False), (1 / 9.80665, True)):
         table.assign(**{name: scale * table[name] for name in ("fx", "fy", "fz")}).to_csv(tmp_path / "probes.csv", index=False)
         lines = propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
-        assert any("if the forces are in kgf" in line for line in lines) is told
+        assert any("if the forces are in kgf" in line for line in lines) is printed
 
 
 @pytest.mark.parametrize("written", WRITTEN.values(), ids=WRITTEN)

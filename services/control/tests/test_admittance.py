@@ -98,17 +98,17 @@ def test_a_far_posture_is_approached_slowly() -> None:
 
 @pytest.mark.parametrize("beside_m", [-0.01, 0.01])
 def test_beside_a_path_through_a_singular_wrist_the_tool_tilts_and_stays_in_place(beside_m: float) -> None:
-    """Two axes of the wrist align: 10 mm beside the planned path they turned at their limits, and the tool was 12 mm off."""
+    """Two axes of the wrist align: 10 mm aside the planned path they turned at their limits, and the tool was 12 mm off."""
     pytest.importorskip("coal")
     model = ArmModel(urdf(Robot(arm="ur5")))
-    law, beside = AdmittanceController(model, MASS), np.array((0.0, beside_m, 0.0))
+    law, aside = AdmittanceController(model, MASS), np.array((0.0, beside_m, 0.0))
     start, travel = np.array((0.3, -1.2, 1.9, -2.2, 0.25, 0.0)), np.array((0.0, 0.0, 0.0, 0.0, -0.5, 0.0))
     q, off, fastest = start, np.zeros(3), 0.0
     for ms in range(2000):
         x = ms / 2000
         planned, rate = start + travel * x * x * (3 - 2 * x), travel * 3 * x * (1 - x)
         asked = setpoint(model, planned, qd=rate)
-        asked = replace(asked, p_WD=asked.p_WD + beside, V_WD=model.J_W @ rate)
+        asked = replace(asked, p_WD=asked.p_WD + aside, V_WD=model.J_W @ rate)
         before = q
         q = law.command(q, rate, reference(asked))
         fastest = max(fastest, float(np.abs(q - before).max()) * 1e3)
