@@ -98,7 +98,7 @@ def test_a_far_posture_is_approached_slowly() -> None:
 
 @pytest.mark.parametrize("beside_m", [-0.01, 0.01])
 def test_beside_a_path_through_a_singular_wrist_the_tool_tilts_and_stays_in_place(beside_m: float) -> None:
-    """Two axes of the wrist align: 10 mm aside the planned path they turned at their limits, and the tool was 12 mm off."""
+    """Two axes of the wrist align: 10 mm from the planned path they turned at their limits, and the tool was 12 mm off."""
     pytest.importorskip("coal")
     model = ArmModel(urdf(Robot(arm="ur5")))
     law, aside = AdmittanceController(model, MASS), np.array((0.0, beside_m, 0.0))
