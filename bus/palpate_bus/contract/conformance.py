@@ -3,7 +3,7 @@
 from collections.abc import Iterator
 from dataclasses import dataclass, fields, is_dataclass
 from enum import StrEnum
-from math import inf, sqrt
+from math import acos, inf, sqrt
 from operator import attrgetter
 from typing import Any
 
@@ -74,8 +74,10 @@ def repeats(message: Message, before: Message, path: str) -> bool:
 
 def turn(now: Message, before: Message) -> float:
     """Return the angle between two orientations, `geometry_msgs/Quaternion` [rad]."""
-    a, b = (np.array((q.x, q.y, q.z, q.w)) for q in (now, before))
-    return float(2 * np.arccos(min(abs(a @ b) / sqrt((a @ a) * (b @ b)), 1.0)))
+    a, b = now, before
+    cosine = abs(a.x * b.x + a.y * b.y + a.z * b.z + a.w * b.w)
+    lengths = sqrt(a.x * a.x + a.y * a.y + a.z * a.z + a.w * a.w) * sqrt(b.x * b.x + b.y * b.y + b.z * b.z + b.w * b.w)
+    return 2 * acos(min(cosine / lengths, 1.0))
 
 
 def broken_past(topic: Topic, past: PastMessages, message: Message, t: int) -> Iterator[MessageViolation]:

@@ -19,8 +19,9 @@ from palpate_models.numerics.frames import Array
 
 def tool_state(stamped: Header, motion: Sequence[float], radius: float) -> ToolState:
     """Return the message of a `Plant.tool_motion` and the radius of the indenter [m]."""
-    pose = Pose(Point(*motion[:3]), Quaternion(*motion[3:7]))
-    return ToolState(stamped, pose, Twist(Vector3(*motion[7:10]), Vector3(*motion[10:])), radius)
+    px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = motion
+    pose = Pose(Point(px, py, pz), Quaternion(x, y, z, w))
+    return ToolState(stamped, pose, Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz)), radius)
 
 
 def link_poses(stamped: Header, links: Sequence[str], poses: Array) -> TFMessage:
