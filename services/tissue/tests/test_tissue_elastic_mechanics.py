@@ -12,16 +12,10 @@ from palpate_errors import UserError
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
-from palpate_tissue.backends.elastic.compliance import (
-    Compliance,
-    ComplianceTuning,
-    LayerKernel,
-    compliance,
-    graded_grid,
-    skin_compliance,
-)
+from palpate_tissue.backends.elastic.compliance import Compliance, ComplianceTuning, LayerKernel, compliance
 from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.slab import FlatSlab, hertz_force
+from palpate_tissue.backends.elastic.solid import graded_grid, skin_compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue, update_rule
 
 STILL = np.zeros(3)
