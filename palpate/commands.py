@@ -5,7 +5,6 @@ imports none of them: it reads their docstrings from the source.
 """
 
 import ast
-import os
 import shutil
 import sys
 from collections.abc import Sequence
@@ -18,7 +17,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, reserve_output, say
+from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, lost_output, output, reserve_output, say
 from palpate_errors import UserError
 from palpate_plugins import missing_libraries, needs
 
@@ -93,6 +92,18 @@ COMMANDS = {name: where for group in GROUPS.values() for name, where in group.it
 
 def main() -> None:
     """Run the command of `sys.argv`."""
+    sys.stdout, sys.stderr = output(sys.stdout), output(sys.stderr)
+    try:
+        _run()
+        sys.exit()
+    except SystemExit as left:
+        if (why := lost_output()) and not left.code:
+            say(f"the output could not be written: {why}; all else was done")
+            sys.exit(EXIT_TROUBLE)
+        raise
+
+
+def _run() -> None:
     name = sys.argv[1] if len(sys.argv) > 1 else ""
     if "--json" in sys.argv:
         reserve_output()
@@ -100,7 +111,6 @@ def main() -> None:
         _check_libraries(name)
         app_for(name)(prog_name="palpate")
     except BrokenPipeError:
-        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         sys.exit(EXIT_TROUBLE)
     except ModuleNotFoundError as error:  # of a library that the command imports late
         _exit_for_missing(name, error)

@@ -1,5 +1,6 @@
 """Console output, exit statuses, output options and progress bars of the `palpate` commands."""
 
+import io
 import json
 import os
 import sys
@@ -27,7 +28,7 @@ from palpate_errors import RunError, UserError
 from palpate_inputs import printable
 
 EXIT_TROUBLE = 1
-"""A check found something wrong, or the reader of the output left."""
+"""A check found something wrong, or the output could not be written."""
 EXIT_BAD_INPUT = 2
 """The command refused its input and started nothing."""
 EXIT_FAILED = 3
@@ -51,6 +52,38 @@ class SteadyConsole(Console):
         """Discard further output."""
         self.quiet = True
         os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+class _Output(io.FileIO):
+    """Standard output or error. What prevents writing, as a full disk does, is kept, and the rest discarded."""
+
+    lost = ""
+
+    def write(self, data: Any) -> int:
+        """Write bytes, or discard them; return their number. Raises BrokenPipeError."""
+        try:
+            return int(super().write(data) or 0)
+        except BrokenPipeError:
+            raise
+        except OSError as error:
+            _Output.lost = error.strerror or str(error)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), self.fileno())
+            return len(data)
+
+
+def output(stream: TextIO) -> TextIO:
+    """Return a stream to the same output that does not end a command if it cannot be written; see `lost_output`."""
+    buffer = io.BufferedWriter(_Output(stream.fileno(), "w", closefd=False))
+    return io.TextIOWrapper(buffer, stream.encoding, stream.errors, line_buffering=bool(stream.line_buffering))
+
+
+def lost_output() -> str:
+    """Return what prevented writing to standard output or error; empty if all was written, or if its reader left."""
+    try:
+        sys.stdout.flush()
+    except BrokenPipeError:
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+    return _Output.lost
 
 
 class CommandGroup(TyperGroup):
@@ -143,7 +176,7 @@ def reserve_output() -> None:
     global _DOCUMENT  # noqa: PLW0603 - standard output is one for the process
     if _DOCUMENT is None:
         sys.stdout.flush()
-        _DOCUMENT = os.fdopen(os.dup(1), "w", encoding="utf-8")
+        _DOCUMENT = output(os.fdopen(os.dup(1), "w", encoding="utf-8", closefd=False))
         os.dup2(2, 1)
 
 

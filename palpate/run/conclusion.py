@@ -1,6 +1,7 @@
 """The end of an examination: writes the results, prints the findings, sets the exit status."""
 
 import logging
+import tempfile
 from contextlib import nullcontext
 from pathlib import Path
 from typing import Final
@@ -12,7 +13,8 @@ from palpate.console import EXIT_FAILED, SteadyConsole, print_line, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
-from palpate.run.folder import megabytes_of
+from palpate.run.folder import another_folder, megabytes_of
+from palpate.run.roles import write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import ExamState, RobotStatus
@@ -72,17 +74,36 @@ def _hold_text(result: RunResult) -> str:
 
 
 def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path | None, str]:
-    """Write the results into a folder; return the report, its page, None if the folder is not writable, and what went wrong."""
-    trouble = ""
-    while True:
-        try:
-            return write_results(folder, scenario, result), write_page(folder), trouble
-        except OSError as error:
-            report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
-            return report, None, f"{folder}: the results cannot be written there ({error.strerror}); they are only printed here"
-        except Exception as error:  # a user-defined assessment may send a map with invalid triangles
-            if result.collected.stiffness_map is None:
-                raise
-            log.exception("the map cannot be used")
-            result.collected.stiffness_map = None
-            trouble = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"
+    """Write the results into a folder, or into another if that fails; return the report, its page, and what went wrong.
+
+    If no folder is writable, there is no page.
+    """
+    try:
+        return _write_into(folder, scenario, result)
+    except OSError as error:
+        trouble = f"{folder}: the results cannot be written there ({error.strerror})"
+    try:
+        other = another_folder()
+        write_scenario_files(scenario, other)
+        report, page, why = _write_into(other, scenario, result)
+        return report, page, f"{trouble}; they are in {other}" + (f"; {why}" if why else "")
+    except OSError as error:
+        report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
+        return (
+            report,
+            None,
+            f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
+        )
+
+
+def _write_into(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:
+    """Write the results into a folder, without a map that cannot be drawn; return report, page and why. Raises OSError."""
+    try:
+        return write_results(folder, scenario, result), write_page(folder), ""
+    except OSError:
+        raise
+    except Exception as error:  # a user-defined assessment may send a map with invalid triangles
+        log.exception("the map cannot be used")
+        result.collected.stiffness_map = None
+        why = f"assessment/map cannot be used ({type(error).__name__}: {error}); everything else is kept"
+        return write_results(folder, scenario, result), write_page(folder), why

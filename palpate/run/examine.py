@@ -16,7 +16,7 @@ from palpate.run.composed import run_composed
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import NEEDS_WALLCLOCK
 from palpate.run.distributed import run_distributed
-from palpate.run.folder import check_room, results_folder, unless_begun, usual_folder, what_it_takes
+from palpate.run.folder import WatchedRoom, check_room, results_folder, unless_begun, usual_folder, what_it_takes
 from palpate.run.group import Groups, placement
 from palpate.run.interrupts import results_first
 from palpate.run.options import RunOptions
@@ -24,7 +24,7 @@ from palpate.run.places import Absent
 from palpate.run.processes import SecureBus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
-from palpate.run.self_test import RATES, SELF_TEST, measure
+from palpate.run.self_test import RATES, REAL_PROCESSES, SIMULATED_PROCESSES, measure
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_conductor.outcome import RunResult, Tell, Timing
@@ -58,9 +58,10 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
         if not options.silent:
             _announce(console, scenario, options, folder)
         with RunDisplay(console, options.silent, scenario.exam) as display, given({"PALPATE_RECORD": options.record}):
+            tell = WatchedRoom(folder, display.show, say).check
             with unless_begun(folder, lambda: display.begun), checkpoint_given(None if before is None else before.checkpoint):
                 check_room(folder, scenario.exam, options.record)
-                result = _run(scenario, folder.resolve(), display.show, options, observers, absent, groups)
+                result = _run(scenario, folder.resolve(), tell, options, observers, absent, groups)
                 if result.unbegun:
                     raise KeyboardInterrupt
             if before is not None:
@@ -136,7 +137,7 @@ def _rate(scenario: Scenario) -> float:
     real, emulated = scenario.services.tissue == NONE, scenario.robot.driver.emulated
     given = rate = Settings.read().rate
     if rate is None:
-        measured = measure(SELF_TEST.real_processes if scenario.services.tissue == NONE else SELF_TEST.simulated_processes)
+        measured = measure(REAL_PROCESSES if scenario.services.tissue == NONE else SIMULATED_PROCESSES)
         rate = measured.rate
         if rate is None:
             raise UserError(f"this machine cannot keep {RATES[-1]:g} of real time now: {measured.summary}; run in lockstep")

@@ -5,6 +5,7 @@ import json
 import os
 import re
 import shutil
+import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from datetime import datetime
@@ -16,6 +17,7 @@ from palpate.run.inputs import Outlook, duration_text
 from palpate.run.options import Record
 from palpate_bus.runs.run_folder import FILE, LOCK, in_use, run_of
 from palpate_bus.settings import RECORDING
+from palpate_conductor.outcome import RunProgress, Tell
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Exam
 
@@ -129,6 +131,8 @@ REPORT_MB = 10
 """Report, page, map, evidence and logs."""
 RECORDED_MB_PER_S: Final[dict[Record, float]] = {"none": 0.0, "normal": 0.3, "full": 2.5}
 """Both recordings, per simulated second."""
+LOW_MB = 20
+"""Free space below which a warning is printed."""
 
 
 def expected_mb(exam: Exam, record: Record) -> float:
@@ -164,3 +168,23 @@ def free_mb(folder: Path) -> float:
         return shutil.disk_usage(folder).free / MB
     except OSError:
         return 0.0
+
+
+class WatchedRoom:
+    """Passes on the progress of a run, and warns once when the disk of its results is nearly full."""
+
+    def __init__(self, folder: Path, tell: Tell, warn: Callable[[str], None]) -> None:
+        self._folder, self._tell, self._warn = folder, tell, warn
+        self._warned = False
+
+    def check(self, progress: RunProgress) -> None:
+        """Check the free space and passes on the progress."""
+        if not self._warned and (left := free_mb(self._folder)) < LOW_MB:
+            self._warned = True
+            self._warn(f"{self._folder}: {left:.0f} MB are left there: recordings will stop, the examination continues")
+        self._tell(progress)
+
+
+def another_folder() -> Path:
+    """Return a new folder for results that cannot be written into their own."""
+    return Path(tempfile.mkdtemp(prefix="palpate-results-"))

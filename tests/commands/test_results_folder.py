@@ -12,16 +12,18 @@ from conductor_messages import SETTINGS, collected, result
 from PIL import Image
 from rich.console import Console
 
-from palpate.console import EXIT_FAILED
+from palpate.console import EXIT_FAILED, EXIT_TROUBLE
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_text
 from palpate.report.page import write_page
 from palpate.report.results import write_results
 from palpate.run.conclusion import conclude
 from palpate.run.conducting import conduct_others
-from palpate.run.folder import check_room, locked, results_folder, unless_begun
+from palpate.run.folder import WatchedRoom, another_folder, check_room, locked, results_folder, unless_begun
 from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
+from palpate_conductor.collector import Collected
+from palpate_conductor.outcome import RunProgress
 from palpate_errors import UserError
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Exam, Scenario
@@ -100,13 +102,12 @@ def test_a_killed_run_is_not_conducted_over(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("words", [["scenarios"], ["scenarios", "--json"]])
-def test_a_command_on_a_full_disk_says_so_in_a_line(words: list[str]) -> None:
+def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "palpate", *words]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert done.returncode != 0
-    assert done.stderr.count("\n") == 1
-    assert "No space left on device" in done.stderr
+    assert (done.returncode, done.stderr.count("\n")) == (EXIT_TROUBLE, 1)
+    assert "the output could not be written: No space left on device" in done.stderr
 
 
 @pytest.mark.parametrize("name", ["../../escape", "..", "a/b", "a\nb", "", "a" * 101])
@@ -168,11 +169,32 @@ def test_a_run_that_does_not_fit_is_refused_with_what_it_needs(tmp_path: Path, m
         check_room(tmp_path, Exam(), "full")
 
 
-def test_results_that_a_folder_does_not_take_are_printed(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_disk_that_fills_up_is_reported_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    said: list[str] = []
+    progress: list[RunProgress] = []
+    room = WatchedRoom(tmp_path, progress.append, said.append)
+    for megabytes in (500, 10, 5):
+        leave(megabytes, monkeypatch)
+        room.check(RunProgress(0, 1.0, Collected(), ()))
+    assert len(progress) == 3
+    assert said == [f"{tmp_path}: 10 MB are left there: recordings will stop, the examination continues"]
+
+
+@pytest.mark.parametrize("other", ["", "nor here"])
+def test_results_that_a_folder_does_not_take_go_to_another_or_to_the_console(
+    other: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / other))
     scenario = load_scenario("clean", SETTINGS, seed=3)
     with pytest.raises(typer.Exit) as left:
         conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected()), quiet=True)
     assert left.value.exit_code == EXIT_FAILED
     out, err = capsys.readouterr()
     assert "RLQ" in out
-    assert "only printed here" in err.replace("\n", " ")
+    if other:
+        assert "nothing is kept but what is printed here" in err.replace("\n", "")
+    else:
+        (folder,) = tmp_path.glob("palpate-results-*")
+        assert {"report.json", "report.html", "map.png"} <= {path.name for path in folder.iterdir()}
+        assert str(folder) in err.replace("\n", "")
+        assert another_folder() != folder
