@@ -9,11 +9,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import zenoh
-from toy_runs import Running, assert_failed, at, once, run_toys
+from toy_runs import Running, assert_failed, at, composed_hash, once, run_toys
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import JointTorqueCommand, RunControl, codec
-from palpate_bus.messages.stamps import duration_message
+from palpate_bus.messages.stamps import NS, duration_message
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.wire.rmw import AttachmentWriter, make_key, message_key, topic_key, unpack
@@ -69,13 +69,6 @@ def meddling(*clones: Clone) -> Callable[[Running], None]:
     return meddle
 
 
-def composed_hash_of(seconds: int) -> str:
-    program = "import toy_runs; print(toy_runs.composed_hash())"
-    environment = {"TOY_END_S": str(seconds), "PYTHONPATH": str(Path(__file__).parent)}
-    done = subprocess.run([sys.executable, "-c", program], env=environment, capture_output=True, text=True, check=True)
-    return done.stdout.strip()
-
-
 @pytest.mark.parametrize(("clone", "topic"), [(abort, "palpate/control"), (torque, "control/joint_torque")])
 def test_without_a_key_a_forged_sender_is_detected(clone: Callable[[], Clone], topic: str) -> None:
     outcome = run_toys(meddling(clone()))
@@ -87,7 +80,7 @@ def test_with_a_key_forged_messages_are_reported_and_ignored(tmp_path: Path, mon
     monkeypatch.setenv("PALPATE_KEY", str(make_key(tmp_path / "run.key")))
     outcome = run_toys(meddling(abort(), torque()), {"TOY_END_S": "3"})
     assert outcome.failure is None
-    assert outcome.run_hash == composed_hash_of(3)
+    assert outcome.run_hash == composed_hash(3 * NS)
     assert outcome.counters["robot"]["forged"] == 1
     for topic in ("palpate/control", "control/joint_torque"):
         assert [line for line in outcome.trouble if line.startswith(f"{topic}: ") and "tag" in line], outcome.trouble

@@ -8,7 +8,7 @@ from types import SimpleNamespace
 from typing import Any
 
 import pytest
-from toy_runs import APART, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services
+from toy_runs import APART, LOOP, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services, with_own_process
 
 from palpate_bus.contract import MS, Topic, contract
 from palpate_bus.messages import DiagnosticStatus, ServiceReport, codec
@@ -49,13 +49,7 @@ def test_a_failed_observer_or_tap_does_not_end_a_composed_run() -> None:
     assert set(run.finish()) == {*toy_services.TOYS, "conductor"}
 
 
-LOOP = ("robot", "tissue", "control")
 PAIR = ("planning", "perception")
-
-
-def with_own_process(*groups: tuple[str, ...]) -> list[tuple[str, ...]]:
-    """Return these groups of roles, and every other role alone."""
-    return [*groups, *((role,) for role in ROLES if not any(role in group for group in groups))]
 
 
 @pytest.mark.parametrize("groups", [APART, with_own_process(LOOP, PAIR), [ROLES[::2], ROLES[1::2]]])
@@ -178,7 +172,7 @@ def test_a_violation_is_published_on_diagnostics() -> None:
         while (sample := subscriptions[0].get(0)) is not None:
             received.append(sample.payload)
 
-    outcome = run_toys(listen, {"TOY_END_S": "8"}, faults={"tissue": ("truth/patient", "nan", "1")})
+    outcome = run_toys(listen, {"TOY_END_S": "4"}, faults={"tissue": ("truth/patient", "nan", "1")})
     assert outcome.failure is None  # it has observers only
     statuses = {status.name: status for status in codec.decode(received[-1], topic.type).status}
     for name in ("palpate/topic/truth/patient", "palpate/tissue"):

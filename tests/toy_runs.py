@@ -6,10 +6,13 @@ import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
+from unittest import mock
 
 import zenoh
 
+from palpate.run.forks import Forked, Forks
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
@@ -19,19 +22,30 @@ from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.outcome import Patience, RunResult, Timing
 
-TOYS = Path(__file__).parents[1] / "bus" / "tests" / "toy_services.py"
-sys.path.insert(0, str(TOYS.parent))
-import toy_services  # noqa: E402
+sys.path.insert(0, str(Path(__file__).parents[1] / "bus" / "tests"))
+import toy_services
 
+TOYS = toy_services.__name__
+FORKS = Forks(["palpate_bus.run"])
+"""Processes of the toy services, which import their libraries once."""
 ROLES = tuple(toy_services.TOYS)
+LOOP = ("robot", "tissue", "control")
+
+
+def with_own_process(*groups: tuple[str, ...]) -> tuple[tuple[str, ...], ...]:
+    """Return these groups of roles, and all other roles as one more."""
+    return (*groups, tuple(role for role in ROLES if not any(role in group for group in groups)))
+
+
 APART = tuple((role,) for role in ROLES)
+LOOP_APART = with_own_process(("robot",), ("tissue",), ("control",))
 
 
 @dataclass
 class Running:
     """A toy run in progress."""
 
-    processes: dict[str, subprocess.Popen[bytes]]
+    processes: dict[str, Forked]
     session: zenoh.Session
     conductor: Conductor
 
@@ -42,7 +56,7 @@ def run_toys(
     patience: Patience | None = None,
     wallclock: bool = False,
     faults: Mapping[str, tuple[str, ...]] | None = None,
-    groups: Sequence[tuple[str, ...]] = APART,
+    groups: Sequence[tuple[str, ...]] = (),
     router: str = "",
 ) -> RunResult:
     """Run the toy services.
@@ -53,11 +67,12 @@ def run_toys(
         patience: time limits of the conductor
         wallclock: run in wall-clock mode instead of lockstep
         faults: by role, a fault of its transport (topic, kind, simulated second)
-        groups: roles of each process
+        groups: roles of each process; by default the 1 kHz loop apart and the rest together, by the wall clock each apart
         router: if given, all processes are clients of it
     """
+    groups = groups or (APART if wallclock else LOOP_APART)
     with tempfile.TemporaryDirectory(prefix="toy-") as folder:
-        loop = tuple(group[0] for group in groups if {"robot", "control", "tissue"}.issuperset(group))
+        loop = tuple(group[0] for group in groups if set(group) <= set(LOOP))
         bus = mesh(("conductor", *(group[0] for group in groups)), Path(folder), lowlatency=loop)
         if router:
             bus = dict.fromkeys(bus, BusOptions(mode="client", router=router))
@@ -70,10 +85,10 @@ def run_toys(
             "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         }
         started = {
-            group: subprocess.Popen(
-                [sys.executable, str(TOYS), ",".join(group), *(faults or {}).get(group[0], ())],
-                env={**base, **bus[group[0]].to_env()},
-                stderr=subprocess.DEVNULL,
+            group: FORKS.start(
+                (sys.executable, "-m", TOYS, ",".join(group), *(faults or {}).get(group[0], ())),
+                {**base, **bus[group[0]].to_env()},
+                Path(os.devnull),
             )
             for group in groups
         }
@@ -101,10 +116,13 @@ def assert_failed(outcome: RunResult, code: FailureCode, *roles: str) -> None:
     assert set(outcome.failure.roles) == set(roles), outcome.failure
 
 
-def composed_hash() -> str:
+@cache
+def composed_hash(end: int = toy_services.END) -> str:
+    """Return the run hash of the toy services in one process, up to `end` [ns]."""
     collector = Collector()
     run = Composed([*(toy() for toy in toy_services.TOYS.values()), collector])
-    assert run.run(lambda: collector.collected.end_tick, 60 * NS) == toy_services.END
+    with mock.patch.object(toy_services, "END", end):
+        assert run.run(lambda: collector.collected.end_tick, 60 * NS) == end
     return run.run_hash()
 
 

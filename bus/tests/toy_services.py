@@ -8,6 +8,7 @@ import os
 import signal
 import sys
 import time
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,6 @@ import zenoh
 from palpate_bus.contract import MS
 from palpate_bus.messages import (
     CameraTrigger,
-    ExamState,
     Image,
     ImpedanceSetpoint,
     IndentationTruth,
@@ -28,7 +28,6 @@ from palpate_bus.messages import (
     Point,
     Pose,
     Quaternion,
-    RobotStatus,
     String,
     SupervisorState,
     SurfaceMesh,
@@ -39,13 +38,14 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
-from palpate_bus.messages.stamps import NS, duration_message, header
+from palpate_bus.messages.stamps import NS, blank, duration_message, header
 from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions
 
+EXAM, STATUS = blank("palpation_msgs/msg/ExamState"), blank("palpation_msgs/msg/RobotStatus")
 NAMES = [f"lbr_A{i}" for i in range(1, 8)]
 END = int(float(os.environ.get("TOY_END_S", "2")) * NS)
 
@@ -104,14 +104,8 @@ class Robot(Service):
 
 
 def _status(h: Any, x: Any, t: int, lost: bool) -> Any:
-    fields = {
-        name: x
-        for name in ("applied_torque", "measured_torque", "position", "velocity")
-        if name in RobotStatus.__dataclass_fields__
-    }
-    if "wrench" in RobotStatus.__dataclass_fields__:
-        fields["wrench"] = wrench(1e-9 * t)
-    return RobotStatus(header=h, mode=2 if lost else 1, cause=0, reason="", culprit="", commands_rejected=0, **fields)
+    joints = dict.fromkeys(("applied_torque", "measured_torque", "position", "velocity"), x)
+    return replace(STATUS, header=h, mode=2 if lost else 1, wrench=wrench(1e-9 * t), **joints)
 
 
 class Control(Service):
@@ -171,30 +165,7 @@ class Planning(Service):
             "planning/setpoint": ImpedanceSetpoint(
                 h, 0, pose(), twist(), wrench(), np.zeros(6), np.zeros(6), q, np.zeros(7), np.zeros(7), duration_message(250 * MS)
             ),
-            "exam/state": ExamState(
-                h,
-                0,
-                "",
-                0,
-                0,
-                0,
-                False,
-                False,
-                False,
-                False,
-                0.0,
-                0.0,
-                0.0,
-                Point(0.0, 0.0, 0.0),
-                Vector3(0.0, 0.0, 1.0),
-                end,
-                0.0,
-                0.0,
-                0,
-                False,
-                0,
-                "",
-            ),
+            "exam/state": replace(EXAM, header=h, end_tick=end, surface_normal=Vector3(0.0, 0.0, 1.0)),
         }
         if t % (500 * MS) == 0:
             out["planning/camera_trigger"] = CameraTrigger(h, 3)

@@ -1,9 +1,11 @@
 """A default install, without the libraries of other extras: each command shows its help, or refuses in one line at its start."""
 
+import json
 import os
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import pytest
 
@@ -25,31 +27,57 @@ CALLS = {
     "fuzz": [],
 }
 """A call of each command that needs another extra."""
-HELPS = """
-import os, sys
+SERVICES = ("tissue=fmu", "robot=mujoco")
+FORKS = """
+import json, os, sys
 from palpate import commands
-for name in commands.COMMANDS:
+for number, words in enumerate(json.loads(sys.argv[1])):
     if (child := os.fork()) == 0:
-        sys.argv = ["palpate", name, "--help"]
+        for stream in (1, 2):
+            os.dup2(os.open(f"{sys.argv[2]}/{number}.{stream}", os.O_CREAT | os.O_WRONLY), stream)
+        sys.argv = ["palpate", *words]
         try:
             commands.main()
         except SystemExit as left:
+            sys.stdout.flush()
+            sys.stderr.flush()
             os._exit(left.code or 0)
-    print(name, os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), file=sys.stderr)
+    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]))
 """
+"""Calls each command in a fork."""
 
 
-def called(*words: str, folder: Path) -> subprocess.CompletedProcess[str]:
-    """Run Python in a default install."""
-    return subprocess.run(
-        [sys.executable, *words], cwd=folder, env=ENVIRONMENT, capture_output=True, text=True, timeout=120, check=False
-    )
+class Called(NamedTuple):
+    """How a command ended and what it printed."""
+
+    status: int
+    out: str
+    err: str
+
+
+def call_each(calls: dict[str, list[str]], folder: Path) -> dict[str, Called]:
+    """Call commands in a default install, in an empty folder that stays empty."""
+    printed, empty = folder / "printed", folder / "empty"
+    printed.mkdir()
+    empty.mkdir()
+    words = [sys.executable, "-c", FORKS, json.dumps(list(calls.values())), str(printed)]
+    done = subprocess.run(words, cwd=empty, env=ENVIRONMENT, capture_output=True, text=True, timeout=240, check=True)
+    assert not any(empty.iterdir())
+    ended = zip(calls, done.stdout.split(), strict=True)
+    files = [[(printed / f"{number}.{stream}").read_text() for stream in (1, 2)] for number in range(len(calls))]
+    return {name: Called(int(status), *texts) for (name, status), texts in zip(ended, files, strict=True)}
 
 
 def test_the_help_of_each_command_needs_no_other_extra(tmp_path: Path) -> None:
-    done = called("-c", HELPS, folder=tmp_path)
-    assert done.stderr.splitlines() == [f"{name} 0" for name in COMMANDS]
-    assert done.stdout.count("Usage: palpate ") == len(COMMANDS)
+    for name, (status, out, err) in call_each({name: [name, "--help"] for name in COMMANDS}, tmp_path).items():
+        assert (status, err) == (0, ""), name
+        assert f"Usage: palpate {name}" in out
+
+
+@pytest.fixture(scope="module")
+def refused(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Called]:
+    calls = {name: [name, *words] for name, words in CALLS.items()}
+    return call_each({**calls, **{one: ["run", "clean", "--service", one] for one in SERVICES}}, tmp_path_factory.mktemp("calls"))
 
 
 def test_each_command_of_another_extra_has_a_call() -> None:
@@ -57,21 +85,19 @@ def test_each_command_of_another_extra_has_a_call() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(CALLS))
-def test_a_command_refuses_at_its_start_in_one_line_that_names_the_extra(name: str, tmp_path: Path) -> None:
-    done = called("-m", "palpate", name, *CALLS[name], folder=tmp_path)
-    assert (done.returncode, done.stdout) == (2, "")
-    (line,) = done.stderr.splitlines()
+def test_a_command_refuses_at_its_start_in_one_line_that_names_the_extra(name: str, refused: dict[str, Called]) -> None:
+    status, out, err = refused[name]
+    assert (status, out) == (2, "")
+    (line,) = err.splitlines()
     assert line.startswith(f"palpate: the command {name} needs ")
     assert line.endswith(f"pip install 'palpate[{EXTRAS[name]}]'")
-    assert not any(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize("service", ["tissue=fmu", "robot=mujoco"])
-def test_a_service_of_another_extra_is_refused_before_anything_starts(service: str, tmp_path: Path) -> None:
-    done = called("-m", "palpate", "run", "clean", "--service", service, folder=tmp_path)
-    assert done.returncode == 2
-    (line,) = done.stderr.splitlines()
+@pytest.mark.parametrize("service", SERVICES)
+def test_a_service_of_another_extra_is_refused_before_anything_starts(service: str, refused: dict[str, Called]) -> None:
+    status, _, err = refused[service]
+    assert status == 2
+    (line,) = err.splitlines()
     role, name = service.split("=")
     assert line.startswith(f"palpate: clean: services.{role} = '{name}': needs ")
     assert line.endswith(f"pip install 'palpate[{name}]'")
-    assert not any(tmp_path.iterdir())

@@ -11,7 +11,9 @@ import typer
 from conductor_messages import SETTINGS, collected, result
 from PIL import Image
 from rich.console import Console
+from typer.testing import CliRunner
 
+from palpate.commands import app_for
 from palpate.console import EXIT_FAILED, EXIT_TROUBLE
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_text
@@ -45,8 +47,9 @@ def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Pa
     (tmp_path / "report.json").write_text("{}", encoding="utf-8")
     (tmp_path / "notes.txt").write_text("mine", encoding="utf-8")
     run = run_of(tmp_path)
-    words = [sys.executable, "-m", "palpate", "prepare", "healthy", "--out", str(tmp_path)]
-    done = subprocess.run(words, capture_output=True, text=True, check=True)
+    words = ["prepare", "healthy", "--out", str(tmp_path)]
+    done = CliRunner().invoke(app_for("prepare"), words)
+    assert done.exit_code == 0, done.output
     (earlier,) = tmp_path.glob(f"*-{run}")
     assert str(earlier) in done.stderr
     assert {path.name for path in earlier.iterdir()} >= {"report.json", "run.json", "scenario.yaml", "logs"}
@@ -54,7 +57,7 @@ def test_preparing_containers_keeps_the_results_of_the_previous_run(tmp_path: Pa
     assert {"notes.txt", "scenario.yaml"} <= {path.name for path in tmp_path.iterdir()}
     assert not (tmp_path / "report.json").exists()
     with locked(tmp_path):
-        assert subprocess.run(words, capture_output=True, check=False).returncode == 2
+        assert CliRunner().invoke(app_for("prepare"), words).exit_code == 2
     assert len(list(tmp_path.glob("2*"))) == 1
 
 
