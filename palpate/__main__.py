@@ -10,9 +10,7 @@ import sys
 from types import FrameType
 
 from palpate.environment import FIXED
-
-EXIT_INTERRUPTED = 130
-"""Exit status after SIGINT, of shells and of Typer."""
+from palpate_errors import ExitStatus
 
 TERMINALS = [number for number in (0, 1, 2) if os.isatty(number)]
 """Those of standard input, output and error that are terminals."""
@@ -32,12 +30,12 @@ def main() -> None:
     except KeyboardInterrupt:
         pass
     except SystemExit as left:
-        if left.code != EXIT_INTERRUPTED:
+        if left.code != ExitStatus.INTERRUPTED:
             raise
     else:
         return
     print("palpate: interrupted", file=sys.stderr)
-    sys.exit(EXIT_INTERRUPTED)
+    sys.exit(ExitStatus.INTERRUPTED)
 
 
 def _hung_up(number: int, frame: FrameType | None) -> None:

@@ -17,8 +17,8 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from palpate.console import EXIT_BAD_INPUT, EXIT_TROUBLE, CommandGroup, lost_output, output, reserve_output, say
-from palpate_errors import UserError
+from palpate.console import CommandGroup, lost_output, output, reserve_output, say
+from palpate_errors import ExitStatus, UserError
 from palpate_plugins import missing_libraries, needs
 
 HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each part of it with a program of your own."
@@ -99,7 +99,7 @@ def main() -> None:
     except SystemExit as left:
         if (why := lost_output()) and not left.code:
             say(f"the output could not be written: {why}; all else was done")
-            sys.exit(EXIT_TROUBLE)
+            sys.exit(ExitStatus.TROUBLE)
         raise
 
 
@@ -111,12 +111,12 @@ def _run() -> None:
         _check_libraries(name)
         app_for(name)(prog_name="palpate")
     except BrokenPipeError:
-        sys.exit(EXIT_TROUBLE)
+        sys.exit(ExitStatus.TROUBLE)
     except ModuleNotFoundError as error:  # of a library that the command imports late
         _exit_for_missing(name, error)
     except UserError as error:  # a setting or contract that cannot be used, found when the command is imported
         say(error)
-        sys.exit(EXIT_BAD_INPUT)
+        sys.exit(ExitStatus.BAD_INPUT)
 
 
 def app_for(name: str, columns: int | None = None) -> typer.Typer:
@@ -210,7 +210,7 @@ def _check_libraries(name: str) -> None:
 
 def _refuse_without(missing: Sequence[str], name: str) -> NoReturn:
     print(f"palpate: the command {name} {needs(missing, EXTRAS.get(name, 'run'))}", file=sys.stderr)
-    sys.exit(EXIT_BAD_INPUT)
+    sys.exit(ExitStatus.BAD_INPUT)
 
 
 def _summary(where: str) -> str:

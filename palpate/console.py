@@ -24,17 +24,8 @@ from rich.table import Table
 from rich.text import Text
 from typer.core import TyperGroup
 
-from palpate_errors import RunError, UserError
+from palpate_errors import ExitStatus, RunError, UserError
 from palpate_inputs import printable
-
-EXIT_TROUBLE = 1
-"""A check found something wrong, or the output could not be written."""
-EXIT_BAD_INPUT = 2
-"""The command refused its input and started nothing."""
-EXIT_FAILED = 3
-"""The command failed after it had started."""
-WIDE_COLUMNS = 140
-"""Width of tables in a pipe."""
 
 
 class SteadyConsole(Console):
@@ -111,13 +102,13 @@ def say(why: object) -> None:
 def refuse(why: object) -> NoReturn:
     """Print a message and exits with the status of bad input."""
     say(why)
-    raise typer.Exit(EXIT_BAD_INPUT) from None
+    raise typer.Exit(ExitStatus.BAD_INPUT) from None
 
 
 def fail(why: object) -> NoReturn:
     """Print a message and exits with the status of a failure after the start."""
     say(why)
-    raise typer.Exit(EXIT_FAILED) from None
+    raise typer.Exit(ExitStatus.FAILED) from None
 
 
 def output_file(text: str, *names: str) -> typer.models.OptionInfo:
@@ -161,10 +152,11 @@ def _option(text: str, check: Callable[[Path | None], Path | None], *names: str)
     return option
 
 
-def wide_console() -> Console:
-    """Return a console on standard output, wide if that is not a terminal, so that tables stay whole in a pipe."""
+def wide_console(least: int = 0) -> Console:
+    """Return a console on standard output with `least` columns at least, and 140 if it is a pipe, so that tables stay whole."""
     plain = SteadyConsole(highlight=False)
-    return plain if plain.is_terminal else SteadyConsole(highlight=False, width=max(WIDE_COLUMNS, plain.width))
+    least = max(least, 0 if plain.is_terminal else 140)
+    return plain if plain.width >= least else SteadyConsole(highlight=False, width=least)
 
 
 _DOCUMENT: TextIO | None = None

@@ -13,7 +13,7 @@ from rich.table import Table
 from rich.text import Text
 
 from palpate.apart import guarded
-from palpate.console import SteadyConsole, refuse
+from palpate.console import SteadyConsole, refuse, wide_console
 
 if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
@@ -120,7 +120,7 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
         bounds = "" if v.low is None and v.high is None else f"{v.low or ''} .. {v.high or ''}"
         shape = " x ".join(map(str, v.shape))
         table.add_row(v.name, shape, v.type, f"{v.causality} ({v.variability})", v.unit or "", bounds, v.doc or "")
-    SteadyConsole(width=max(150, console.width)).print(table)
+    wide_console(150).print(table)
     names = len(description.modelVariables) <= NAMES_CHECKED
     verdict = "valid" if names else f"valid ({len(description.modelVariables)} names not parsed)"
     try:

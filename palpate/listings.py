@@ -6,10 +6,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from palpate.console import SteadyConsole, print_line
-
-WIDE = 160
-"""Columns of the table of topics, where the terminal has fewer or there is none."""
+from palpate.console import SteadyConsole, print_line, wide_console
 
 
 def scenarios(as_json: Annotated[bool, typer.Option("--json", help="Print them as JSON.")] = False) -> None:
@@ -41,4 +38,4 @@ def topics() -> None:
             "yes" if topic.hashed else "",
             ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking),
         )
-    SteadyConsole(width=max(WIDE, SteadyConsole().width)).print(table)
+    wide_console(160).print(table)

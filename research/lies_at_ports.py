@@ -14,14 +14,12 @@ from dataclasses import replace
 from pathlib import Path
 
 from palpate_benchmarks.liar import Lie, LyingTopic
-from palpate_benchmarks.lies import BEFORE_S, MOMENTS, cases, moments_of
+from palpate_benchmarks.lies import LIES, MOMENTS, cases, moments_of
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import PortCheck, RefusedMessage
 from palpate_bus.messages.codec import Message, decoder
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import Recording, open_recording
-
-SECOND_NS = 1_000_000_000
 
 
 def refused_after(lie: Lie, sent: dict[str, list[tuple[int, Message]]]) -> float | None:
@@ -43,7 +41,7 @@ def window(recording: Recording, at_s: float) -> dict[str, list[tuple[int, Messa
     """Return the messages of all topics from shortly before a moment until a second after it, with their times [ns]."""
     rows = contract().topics
     sent: dict[str, list[tuple[int, Message]]] = defaultdict(list)
-    begin, end = round((at_s - BEFORE_S) * NS), round(at_s * NS) + SECOND_NS
+    begin, end = round((at_s - LIES.before_s) * NS), round(at_s * NS) + NS
     for recorded in recording.messages([name for name, row in rows.items() if not row.latched], begin, end):
         sent[recorded.topic].append((recorded.stamp, decoder(rows[recorded.topic].type)(recorded.payload)))
     return sent

@@ -39,10 +39,6 @@ Complex = NDArray[np.complex128]
 
 DT = 1e-3
 STEP_M = 2e-5
-RESPONSE_STEPS = 400
-SETTLE_STEPS = 400
-CIRCLE = 1 + 1e-5
-"""Radius of the contour: what grows by less than 1e-5 a millisecond counts as stable."""
 MOST_MS = 24
 
 
@@ -67,9 +63,12 @@ class LinearLoop:
 
     @cached_property
     def _contour(self) -> tuple[Complex, Complex, Complex]:
-        """The contour z, (n,), and G H_c and G J' Z_t J on it, (n, 7, 7); it is finest where the arm's double pole is near."""
+        """The contour z, (n,), and G H_c and G J' Z_t J on it, (n, 7, 7).
+
+        It is finest where the arm's double pole is near. What grows by less than 1e-5 a millisecond counts as stable.
+        """
         half = np.concatenate((np.geomspace(1e-5, 0.05, 200), np.linspace(0.05, np.pi, 1500)[1:]))
-        z = CIRCLE * np.exp(1j * np.concatenate((-half[::-1], half)))
+        z = (1 + 1e-5) * np.exp(1j * np.concatenate((-half[::-1], half)))
         at = z[:, None, None]
         robot = DT**2 * at / (at - 1) * np.linalg.inv((self.inertia + DT * self.friction) * at - self.inertia)
         control = self.stiffness + self.damping * (1 - 1 / at) / DT
@@ -155,8 +154,8 @@ def tissue_response(contrast: float) -> Array:
     for step in (0.0, STEP_M):
         tissue = WinklerTissue(build_phantom(chosen.phantom, chosen.seed), chosen.phantom.stiffness)
         p = np.array((0.0, 0.0, radius - DEPTH_M))
-        for _ in range(SETTLE_STEPS):
+        for _ in range(400):
             tissue.step(0.0, p, STILL, radius)
         p[2] -= step
-        forces.append([tissue.step(0.0, p, STILL, radius)[0][2] for _ in range(RESPONSE_STEPS)])
+        forces.append([tissue.step(0.0, p, STILL, radius)[0][2] for _ in range(400)])
     return np.asarray((np.array(forces[1]) - np.array(forces[0])) / STEP_M)

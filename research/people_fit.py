@@ -22,7 +22,6 @@ from palpate_validation.people import COMPARED_M, PRESS, at_depths, press
 LENGTHS_M = np.geomspace(0.005, 0.026, 9)
 STIFFENINGS_PER_M = np.array((0.0, 20.0, 35.0, 50.0, 65.0, 80.0, 100.0, 120.0, 145.0, 175.0))
 TENSIONS = np.array((0.0, 1.0, 2.0, 4.0, 7.0, 11.0, 16.0, 22.0, 30.0))
-MOST_OFFSET_M = 0.002
 USUAL_LENGTH_M = 0.015
 LENGTH_WEIGHT = 0.05
 """A force over depth says little of the wall length, so it is drawn to the usual one: by ln 2 costs as much as 3.5 % RMS."""
@@ -51,7 +50,7 @@ def fit(measured: Array, simulated: Simulated) -> tuple[WallParameters, float, f
         error = relative * (relative.sum() / (relative @ relative)) - 1  # with the best k_w
         return np.append(error / np.sqrt(len(error)), LENGTH_WEIGHT * np.log(x[0] / USUAL_LENGTH_M))
 
-    bounds = ((LENGTHS_M[0], 0.0, 0.0), (LENGTHS_M[-1], STIFFENINGS_PER_M[-1], MOST_OFFSET_M))
+    bounds = ((LENGTHS_M[0], 0.0, 0.0), (LENGTHS_M[-1], STIFFENINGS_PER_M[-1], 0.002))
     starts = [(length, beta, 0.0004) for length in (0.010, 0.020) for beta in (30.0, 100.0)]
     found = [least_squares(residual, x, bounds=bounds, x_scale=(0.005, 30.0, 0.0005)) for x in starts]
     best = min(found, key=lambda f: f.cost)

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType
 
-from palpate_bus.contract import contract
+from palpate_bus.contract import MS, contract
 from palpate_bus.messages import (
     Duration,
     JointState,
@@ -31,8 +31,6 @@ from palpate_bus.messages import (
 from palpate_bus.messages.stamps import header
 from palpate_recorder.bag import BagWriter
 from palpate_recorder.service import channels
-
-MS = 1_000_000
 
 
 def traffic(seconds: float) -> list[tuple[str, bytes, int, int]]:

@@ -13,9 +13,6 @@ from palpate_fmu.instance import FmuInstance
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom
 
-RADIUS_M = 0.015
-DEPTH_M = 0.010
-STEP_S = 1e-3
 MOTION, WRENCH = [1, 4], [10, 13]
 """Value references of position and velocity, and of force and torque."""
 
@@ -26,19 +23,20 @@ class Step:
     params = ["fmpy", "ctypes"]  # noqa: RUF012 - the form that asv reads
     param_names = ("by",)
     timeout = 300
+    radius_m, depth_m, step_s = 0.015, 0.010, 1e-3
 
     def setup_cache(self) -> str:
         """Compile the FMU once."""
         path = Path(tempfile.mkdtemp(prefix="palpate-asv-")) / "abdomen.fmu"
         phantom = Phantom(lesions=(Lesion(centre_m=(-0.055, 0.01)),))
-        build_fmu(phantom, 0, path, 3, [native()], RADIUS_M, build_phantom(phantom, seed=0))
+        build_fmu(phantom, 0, path, 3, [native()], self.radius_m, build_phantom(phantom, seed=0))
         return str(path)
 
     def setup(self, path: str, by: str) -> None:
         """Load the FMU and press."""
         model = build_phantom(Phantom(), seed=0)
         top = float(model.vertices[np.hypot(*model.vertices[:, :2].T).argmin(), 2])
-        self.position, self.velocity, self.k = np.array((0.0, 0.0, top + RADIUS_M - DEPTH_M)), np.zeros(3), 0
+        self.position, self.velocity, self.k = np.array((0.0, 0.0, top + self.radius_m - self.depth_m)), np.zeros(3), 0
         if by == "fmpy":
             folder = tempfile.mkdtemp(prefix="palpate-asv-")
             fmpy.extract(path, unzipdir=folder)
@@ -55,13 +53,13 @@ class Step:
         self.k += 1
         if by == "fmpy":
             self.fmu.setFloat64(MOTION, [*self.position, *self.velocity])
-            self.fmu.doStep(self.k * STEP_S, STEP_S)
+            self.fmu.doStep(self.k * self.step_s, self.step_s)
             self.fmu.getFloat64(WRENCH, 6)
         else:
             self.motion["indenter_position"][:] = self.position
             self.motion["indenter_velocity"][:] = self.velocity
             self.motion.push()
-            self.fmu.step(self.k * STEP_S, STEP_S)
+            self.fmu.step(self.k * self.step_s, self.step_s)
             self.wrench.pull()
 
     def teardown(self, _path: str, by: str) -> None:

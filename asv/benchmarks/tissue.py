@@ -16,18 +16,11 @@ from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_tissue.surface import SkinSurface
 
-SPEED_MPS = 0.03
-RADIUS_M = 0.015
-DEPTH_M = 0.010
-STEPS = 200
-HALF_WIDTH_M = 0.13
-"""Half width of the flat patch of the size sweep, as large as an abdomen's front."""
-VELOCITY = np.array((SPEED_MPS, 0.0, 0.0))
-
 
 class Slide:
     """Steps along a path, forwards again from its start when it ends."""
 
+    speed_mps, radius_m, depth_m, steps = 0.03, 0.015, 0.010, 200
     body: TissueBackend
     path: Array
     k = 0
@@ -35,7 +28,8 @@ class Slide:
     def step(self) -> None:
         """One step of 1 ms."""
         self.k += 1
-        self.body.step(self.k * self.body.dt, self.path[self.k % len(self.path)], VELOCITY, RADIUS_M, np.zeros(3))
+        velocity = np.array((self.speed_mps, 0.0, 0.0))
+        self.body.step(self.k * self.body.dt, self.path[self.k % len(self.path)], velocity, self.radius_m, np.zeros(3))
 
 
 class Abdomen(Slide):
@@ -57,8 +51,8 @@ class Abdomen(Slide):
         else:
             self.body = ElasticTissue(model, compliance(model, phantom.lesions), phantom.stiffness)
         surface = SkinSurface(model)
-        under = [surface.nearest(np.array((-0.06 + SPEED_MPS * 1e-3 * k, 0.01, 0.0))) for k in range(STEPS)]
-        self.path = np.array([place.position + (RADIUS_M - DEPTH_M) * place.normal for place in under])
+        under = [surface.nearest(np.array((-0.06 + self.speed_mps * 1e-3 * k, 0.01, 0.0))) for k in range(self.steps)]
+        self.path = np.array([place.position + (self.radius_m - self.depth_m) * place.normal for place in under])
         self.step()
 
     def time_step(self, *_: str) -> None:
@@ -86,8 +80,8 @@ class FlatPatch(Slide):
                 self.body = ElasticTissue(model, compliance(model, thickness_m=0.2), Stiffness())
         except UserError as error:
             raise NotImplementedError from error
-        x = -SPEED_MPS * 5e-4 * STEPS + SPEED_MPS * 1e-3 * np.arange(STEPS)
-        self.path = np.column_stack((x, np.full(STEPS, 0.001), np.full(STEPS, RADIUS_M - DEPTH_M)))
+        x = -self.speed_mps * 5e-4 * self.steps + self.speed_mps * 1e-3 * np.arange(self.steps)
+        self.path = np.column_stack((x, np.full(self.steps, 0.001), np.full(self.steps, self.radius_m - self.depth_m)))
         self.step()
 
     def time_step(self, *_: object) -> None:
@@ -99,7 +93,7 @@ class FlatPatch(Slide):
         _ = self.body.deformed_vertices
 
 
-def flat_patch(vertices: int) -> PhantomModel:
-    """Return a flat square of about `vertices` vertices."""
-    edge = 2 * HALF_WIDTH_M / math.sqrt(vertices * math.sqrt(3) / 2)
-    return flat_phantom(HALF_WIDTH_M, edge)
+def flat_patch(vertices: int, half_width_m: float = 0.13) -> PhantomModel:
+    """Return a flat square of about `vertices` vertices, by default as large as an abdomen's front."""
+    edge = 2 * half_width_m / math.sqrt(vertices * math.sqrt(3) / 2)
+    return flat_phantom(half_width_m, edge)

@@ -16,15 +16,12 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.console import CaseDisplay, output_file
+from palpate.console import CaseDisplay, output_file, wide_console
 from palpate.run.options import DEFAULT_SCENARIO, Settings
 
 if TYPE_CHECKING:
     from palpate_conductor.outcome import RunResult
     from palpate_models.scenario.schema import Scenario
-
-WIDTH = 160
-"""Least width of the tables [characters], also where the output is not a terminal."""
 
 
 def bench(
@@ -37,7 +34,7 @@ def bench(
     from palpate.report.files import fingerprint
     from palpate.run.inputs import usable
 
-    screen, console = Console(stderr=True), Console(width=max(WIDTH, Console().width))
+    screen, console = Console(stderr=True), wide_console(160)
     chosen = usable(scenario, settings)
     figures: dict[str, Any] = {"platform": fingerprint(), "runs": {}}
     try:

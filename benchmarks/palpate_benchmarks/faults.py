@@ -9,13 +9,12 @@ from typing import Annotated
 import typer
 from rich.table import Table
 
-from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, output_file, refuse
+from palpate.console import CaseDisplay, SteadyConsole, output_file, refuse, wide_console
 from palpate.report.files import write_text
 from palpate_benchmarks.fault_cases import KINDS, LIE, FaultFinding, csv_text, from_csv, in_order
+from palpate_errors import ExitStatus
 
 MODES = ("lockstep", "wallclock")
-WIDTH = 200
-"""Least width of the table in characters."""
 COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
 
 
@@ -39,7 +38,7 @@ def faults(
     from palpate_benchmarks import lies
     from palpate_benchmarks.campaign import cases, drawn, run_case
 
-    console = SteadyConsole(stderr=True, width=max(WIDTH, SteadyConsole().width))
+    console = SteadyConsole(stderr=True, width=wide_console(200).width)
     modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
     for name, given, known in (("--mode", modes, MODES), ("--kind", kinds, KINDS)):
         for value in given:
@@ -67,9 +66,9 @@ def faults(
             found = [f for f in found if f.identity != finding.identity] + [finding]
             write_text(out, csv_text(found))
             display.show(number, len(todo), f"{'ok' if finding.good else 'bad'} {finding.where}: {finding.sign or finding.ended}")
-    SteadyConsole(width=max(WIDTH, SteadyConsole().width)).print(table(found))
+    wide_console(200).print(table(found))
     if any(not finding.good for finding in found):
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _load(path: Path) -> list[FaultFinding]:

@@ -61,18 +61,27 @@ FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0
 DELAYS_MS: Final = (20, 50, 200)
 LIVE_KINDS: Final = ("zero", "stale")
 """Further kinds of the cases in wall-clock mode."""
-LEAST_SHARE: Final = 0.9
-"""Share of the twin's targets that a complete examination has felt."""
-SAME_BACKGROUND: Final = 0.25
-"""Relative change of the map's background that counts as harm."""
-LONGEST_NS: Final = 180 * NS
-"""Simulated time after which a case has hung."""
-CASE_S: Final = 900.0
-"""Wall time of a case at most."""
+
+
+@dataclass(frozen=True)
+class LieTuning:
+    """Times of a lie's case, and limits of its outcome."""
+
+    least_share: float = 0.9
+    """Share of the twin's targets that a complete examination has felt."""
+    same_background: float = 0.25
+    """Relative change of the map's background that counts as harm."""
+    longest_ns: int = 180 * NS
+    """Simulated time after which a case has hung."""
+    case_s: float = 900.0
+    """Wall time of a case at most."""
+    before_s: float = 0.25
+    """A case of old messages is forked this long before its lie, so that the liar has some."""
+    never_ns: int = 10**18
+
+
+LIES: Final = LieTuning()
 HANGS: Final = "the examination did not end"
-BEFORE_S: Final = 0.25
-"""A case of old messages is forked this long before its lie, so that the liar has some."""
-NEVER_NS: Final = 10**18
 LEFT_OUT: Final = {
     "assessment/samples": "only a search reads it",
     "exam/request": "only a search sends it",
@@ -217,7 +226,7 @@ def lie_of(where: str, healthy: Healthy) -> Lie:
 
 def start_s(lie: Lie) -> float:
     """Return the simulated time at which a case is forked."""
-    return max(lie.at_s - (BEFORE_S if lie.kind in (*liar.ORDER_KINDS, "delayed") else 0.0), 0.0)
+    return max(lie.at_s - (LIES.before_s if lie.kind in (*liar.ORDER_KINDS, "delayed") else 0.0), 0.0)
 
 
 def undetectable(lie: Lie) -> str:
@@ -234,7 +243,7 @@ class Lockstep:
         scenario = load_scenario("clean", SETTINGS)
         self._collector = Collector(tree=FrameTree(exam_input(scenario)))
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
-        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None).result), CASE_S)
+        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
 
     def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
         """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
@@ -242,7 +251,7 @@ class Lockstep:
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
         try:
-            return guarded(str(lie), lambda: judged(finding, lie, self._finished(lie), self.twin), CASE_S)
+            return guarded(str(lie), lambda: judged(finding, lie, self._finished(lie), self.twin), LIES.case_s)
         except RunError as error:  # one case must not end the campaign
             finding.hung, finding.outcome, finding.ended = True, CaseOutcome.ENDED, str(error)
             return finding
@@ -251,7 +260,7 @@ class Lockstep:
         """Run to the end, in a child process."""
         run, collected = self._run, self._collector.collected
         watched = Watched(RunResult("composed", collected))
-        since = NEVER_NS if lie is None else lie.at_s * NS
+        since = LIES.never_ns if lie is None else lie.at_s * NS
         if lie is not None:
             stepper = run.steppers[lie.role]
             stepper.service = liar.Liar(stepper.service, lie)
@@ -263,7 +272,7 @@ class Lockstep:
 
         failure: Failure | None
         try:
-            run.run(end, LONGEST_NS)
+            run.run(end, LIES.longest_ns)
             failure = gave_up(collected)
             if failure is None and collected.end_tick is None:
                 failure = Failure(FailureCode.BLOCKED, HANGS)
@@ -341,10 +350,10 @@ def judged(finding: FaultFinding, lie: Lie, watched: Watched, twin: Healthy) -> 
     felt, findings, background = _felt(collected)
     if failure is not None:
         finding.ended = str(failure)
-    elif felt < LEAST_SHARE * twin.felt:
+    elif felt < LIES.least_share * twin.felt:
         message = collected.exam.message if collected.exam else ""
         finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {message}"
-    elif findings == twin.findings and abs(background - twin.background) <= SAME_BACKGROUND * twin.background:
+    elif findings == twin.findings and abs(background - twin.background) <= LIES.same_background * twin.background:
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
         finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"

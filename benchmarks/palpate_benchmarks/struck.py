@@ -26,7 +26,7 @@ from palpate.run.group import Groups, one_per_process
 from palpate.run.options import Record
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
 from palpate.run.roles import WORKERS, choice, write_scenario_files
-from palpate.run.self_test import RATES, SIMULATED_PROCESSES, measure
+from palpate.run.self_test import RATES, TEST, measure
 from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
 from palpate_bus import implementations
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
@@ -177,7 +177,7 @@ def signs_of(progress: RunProgress) -> list[Sign]:
 @cache
 def kept_rate() -> float:
     """Return the rate that this machine sustains for a second."""
-    return measure(SIMULATED_PROCESSES).rate or RATES[-1]
+    return measure(TEST.simulated_processes).rate or RATES[-1]
 
 
 def calm_rate() -> float:

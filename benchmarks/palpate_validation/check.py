@@ -9,8 +9,9 @@ from typing import Any
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
-from rich.console import Console
 from rich.table import Table
+
+from palpate.console import wide_console
 
 Draw = Callable[[Figure], None]
 
@@ -141,6 +142,4 @@ def _number(value: float) -> float | None:
 def show(section: PageSection, out: Path = Path("out/research")) -> None:
     """Print the checks of one section and write its files, for a study in `research`."""
     write([section], out)
-    console = Console()
-    Console(width=max(150, console.width)).print(table([section]))
-    console.print(section.text)
+    wide_console(150).print(table([section]), section.text)

@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 from rich.console import Console
 
-from palpate.console import CaseDisplay, output_folder, refuse
+from palpate.console import CaseDisplay, output_folder, refuse, wide_console
+from palpate_errors import ExitStatus
 
 if TYPE_CHECKING:
     from palpate_validation.check import PageSection
 
-EXIT_MISSED = 3
 SECTIONS = {
     "hertz": "hertz",
     "elastic": "hertz",
@@ -65,10 +65,9 @@ def validate(
                 write(sections, out)  # an error or Ctrl-C in a later section keeps these
     except OSError as error:
         refuse(error)
-    shown = Console()
-    Console(width=max(150, shown.width)).print(table(sections))
+    wide_console(150).print(table(sections))
     console.print(f"plots and figures in {out}", highlight=False)
     missed = failures(sections)
     if missed:
         console.print(f"[bold red]{len(missed)} outside their bounds:[/] {'; '.join(c.name for c in missed)}", highlight=False)
-        raise typer.Exit(EXIT_MISSED)
+        raise typer.Exit(ExitStatus.FAILED)

@@ -29,10 +29,8 @@ from palpate_bus.service import Service
 from palpate_bus.settings import BusConfigError, Settings
 from palpate_bus.wire.transport import Transport
 from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_session
-from palpate_errors import UserError
+from palpate_errors import ExitStatus, UserError
 from palpate_inputs import PrintableFormatter
-
-EXIT_FAILED = 3
 
 
 @dataclass(frozen=True)
@@ -111,15 +109,15 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
             member.leave()
     except RunAborted as aborted:
         log.warning("run ended early: %s", aborted)
-        status = EXIT_FAILED
+        status = ExitStatus.FAILED
     except KeyboardInterrupt:
-        status = EXIT_FAILED
+        status = ExitStatus.FAILED
     except UserError as error:
         log.error("%s", error)
-        status = EXIT_FAILED
+        status = ExitStatus.FAILED
     except (Exception, SystemExit):
         log.exception("%s failed", name)
-        status = EXIT_FAILED
+        status = ExitStatus.FAILED
     leave(sessions.values(), status)
 
 

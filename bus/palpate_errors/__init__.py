@@ -1,4 +1,22 @@
-"""Base classes of every exception that Palpate raises on purpose. Imports nothing, so every package may use it."""
+"""Base classes of every exception that Palpate raises on purpose, and the exit status of its commands.
+
+Imports no other package of Palpate, so every package may use it.
+"""
+
+from enum import IntEnum
+
+
+class ExitStatus(IntEnum):
+    """Exit status of a command other than 0."""
+
+    TROUBLE = 1
+    """A check found something wrong, or the output could not be written."""
+    BAD_INPUT = 2
+    """The command refused its input and started nothing."""
+    FAILED = 3
+    """The command failed after it had started."""
+    INTERRUPTED = 130
+    """After SIGINT, as in shells and Typer."""
 
 
 class PalpateError(Exception):

@@ -4,6 +4,7 @@ Messages in, rerun entities out.
 """
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from functools import cache
 from typing import Any, Final
 
@@ -22,18 +23,26 @@ from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Camera, Robot
 
-METRES_PER_NEWTON: Final = 0.03
-"""Scale of the force arrow: 5 N are 15 cm."""
+
+@dataclass(frozen=True)
+class SceneTuning:
+    """Scale and detail of the scene."""
+
+    metres_per_newton: float = 0.03
+    """Scale of the force arrow: 5 N are 15 cm."""
+    resolution_m: float = 2e-4
+    """Vertices are rounded to this, so that resting ones are bit-identical and compress to nothing."""
+    cloud_points: int = 6000
+    """Greatest number of drawn points of the perceived cloud."""
+    carry_m: float = 0.012
+    """Greatest distance from a vertex of the abdomen to the map vertex that colours it."""
+    trail_step_m: float = 0.001
+    """Distance between points of the travelled path."""
+
+
+SCENE: Final = SceneTuning()
 FORCE_OFFSET_W_M: Final = np.array((0.035, -0.035, 0.0))
 """Offset of the force arrow towards the viewer, in world: the tool would hide it."""
-RESOLUTION_M: Final = 2e-4
-"""Vertices are rounded to this, so that resting ones are bit-identical and compress to nothing."""
-CLOUD_POINTS: Final = 6000
-"""Greatest number of drawn points of the perceived cloud."""
-CARRY_M: Final = 0.012
-"""Greatest distance from a vertex of the abdomen to the map vertex that colours it."""
-TRAIL_STEP_M: Final = 0.001
-"""Distance between points of the travelled path."""
 CAMERA_FRAME: Final = contract().topics["camera/depth/image_raw"].frame
 FURNITURE: Final = {"table_top": palette.SHEET, "table_column": palette.STEEL, "robot_base": palette.PLINTH}
 LAYERS: Final = ("mean", "band")
@@ -102,7 +111,7 @@ class SceneView:
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=self._triangles))
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=skin), t)
             self._canvas.recording.flush()  # a live viewer must receive the triangles before the vertices
-        rounded = np.round(vertices / RESOLUTION_M).astype(np.float32) * np.float32(RESOLUTION_M)
+        rounded = np.round(vertices / SCENE.resolution_m).astype(np.float32) * np.float32(SCENE.resolution_m)
         if self._drawn is not None and np.array_equal(rounded, self._drawn):
             return
         self._drawn = rounded
@@ -115,7 +124,7 @@ class SceneView:
             return
         if self._carry is None or self._map_vertices is None or not np.array_equal(vertices, self._map_vertices):
             self._map_vertices = vertices
-            self._carry = Carry(vertices, self._rest, CARRY_M)
+            self._carry = Carry(vertices, self._rest, SCENE.carry_m)
         skin = palette.packed(palette.SKIN)
         colors = self._carry(np.where(scanned, palette.stiffness_colors(ratio), skin), skin)
         self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)), t)
@@ -123,7 +132,7 @@ class SceneView:
     def body(self, t: int, X_WA: NDArray[np.float64], excursion: float) -> None:
         """Move `world/truth` by the patient's true pose, shape (4, 4), and breathing excursion [m]."""
         lifted = np.concatenate((X_WA[:3, 3] + excursion * X_WA[:3, 2], quaternion(X_WA[:3, :3])))
-        if self._lifted is None or np.abs(lifted - self._lifted).max() > RESOLUTION_M:
+        if self._lifted is None or np.abs(lifted - self._lifted).max() > SCENE.resolution_m:
             self._lifted = lifted
             self._canvas.add("world/truth", transforms, t, lifted)
 
@@ -174,9 +183,9 @@ class SceneView:
         self._canvas.log("world/camera/depth", shape, t)
 
     def cloud(self, t: int, message: Message) -> None:
-        """Draw the perceived point cloud, thinned to `CLOUD_POINTS`."""
+        """Draw the perceived point cloud, thinned to `SCENE.cloud_points`."""
         seen = cloud(message)
-        thinned = seen[:: max(1, -(-len(seen) // CLOUD_POINTS))]
+        thinned = seen[:: max(1, -(-len(seen) // SCENE.cloud_points))]
         self._canvas.log("world/perception/points", rr.Points3D(thinned, colors=[palette.POINTS], radii=[0.0012]), t)
 
     def clear_cloud(self, t: int) -> None:
@@ -210,7 +219,7 @@ class SceneView:
 
     def _tool(self, t: int, position: Floats, in_contact: bool) -> None:
         """Extend the travelled path by the tool's position, shape (3,)."""
-        if self._trail and np.abs(position - self._trail[-1]).max() < TRAIL_STEP_M:
+        if self._trail and np.abs(position - self._trail[-1]).max() < SCENE.trail_step_m:
             return
         self._trail.append(position)
         if len(self._trail) >= 10:
@@ -229,7 +238,7 @@ class SceneView:
         """Draw the contact force [N], shape (3,), on the indenter at `position`, next to the tool."""
         shown = bool(np.abs(force).max() > 0.05)
         if shown or self._force_shown:
-            vector = METRES_PER_NEWTON * force if shown else np.zeros(3)
+            vector = SCENE.metres_per_newton * force if shown else np.zeros(3)
             self._canvas.add("world/tool/force", arrows, t, (position + FORCE_OFFSET_W_M, vector))
         self._force_shown = shown
 

@@ -46,7 +46,7 @@ from palpate_bus.messages.stamps import header, time_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M
+from palpate_models.robot.arm import TOOL
 from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000
@@ -79,7 +79,11 @@ def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
         position = position + rotation.apply(lbr.JOINT_ORIGIN[i])
         rotation = rotation * Rotation.from_rotvec(np.array(lbr.JOINT_AXIS[i]) * joints[i])
         poses[f"lbr_link_{i + 1}"] = (position, rotation)
-    for link, step in (("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M), ("ft_sensor", FLANGE_TO_FT_M), ("indenter", FT_TO_INDENTER_M)):
+    for link, step in (
+        ("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M),
+        ("ft_sensor", TOOL.flange_to_ft_m),
+        ("indenter", TOOL.ft_to_indenter_m),
+    ):
         position = position + rotation.apply((0.0, 0.0, step))
         poses[link] = (position, rotation)
     return poses

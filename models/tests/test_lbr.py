@@ -10,7 +10,7 @@ import trimesh
 
 from palpate_models.robot import arm as robot_arm
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_MASS_KG, FT_TO_INDENTER_M, link_names, urdf
+from palpate_models.robot.arm import TOOL, link_names, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.kinematics import link_transforms, tool_pose
 from palpate_models.robot.table import Box, boxes
@@ -32,7 +32,7 @@ def test_masses_are_the_published_ones() -> None:
     below_sensor = inertias["ft_sensor"].mass + inertias["indenter"].mass
     assert below_sensor == pytest.approx(robot.tool_mass_kg)
     total = sum(float(link.find("inertial/mass").get("value")) for link in _links(robot) if link.find("inertial"))
-    assert total == pytest.approx(23.9 + FT_SENSOR_MASS_KG + robot.tool_mass_kg, abs=1e-5)
+    assert total == pytest.approx(23.9 + TOOL.ft_sensor_mass_kg + robot.tool_mass_kg, abs=1e-5)
 
 
 def _links(robot: Robot) -> list[ElementTree.Element]:
@@ -59,7 +59,7 @@ def test_upright_arm_has_the_published_height(model: pin.Model) -> None:
     # 1.266 m from the base to the flange of an iiwa 7 R800 (340 + 400 + 400 + 126 mm)
     np.testing.assert_allclose(flange.translation, [*Robot().base_xy_m, Robot().base_height_m + 1.266], atol=1e-12)
     indenter = data.oMf[model.getFrameId("indenter")]
-    tool = FLANGE_TO_FT_M + FT_TO_INDENTER_M
+    tool = TOOL.flange_to_ft_m + TOOL.ft_to_indenter_m
     np.testing.assert_allclose(flange.actInv(indenter).translation, [0.0, 0.0, tool], atol=1e-12)
     np.testing.assert_allclose(flange.rotation, indenter.rotation, atol=1e-12)
 

@@ -23,7 +23,8 @@ def check(arm: Name) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from palpate.console import EXIT_BAD_INPUT, say
+    from palpate.console import say
+    from palpate_errors import ExitStatus
     from palpate_models.robot.arm import checked_arm
 
     found, faults = checked_arm(arm)
@@ -33,7 +34,7 @@ def check(arm: Name) -> None:
     for fault in faults:
         say(f"{arm}: {fault}")
     if found is None:
-        raise typer.Exit(EXIT_BAD_INPUT)
+        raise typer.Exit(ExitStatus.BAD_INPUT)
     table = Table("joint", "range [rad]", "speed [rad/s]", "torque [N m]", "home [rad]", "link [kg]", box=None)
     limits = (found.lower_rad, found.upper_rad, found.velocity_radps, found.torque_nm, found.home_rad)
     for k, (name, low, high, speed, torque, home) in enumerate(zip(found.joint_names, *limits, strict=True)):
@@ -60,7 +61,7 @@ def place(
     import numpy as np
     from rich.console import Console
 
-    from palpate.arm.placement import RAISED_M, best_placement, describe, scan_targets
+    from palpate.arm.placement import PLACEMENT, best_placement, describe, scan_targets
     from palpate.console import say
     from palpate.run.inputs import usable
     from palpate_models.robot.arm import arm_of
@@ -72,7 +73,7 @@ def place(
     console = Console()
     with Console(stderr=True).status("optimising: about a minute"):
         robot = best_placement(chosen).robot
-        targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, RAISED_M)]
+        targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, PLACEMENT.raised_m)]
         home = arm_of(robot).home_rad
         deep, raised = (plan_redundancy(robot, *pair, home) for pair in targets)
     console.print(f"pressed: {describe(robot, deep)}", highlight=False, soft_wrap=True)
@@ -108,12 +109,12 @@ def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base
     from matplotlib.figure import Figure
     from matplotlib.patches import Rectangle
 
-    from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M, TABLE_Y_M
+    from palpate_models.robot.table import BASE_SIDE_M, TABLE
 
     figure = Figure(figsize=(6.5, 6.5), dpi=110, layout="constrained")
     axes = figure.add_subplot()
-    width, length = TABLE_X_M[1] - TABLE_X_M[0], TABLE_Y_M[1] - TABLE_Y_M[0]
-    axes.add_patch(Rectangle((TABLE_X_M[0], TABLE_Y_M[0]), width, length, fill=False, color="#7a8c94", label="table"))
+    width, length = TABLE.x_m[1] - TABLE.x_m[0], TABLE.y_m[1] - TABLE.y_m[0]
+    axes.add_patch(Rectangle((TABLE.x_m[0], TABLE.y_m[0]), width, length, fill=False, color="#7a8c94", label="table"))
     corner = (base_xy[0] - BASE_SIDE_M / 2, base_xy[1] - BASE_SIDE_M / 2)
     axes.add_patch(Rectangle(corner, BASE_SIDE_M, BASE_SIDE_M, color="#c9d1d4", label="base"))
     for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "out of reach")):

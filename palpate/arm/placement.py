@@ -5,6 +5,7 @@ approach and retreat, other patients and registration errors.
 """
 
 from dataclasses import dataclass
+from typing import Final
 
 import numpy as np
 
@@ -12,26 +13,34 @@ from palpate_errors import RunError
 from palpate_models.numerics.frames import Array, apply, matrix
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.robot.arm import arm_of
-from palpate_models.robot.table import BASE_SIDE_M, TABLE_X_M
+from palpate_models.robot.table import BASE_SIDE_M, TABLE
 from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Exam, Robot, Scenario
 from palpate_planning.placement.redundancy import POSTURES, Mask, PostureSequence, plan_redundancy
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
-BORDER_M = 0.005
-"""Border about the examined region that is served too: turns between scan lines bulge over it."""
-RAISED_M = 0.035
-"""Rise of the indenter from its depth along the normal that is served too: 25 mm above the surface."""
-CLEARANCE_M = 0.05
-"""Between base and table (assumed)."""
+
+@dataclass(frozen=True)
+class PlacementTuning:
+    """Settings of the search for a place of the base."""
+
+    border_m: float = 0.005
+    """Border about the examined region that is served too: turns between scan lines bulge over it."""
+    raised_m: float = 0.035
+    """Rise of the indenter from its depth along the normal that is served too: 25 mm above the surface."""
+    clearance_m: float = 0.05
+    """Between base and table (assumed)."""
+    mean_weight: float = 0.3
+    """Weight of the mean cost next to the worst target's."""
+    margin_rad: float = 0.05
+    ipopt_steps: int = 300
+
+
+PLACEMENT: Final = PlacementTuning()
 BOUNDS: tuple[Array, Array] = (np.array([-0.6, -0.4, 0.3, -0.3]), np.array([0.3, 0.4, 1.4, 0.3]))
 """Least and largest x, y and height [m] and yaw [rad] of the base."""
 STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (0.0, 0.0, 1.1, 0.0), (0.0, 0.1, 1.1, 0.0))
 """Placements to start from; the best result counts, as the problem is not convex."""
-MEAN_WEIGHT = 0.3
-"""Weight of the mean cost next to the worst target's."""
-_MARGIN_RAD = 0.05
-_IPOPT_STEPS = 300
 
 
 @dataclass(frozen=True, slots=True)
@@ -71,8 +80,8 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
 
 def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
     """Return the base placement with the least cost over the scenario's region. Raises RunError if no start converges."""
-    contact = scan_targets(scenario, spacing, BORDER_M)
-    raised = scan_targets(scenario, spacing, BORDER_M, RAISED_M)
+    contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
+    raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
     found = [_optimise(scenario.robot, positions, normals, np.array(start)) for start in STARTS]
     placements = [placement for placement in found if placement is not None]
@@ -86,12 +95,14 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
     ca = casadi()
     count = len(positions)
     model, functions = arm_of(robot), arm(robot)
-    guess = plan_redundancy(_standing(robot, start), positions, normals, model.home_rad, joint_margin_rad=2 * _MARGIN_RAD).q
+    guess = plan_redundancy(
+        _standing(robot, start), positions, normals, model.home_rad, joint_margin_rad=2 * PLACEMENT.margin_rad
+    ).q
 
     base, Q, worst = ca.MX.sym("base", 4), ca.MX.sym("q", model.joints, count), ca.MX.sym("worst")
     bases = ca.repmat(base, 1, count)
     costs = functions.cost.map(count)(Q, bases, POSTURES.pressing_force_n)[0]
-    objective = worst + MEAN_WEIGHT * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
+    objective = worst + PLACEMENT.mean_weight * ca.sum2(costs) / count + 0.1 * (ca.sumsqr(base[1]) + ca.sumsqr(base[3]))
     first = functions.cost.map(count)(guess.T, np.tile(start[:, None], (1, count)), POSTURES.pressing_force_n)[0]
     residual = functions.task.map(count)(Q, bases, positions.T, np.hstack(list(surface_frames(normals))))[0]
     corner = base[0] + BASE_SIDE_M / 2 * (ca.cos(base[3]) + ca.sqrt(ca.sin(base[3]) ** 2 + 1e-6))
@@ -101,18 +112,18 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
         "g": ca.vertcat(ca.vec(residual), corner, costs.T - worst),
     }
     options = {
-        "ipopt": {"max_iter": _IPOPT_STEPS, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
+        "ipopt": {"max_iter": PLACEMENT.ipopt_steps, "tol": 1e-4, "print_level": 0, "sb": "yes", "max_wall_time": 1e6},
         "print_time": False,
     }
     solver = ca.nlpsol("placement", "ipopt", problem, options)
-    lower, upper = np.tile(model.lower_rad + _MARGIN_RAD, count), np.tile(model.upper_rad - _MARGIN_RAD, count)
+    lower, upper = np.tile(model.lower_rad + PLACEMENT.margin_rad, count), np.tile(model.upper_rad - PLACEMENT.margin_rad, count)
     zeros = np.zeros(5 * count)
     result = solver(
         x0=np.concatenate((start, guess.ravel(), [float(np.array(first).max())])),
         lbx=np.concatenate((BOUNDS[0], lower, [-np.inf])),
         ubx=np.concatenate((BOUNDS[1], upper, [np.inf])),
         lbg=np.concatenate((zeros, np.full(1 + count, -np.inf))),
-        ubg=np.concatenate((zeros, [TABLE_X_M[0] - CLEARANCE_M], np.zeros(count))),
+        ubg=np.concatenate((zeros, [TABLE.x_m[0] - PLACEMENT.clearance_m], np.zeros(count))),
     )
     if not solver.stats()["success"]:
         return None

@@ -40,8 +40,9 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate.check.rig import RigSettings
     from palpate.check.suites import SUITES
     from palpate.check.suites.tissue import STILL
-    from palpate.console import EXIT_TROUBLE, print_json
+    from palpate.console import print_json
     from palpate_bus.runs.announcement import NoBus
+    from palpate_errors import ExitStatus
     from palpate_models.scenario.load import load_scenario
 
     if role not in SUITES:
@@ -58,4 +59,4 @@ def check_command(  # noqa: PLR0913 - the options of a command
     else:
         print_report(report, failures)
     if not report.passed:
-        raise typer.Exit(EXIT_TROUBLE)
+        raise typer.Exit(ExitStatus.TROUBLE)

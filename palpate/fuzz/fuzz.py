@@ -25,22 +25,30 @@ from typing import TYPE_CHECKING, Annotated, Any, Final, NamedTuple
 import typer
 
 from palpate.apart import ChildLost, TimeLimit, run_apart, shared_numbers
-from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, table, wide_console
-from palpate_errors import UserError
+from palpate.console import CaseDisplay, SteadyConsole, table, wide_console
+from palpate_errors import ExitStatus, UserError
 
 if TYPE_CHECKING:
     from palpate.fuzz.bus_readers import FuzzTarget
 
-SLOW_S = 1.0
-"""Processor time above which an input is a find, since it would delay a service."""
-HANGING_S = 60.0
-"""Wall-clock time after which an input that does not return is a find, and ends its target."""
-MEMORY_BYTES: Final = 1 << 30
-"""Memory that a target may allocate beyond that of its libraries."""
+
+@dataclass(frozen=True)
+class FuzzLimits:
+    """Limits of an attempt."""
+
+    slow_s: float = 1.0
+    """Processor time above which an input is a find, since it would delay a service."""
+    hanging_s: float = 60.0
+    """Wall-clock time after which an input that does not return is a find, and ends its target."""
+    memory_bytes: int = 1 << 30
+    """Memory that a target may allocate beyond that of its libraries."""
+    kept: int = 64
+    """Inputs per target that are kept for splicing."""
+
+
+LIMITS: Final = FuzzLimits()
 _WRITES: Final = os.O_WRONLY | os.O_RDWR | os.O_CREAT
 _CHANGES: Final = frozenset(("os.mkdir", "os.rename", "os.link", "os.symlink", "os.remove", "os.rmdir", "os.truncate"))
-KEPT = 64
-"""Inputs per target that are kept for splicing."""
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
 
 
@@ -54,7 +62,7 @@ class FuzzPlan:
     """Processor time [s]."""
     most: int = 100
     """Finds after which it stops."""
-    slow_s: float = SLOW_S
+    slow_s: float = LIMITS.slow_s
 
 
 class Find(NamedTuple):
@@ -111,7 +119,7 @@ def mutate(data: bytes, rng: random.Random, others: Sequence[bytes]) -> bytes:
     return bytes(changed)
 
 
-def attempt(target: FuzzTarget, data: bytes, slow_s: float = SLOW_S) -> Find | bool:
+def attempt(target: FuzzTarget, data: bytes, slow_s: float = LIMITS.slow_s) -> Find | bool:
     """Run one input; return a find, else True if it was accepted."""
     begin = thread_time()
     try:
@@ -127,7 +135,7 @@ def _confine(target: FuzzTarget, seeds: Sequence[bytes], written: list[str]) -> 
     for data in seeds:  # first, since they import libraries
         attempt(target, data)
     pages = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
-    most = pages * resource.getpagesize() + MEMORY_BYTES
+    most = pages * resource.getpagesize() + LIMITS.memory_bytes
     resource.setrlimit(resource.RLIMIT_AS, (most, most))
     inside = f"{Path.cwd()}{os.sep}"
 
@@ -152,7 +160,7 @@ def _fuzz(target: FuzzTarget, plan: FuzzPlan, place: MutableSequence[int]) -> Ta
         data = pool[number] if number < len(pool) else mutate(rng.choice(pool), rng, pool)
         if number % 997 == 0:
             pool[rng.randrange(len(pool))] = data  # so that changes accumulate
-            pool += target.seeds(rng)[: max(KEPT - len(pool), 0)]
+            pool += target.seeds(rng)[: max(LIMITS.kept - len(pool), 0)]
         outcome = attempt(target, data, plan.slow_s)
         if written:
             outcome = Find(target.name, data, f"opens for writing: {written[0]}")
@@ -187,7 +195,7 @@ def campaign(
                 return _fuzz(target, plan, place)
 
         try:
-            limit = TimeLimit(lambda place=place: (place[0],), lambda: HANGING_S)  # type: ignore[misc]
+            limit = TimeLimit(lambda place=place: (place[0],), lambda: LIMITS.hanging_s)  # type: ignore[misc]
             result = run_apart(work, check=limit.check)
         except ChildLost as lost:
             find = Find(target.name, b"", f"input {place[0]} of seed {plan.seed}: the process {lost}")
@@ -230,4 +238,4 @@ def fuzz(
     total = sum(result.inputs for result in done.values())
     took_s = perf_counter() - begin
     print(f"{total} inputs, {len(chosen)} targets, seed {seed}: {len(finds)} kinds of finds, {took_s:.0f} s")
-    raise typer.Exit(EXIT_FAILED if finds else 0)
+    raise typer.Exit(ExitStatus.FAILED if finds else 0)

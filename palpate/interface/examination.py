@@ -13,7 +13,6 @@ from typing import Any, Final, Literal
 
 import pandas as pd
 
-from palpate.console import EXIT_FAILED
 from palpate.environment import FIXED
 from palpate.interface.assessment import StiffnessMap, findings_frame, findings_html, html_of
 from palpate.interface.scenarios import scenario as scenario_of
@@ -25,7 +24,7 @@ from palpate.report.rows import Report
 from palpate.run.folder import usual_folder
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_bus.settings import RECORDING
-from palpate_errors import RunError
+from palpate_errors import ExitStatus, RunError
 from palpate_inputs import printable
 from palpate_models.scenario.load import dump_scenario
 from palpate_models.scenario.schema import Scenario
@@ -176,7 +175,7 @@ def run(
         arguments = [str(file), "--out", str(folder), "--composed", "--record", record]
         arguments += [flag for flag, wanted in flags.items() if wanted]
         status, messages = _palpate("run", *arguments, quiet=quiet)
-    if status not in (0, EXIT_FAILED) or not (folder / "report.json").is_file():
+    if status not in (0, ExitStatus.FAILED) or not (folder / "report.json").is_file():
         raise ExaminationError(messages[-1] if messages else f"{folder}: there are no results (status {status})")
     examination = Examination(folder)
     if examination.failure:

@@ -7,12 +7,12 @@ from dataclasses import asdict, dataclass
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic, sleep
-from typing import Annotated, Any, NamedTuple, NoReturn
+from typing import Annotated, Any, Final, NamedTuple, NoReturn
 
 import typer
 from rich.text import Text
 
-from palpate.console import EXIT_TROUBLE, SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
+from palpate.console import SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import contract
@@ -22,14 +22,23 @@ from palpate_bus.runs.announcement import live as live_runs
 from palpate_bus.runs.announcement import versions
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.wire.liveliness import mismatches
+from palpate_errors import ExitStatus
 
-POLL_S = 0.04
+
+@dataclass(frozen=True)
+class DoctorLimits:
+    """Limits beyond which the doctor reports a fault."""
+
+    poll_s: float = 0.04
+    min_shared_memory_mb: int = 64
+    """With less free shared memory, large messages may fall back to the network."""
+    min_message_age_ms: float = -2.0
+    """A message with a smaller age was stamped by a clock that is ahead of the local one."""
+    silent_s: float = 5.0
+
+
+LIMITS: Final = DoctorLimits()
 SHARED_MEMORY = Path("/dev/shm")
-MIN_SHARED_MEMORY_MB = 64
-"""With less free shared memory, large messages may fall back to the network."""
-MIN_MESSAGE_AGE_MS = -2.0
-"""A message with a smaller age was stamped by a clock that is ahead of the local one."""
-SILENT_S = 5.0
 
 
 class Severity(StrEnum):
@@ -76,7 +85,7 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
     try:
         while monotonic() < end:
             live.poll()
-            sleep(POLL_S)
+            sleep(LIMITS.poll_s)
         live.poll()
         parts = (
             _versions(bus),
@@ -133,7 +142,7 @@ def _shared_memory(bus: Joined) -> Iterator[Remark]:
     else:
         state = os.statvfs(SHARED_MEMORY)
         free, size = state.f_bavail * state.f_frsize / 1e6, state.f_blocks * state.f_frsize / 1e6
-        few = free < MIN_SHARED_MEMORY_MB
+        few = free < LIMITS.min_shared_memory_mb
         hint = "; too little for depth images and meshes: enlarge it (docker: shm_size)" if few else ""
         text = f"{SHARED_MEMORY}: {free:.0f} MB of {size:.0f} MB free{hint}"
         yield Remark("shared memory", Severity.WARN if few else Severity.OK, text)
@@ -148,7 +157,7 @@ def _clock(live: LiveMonitor) -> Iterator[Remark]:
         text = f"{kind} time {time / 1e9:.2f} s, {moves}"
     yield Remark("clock", Severity.OK if time is not None and progress else Severity.WARN, text)
     for name, age in live.offsets.items():
-        if age < MIN_MESSAGE_AGE_MS:
+        if age < LIMITS.min_message_age_ms:
             sender = live.monitor.rules.topics[name].producer
             text = f"the clock of {sender}'s host is at least {-age:.1f} ms ahead of ours ({name}); synchronise them (NTP, PTP)"
             yield Remark("clock", Severity.WARN, text)
@@ -177,7 +186,7 @@ def _progress(live: LiveMonitor) -> Iterator[Remark]:
     """Report which service waits for which, from the services' own reports."""
     now = monotonic()
     for role, (_, received) in sorted(live.reports.items()):
-        if now - received > SILENT_S:
+        if now - received > LIMITS.silent_s:
             yield Remark("progress", Severity.WARN, f"{role} has not reported for {now - received:.0f} s")
     if live.reports and live.monitor.time.progress == 0:
         for role, (report, _) in sorted(live.reports.items()):
@@ -220,7 +229,7 @@ def doctor(
     else:
         _print(diagnosis)
     if not diagnosis.healthy:
-        raise typer.Exit(EXIT_TROUBLE)
+        raise typer.Exit(ExitStatus.TROUBLE)
 
 
 def _monitor(bus: Joined) -> LiveMonitor:
@@ -239,7 +248,7 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
                 else:
                     line = Text.assemble((f"{after_s:8.2f} s", "dim"), "  ", (str(violation), "red"))
                     wide_console().print(line, soft_wrap=True)
-            sleep(POLL_S)
+            sleep(LIMITS.poll_s)
     finally:
         live.close()
 

@@ -6,12 +6,12 @@ from typing import Annotated
 import typer
 import zenoh
 
-from palpate.console import EXIT_FAILED, SteadyConsole, say
+from palpate.console import SteadyConsole, say
 from palpate.live.bus import ChosenRun
 from palpate_bus.runs.announcement import BusTarget, find, find_all
 from palpate_bus.runs.operator import NoConductorError, ask
 from palpate_bus.wire.zenoh_config import session
-from palpate_errors import PalpateError
+from palpate_errors import ExitStatus, PalpateError
 
 
 def stop(
@@ -67,7 +67,7 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
             text = f"{bus.title}: {answer} (confirmed after {after_ms:.0f} ms)"
             console.print(text, highlight=False, soft_wrap=True)
     if failed:
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: int) -> tuple[str, float]:

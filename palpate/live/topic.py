@@ -3,11 +3,11 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
-from dataclasses import fields, is_dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from math import inf
 from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import typer
@@ -26,15 +26,23 @@ from palpate_bus.wire.liveliness import Entity, EntityKind
 from palpate_bus.wire.rmw import WireError, topic_key, unpack
 from palpate_bus.wire.transport import subscribe
 
-REPORT_PERIOD_S = 1.0
-SILENT_S = 5.0
-"""A topic without a message for this time is announced."""
-BANDWIDTH_PERIODS = 5
-"""Bandwidth is the mean over this many report periods."""
-SPACING_MESSAGES = 10_000
-"""Messages over which rate and spacing are computed at most."""
-SHOWN_ITEMS = 12
-"""Longer arrays are shortened in the output."""
+
+@dataclass(frozen=True)
+class TopicTimes:
+    """Windows of the statistics, and limits of the output."""
+
+    report_period_s: float = 1.0
+    silent_s: float = 5.0
+    """A topic without a message for this time is announced."""
+    bandwidth_periods: int = 5
+    """Bandwidth is the mean over this many report periods."""
+    spacing_messages: int = 10_000
+    """Messages over which rate and spacing are computed at most."""
+    shown_items: int = 12
+    """Longer arrays are shortened in the output."""
+
+
+TOPIC: Final = TopicTimes()
 
 app = typer.Typer(help="Topics on a live bus.", no_args_is_help=True)
 Name = Annotated[str, typer.Argument(metavar="TOPIC", help="Name of a topic, e.g. joint_states.")]
@@ -145,7 +153,7 @@ def hz(
 ) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
     with _subscribed(name, connect, run, domain) as (topic, reader):
-        rows: deque[tuple[int, int | None]] = deque(maxlen=SPACING_MESSAGES)
+        rows: deque[tuple[int, int | None]] = deque(maxlen=TOPIC.spacing_messages)
         for received in _each_period(reader, seconds):
             rows.extend((message.sent_ns, _stamp_ns(message, topic)) for message in received)
             _print_rate(list(rows)[-len(received) - 1 :], topic, as_json)
@@ -164,11 +172,11 @@ def bw(
 ) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
     with _subscribed(name, connect, run, domain) as (topic, reader):
-        window: deque[list[int]] = deque(maxlen=BANDWIDTH_PERIODS)
+        window: deque[list[int]] = deque(maxlen=TOPIC.bandwidth_periods)
         for received in _each_period(reader, seconds):
             window.append([len(message.payload) for message in received])
             sizes = [size for period in window for size in period]
-            rate, mean = sum(sizes) / (len(window) * REPORT_PERIOD_S), sum(sizes) / max(len(sizes), 1)
+            rate, mean = sum(sizes) / (len(window) * TOPIC.report_period_s), sum(sizes) / max(len(sizes), 1)
             if as_json:
                 print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
             elif not sizes:
@@ -271,18 +279,18 @@ def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
         if (received := reader.get(0.1)) is not None:
             silent = False
             yield received
-        elif silent and monotonic() - begin > SILENT_S:
+        elif silent and monotonic() - begin > TOPIC.silent_s:
             silent = False
             limit = "until Ctrl-C" if seconds is None else f"{seconds:g} s at most"
-            say(f"no message on {reader.name} for {SILENT_S:g} s; waiting {limit}")
+            say(f"no message on {reader.name} for {TOPIC.silent_s:g} s; waiting {limit}")
 
 
 def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Received]]:
     """Yield the messages of each report period until the time is over."""
     left = inf if seconds is None else seconds
     while left > 0:
-        yield list(_until(reader, min(left, REPORT_PERIOD_S)))
-        left -= REPORT_PERIOD_S
+        yield list(_until(reader, min(left, TOPIC.report_period_s)))
+        left -= TOPIC.report_period_s
 
 
 def _message(received: Received, topic: Topic) -> Any:
@@ -316,7 +324,7 @@ def _plain(value: Any, full: bool) -> Any:
         names = [field.name for field in fields(value) if not field.name.isupper() and field.name != "__msgtype__"]
         return {name: _plain(getattr(value, name), full) for name in names}
     if isinstance(value, np.ndarray | list | tuple):
-        items = [_plain(item, full) for item in (value if full else value[:SHOWN_ITEMS])]
+        items = [_plain(item, full) for item in (value if full else value[: TOPIC.shown_items])]
         return items if len(items) == len(value) else [*items, f"... {len(value)} items"]
     return value.item() if isinstance(value, np.generic) else value
 

@@ -30,7 +30,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
-from palpate_models.robot.arm import FT_TO_INDENTER_M
+from palpate_models.robot.arm import TOOL
 from palpate_models.scenario.errors import Level, draw_errors, levels
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_models.section import NonNegative, Positive, Section
@@ -255,7 +255,7 @@ class _TaredSensor:
         self._tare, self._felt = 0.0, 0.0
         self._lag = exp(-PERIOD_S / drawn.lag_s) if drawn.lag_s else 0.0
         self.tare(0)
-        reads, lever = drawn.sensitivity[2], FT_TO_INDENTER_M
+        reads, lever = drawn.sensitivity[2], TOOL.ft_to_indenter_m
         self._row = np.array((reads[0] + lever * reads[4], reads[1] - lever * reads[3], reads[2]))
         """Reading of z for a unit force at the sphere's centre along each of the sensor's axes, shape (3,)."""
 

@@ -5,7 +5,8 @@ from typing import Annotated
 
 import typer
 
-from palpate.console import EXIT_BAD_INPUT, SteadyConsole, print_line, say
+from palpate.console import SteadyConsole, print_line, say
+from palpate_errors import ExitStatus
 
 
 def assess(
@@ -52,4 +53,4 @@ def assess(
         print_findings(console, report)
         console.print(f"to read: {page}")
     if not report.assessed:
-        raise typer.Exit(EXIT_BAD_INPUT)
+        raise typer.Exit(ExitStatus.BAD_INPUT)

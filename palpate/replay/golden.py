@@ -18,7 +18,7 @@ import numpy as np
 from mcap.writer import CompressionType, Writer
 
 from palpate.apart import guarded, shared_numbers
-from palpate.console import SteadyConsole, TimeLeft, fail, print_json
+from palpate.console import SteadyConsole, TimeLeft, fail, print_json, wide_console
 from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
 from palpate_bus import implementations
 from palpate_bus.contract import MS, Contract, Edge, Topic, contract
@@ -277,6 +277,6 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
     if as_json:
         print_json({name: as_dict(result) for name, result in results.items()})
     else:
-        SteadyConsole(width=max(140, SteadyConsole().width)).print(result_table(results))
+        wide_console(140).print(result_table(results))
     if not all(result.agrees for result in results.values()):
         fail(f"the messages of {role} differ from {file}; if this is intended, renew it with --update-refs")

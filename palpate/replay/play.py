@@ -2,10 +2,11 @@
 
 import logging
 from collections.abc import Callable, Collection
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns, sleep
 from types import TracebackType
-from typing import Self
+from typing import Final, Self
 
 from palpate.console import SteadyConsole, TimeLeft
 from palpate_bus.contract import MS, Contract, contract
@@ -23,12 +24,21 @@ DEFAULT_LISTEN = "tcp/127.0.0.1:7447"
 """Endpoint of a replay if the environment names none: ROS 2's rmw_zenoh expects its router here."""
 LOOK_NS = NS
 """The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
-LONGEST_NS = 7 * 86400 * NS
-"""Longest recording that is played [ns]; a longer one has stamps of two clocks."""
-GAP_NS = 5 * NS
-"""A longer time without a message is announced [ns]."""
+
+
+@dataclass(frozen=True)
+class PlayTimes:
+    """Times of a replay."""
+
+    longest_ns: int = 7 * 86400 * NS
+    """Longest recording that is played [ns]; a longer one has stamps of two clocks."""
+    gap_ns: int = 5 * NS
+    """A longer time without a message is announced [ns]."""
+    clock_period_ns: int = 10 * MS
+
+
+PLAY: Final = PlayTimes()
 CLOCK = "clock"
-CLOCK_PERIOD_NS = 10 * MS
 
 
 class Player:
@@ -56,7 +66,7 @@ class Player:
         recording.check(rules, self.topics, whole=False)
         self.origin = recording.origin(self.topics)
         """Stamp [ns] from which the times of `play` count."""
-        if (span := recording.last - self.origin) > LONGEST_NS:
+        if (span := recording.last - self.origin) > PLAY.longest_ns:
             raise UserError(f"{recording.path}: its stamps span {span / NS / 86400:.0f} days: some of them are wrong")
         options = _options(listen)
         self.where = f"on {', '.join(options.listen)}" if options.listen else "on the bus of the environment"
@@ -123,7 +133,7 @@ class Player:
         epoch = 0
         for message in self._recording.messages(self.topics, start, until):
             epoch = epoch or monotonic_ns()  # after the first chunk is unpacked
-            if (silent := (message.stamp - self.origin - self.now) / self._rate) > GAP_NS:
+            if (silent := (message.stamp - self.origin - self.now) / self._rate) > PLAY.gap_ns:
                 gap(silent / NS)
             while self._own_clock and self._next_clock <= message.stamp:
                 self._wait(epoch + round((self._next_clock - start) / self._rate))
@@ -144,8 +154,8 @@ class Player:
 
     def _tick(self) -> None:
         message = Clock(time_message(self._next_clock))
-        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // CLOCK_PERIOD_NS + 1)
-        self._next_clock += CLOCK_PERIOD_NS
+        self._publishers[CLOCK].put(self._encode_clock(message), self._next_clock // PLAY.clock_period_ns + 1)
+        self._next_clock += PLAY.clock_period_ns
 
     def _wait(self, due: int) -> None:
         left = due - monotonic_ns()

@@ -2,6 +2,7 @@
 
 import base64
 import io
+from dataclasses import dataclass
 from typing import Any, Final
 
 import numpy as np
@@ -34,10 +35,24 @@ _PHASE_TINTS: Final = {
     ExamState.PHASE_ASSESS: ("assess", "#dcfce7"),
     ExamState.PHASE_ABORTED: ("aborted", "#fecaca"),
 }
-_FREE_MM: Final = -20.0
-"""Depth below which the tool is clear of the surface; not drawn."""
-_SHOWN_MM: Final = -5.0
-"""Least depth in figures of the contact."""
+
+
+@dataclass(frozen=True)
+class FigureTuning:
+    """Ranges and limits of the figures."""
+
+    free_mm: float = -20.0
+    """Depth below which the tool is clear of the surface; not drawn."""
+    least_mm: float = -5.0
+    """Least depth in figures of the contact."""
+    vertices: int = 65_535
+    """The viewer's indices have 16 bits."""
+    unknown_grey: float = 0.80
+    axis_m: float = 0.05
+    """Length of the axes of the abdomen frame."""
+
+
+SHOWN: Final = FigureTuning()
 
 
 def _figure(width: float, height: float) -> Figure:
@@ -113,12 +128,12 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
         at = states.force_limited
         force.plot(states.time[at], states.force[at], ".", ms=2, color=LIMIT, label="depth yields to the limit")
     plain(force, "normal force [N]")
-    measured = np.where(states.depth * 1e3 > _FREE_MM, states.depth * 1e3, np.nan)
-    wanted = np.where(states.setpoint * 1e3 > _FREE_MM, states.setpoint * 1e3, np.nan)
+    measured = np.where(states.depth * 1e3 > SHOWN.free_mm, states.depth * 1e3, np.nan)
+    wanted = np.where(states.setpoint * 1e3 > SHOWN.free_mm, states.setpoint * 1e3, np.nan)
     depth.plot(states.time, wanted, color=figures.QUIET, lw=1.4, label="set-point")
     depth.plot(states.time, measured, color=MEASURED, lw=0.7, label="measured depth")
     plain(depth, "depth [mm]", "simulated time [s]")
-    depth.set_ylim(_SHOWN_MM, None)
+    depth.set_ylim(SHOWN.least_mm, None)
     for axes in (force, depth):
         axes.legend(fontsize=8.5, ncols=9, loc="lower left", bbox_to_anchor=(0, 1.0), frameon=False)
     force.set_xlim(states.time[0], states.time[-1])
@@ -128,7 +143,7 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
 def force_depth(evidence: Evidence) -> bytes | None:
     """Return force against depth in contact, coloured by time; None without contact."""
     states = evidence.states
-    held = states.in_contact & (states.depth * 1e3 > _SHOWN_MM)  # a sensor that is not tared yet reports contact in the air
+    held = states.in_contact & (states.depth * 1e3 > SHOWN.least_mm)  # a sensor that is not tared yet reports contact in the air
     if not held.any():
         return None
     figure = _figure(5.6, 4.4)
@@ -174,13 +189,8 @@ def _depth_errors(axes: Axes, evidence: Evidence) -> None:
     figures.panel_title(axes, "f", "Error of the depth", "in steady contact")
 
 
-MAX_VERTICES = 65_535
-"""The viewer's indices have 16 bits."""
-_UNKNOWN = 0.80
 ABOVE_SURFACE_M = np.array((0.0, 0.0, 0.001))
 """Offset of the findings' outline above the surface."""
-AXIS_M = 0.05
-"""Length of the axes of the abdomen frame."""
 
 
 def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], dict[str, Any]] | None:
@@ -192,7 +202,7 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], d
     triangles = np.asarray(message.triangles, dtype=np.int32).reshape(-1, 3)
     whole = mapped.scanned[triangles].all(axis=1)
     triangles = np.concatenate((triangles[whole], triangles[~whole]))
-    if not mapped.scanned.any() or len(mapped.vertices) > MAX_VERTICES:
+    if not mapped.scanned.any() or len(mapped.vertices) > SHOWN.vertices:
         return None
     middle = mapped.vertices[mapped.scanned].mean(axis=0)
     shape = mapped.vertices - middle
@@ -209,7 +219,7 @@ def surface(message: Any, abdomen: bool = True) -> tuple[list[dict[str, Any]], d
 
     def add(name: str, positions: Array, values: Array, norm: Normalize, cmap: str, form: str, outlined: bool) -> None:
         scale = colormaps[cmap]
-        colors = np.where(known[:, None], scale(norm(values))[:, :3], _UNKNOWN)
+        colors = np.where(known[:, None], scale(norm(values))[:, :3], SHOWN.unknown_grey)
         stops = [to_hex(scale(x)) for x in np.linspace(0, 1, 9)]
         ticks = [form.format(float(norm.inverse(x))) for x in np.linspace(0, 1, 5)]
         shown = triangles if outlined else triangles[: whole.sum()]
@@ -251,8 +261,8 @@ def _labels(shape: Array, known: NDArray[np.bool_], middle: Array, abdomen: bool
 
     x, y, _ = 0.16 * max(right - left, head - feet) * np.eye(3)
     corner = on_surface(left, feet) - 0.3 * (x + y)
-    ends = corner + AXIS_M * np.eye(3)
-    words = {f"{name} {1e3 * AXIS_M:.0f} mm": end for name, end in zip("xyz", ends, strict=True)}
+    ends = corner + SHOWN.axis_m * np.eye(3)
+    words = {f"{name} {1e3 * SHOWN.axis_m:.0f} mm": end for name, end in zip("xyz", ends, strict=True)}
     if abdomen:
         words |= {"head": on_surface(0.0, head) + y, "feet": on_surface(0.0, feet) - y}
         words |= {"patient's right": on_surface(left, 0.0) - x, "patient's left": on_surface(right, 0.0) + x}

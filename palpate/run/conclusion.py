@@ -9,7 +9,7 @@ from typing import Final
 import typer
 from rich.console import Console
 
-from palpate.console import EXIT_FAILED, SteadyConsole, print_line, say
+from palpate.console import SteadyConsole, print_line, say
 from palpate.report.page import write_page
 from palpate.report.results import assemble, print_findings, truth_of_run, write_results
 from palpate.report.rows import Report
@@ -22,6 +22,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.settings import RECORDING
 from palpate_conductor.outcome import RunResult
+from palpate_errors import ExitStatus
 from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
@@ -59,7 +60,7 @@ def conclude(
         if (folder / RECORDING).is_dir() and not quiet:
             console.print(f"to examine the remaining targets: palpate run --resume {folder}", highlight=False, soft_wrap=True)
     if result.failure or trouble:
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _hold_text(result: RunResult) -> str:

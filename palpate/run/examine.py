@@ -24,7 +24,7 @@ from palpate.run.places import Absent
 from palpate.run.processes import SecureBus
 from palpate.run.progress import RunDisplay
 from palpate.run.roles import NONE, OBSERVERS, choice, workers
-from palpate.run.self_test import RATES, REAL_PROCESSES, SIMULATED_PROCESSES, measure
+from palpate.run.self_test import RATES, TEST, measure
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_conductor.outcome import RunResult, Tell, Timing
@@ -137,7 +137,7 @@ def _rate(scenario: Scenario) -> float:
     real, emulated = scenario.services.tissue == NONE, scenario.robot.driver.emulated
     given = rate = Settings.read().rate
     if rate is None:
-        measured = measure(REAL_PROCESSES if scenario.services.tissue == NONE else SIMULATED_PROCESSES)
+        measured = measure(TEST.real_processes if scenario.services.tissue == NONE else TEST.simulated_processes)
         rate = measured.rate
         if rate is None:
             raise UserError(f"this machine cannot keep {RATES[-1]:g} of real time now: {measured.summary}; run in lockstep")

@@ -9,23 +9,33 @@ milliseconds for a tick; ages and deadlines are stretched alike.
 import json
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns, sleep
 from typing import Final, NamedTuple
 
 MS: Final = 1_000_000
-TICKS: Final = 1000
-WORK_NS: Final = 800_000
-"""A third of what all services take per millisecond: an examination of 50 s takes 161 s of processor time, about 40 of them for
-start and report."""
-LATE_MS: Final = 10.0
-"""Half of the age at which joint states are stale."""
-SIMULATED_PROCESSES: Final = 3
-REAL_PROCESSES: Final = 2
-"""Without simulated tissue, arm and camera two cores are enough."""
+
+
+@dataclass(frozen=True)
+class LoadTest:
+    """Work of the test, and what an examination needs."""
+
+    ticks: int = 1000
+    work_ns: int = 800_000
+    """A third of what all services take per millisecond: an examination of 50 s takes 161 s of processor time, about 40 of them
+    for start and report."""
+    late_ms: float = 10.0
+    """Half of the age at which joint states are stale."""
+    starts_within_ns: int = 1500 * MS
+    simulated_processes: int = 3
+    real_processes: int = 2
+    """Without simulated tissue, arm and camera two cores are enough."""
+
+
+TEST: Final = LoadTest()
 RATES: Final = (1.0, 0.5, 0.25, 0.1)
 """Allowed rates, simulated seconds per second."""
-STARTS_WITHIN_NS: Final = 1500 * MS
 
 
 class TimingResult(NamedTuple):
@@ -39,7 +49,7 @@ class TimingResult(NamedTuple):
     @property
     def rate(self) -> float | None:
         """Return the greatest of `RATES` that the machine can keep, None if there is none."""
-        possible = min(self.ticks, LATE_MS / max(self.late_ms, 1e-3))
+        possible = min(self.ticks, TEST.late_ms / max(self.late_ms, 1e-3))
         return next((rate for rate in RATES if rate <= possible), None)
 
     @property
@@ -50,7 +60,7 @@ class TimingResult(NamedTuple):
 
 def measure(processes: int) -> TimingResult:
     """Measure for a second with this number of processes; takes about two and a half."""
-    start = monotonic_ns() + STARTS_WITHIN_NS
+    start = monotonic_ns() + TEST.starts_within_ns
     command = [sys.executable, str(Path(__file__)), str(start)]
     children = [subprocess.Popen(command, stdout=subprocess.PIPE, text=True) for _ in range(processes)]
     figures = [json.loads(child.communicate()[0]) for child in children]
@@ -61,17 +71,17 @@ def _tick(start: int) -> tuple[float, float]:
     """Wake at each tick; return the share of ticks in time, and the lateness [ms] that one in a thousand exceeds."""
     late: list[int] = []
     tick = max(0, (monotonic_ns() - start) // MS)
-    while tick < TICKS:
+    while tick < TEST.ticks:
         due = start + tick * MS
         if (left := due - monotonic_ns()) > 0:
             sleep(left / 1e9)
         woke = monotonic_ns()
         late.append(woke - due)
-        while monotonic_ns() - woke < WORK_NS:
+        while monotonic_ns() - woke < TEST.work_ns:
             pass
         tick = max(tick + 1, (monotonic_ns() - start) // MS)
     late.sort()
-    return len(late) / TICKS, (late[-2] if len(late) > 1 else TICKS * MS) / MS
+    return len(late) / TEST.ticks, (late[-2] if len(late) > 1 else TEST.ticks * MS) / MS
 
 
 if __name__ == "__main__":

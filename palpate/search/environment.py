@@ -8,11 +8,11 @@
     (30, 5)
 
 An episode is one patient and `presses` presses. The reward of a press is the decrease of the entropy of the posterior over
-"no lump, or one at this place" [nat], less TIME_COST per second. The last press adds the logarithm of the probability of the
-truth (no lump, or one near its true place), at least WORST.
+"no lump, or one at this place" [nat], less `REWARD.per_s` per second. The last press adds the logarithm of the probability of the
+truth (no lump, or one near its true place), at least `REWARD.least`.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any, Final, Literal
 
@@ -28,10 +28,19 @@ from palpate_search.posterior import LAYERS, Posterior, maps, shape
 from palpate_search.presses import Budget, Task, press_duration
 
 ID: Final = "Palpate/Search-v0"
-TIME_COST: Final = 0.01
-WORST: Final = -5.0
-NEAR_M: Final = 0.020
-"""A lump hypothesis within this distance of the true place counts as correct."""
+
+
+@dataclass(frozen=True)
+class RewardTuning:
+    """Settings of the reward."""
+
+    per_s: float = 0.01
+    least: float = -5.0
+    near_m: float = 0.020
+    """A lump hypothesis within this distance of the true place counts as correct."""
+
+
+REWARD: Final = RewardTuning()
 ONE_MODEL: Final = ((1.0, 1.0),)
 """The reward uses one model of roughness and errors: a fifth of the computing time."""
 Observation = dict[str, NDArray[np.float32]]
@@ -83,12 +92,12 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         before, here = self._entropy(), self._posterior.here
         felt = self._hand.press(xy, float(depth))
         self._posterior.add(felt)
-        reward = before - self._entropy() - TIME_COST * float(press_duration(here, xy))
+        reward = before - self._entropy() - REWARD.per_s * float(press_duration(here, xy))
         self._history[self._count] = (*(2 * share - 1), np.log(felt.force / 5.0), 1.0)
         self._count += 1
         over = self._count == self._presses
         if over:
-            reward += max(float(np.log(max(self._truth(), 1e-12))), WORST)
+            reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.least)
         info = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
         return self._observed(), float(reward), over, False, info
 
@@ -130,7 +139,7 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         centre: Array | None = self._case.centre
         if centre is None:
             return self._posterior.none
-        near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= NEAR_M
+        near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= REWARD.near_m
         return float(self._posterior.by_place[near].sum())
 
     def _observed(self) -> Observation:

@@ -4,7 +4,7 @@
 (`palpate.quick.felt`): no physics, a hundredth of the time. Places are in the registered abdomen frame.
 """
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Final, Protocol
 
 import numpy as np
@@ -19,15 +19,23 @@ from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 from palpate_search.presses import Press, Task, press_duration
 
-DESCENT_MPS: Final = 0.030
-HOLD_S: Final = 0.3
-_TARE_N: Final = 0.05
-"""SD of the surrogate's force after taring."""
-_NOISE_N: Final = 0.02
-"""SD of the surrogate's mean force of a press."""
+
+@dataclass(frozen=True)
+class HandTuning:
+    """Presses of the hands."""
+
+    descent_mps: float = 0.030
+    hold_s: float = 0.3
+    tare_n: float = 0.05
+    """SD of the surrogate's force after taring."""
+    noise_n: float = 0.02
+    """SD of the surrogate's mean force of a press."""
+    shallowest_m: float = 0.002
+
+
+HAND: Final = HandTuning()
 _EXPONENT: Final = (1.35, 0.1)
 """Mean and SD over persons of the surrogate's exponent of force over depth."""
-_SHALLOWEST_M: Final = 0.002
 
 
 class Hand(Protocol):
@@ -83,7 +91,7 @@ class PatientHand(_Timed):
     def press(self, xy: Array, depth: float) -> Press:
         """As `Hand.press`."""
         patient, loop = self.patient, self._loop
-        idle = self._begin(xy, depth) - depth / DESCENT_MPS - HOLD_S
+        idle = self._begin(xy, depth) - depth / HAND.descent_mps - HAND.hold_s
         patient.rest(max(idle, 0.0))
         loop.sensor.tare(self._period)
         places, normals = patient.surface.points((xy + loop.aside_m)[None])
@@ -93,12 +101,12 @@ class PatientHand(_Timed):
         measured, force, limited, held = 0.0, 0.0, False, 0
         depths: list[float] = []
         forces: list[float] = []
-        while held < round(HOLD_S / PERIOD_S):
+        while held < round(HAND.hold_s / PERIOD_S):
             if force >= self.task.force:
                 limited = True
             at_depth = limited or measured >= depth
             held += at_depth
-            measured = measured if at_depth else min(measured + DESCENT_MPS * PERIOD_S, depth)
+            measured = measured if at_depth else min(measured + HAND.descent_mps * PERIOD_S, depth)
             excursion = patient.tissue.excursion(patient.time + PERIOD_S)
             unseen = (1.0 - loop.followed) * share * (excursion - self._mean)
             true = measured - wrong - loop.wander.at(self._period) + unseen
@@ -141,7 +149,7 @@ class SurrogateHand(_Timed):
         loop, rng = self._loop, self._rng
         self._begin(xy, depth)
         time = loop.begin_s + self.spent
-        excursion = np.mean([self._breathing.excursion(time - share * HOLD_S) for share in (0.0, 0.5, 1.0)])
+        excursion = np.mean([self._breathing.excursion(time - share * HAND.hold_s) for share in (0.0, 0.5, 1.0)])
         unseen = (1.0 - loop.followed) * (float(excursion) - self._breathing.mean_m)
         wander = self._errors.wander_m * float(rng.standard_normal())
         stiff = float(self.felt.force_at((xy + loop.aside_m)[None])[0])
@@ -154,5 +162,7 @@ class SurrogateHand(_Timed):
         if limited:
             depths = np.linspace(0.0, depth, 50)
             depth = float(np.interp(self.task.force, [felt(d) for d in depths.tolist()], depths))
-        force = max(felt(depth) + float(rng.normal(0.0, _TARE_N) + rng.normal(0.0, _NOISE_N)), 0.02)
-        return Press(float(xy[0]), float(xy[1]), max(depth, _SHALLOWEST_M), force, time, _NOISE_N, limited, self._reported_sd_m)
+        force = max(felt(depth) + float(rng.normal(0.0, HAND.tare_n) + rng.normal(0.0, HAND.noise_n)), 0.02)
+        return Press(
+            float(xy[0]), float(xy[1]), max(depth, HAND.shallowest_m), force, time, HAND.noise_n, limited, self._reported_sd_m
+        )

@@ -14,12 +14,20 @@ from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_search.posterior import Policy, Posterior
 
-CONTRAST: Final = 2.0
-"""Felt contrast of each lump, by the surrogate, at its centre."""
-RADIUS_M: Final = 0.020
-BORDER_M: Final = 0.030
-"""Least distance of a lump's centre from the region's edge."""
-PRESSES: Final = 100
+
+@dataclass(frozen=True)
+class TrialLump:
+    """The lump and the budget of a trial."""
+
+    contrast: float = 2.0
+    """Felt contrast of each lump, by the surrogate, at its centre."""
+    radius_m: float = 0.020
+    border_m: float = 0.030
+    """Least distance of a lump's centre from the region's edge."""
+    presses: int = 100
+
+
+TRIAL: Final = TrialLump()
 _MODULI: Final = (1.2, 30.0)
 """Search interval of the modulus contrast."""
 
@@ -36,23 +44,23 @@ class SearchCase:
 
 
 def case(seed: int, errors: str = "typical") -> SearchCase:
-    """Return the patient of a seed: odd seeds have a lump, whose modulus gives the felt contrast CONTRAST."""
+    """Return the patient of a seed: odd seeds have a lump, whose modulus gives the felt contrast `TRIAL.contrast`."""
     settings = [f"errors={errors}", "phantom.breathing.kind=quiet", "phantom.draw.lumps=[0, 0]"]
-    settings += [f"exam.budget.presses={PRESSES}", "exam.budget.seconds=3600"]
+    settings += [f"exam.budget.presses={TRIAL.presses}", "exam.budget.seconds=3600"]
     if seed % 2 == 0:
         scenario = load_scenario("person", settings, seed)
         return SearchCase(scenario, felt_patient(scenario.phantom, seed), None)
     region = load_scenario("person", settings, seed).exam
-    half = 0.5 * np.array(region.region_m) - BORDER_M
+    half = 0.5 * np.array(region.region_m) - TRIAL.border_m
     centre = generator(seed, "search lump").uniform(-half, half) + region.centre_m
     low, high = np.log(_MODULI)
     for _ in range(5):  # log felt contrast is nearly linear in log modulus
         middle = 0.5 * (low + high)
-        lump = f"{{centre_m: {centre.tolist()}, radii_m: [{RADIUS_M}, {RADIUS_M}], contrast: {np.exp(middle):.4f}}}"
+        lump = f"{{centre_m: {centre.tolist()}, radii_m: [{TRIAL.radius_m}, {TRIAL.radius_m}], contrast: {np.exp(middle):.4f}}}"
         scenario = load_scenario("person", [*settings, f"phantom.lesions=[{lump}]"], seed)
         felt = felt_patient(scenario.phantom, seed)
         excess = float(felt.excess_at(centre[None])[0])
-        low, high = (middle, high) if excess < np.log(CONTRAST) else (low, middle)
+        low, high = (middle, high) if excess < np.log(TRIAL.contrast) else (low, middle)
     return SearchCase(scenario, felt, centre)
 
 

@@ -11,8 +11,9 @@ import typer
 from rich.console import Console
 from rich.table import Table
 
-from palpate.console import EXIT_FAILED, CaseDisplay, SteadyConsole, fail, output_folder, refuse
+from palpate.console import CaseDisplay, SteadyConsole, fail, output_folder, refuse
 from palpate.run.options import ServiceChoices, Settings
+from palpate_errors import ExitStatus
 
 if TYPE_CHECKING:
     from palpate.study.cases import Case
@@ -225,7 +226,7 @@ def _conclude(folder: Folder, manifest: Manifest) -> None:
         out.print(f"... and {len(incomplete) - SHOWN} more that did not complete", highlight=False)
     out.print(f"page: {folder.path / 'study.html'}", highlight=False, soft_wrap=True)
     if found.failed:
-        raise typer.Exit(EXIT_FAILED)
+        raise typer.Exit(ExitStatus.FAILED)
 
 
 def _result(found: RunRecord) -> str:

@@ -161,14 +161,21 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-CONNECT_S: Final = 30
-"""Time limit for the connection to a scheduler."""
+@dataclass(frozen=True)
+class PoolTuning:
+    """Distribution of cases to workers."""
+
+    connect_s: int = 30
+    """Time limit for the connection to a scheduler."""
+    tasks_per_worker: int = 4
+    """Minimum number of tasks for each worker, so that none waits for another at the end."""
+    poll_s: float = 2.0
+    """Interval of the check that the scheduler is alive."""
+
+
+POOL: Final = PoolTuning()
 BATCH: Final = {"whole": 1, "quick": 8}
 """Maximum number of cases of one task; they share a process."""
-TASKS_A_WORKER: Final = 4
-"""Minimum number of tasks for each worker, so that none waits for another at the end."""
-POLL_S: Final = 2.0
-"""Interval of the check that the scheduler is alive."""
 
 
 class StudyStopped(RunError):
@@ -222,7 +229,7 @@ def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
                 stack.enter_context(local)
                 client = stack.enter_context(Client(local))
             else:
-                client = stack.enter_context(Client(scheduler, timeout=CONNECT_S))
+                client = stack.enter_context(Client(scheduler, timeout=POOL.connect_s))
         except (OSError, ValueError, TimeoutError) as error:
             raise StudyError(f"--scheduler {scheduler}: {error}" if scheduler else f"--workers {count}: {error}") from error
         known = sum(client.nthreads().values()) or 1
@@ -277,11 +284,11 @@ def _run(folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable
     def submit(batch: list[Case]) -> None:
         running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch], kept)] = batch
 
-    size = max(1, min(BATCH[todo[0].tier], len(todo) // (TASKS_A_WORKER * workers.count))) if todo else 1
+    size = max(1, min(BATCH[todo[0].tier], len(todo) // (POOL.tasks_per_worker * workers.count))) if todo else 1
     for batch in _batches(todo, size):
         submit(batch)
     while running:
-        ended, _ = wait(running, timeout=POLL_S, return_when=FIRST_COMPLETED)
+        ended, _ = wait(running, timeout=POOL.poll_s, return_when=FIRST_COMPLETED)
         if not ended and not workers.alive:
             raise StudyStopped("connection to the scheduler lost")
         for future in ended:

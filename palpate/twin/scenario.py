@@ -26,10 +26,19 @@ from palpate_tissue.backends.elastic.service import create as elastic_service
 from palpate_tissue.service import TissueService
 
 GRID: Final = "twin.csv"
-ELASTIC_PRESSES: Final = 20
-"""Presses from which the scale of Young's modulus is found."""
-ELASTIC_STEPS: Final = 8
-"""Time steps of such a press: it goes down during the first half."""
+
+
+@dataclass(frozen=True)
+class ElasticPresses:
+    """Presses from which the elastic twin is made."""
+
+    presses: int = 20
+    """Presses from which the scale of Young's modulus is found."""
+    steps: int = 8
+    """Time steps of such a press: it goes down during the first half."""
+
+
+ELASTIC: Final = ElasticPresses()
 
 
 @dataclass(frozen=True)
@@ -153,15 +162,15 @@ def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array
     service = elastic_service(scenario)
     assert isinstance(service, TissueService)
     fitted = np.flatnonzero(~wall.held_out)
-    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // ELASTIC_PRESSES)]]
-    step = float(np.median([press.time[-1] for press in presses])) / ELASTIC_STEPS
+    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // ELASTIC.presses)]]
+    step = float(np.median([press.time[-1] for press in presses])) / ELASTIC.steps
     tissue = service.backend.in_steps_of(step)
     expected = []
     for press, place, normal in zip(presses, *skin_at(tissue.model, presses), strict=True):
         tissue.settle()
         depth = press.depth.max() + wall.onset_m
-        for k in range(1, ELASTIC_STEPS + 1):
-            centre = place + (radius - depth * min(1.0, 2 * k / ELASTIC_STEPS)) * normal
+        for k in range(1, ELASTIC.steps + 1):
+            centre = place + (radius - depth * min(1.0, 2 * k / ELASTIC.steps)) * normal
             force, _ = tissue.step(k * step, centre, np.zeros(3), radius)
         expected.append(float(force @ normal))
     return np.array([press.felt for press in presses]), np.array(expected)

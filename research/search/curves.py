@@ -15,10 +15,9 @@ import typer
 from matplotlib.figure import Figure
 from statsmodels.stats.proportion import proportion_confint
 
+from palpate.study.cases import TUNE_SEEDS
 from palpate_models.numerics.frames import Array
 
-TUNING: Final = 1000
-"""Seeds below this are tuning patients."""
 SPECIFICITY: Final = 0.95
 NEAR_M: Final = 0.020
 OURS: Final = "informed"
@@ -27,7 +26,7 @@ _BOOTSTRAPS: Final = 2000
 
 def thresholds(trials: pd.DataFrame) -> pd.Series:
     """Return the threshold of each policy."""
-    healthy = trials[(trials.seed < TUNING) & trials.apart_m.isna()]
+    healthy = trials[(trials.seed < TUNE_SEEDS) & trials.apart_m.isna()]
     greatest = healthy.groupby(["policy", "seed"]).near.max()
     return greatest.groupby("policy").quantile(SPECIFICITY, interpolation="higher")
 
@@ -35,7 +34,7 @@ def thresholds(trials: pd.DataFrame) -> pd.Series:
 def outcomes(trials: pd.DataFrame, limits: pd.Series) -> pd.DataFrame:
     """A row for each policy and test patient: presses and seconds to the first word, whether it was right, how far off it was."""
     rows = []
-    for (name, seed), trial in trials[trials.seed >= TUNING].groupby(["policy", "seed"]):
+    for (name, seed), trial in trials[trials.seed >= TUNE_SEEDS].groupby(["policy", "seed"]):
         said = np.flatnonzero(trial.near.to_numpy() > float(limits.loc[str(name)]))
         lump, budget = bool(trial.apart_m.notna().any()), len(trial)
         k = int(said[0]) if len(said) else budget - 1
@@ -86,7 +85,7 @@ def _reached(seconds: Array, share: float) -> float:
 
 def table(found: pd.DataFrame, limits: pd.Series, trials: pd.DataFrame) -> str:
     """Return the comparison, as Markdown."""
-    there = trials[(trials.seed >= TUNING) & trials.apart_m.notna()]
+    there = trials[(trials.seed >= TUNE_SEEDS) & trials.apart_m.notna()]
     rng = np.random.Generator(np.random.PCG64(0))
     lines = [
         "| policy | place right after 10 presses | after 30 | threshold | found | healthy without a finding "
@@ -167,7 +166,7 @@ def main(
     trials = pd.concat([pd.read_csv(file) for file in files], ignore_index=True)
     limits = thresholds(trials)
     found = outcomes(trials, limits)
-    tuned = trials[trials.seed < TUNING].seed.nunique()
+    tuned = trials[trials.seed < TUNE_SEEDS].seed.nunique()
     print(f"{found.seed.nunique()} patients, {found[found.lump].seed.nunique()} with a lump; {tuned} healthy tuning patients\n")
     print(table(found, limits, trials))
     print(f"\n{against_raster(found)}")

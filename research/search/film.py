@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Final
+from typing import Annotated
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -15,10 +15,6 @@ from palpate.search.trial import search
 from palpate_models.numerics.frames import Array
 from palpate_search.posterior import Posterior, policy
 from palpate_search.presses import Budget
-
-FRAMES_PER_S: Final = 3
-_LAST: Final = 6
-"""Number of repetitions of the last frame."""
 
 
 def main(
@@ -43,7 +39,7 @@ def main(
     figure, (map_axes, probability_axes) = plt.subplots(
         1, 2, figsize=(8.4, 4.0), dpi=75, layout="constrained", width_ratios=(1.15, 1)
     )
-    writer = PillowWriter(fps=FRAMES_PER_S)
+    writer = PillowWriter(fps=3)
     x, y = (np.unique(axis) for axis in hand.task.places.T)
     with writer.saving(figure, str(out), dpi=75):
         for k in _frames(len(trial.near)):
@@ -67,7 +63,7 @@ def main(
 
 def _frames(count: int) -> Iterator[int]:
     yield from range(count)
-    yield from [count - 1] * _LAST
+    yield from [count - 1] * 6  # the last frame stays
 
 
 if __name__ == "__main__":

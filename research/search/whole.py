@@ -14,7 +14,7 @@ import typer
 from rich.progress import track
 
 import palpate
-from palpate.search.trial import PRESSES, case
+from palpate.search.trial import TRIAL, case
 from palpate_bus.messages.geometry import Array
 from research.search.curves import in_words, share
 
@@ -53,7 +53,7 @@ def summary(rows: pd.DataFrame) -> Iterator[str]:
     rng = np.random.default_rng(0)
     for name, mine in rows.groupby("policy"):
         ill, healthy = mine[mine.lump], mine[~mine.lump]
-        presses: Array = np.where(ill.found, ill.presses, PRESSES).astype(float)
+        presses: Array = np.where(ill.found, ill.presses, TRIAL.presses).astype(float)
         if len(ill):
             middle, most = (in_words(presses, quantile, rng) for quantile in (0.5, 0.9))
             found, false = share(int(ill.found.sum()), len(ill)), share(int((ill.false_findings > 0).sum()), len(ill))

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 from typer.testing import CliRunner
 
-from palpate.console import EXIT_BAD_INPUT
+from palpate_errors import ExitStatus
 from palpate_models.patient.remus2024 import relaxed_people
 from palpate_validation import buried, drop, energy, guarding, hertz, meshes, people, persons, population, relaxation
 from palpate_validation.check import Check, PageSection, failures, write
@@ -152,6 +152,6 @@ def test_the_command(tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(cli, "run_section", lambda name: a_section())
     runner = CliRunner()
     result = runner.invoke(cli.app, ["--only", "hertz", "--out", str(tmp_path)])
-    assert result.exit_code == cli.EXIT_MISSED
+    assert result.exit_code == ExitStatus.FAILED
     assert "FAIL" in result.output
-    assert runner.invoke(cli.app, ["--only", "nonsense"]).exit_code == EXIT_BAD_INPUT
+    assert runner.invoke(cli.app, ["--only", "nonsense"]).exit_code == ExitStatus.BAD_INPUT

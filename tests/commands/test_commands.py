@@ -14,9 +14,9 @@ from typer.testing import CliRunner
 
 from palpate import commands
 from palpate.commands import COMMANDS, app_for, main
-from palpate.console import EXIT_BAD_INPUT
 from palpate.run import examine
 from palpate.run.options import RunOptions
+from palpate_errors import ExitStatus
 from palpate_models.scenario.load import load_scenario
 from palpate_plugins import PluginError, PluginKind
 
@@ -127,7 +127,7 @@ def test_a_variable_that_cannot_be_used_is_a_line(monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr(sys, "argv", ["palpate", "doctor"])
     with pytest.raises(SystemExit) as end:
         main()
-    assert end.value.code == EXIT_BAD_INPUT
+    assert end.value.code == ExitStatus.BAD_INPUT
     sys.stderr.flush()
     assert capfd.readouterr().err == "palpate: PALPATE_RATE is '7'; allowed: a number above 0, up to 1\n"
 

@@ -11,8 +11,8 @@ from PIL import Image
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.console import EXIT_BAD_INPUT
 from palpate.run.inputs import scan_over
+from palpate_errors import ExitStatus
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import load_scenario, scenario_names
 
@@ -35,7 +35,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 def refused(*words: str) -> str:
     """Return the output of a command that refuses its input, on one line."""
     called = CliRunner().invoke(app_for(words[0]), words)
-    assert called.exit_code == EXIT_BAD_INPUT, called.output
+    assert called.exit_code == ExitStatus.BAD_INPUT, called.output
     return " ".join(called.output.replace("│", " ").split())
 
 

@@ -14,7 +14,6 @@ from rich.console import Console
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.console import EXIT_FAILED, EXIT_TROUBLE
 from palpate.report.archive import EvidenceError, read_evidence
 from palpate.report.files import write_text
 from palpate.report.page import write_page
@@ -26,7 +25,7 @@ from palpate.run.roles import write_scenario_files
 from palpate_bus.runs.run_folder import LOCK, name_run, run_of
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunProgress
-from palpate_errors import UserError
+from palpate_errors import ExitStatus, UserError
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Exam, Scenario
 
@@ -109,7 +108,7 @@ def test_a_command_on_a_full_disk_is_not_refused(words: list[str]) -> None:
     with Path("/dev/full").open("w") as full:
         command = [sys.executable, "-m", "palpate", *words]
         done = subprocess.run(command, stdout=full, stderr=subprocess.PIPE, text=True, check=False)
-    assert (done.returncode, done.stderr.count("\n")) == (EXIT_TROUBLE, 1)
+    assert (done.returncode, done.stderr.count("\n")) == (ExitStatus.TROUBLE, 1)
     assert "the output could not be written: No space left on device" in done.stderr
 
 
@@ -191,7 +190,7 @@ def test_results_that_a_folder_does_not_take_go_to_another_or_to_the_console(
     scenario = load_scenario("clean", SETTINGS, seed=3)
     with pytest.raises(typer.Exit) as left:
         conclude(Console(quiet=True), tmp_path / "gone", scenario, result(collected()), quiet=True)
-    assert left.value.exit_code == EXIT_FAILED
+    assert left.value.exit_code == ExitStatus.FAILED
     out, err = capsys.readouterr()
     assert "RLQ" in out
     if other:

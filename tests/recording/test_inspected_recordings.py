@@ -8,12 +8,11 @@ import pytest
 from typer.testing import CliRunner
 
 from palpate.commands import app_for
-from palpate.console import EXIT_BAD_INPUT
 from palpate.recording.inspect import propose
 from palpate.recording.mapping import read_mapping
 from palpate.recording.read import read_recording
 from palpate.recording.readings import read_table
-from palpate_errors import UserError
+from palpate_errors import ExitStatus, UserError
 
 HEADERS = {
     "plain": ("probe", "x", "y", "z", "fx", "fy", "fz"),
@@ -106,7 +105,7 @@ def test_a_recording_without_a_map_has_a_report_and_status_2(tmp_path: Path) -> 
     propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
     table, mapping, out = (str(tmp_path / name) for name in ("probes.csv", "mapping.yaml", "results"))
     called = CliRunner().invoke(app_for("assess"), ["assess", table, "--mapping", mapping, "--out", out])
-    assert called.exit_code == EXIT_BAD_INPUT
+    assert called.exit_code == ExitStatus.BAD_INPUT
     assert "2 of 2 contacts lie on one line" in called.output
     assert "lie on one line" in (tmp_path / "results" / "report.html").read_text()
 

@@ -5,6 +5,7 @@ the flange.
 """
 
 import warnings
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -16,16 +17,26 @@ from palpate_models.robot.lbr import ARM
 from palpate_models.robot.urdf_arm import load_arm, read_arm
 from palpate_models.scenario.schema import Robot
 
-FLANGE_TO_FT_M: Final = 0.030
-"""Thickness of the F/T sensor: flange to measuring face [A: like an ATI Gamma, 75 mm x 33 mm, 0.255 kg]."""
-FT_TO_INDENTER_M: Final = 0.100
-"""Measuring face to the sphere's centre: the stand-off (assumed)."""
-FT_SENSOR_MASS_KG: Final = 0.25
-"""The sensor's own mass, on the flange's side of its measuring face (assumed)."""
-FT_SENSOR_RADIUS_M: Final = 0.0375
-STANDOFF_RADIUS_M: Final = 0.0125
-STANDOFF_MASS_FRACTION: Final = 0.6
-"""Part of the tool's mass that is in the stand-off; the rest is in the sphere (assumed)."""
+
+@dataclass(frozen=True)
+class ToolGeometry:
+    """F/T sensor and standoff between flange and indenter."""
+
+    flange_to_ft_m: float = 0.030
+    """Thickness of the F/T sensor: flange to measuring face [A: like an ATI Gamma, 75 mm x 33 mm, 0.255 kg]."""
+    ft_to_indenter_m: float = 0.100
+    """Measuring face to the sphere's centre: the stand-off (assumed)."""
+    ft_sensor_mass_kg: float = 0.25
+    """The sensor's own mass, on the flange's side of its measuring face (assumed)."""
+    ft_sensor_radius_m: float = 0.0375
+    standoff_radius_m: float = 0.0125
+    standoff_mass_fraction: float = 0.6
+    """Part of the tool's mass that is in the stand-off; the rest is in the sphere (assumed)."""
+    mount_clearance_m: float = 0.02
+    """A link that comes nearer to the base in every posture is not checked against it."""
+
+
+TOOL: Final = ToolGeometry()
 
 
 def arm_of(robot: Robot) -> Arm:
@@ -56,11 +67,7 @@ def link_names(robot: Robot) -> tuple[str, ...]:
 def mounts(robot: Robot) -> Array:
     """Return the origins of flange, F/T sensor and indenter in the arm's last link [m], shape (3, 3)."""
     x, y, z = arm_of(robot).flange_m
-    return np.column_stack((np.full(3, x), np.full(3, y), np.cumsum((z, FLANGE_TO_FT_M, FT_TO_INDENTER_M))))
-
-
-MOUNT_CLEARANCE_M: Final = 0.02
-"""A link that comes nearer to the base in every posture is not checked against it."""
+    return np.column_stack((np.full(3, x), np.full(3, y), np.cumsum((z, TOOL.flange_to_ft_m, TOOL.ft_to_indenter_m))))
 
 
 def mounted(robot: Robot) -> int:
@@ -71,7 +78,7 @@ def mounted(robot: Robot) -> int:
     arm = arm_of(robot)
     height = float(arm.posture(np.zeros(arm.joints))[0][1, 2])
     thickness = max((capsule.radius for capsule in arm.capsules[2]), default=0.0)
-    return 2 if height - thickness > MOUNT_CLEARANCE_M else 3
+    return 2 if height - thickness > TOOL.mount_clearance_m else 3
 
 
 def _cylinder(mass: float, radius: float, length: float, z: float) -> Inertia:
@@ -88,10 +95,10 @@ def _sphere(mass: float, radius: float) -> Inertia:
 
 def inertias(robot: Robot) -> dict[str, Inertia]:
     """Return the inertia by link: the stand-off is in `ft_sensor`, the sphere in `indenter`, the sensor in the flange."""
-    standoff = STANDOFF_MASS_FRACTION * robot.tool_mass_kg
+    standoff = TOOL.standoff_mass_fraction * robot.tool_mass_kg
     tool = (
-        _cylinder(FT_SENSOR_MASS_KG, FT_SENSOR_RADIUS_M, FLANGE_TO_FT_M, FLANGE_TO_FT_M / 2),
-        _cylinder(standoff, STANDOFF_RADIUS_M, FT_TO_INDENTER_M, FT_TO_INDENTER_M / 2),
+        _cylinder(TOOL.ft_sensor_mass_kg, TOOL.ft_sensor_radius_m, TOOL.flange_to_ft_m, TOOL.flange_to_ft_m / 2),
+        _cylinder(standoff, TOOL.standoff_radius_m, TOOL.ft_to_indenter_m, TOOL.ft_to_indenter_m / 2),
         _sphere(robot.tool_mass_kg - standoff, robot.indenter_radius_m),
     )
     return dict(zip(link_names(robot), (*arm_of(robot).inertias, *tool), strict=True))
@@ -101,8 +108,8 @@ def capsules(robot: Robot) -> dict[str, tuple[Capsule, ...]]:
     """Return the collision geometry by link, in link frames. It encloses the visual meshes to within a few millimetres."""
     tip = (0.0, 0.0, 0.0)
     tool = (
-        (Capsule(tip, (0.0, 0.0, FLANGE_TO_FT_M / 2), FT_SENSOR_RADIUS_M),),
-        (Capsule((0.0, 0.0, 0.01), (0.0, 0.0, FT_TO_INDENTER_M), STANDOFF_RADIUS_M),),
+        (Capsule(tip, (0.0, 0.0, TOOL.flange_to_ft_m / 2), TOOL.ft_sensor_radius_m),),
+        (Capsule((0.0, 0.0, 0.01), (0.0, 0.0, TOOL.ft_to_indenter_m), TOOL.standoff_radius_m),),
         (Capsule(tip, tip, robot.indenter_radius_m),),
     )
     return dict(zip(link_names(robot), (*arm_of(robot).capsules, *tool), strict=True))
@@ -176,7 +183,7 @@ def urdf(robot: Robot, *, geometry: bool = True) -> str:
     parts += [_revolute(arm, i, robot) for i in range(arm.joints)]
     flange = arm.link_names[-1]
     parts.append(_joint(f"{arm.name}_flange", "fixed", arm.link_names[-2], flange, arm.flange_m))
-    parts.append(_joint("ft_sensor_mount", "fixed", flange, "ft_sensor", (0.0, 0.0, FLANGE_TO_FT_M)))
-    parts.append(_joint("standoff", "fixed", "ft_sensor", "indenter", (0.0, 0.0, FT_TO_INDENTER_M)))
+    parts.append(_joint("ft_sensor_mount", "fixed", flange, "ft_sensor", (0.0, 0.0, TOOL.flange_to_ft_m)))
+    parts.append(_joint("standoff", "fixed", "ft_sensor", "indenter", (0.0, 0.0, TOOL.ft_to_indenter_m)))
     parts.append("</robot>\n")
     return "\n".join(parts)

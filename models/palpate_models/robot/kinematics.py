@@ -4,7 +4,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose, link_names
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, link_names
 from palpate_models.scenario.schema import Robot
 
 
@@ -18,7 +18,7 @@ def link_transforms(q: Array, robot: Robot) -> list[tuple[str, str, Array]]:
         X[:3, :3] = turn
         X[:3, 3] = origin
         found.append(X)
-    for step in (arm.flange_m, (0.0, 0.0, FLANGE_TO_FT_M), (0.0, 0.0, FT_TO_INDENTER_M)):
+    for step in (arm.flange_m, (0.0, 0.0, TOOL.flange_to_ft_m), (0.0, 0.0, TOOL.ft_to_indenter_m)):
         X = np.eye(4)
         X[:3, 3] = step
         found.append(X)

@@ -9,13 +9,21 @@ from palpate_models.numerics.frames import Array, matrix
 from palpate_models.scenario.schema import Robot
 from palpate_models.section import Pose, Vec3
 
-TABLE_TOP_M: Final = 0.73
-"""Height of the table's top face (assumed)."""
-TABLE_X_M: Final = (0.285, 0.835)
-TABLE_Y_M: Final = (-1.0, 1.0)
-TABLE_THICKNESS_M: Final = 0.10
-COLUMN_M: Final = (0.30, 0.60)
-"""Footprint of the table's column, x and y (assumed)."""
+
+@dataclass(frozen=True)
+class OperatingTable:
+    """Measures of the operating table."""
+
+    top_m: float = 0.73
+    """Height of the table's top face (assumed)."""
+    x_m: tuple[float, float] = (0.285, 0.835)
+    y_m: tuple[float, float] = (-1.0, 1.0)
+    thickness_m: float = 0.10
+    column_m: tuple[float, float] = (0.30, 0.60)
+    """Footprint of the table's column, x and y (assumed)."""
+
+
+TABLE: Final = OperatingTable()
 BASE_SIDE_M: Final = 0.40
 
 
@@ -38,14 +46,16 @@ def _aligned(name: str, low: Vec3, high: Vec3) -> Box:
 
 def boxes(robot: Robot) -> tuple[Box, ...]:
     """Table top, table column and robot base, in world. The base reaches from the floor to `robot.base_height_m`."""
-    under = TABLE_TOP_M - TABLE_THICKNESS_M
-    x, y = sum(TABLE_X_M) / 2, sum(TABLE_Y_M) / 2
+    under = TABLE.top_m - TABLE.thickness_m
+    x, y = sum(TABLE.x_m) / 2, sum(TABLE.y_m) / 2
     height = robot.base_height_m
     base = Pose(xyz_m=(*robot.base_xy_m, height / 2), rpy_rad=(0.0, 0.0, robot.base_yaw_rad))
     return (
-        _aligned("table_top", (TABLE_X_M[0], TABLE_Y_M[0], under), (TABLE_X_M[1], TABLE_Y_M[1], TABLE_TOP_M)),
+        _aligned("table_top", (TABLE.x_m[0], TABLE.y_m[0], under), (TABLE.x_m[1], TABLE.y_m[1], TABLE.top_m)),
         _aligned(
-            "table_column", (x - COLUMN_M[0] / 2, y - COLUMN_M[1] / 2, 0.0), (x + COLUMN_M[0] / 2, y + COLUMN_M[1] / 2, under)
+            "table_column",
+            (x - TABLE.column_m[0] / 2, y - TABLE.column_m[1] / 2, 0.0),
+            (x + TABLE.column_m[0] / 2, y + TABLE.column_m[1] / 2, under),
         ),
         Box("robot_base", matrix(base), (BASE_SIDE_M, BASE_SIDE_M, height)),
     )

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_SENSOR_RADIUS_M, FT_TO_INDENTER_M, STANDOFF_RADIUS_M, arm_of
+from palpate_models.robot.arm import TOOL, arm_of
 from palpate_models.robot.chain import Arm, Capsule
 from palpate_models.scenario.schema import Robot
 
@@ -71,8 +71,8 @@ def _turned(profile: list[tuple[float, float]], rgba: Rgba) -> VisualMesh:
 
 
 def _tool(robot: Robot) -> dict[str, list[VisualMesh]]:
-    sensor, length = FLANGE_TO_FT_M, FT_TO_INDENTER_M
-    r, rod = FT_SENSOR_RADIUS_M, STANDOFF_RADIUS_M
+    sensor, length = TOOL.flange_to_ft_m, TOOL.ft_to_indenter_m
+    r, rod = TOOL.ft_sensor_radius_m, TOOL.standoff_radius_m
     angle = np.linspace(0.0, np.pi, 25)
     sphere = robot.indenter_radius_m * np.stack((np.sin(angle), -np.cos(angle)), axis=1)
     sphere[[0, -1], 0] = 0.0

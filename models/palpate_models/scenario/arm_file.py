@@ -11,7 +11,7 @@ from palpate_errors import UserError
 from palpate_inputs import read_yaml
 from palpate_models.section import NonNegative, Section, Vec2, Vec3
 
-FOLDER: Final = Path(__file__).parent / "arms"
+FOLDER: Final = Path(__file__).with_name("arms")
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
 
 DEFAULT_ARM: Final = "lbr"

@@ -1,6 +1,7 @@
 """Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
@@ -15,14 +16,23 @@ from palpate_models.robot.chain import Arm
 from palpate_models.scenario.arm_file import CommandLevel
 
 COMMAND = "control/joint_torque"
-PUSH_FRACTION = 0.02
-"""Torque that moves a joint slightly in `PUSH_S`, over its limit, on top of twice the friction."""
-PUSH_RAD = 0.01
-"""The same for an arm that takes positions."""
-PUSH_S = 0.06
-MOVED_RAD = 2e-4
-DRIFT_RAD = 0.05
-PRESS_N = 10.0
+
+
+@dataclass(frozen=True)
+class RobotTouches:
+    """Pushes on the robot, and its largest motion without."""
+
+    push_s: float = 0.06
+    push_fraction: float = 0.02
+    """Torque that moves a joint slightly in `push_s`, over its limit, on top of twice the friction."""
+    push_rad: float = 0.01
+    """The same for an arm that takes positions."""
+    moved_rad: float = 2e-4
+    drift_rad: float = 0.05
+    press_n: float = 10.0
+
+
+TOUCH: Final = RobotTouches()
 CEASED = (RobotStatus.CAUSE_COMMAND_EXPIRED, RobotStatus.CAUSE_COMMANDER_LOST)
 
 
@@ -110,7 +120,7 @@ def _joints(rig: Rig, arm: Arm, received: list[ReceivedMessage]) -> None:
     inside = bool(np.all((q >= arm.lower_rad) & (q <= arm.upper_rad)))
     limits = f"{np.rad2deg(arm.lower_rad).round()} to {np.rad2deg(arm.upper_rad).round()} deg"
     rig.expect("joints within their limits", inside, limits, np.rad2deg(q[-1]).round(1))
-    rig.below("holds still without commands", np.max(np.abs(q[-1] - q[0])), DRIFT_RAD, "rad in 0.5 s")
+    rig.below("holds still without commands", np.max(np.abs(q[-1] - q[0])), TOUCH.drift_rad, "rad in 0.5 s")
 
 
 def _description(rig: Rig) -> None:
@@ -126,7 +136,7 @@ def _gravity(rig: Rig) -> None:
     moved = rig.run(0.4, commanding(rig, _still(rig)))["joint_states"]
     _expect_mode(rig, "obeys commands", RobotStatus.MODE_ACTIVE)
     drift = np.max(np.abs(moved[-1].message.position - moved[0].message.position)) if moved else np.inf
-    rig.below("stays where it is when commanded nothing else: commands exclude gravity", drift, DRIFT_RAD, "rad in 0.4 s")
+    rig.below("stays where it is when commanded nothing else: commands exclude gravity", drift, TOUCH.drift_rad, "rad in 0.4 s")
 
 
 def _signs(rig: Rig) -> None:
@@ -137,11 +147,13 @@ def _signs(rig: Rig) -> None:
     for joint, name in enumerate(arm.joint_names):
         release(rig)
         push = _still(rig)
-        push[joint] = PUSH_RAD if _positions(rig) else PUSH_FRACTION * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
-        received = rig.run(PUSH_S, commanding(rig, push))["joint_states"]
+        push[joint] = (
+            TOUCH.push_rad if _positions(rig) else TOUCH.push_fraction * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
+        )
+        received = rig.run(TOUCH.push_s, commanding(rig, push))["joint_states"]
         settle(rig)
         q = np.array([item.message.position[joint] for item in received])
-        if len(q) < 10 or q[-5:].mean() - q[:5].mean() < MOVED_RAD:
+        if len(q) < 10 or q[-5:].mean() - q[:5].mean() < TOUCH.moved_rad:
             wrong.append(name)
         if not any(abs(item.message.effort[joint] - push[joint]) < 0.2 * push[joint] for item in received):
             unreported.append(name)
@@ -243,12 +255,12 @@ def _force(rig: Rig) -> None:
     _activate(rig)
     rig.run(0.4, quiet(rig))
     before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
-    force_W = np.array([0.0, 0.0, PRESS_N])
+    force_W = np.array([0.0, 0.0, TOUCH.press_n])
     pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
     R_WI = rotation(rig.last("sim/tool_state").pose.orientation)
     off = np.linalg.norm(pressed - before - R_WI.T @ force_W)
     rig.run(0.3, quiet(rig))
-    rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * PRESS_N, "N off in the sensor's axes")
+    rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * TOUCH.press_n, "N off in the sensor's axes")
 
 
 def _mean_force(received: list[ReceivedMessage]) -> Array:

@@ -5,6 +5,7 @@ Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however
 """
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Final
 
 import numpy as np
@@ -22,13 +23,22 @@ FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
 MADE: Final = ("contrast", "radius_m", "depth_m")
 """The lump itself: stiffness relative to its surroundings, radius, depth."""
 LOGARITHMIC: Final = ("felt_contrast", "contrast")
-GREATEST_LAPSE: Final = 0.25
-PRIOR_SD: Final = 10.0
-"""Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all, the
-likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+
+
+@dataclass(frozen=True)
+class DetectabilityTuning:
+    """Settings of the fit."""
+
+    greatest_lapse: float = 0.25
+    prior_sd: float = 10.0
+    """Standard deviation of the weak normal prior on every standardised slope: if found and missed lumps do not overlap at all,
+    the likelihood alone has no maximum (Gelman et al., Ann Appl Stat 2008;2:1360)."""
+    fewest: int = 10
+    """Least numbers of found and of missed lumps for a fit."""
+
+
+FIT: Final = DetectabilityTuning()
 QUARTILES: Final = (0.25, 0.5, 0.75)
-FEWEST: Final = 10
-"""Least numbers of found and of missed lumps for a fit."""
 
 
 class Surface(Row, allow_inf_nan=False):
@@ -112,11 +122,11 @@ class Surface(Row, allow_inf_nan=False):
 
 
 def surface(variant: Variant, names: Sequence[str], bootstrap: Bootstrap) -> Surface | None:
-    """Return the surface of one method; None with fewer than FEWEST lumps found or missed, or if all lumps are equal."""
+    """Return the surface of one method; None with fewer than `FIT.fewest` lumps found or missed, or if all lumps are equal."""
     lumps = variant.lumps.dropna(subset=list(names))
     lumps = lumps[(lumps[[name for name in names if name in LOGARITHMIC]] > 0).all(axis=1)]
     found = lumps["found"].to_numpy(dtype=bool)
-    if min(found.sum(), (~found).sum()) < FEWEST:
+    if min(found.sum(), (~found).sum()) < FIT.fewest:
         return None
     varied = tuple(name for name in names if np.ptp(lumps[name].to_numpy(dtype=np.float64)) > 1e-9)
     if not varied:
@@ -157,7 +167,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
     sign = np.where(found, 1.0, -1.0)
 
     def lapse_of(free: float) -> float:
-        return GREATEST_LAPSE * float(expit(free)) if with_lapse else 0.0
+        return FIT.greatest_lapse * float(expit(free)) if with_lapse else 0.0
 
     def cost(parameters: Array) -> tuple[float, Array]:
         b, lapse = parameters[:k], lapse_of(float(parameters[k])) if with_lapse else 0.0
@@ -166,16 +176,16 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
         p = np.clip(np.where(found, hit, 1 - hit), 1e-12, None)
         slopes = np.append(0.0, b[1:])
         d_p = count * sign / p
-        gradient = -(d_p * (1 - lapse) * s * (1 - s)) @ z + slopes / PRIOR_SD**2
-        value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * PRIOR_SD**2)
+        gradient = -(d_p * (1 - lapse) * s * (1 - s)) @ z + slopes / FIT.prior_sd**2
+        value = -float(count @ np.log(p)) + float(slopes @ slopes) / (2 * FIT.prior_sd**2)
         if not with_lapse:
             return value, gradient
-        d_lapse = float(d_p @ s) * lapse * (1 - lapse / GREATEST_LAPSE)
+        d_lapse = float(d_p @ s) * lapse * (1 - lapse / FIT.greatest_lapse)
         return value, np.append(gradient, d_lapse)
 
     begin = np.zeros(k) if start is None else start[:k]
     if with_lapse:
-        share = 0.1 if start is None else np.clip(start[k] / GREATEST_LAPSE, 0.02, 0.98)
+        share = 0.1 if start is None else np.clip(start[k] / FIT.greatest_lapse, 0.02, 0.98)
         begin = np.append(begin, logit(share))
     done = minimize(cost, begin, jac=True, method="L-BFGS-B")
     lapse = lapse_of(float(done.x[k])) if with_lapse else 0.0

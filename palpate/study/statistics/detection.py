@@ -12,7 +12,19 @@ from statsmodels.stats.rates import confint_poisson
 from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate, percentiles, wilson
 from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
-SURE: Final = 0.5
+
+@dataclass(frozen=True)
+class DetectionTuning:
+    """Thresholds of the counts, and the length of the curve."""
+
+    sure: float = 0.5
+    shown: int = 200
+    """Points of the curve that are kept for its plot."""
+    wide_m: float = 0.015
+    """Felt radius from which a lump also counts as large."""
+
+
+COUNTED: Final = DetectionTuning()
 
 
 class Rates(Row):
@@ -37,7 +49,7 @@ class Rates(Row):
     false_findings_of_healthy: Estimate
     """Per examination of a person without a lump."""
     sure_on_structures: Estimate | None = None
-    """Share of persons without a lump who had a finding on a structure of the wall with a confidence above SURE."""
+    """Share of persons without a lump who had a finding on a structure of the wall with a confidence above `COUNTED.sure`."""
 
 
 def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
@@ -45,7 +57,7 @@ def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
     cases = variant.cases
     ill, healthy = cases[cases["ill"]], cases[cases["healthy"]]
     findings = variant.findings
-    sure = findings[findings["reported"] & findings["on_structure"].eq(True) & (findings["confidence"] > SURE)]
+    sure = findings[findings["reported"] & findings["on_structure"].eq(True) & (findings["confidence"] > COUNTED.sure)]
     done = cases["status"] == "done"
     return Rates(
         completed=wilson(int((~cases["failed"]).sum()), len(cases), "patients"),
@@ -145,8 +157,6 @@ def _roc_curves(a: Array, b: Array, w_a: Array, w_b: Array) -> Array:
 
 RATES: Final = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """False findings per examination at which LUNA16 averages the sensitivity (Setio et al., Med Image Anal 2017;42:1)."""
-SHOWN: Final = 200
-"""Points of the curve that are kept for its plot."""
 
 
 @dataclass(frozen=True)
@@ -197,7 +207,7 @@ def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
     all_false, all_sensitivity = _froc_curves(marks, bootstrap, examined, lumps)
     at = np.array([np.interp(RATES, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     zero = np.max(np.where(all_false == 0, all_sensitivity, 0), axis=1)
-    shown = np.union1d(false[np.linspace(0, len(false) - 1, SHOWN).astype(int)], RATES)
+    shown = np.union1d(false[np.linspace(0, len(false) - 1, COUNTED.shown).astype(int)], RATES)
     pointwise = np.array([np.interp(shown, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     band = np.array([percentiles(column) or (np.nan, np.nan) for column in pointwise.T])
     here = np.interp(RATES, false, sensitivity)
@@ -245,8 +255,6 @@ def _froc_curves(marks: _Marks, bootstrap: Bootstrap, examined: Array, lumps: Ar
 
 CLASSES: Final = {"below 1.3": (1.0, 1.3), "1.3 to 1.5": (1.3, 1.5), "1.5 to 2": (1.5, 2.0), "2 and more": (2.0, np.inf)}
 """Felt contrasts; a soft lump counts by its inverse."""
-WIDE_M: Final = 0.015
-"""Felt radius from which a lump also counts as large."""
 
 
 class ContrastRow(Row):
@@ -274,7 +282,7 @@ def by_contrast(variant: Variant, bootstrap: Bootstrap) -> dict[str, ContrastRow
         curve = roc(variant.only(np.union1d(patients, healthy).astype(np.intp)), bootstrap)
         rows[name] = ContrastRow(
             found=_found(own, bootstrap),
-            found_wide=_found(own[own["felt_radius_m"] >= WIDE_M], bootstrap),
+            found_wide=_found(own[own["felt_radius_m"] >= COUNTED.wide_m], bootstrap),
             auc=None if curve is None else curve.auc,
         )
     return rows

@@ -36,23 +36,31 @@ from palpate_models.numerics.frames import Array
 Arrays = tuple[Array, ...]
 
 # Read by compiled functions, which take no dataclass.
-POSITION_CLIP_M = 0.1
-"""Largest position error that loads the spring, per axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use similar values)."""
-ROTATION_CLIP_RAD = 0.5
-NULL_TORQUE_NM = 5.0
-"""Limit of the null-space torque per joint."""
-JOINT_DAMPING_RATIO = 0.7
-"""Damping ratio of the joint springs in mode JOINT and of the null-space posture [1]."""
-STICTION_SPEED_RADPS = 0.02
-"""Joint speed at which half of the Coulomb friction is compensated. Keeps the compensation smooth."""
-LEAST_DAMPING = 0.1
-"""Fraction of the designed damping that is always commanded [1]: the friction estimate is poor."""
-REGULARISATION = 1e-7
-"""Added to the diagonal of a task mobility [1/kg, 1/(kg m^2)], which loses rank where the arm is singular."""
-SLOW_S = 0.1
-"""T: time scale on which friction and inertia matter equally. Postures and scans move this slowly or slower."""
-SPRING_ANGLE_RAD = 0.3
-"""Largest undamped spring frequency times the dead time. Above it sampled damping adds energy."""
+
+
+class LawTuning(NamedTuple):
+    """Settings of the compiled law, which takes no dataclass."""
+
+    position_clip_m: float = 0.1
+    """Largest position error that loads the spring, per axis (Mayr and Salt-Ducaju, JOSS 05194, and CRISP use similar values)."""
+    rotation_clip_rad: float = 0.5
+    null_torque_nm: float = 5.0
+    """Limit of the null-space torque per joint."""
+    joint_damping_ratio: float = 0.7
+    """Damping ratio of the joint springs in mode JOINT and of the null-space posture [1]."""
+    stiction_speed_radps: float = 0.02
+    """Joint speed at which half of the Coulomb friction is compensated. Keeps the compensation smooth."""
+    least_damping: float = 0.1
+    """Fraction of the designed damping that is always commanded [1]: the friction estimate is poor."""
+    regularisation: float = 1e-7
+    """Added to the diagonal of a task mobility [1/kg, 1/(kg m^2)], which loses rank where the arm is singular."""
+    slow_s: float = 0.1
+    """T: time scale on which friction and inertia matter equally. Postures and scans move this slowly or slower."""
+    spring_angle_rad: float = 0.3
+    """Largest undamped spring frequency times the dead time. Above it sampled damping adds energy."""
+
+
+LAW = LawTuning()
 
 
 @dataclass(frozen=True)
@@ -176,15 +184,15 @@ def cartesian_torque(
     K, B, K_0, B_0, J_bar = gains
     viscous, coulomb, velocity_limit = friction[0], friction[1], friction[2]
 
-    p_error = clip(R_WD.T @ (p_WD - p_WI), POSITION_CLIP_M)
-    R_error = clip(-phi, ROTATION_CLIP_RAD)
+    p_error = clip(R_WD.T @ (p_WD - p_WI), LAW.position_clip_m)
+    R_error = clip(-phi, LAW.rotation_clip_rad)
     V_error = to_axes(R_WD.T, V_WD - J @ qd)
     spring = np.concatenate((K[:3] * p_error, Jlog @ (K[3:] * R_error)))  # gradient of 1/2 phi' K phi
     force = to_axes(R_WD, spring + B * V_error) + F_W
 
     tau_0 = K_0 * (q_0 - q) + B_0 * (qd_0 - qd)
     null = tau_0 - J.T @ (J_bar.T @ tau_0)
-    null *= NULL_TORQUE_NM / max(NULL_TORQUE_NM, np.abs(null).max())  # scaled as a whole: stays in the null space
+    null *= LAW.null_torque_nm / max(LAW.null_torque_nm, np.abs(null).max())  # scaled as a whole: stays in the null space
 
     qd_d = clip(qd_0 + J_bar @ (V_WD - J @ qd_0), velocity_limit)
     torque[:] = J.T @ force + null + (bias - gravity) + friction_torque(qd_d, viscous, coulomb)
@@ -199,7 +207,7 @@ def clip(x: Array, bound: Array | float) -> Array:
 @compiled
 def friction_torque(qd: Array, viscous: Array, coulomb: Array) -> Array:
     """Return the torque that compensates joint friction at desired velocities `qd` [rad/s], [N m], shape (n,)."""
-    return (viscous + coulomb / (np.abs(qd) + STICTION_SPEED_RADPS)) * qd
+    return (viscous + coulomb / (np.abs(qd) + LAW.stiction_speed_radps)) * qd
 
 
 @compiled
@@ -223,18 +231,18 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     stiffness, damping_ratio, K_0 = requested
     turn = np.kron(np.eye(2), R_WD.T)  # twist or wrench from world axes to axes of D
     J = turn @ J_W
-    M_inverse, W = np.linalg.inv(M), np.linalg.inv(M + SLOW_S * np.diag(D))
+    M_inverse, W = np.linalg.inv(M), np.linalg.inv(M + LAW.slow_s * np.diag(D))
     mobility = J @ M_inverse @ J.T
-    inertia = np.diag(np.linalg.inv(mobility + REGULARISATION * np.eye(6)))
-    slow_inertia = np.linalg.inv(J @ W @ J.T + REGULARISATION * np.eye(6))
-    friction = (np.diag(slow_inertia) - inertia) / SLOW_S
+    inertia = np.diag(np.linalg.inv(mobility + LAW.regularisation * np.eye(6)))
+    slow_inertia = np.linalg.inv(J @ W @ J.T + LAW.regularisation * np.eye(6))
+    friction = (np.diag(slow_inertia) - inertia) / LAW.slow_s
     # Near a singularity the inertia with the other axes held grows without bound; four times the free inertia is enough.
     mass = np.minimum(inertia, 4 / np.diag(mobility))
-    K = np.minimum(stiffness, np.maximum((SPRING_ANGLE_RAD / dead_time) ** 2 * mass, friction / (4 * dead_time)))
+    K = np.minimum(stiffness, np.maximum((LAW.spring_angle_rad / dead_time) ** 2 * mass, friction / (4 * dead_time)))
     B = 2 * damping_ratio * np.sqrt(K * mass)
-    B_0 = 2 * JOINT_DAMPING_RATIO * np.sqrt(K_0 / np.diag(M_inverse))
+    B_0 = 2 * LAW.joint_damping_ratio * np.sqrt(K_0 / np.diag(M_inverse))
     J_bar = W @ J.T @ slow_inertia @ turn
-    return CartesianGains(K, np.maximum(B - friction, LEAST_DAMPING * B), K_0, B_0, J_bar)
+    return CartesianGains(K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar)
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
@@ -244,6 +252,6 @@ def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: 
     squared, V = np.linalg.eigh((L_inverse * stiffness) @ L_inverse.T)
     P, P_inverse = L @ V, V.T @ L_inverse
     friction = P_inverse**2 @ viscous_friction
-    squared = np.clip(squared, 0.0, np.maximum((SPRING_ANGLE_RAD / dead_time) ** 2, friction / (4 * dead_time)))
-    damping = 2 * JOINT_DAMPING_RATIO * np.sqrt(squared)
-    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LEAST_DAMPING * damping)) @ P.T)
+    squared = np.clip(squared, 0.0, np.maximum((LAW.spring_angle_rad / dead_time) ** 2, friction / (4 * dead_time)))
+    damping = 2 * LAW.joint_damping_ratio * np.sqrt(squared)
+    return JointGains((P * squared) @ P.T, (P * np.maximum(damping - friction, LAW.least_damping * damping)) @ P.T)

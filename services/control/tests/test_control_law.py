@@ -66,7 +66,7 @@ def test_position_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
         ref.setpoint.stiffness[:] = np.array([2000.0, 2000.0, 500.0, 0, 0, 0])
     once, twice = unlimited.command(q, REST, far), unlimited.command(q, REST, farther)
     np.testing.assert_allclose(once, twice, atol=1e-9)
-    np.testing.assert_allclose(once, arm.J_W[2] * 500 * impedance.POSITION_CLIP_M, atol=1e-9)
+    np.testing.assert_allclose(once, arm.J_W[2] * 500 * impedance.LAW.position_clip_m, atol=1e-9)
 
 
 def test_rotation_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController) -> None:
@@ -75,7 +75,7 @@ def test_rotation_error_is_clipped(arm: ArmModel, unlimited: ImpedanceController
     axis = arm.R_WI[:, 0]
     ref = offset(arm, q, np.concatenate((np.zeros(3), 2.0 * axis)))
     np.testing.assert_allclose(
-        unlimited.command(q, REST, ref), arm.J_W[3:].T @ axis * 200 * impedance.ROTATION_CLIP_RAD, atol=1e-8
+        unlimited.command(q, REST, ref), arm.J_W[3:].T @ axis * 200 * impedance.LAW.rotation_clip_rad, atol=1e-8
     )
 
 
@@ -84,10 +84,10 @@ def test_null_space_torque_does_not_move_the_indenter(arm: ArmModel, unlimited: 
     posture = q + np.array([0.3, -0.2, 0.5, 0.1, -0.4, 0.2, 0.3])
     ref = reference(setpoint(arm, q, **{"q": posture, "joint_stiffness": np.full(7, 50.0)}))
     torque = unlimited.command(q, REST, ref)
-    assert np.abs(torque).max() == pytest.approx(impedance.NULL_TORQUE_NM)
-    to_task = arm.J_W @ np.linalg.inv(arm.inertia(q) + impedance.SLOW_S * np.diag(arm.viscous_friction))
-    regularised = np.linalg.inv(to_task @ arm.J_W.T + impedance.REGULARISATION * np.eye(6))
-    left = impedance.REGULARISATION * regularised @ to_task @ (50.0 * (posture - q))  # what the regularisation leaves of it
+    assert np.abs(torque).max() == pytest.approx(impedance.LAW.null_torque_nm)
+    to_task = arm.J_W @ np.linalg.inv(arm.inertia(q) + impedance.LAW.slow_s * np.diag(arm.viscous_friction))
+    regularised = np.linalg.inv(to_task @ arm.J_W.T + impedance.LAW.regularisation * np.eye(6))
+    left = impedance.LAW.regularisation * regularised @ to_task @ (50.0 * (posture - q))  # what the regularisation leaves of it
     assert np.linalg.norm(to_task @ torque) <= np.linalg.norm(left)  # less, as the torque is scaled to its cap
 
 
@@ -157,17 +157,17 @@ def test_the_cartesian_law_is_that_of_its_description(arm: ArmModel, unlimited: 
     asked = setpoint(arm, q, V_WD=twist, qd=qd_0, q=q + 0.01 * rng.normal(size=7), stiffness=np.array([200.0] * 3 + [20.0] * 3))
     torque = unlimited.command(q, qd, reference(asked))
     M, D, J, X = arm.inertia(q), np.diag(arm.viscous_friction), arm.J_W, np.kron(np.eye(2), asked.R_WD.T)
-    W = np.linalg.inv(M + impedance.SLOW_S * D)
+    W = np.linalg.inv(M + impedance.LAW.slow_s * D)
     J_bar = W @ J.T @ np.linalg.inv(J @ W @ J.T)
     m = np.diag(np.linalg.inv(X @ J @ np.linalg.inv(M) @ J.T @ X.T))
-    b = (np.diag(np.linalg.inv(X @ J @ W @ J.T @ X.T)) - m) / impedance.SLOW_S
+    b = (np.diag(np.linalg.inv(X @ J @ W @ J.T @ X.T)) - m) / impedance.LAW.slow_s
     m = np.minimum(m, 4 / np.diag(X @ J @ np.linalg.inv(M) @ J.T @ X.T))
     designed = 2 * asked.damping_ratio * np.sqrt(asked.stiffness * m)
-    B = np.maximum(designed - b, impedance.LEAST_DAMPING * designed)
-    B_0 = 2 * impedance.JOINT_DAMPING_RATIO * np.sqrt(asked.joint_stiffness / np.diag(np.linalg.inv(M)))
+    B = np.maximum(designed - b, impedance.LAW.least_damping * designed)
+    B_0 = 2 * impedance.LAW.joint_damping_ratio * np.sqrt(asked.joint_stiffness / np.diag(np.linalg.inv(M)))
     tau_0 = asked.joint_stiffness * (asked.q - q) + B_0 * (qd_0 - qd)
     qd_d = qd_0 + J_bar @ (twist - J @ qd_0)
-    friction = D @ qd_d + arm.coulomb_friction * qd_d / (np.abs(qd_d) + impedance.STICTION_SPEED_RADPS)
+    friction = D @ qd_d + arm.coulomb_friction * qd_d / (np.abs(qd_d) + impedance.LAW.stiction_speed_radps)
     F = X.T @ (B * (X @ (twist - J @ qd)))
     expected = J.T @ F + (np.eye(7) - J.T @ J_bar.T) @ tau_0 + arm.coriolis + friction
     np.testing.assert_allclose(torque, expected, rtol=1e-4, atol=1e-4)

@@ -19,7 +19,7 @@ from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.robot.arm import capsules
 from palpate_models.robot.kinematics import link_transforms
-from palpate_models.robot.table import TABLE_TOP_M
+from palpate_models.robot.table import TABLE
 from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall
 from palpate_perception.cloud import Image, Intrinsics, RegionBox
@@ -125,7 +125,7 @@ class CameraDrift:
         pixel, depth, noise = steady(frames)
         r_W = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel] @ camera.X_WC[:3, :3].T
         height = camera.X_WC[2, 3] + depth * r_W[:, 2]
-        table = np.abs(height - TABLE_TOP_M) < DRIFT.table_distance_m
+        table = np.abs(height - TABLE.top_m) < DRIFT.table_distance_m
         table[table] &= noise[table] < WALL_FIT.edge_noise * np.median(noise[table]) if table.any() else False
         self.pixel: NDArray[np.intp] = pixel[table]
         """Flat indices of the pixels that show the table, shape (n,)."""

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.robot.table import TABLE_TOP_M
+from palpate_models.robot.table import TABLE
 from palpate_models.scenario.patterns import scan_of, stations
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface, visibility
@@ -123,7 +123,7 @@ class Pipeline:
         organised = cloud.deproject(depth, camera.K, origin)
         points = cloud.to_world(organised, np.asarray(fused.sigma, np.float64), camera.X_WC)  # step 1
         points = cloud.remove_invalid(points)  # step 2
-        points = cloud.crop(points, self._X_WA, self._box, TABLE_TOP_M + CROP.table_clearance_m)  # step 3
+        points = cloud.crop(points, self._X_WA, self._box, TABLE.top_m + CROP.table_clearance_m)  # step 3
         points = cloud.main_sheet(points, depth, self._region.holds(apply(self._X_AW, points.p_W)))
         p_A = apply(self._X_AW, points.p_W)
 

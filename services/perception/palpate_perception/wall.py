@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, map_coordinates
 
 from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.robot.table import TABLE_TOP_M
+from palpate_models.robot.table import TABLE
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud, surface
 from palpate_perception.cloud import CROP, Image, Intrinsics, RegionBox
@@ -138,7 +138,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
     p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
     box = watched(exam)
-    keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE_TOP_M + CROP.table_clearance_m)
+    keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE.top_m + CROP.table_clearance_m)
     keep[keep] &= sigma[keep] < WALL_FIT.edge_noise * np.median(sigma[keep]) if keep.any() else False
     if np.count_nonzero(keep) < WALL_FIT.least_pixels:
         raise WallNotVisibleError(

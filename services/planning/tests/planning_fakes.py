@@ -9,7 +9,7 @@ from palpate_bus.contract import contract
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import FT_TO_INDENTER_M
+from palpate_models.robot.arm import TOOL
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
@@ -144,7 +144,7 @@ class World:
         """One planning period."""
         X_WI, R_WS = self.kinematics.poses(self.q)
         contact = R_WS.T @ self._touch(X_WI)
-        arm = np.array((0.0, 0.0, FT_TO_INDENTER_M))
+        arm = np.array((0.0, 0.0, TOOL.ft_to_indenter_m))
         qd = (self.q - self._q_before) / PERIOD_S
         velocity = (self.kinematics.jacobian(self.q) @ qd)[:3]
         inertia = R_WS.T @ (self.weight.mass * (velocity - self._velocity) / PERIOD_S)

@@ -127,10 +127,10 @@ def test_bad_arguments_are_named(changes: dict[str, np.ndarray], named: str) -> 
 
 
 def test_default_base_serves_the_default_scan() -> None:
-    from palpate.arm.placement import RAISED_M, scan_targets
+    from palpate.arm.placement import PLACEMENT, scan_targets
 
     scenario = Scenario()
-    for raised in (0.0, RAISED_M):
+    for raised in (0.0, PLACEMENT.raised_m):
         positions, normals = scan_targets(scenario, scenario.exam.spacing_m, raised=raised)
         postures = plan_redundancy(scenario.robot, positions, normals, np.array(HOME))
         assert postures.reachable.all()

@@ -7,7 +7,7 @@ message encoding `cdr`, schema encoding `ros2msg`; see MCAP's well-known profile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Any, Final
 
 import yaml
 from mcap.writer import CompressionType, Writer
@@ -15,12 +15,20 @@ from mcap.writer import CompressionType, Writer
 from palpate_bus.contract import MS
 from palpate_bus.settings import KEPT_EVERY
 
-CHUNK_BYTES = 4 * 1024 * 1024
-"""Largest size of a chunk, which bounds the memory."""
-FLUSH_NS = 1_000_000_000
-"""Simulated time after which a chunk goes to disk [ns]."""
-FILE_BYTES = 1 << 30
-"""Size at which a file is completed and the next one begun; a crash does not affect a completed file."""
+
+@dataclass(frozen=True)
+class BagSizes:
+    """Sizes of chunks and files."""
+
+    chunk_bytes: int = 4 * 1024 * 1024
+    """Largest size of a chunk, which bounds the memory."""
+    flush_ns: int = 1_000_000_000
+    """Simulated time after which a chunk goes to disk [ns]."""
+    file_bytes: int = 1 << 30
+    """Size at which a file is completed and the next one begun; a crash does not affect a completed file."""
+
+
+SIZES: Final = BagSizes()
 
 _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 """RMW_DURATION_INFINITE, as rosbag2 writes it."""
@@ -110,7 +118,7 @@ def _extent(first: int | None, last: int, messages: int) -> dict[str, Any]:
 class BagWriter:
     """Writes CDR messages into a rosbag2 folder. An old recording in the folder is replaced.
 
-    Messages are collected in a chunk, which goes to disk when it spans `FLUSH_NS` or has `CHUNK_BYTES`,
+    Messages are collected in a chunk, which goes to disk when it spans `SIZES.flush_ns` or has `SIZES.chunk_bytes`,
     so that a crash loses at most that span: an MCAP file is readable up to its last complete chunk.
     Not safe for use from several threads at once.
     """
@@ -121,7 +129,7 @@ class BagWriter:
         channels: Iterable[Channel],
         *,
         run: str = "",
-        file_bytes: int = FILE_BYTES,
+        file_bytes: int = SIZES.file_bytes,
         compression: CompressionType = CompressionType.ZSTD,
     ) -> None:
         """Open `folder` (created, parents included) for `channels` of the run called `run`.
@@ -154,7 +162,7 @@ class BagWriter:
         self._stream = file.path.open("wb")  # if this fails, the earlier files are the recording
         self._file = file
         self._files.append(file)
-        self._writer = Writer(self._stream, chunk_size=CHUNK_BYTES, compression=self._compression)
+        self._writer = Writer(self._stream, chunk_size=SIZES.chunk_bytes, compression=self._compression)
         self._writer.start(profile="ros2", library="palpate-recorder")
         self._writer.add_metadata("palpate", {"run": self._run})
         self._ids = self._register()
@@ -189,10 +197,10 @@ class BagWriter:
         count.bytes += len(payload)
         self._file.take(stamp)
         if self._flush_at is None:
-            self._flush_at = stamp + FLUSH_NS
+            self._flush_at = stamp + SIZES.flush_ns
         elif stamp >= self._flush_at:
             self.flush()
-            self._flush_at = stamp + FLUSH_NS
+            self._flush_at = stamp + SIZES.flush_ns
             if self._stream.tell() >= self._file_bytes:
                 self._end_file()
                 self._begin_file()

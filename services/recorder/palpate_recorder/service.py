@@ -17,7 +17,7 @@ from palpate_bus.runs.run_folder import run_of
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import RECORDING, Settings
 from palpate_models.scenario.schema import Scenario
-from palpate_recorder.bag import FILE_BYTES, BagWriter, Channel
+from palpate_recorder.bag import SIZES, BagWriter, Channel
 
 log = logging.getLogger(__name__)
 
@@ -49,7 +49,7 @@ class RecorderService(Service):
 
     role = "recorder"
 
-    def __init__(self, folder: Path, file_bytes: int = FILE_BYTES, *, full: bool = True) -> None:
+    def __init__(self, folder: Path, file_bytes: int = SIZES.file_bytes, *, full: bool = True) -> None:
         """Open the recording, in files of about `file_bytes`, `full` or thinned by the contract's `record_ms`.
 
         Raises OSError if the folder cannot be written.
@@ -134,4 +134,6 @@ def create(scenario: Scenario) -> RecorderService:
     settings = Settings.read()
     out = settings.required("out", f"the recorder writes to $PALPATE_OUT/{RECORDING}, so give it the run's folder")
     size = settings.record_file_mb
-    return RecorderService(out / RECORDING, FILE_BYTES if size is None else size * 1_000_000, full=settings.record == "full")
+    return RecorderService(
+        out / RECORDING, SIZES.file_bytes if size is None else size * 1_000_000, full=settings.record == "full"
+    )

@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from palpate_models.numerics.frames import GRAVITY
 from palpate_models.robot import arm as robot_arm
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import FT_TO_INDENTER_M, link_names, urdf
+from palpate_models.robot.arm import TOOL, link_names, urdf
 from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart.plant import CLEARANCE, DartPlant
@@ -196,7 +196,7 @@ def test_moving_tool_reads_weight_contact_and_inertia() -> None:
     data = model.createData()
     frame = model.getFrameId("ft_sensor")
     inertias = robot_arm.inertias(ROBOT)
-    X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, FT_TO_INDENTER_M]))
+    X_SI = pin.SE3(np.eye(3), np.array([0.0, 0.0, TOOL.ft_to_indenter_m]))
     spatial = {
         link: pin.Inertia(i.mass, np.array(i.com), np.diag(i.diagonal))
         for link, i in inertias.items()

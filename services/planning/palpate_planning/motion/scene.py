@@ -98,7 +98,7 @@ class CollisionScene:
         arm, links = self._add_arm(robot), link_names(robot)
         obstacles = [(box.name, self._add(box.name, 0, pin.SE3(box.X_WB), coal.Box(*box.size))) for box in table.boxes(robot)]
         if abdomen is not None:
-            vertices, triangles = with_skirt(*abdomen, table.TABLE_TOP_M)
+            vertices, triangles = with_skirt(*abdomen, table.TABLE.top_m)
             obstacles.append(("abdomen", self._add("abdomen", 0, pin.SE3.Identity(), mesh_geometry(vertices, triangles))))
         for k, (link, shape) in enumerate(arm):
             for other, other_shape in arm[:k]:

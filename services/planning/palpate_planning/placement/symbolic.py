@@ -12,7 +12,7 @@ import numpy as np
 
 from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, inertias
+from palpate_models.robot.arm import TOOL, arm_of, inertias
 from palpate_models.scenario.schema import Robot
 
 ELBOW_CLEARANCE_M = 0.15
@@ -94,7 +94,7 @@ def arm(robot: Robot) -> ArmFunctions:
         link = loads[i + 1]
         energy += link.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(link.com)))[2]
     p = p + ca.mtimes(R[:, :2], ca.DM(model.flange_m[:2])) if model.flange_m[:2].any() else p
-    for load, offset in zip(loads[-3:], (model.flange_m[2], FLANGE_TO_FT_M, FT_TO_INDENTER_M), strict=True):
+    for load, offset in zip(loads[-3:], (model.flange_m[2], TOOL.flange_to_ft_m, TOOL.ft_to_indenter_m), strict=True):
         p = p + R[:, 2] * offset
         energy += load.mass * GRAVITY * (p + ca.mtimes(R, ca.DM(load.com)))[2]
 

@@ -6,7 +6,8 @@ the single-point functions are compiled; the values are equal.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from dataclasses import dataclass
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
@@ -72,15 +73,22 @@ def _basis(knots: Array, x: float) -> tuple[int, Array]:
     return i - DEGREE, values
 
 
-GRID_M = 0.004
-"""Spacing of the spline grid; finer than the perceived detail."""
-ITERATIONS = 4
-"""Largest number of iterations in the search for the foot of a perpendicular."""
-CONVERGED_M = 1e-6
-STRIDE_M = 0.02
-"""Largest motion of the foot in one iteration."""
-STEEPEST = 10.0
-"""Largest slope (84 degrees) that a height field represents."""
+@dataclass(frozen=True)
+class FieldTuning:
+    """Settings of the height field."""
+
+    grid_m: float = 0.004
+    """Spacing of the spline grid; finer than the perceived detail."""
+    steepest: float = 10.0
+    """Largest slope (84 degrees) that a height field represents."""
+    iterations: int = 4
+    """Largest number of iterations in the search for the foot of a perpendicular."""
+    converged_m: float = 1e-6
+    stride_m: float = 0.02
+    """Largest motion of the foot in one iteration."""
+
+
+FIELD: Final = FieldTuning()
 
 
 class BicubicField:
@@ -141,15 +149,15 @@ class PerceivedSurface:
         p_A = apply(inverse(X_WA), np.asarray(vertices_W, dtype=float))
         xy = p_A[:, :2]
         low, high = xy.min(axis=0), xy.max(axis=0)
-        if np.any(high - low < 4 * GRID_M):
-            raise ValueError(f"perceived surface spans {high - low} m, at least {4 * GRID_M} m are needed each way")
-        counts = [max(8, round(float(extent) / GRID_M) + 1) for extent in high - low]
+        if np.any(high - low < 4 * FIELD.grid_m):
+            raise ValueError(f"perceived surface spans {high - low} m, at least {4 * FIELD.grid_m} m are needed each way")
+        counts = [max(8, round(float(extent) / FIELD.grid_m) + 1) for extent in high - low]
         axes = [np.linspace(low[k], high[k], counts[k]) for k in (0, 1)]
         grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
         columns = [p_A[:, 2]]
         if normals_W is not None and len(normals_W):
             n_A = np.asarray(normals_W, dtype=float) @ X_WA[:3, :3]
-            up = np.maximum(n_A[:, 2], 1.0 / STEEPEST)
+            up = np.maximum(n_A[:, 2], 1.0 / FIELD.steepest)
             columns += [-n_A[:, 0] / up, -n_A[:, 1] / up]
         heights = len(columns)
         if breathing is not None and len(breathing):
@@ -212,7 +220,7 @@ def foot(field: BicubicSpline, X_WA: Array, c_W: Array) -> tuple[Array, Array, f
     c_A = (c_W - p_WA) @ R_WA
     xy_A = c_A[:2]
     p_A, n_A, distance = c_A, c_A, 0.0
-    for _ in range(ITERATIONS):
+    for _ in range(FIELD.iterations):
         height, slope_x, slope_y = bicubic_at(field, xy_A[0], xy_A[1])
         p_A = np.array((xy_A[0], xy_A[1], height))
         n_A = np.array((-slope_x, -slope_y, 1.0)) / np.sqrt(1.0 + slope_x**2 + slope_y**2)
@@ -220,7 +228,7 @@ def foot(field: BicubicSpline, X_WA: Array, c_W: Array) -> tuple[Array, Array, f
         distance = gap @ n_A
         slide = (gap - distance * n_A)[:2]
         size = np.abs(slide).max()
-        if size < CONVERGED_M:
+        if size < FIELD.converged_m:
             break
-        xy_A = xy_A + min(1.0, STRIDE_M / size) * slide
+        xy_A = xy_A + min(1.0, FIELD.stride_m / size) * slide
     return R_WA @ p_A + p_WA, R_WA @ n_A, distance, p_A[:2]

@@ -9,7 +9,7 @@ in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,16 +22,23 @@ from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
 from palpate_search.presses import Budget, press_duration
 
-_BINS = 64
-_BIN = 0.25
-"""Bin width in SDs: hypotheses in one bin are merged to one Gaussian."""
-_NODES = 41
-_REACH = 4.0
-"""Margin of the grid around the mixture in SDs."""
-_RARE = 2e-5
-"""Less probable hypotheses count as no lump."""
-_SAME = 0.02
-"""Hypotheses that shift the observation by fewer SDs count as no lump."""
+
+class InformationGrid(NamedTuple):
+    """Sums by which compiled code replaces the integrals over an observation."""
+
+    bins: int = 64
+    bin_sd: float = 0.25
+    """Bin width: hypotheses in one bin are merged to one Gaussian."""
+    nodes: int = 41
+    reach_sd: float = 4.0
+    """Margin of the grid around the mixture."""
+    rare: float = 2e-5
+    """Less probable hypotheses count as no lump."""
+    same_sd: float = 0.02
+    """Hypotheses that shift the observation by less count as no lump."""
+
+
+GRID = InformationGrid()
 
 
 @compiled
@@ -43,22 +50,22 @@ def information(unexplained: Array, contrast: Array, contrast_variance: Array, p
     """
     places, hypotheses = unexplained.shape
     out = np.zeros(places)
-    weight, first, second = np.empty(_BINS + 1), np.empty(_BINS + 1), np.empty(_BINS + 1)
+    weight, first, second = np.empty(GRID.bins + 1), np.empty(GRID.bins + 1), np.empty(GRID.bins + 1)
     for i in range(places):
         sd, low, high = np.sqrt(variance[i]), 0.0, 0.0
         for h in range(hypotheses):
-            if probability[h] > _RARE:
+            if probability[h] > GRID.rare:
                 shift = contrast[h] * unexplained[i, h]
                 low, high = min(low, shift), max(high, shift)
-        if high - low < _SAME * sd:
+        if high - low < GRID.same_sd * sd:
             continue
-        width = max(_BIN * sd, (high - low) / (_BINS - 1) + 1e-12)
+        width = max(GRID.bin_sd * sd, (high - low) / (GRID.bins - 1) + 1e-12)
         weight[:], first[:], second[:] = 0.0, 0.0, 0.0
         given, rest = 0.0, 1.0
         for h in range(hypotheses):
             p = probability[h]
             shift = contrast[h] * unexplained[i, h]
-            if p > _RARE and abs(shift) > _SAME * sd:
+            if p > GRID.rare and abs(shift) > GRID.same_sd * sd:
                 spread = variance[i] + contrast_variance[h] * unexplained[i, h] ** 2
                 k = int((shift - low) / width)
                 weight[k] += p
@@ -66,19 +73,19 @@ def information(unexplained: Array, contrast: Array, contrast_variance: Array, p
                 second[k] += p * (shift**2 + spread)
                 given += 0.5 * p * np.log(spread)
                 rest -= p
-        weight[_BINS], first[_BINS], second[_BINS] = max(rest, 0.0), 0.0, max(rest, 0.0) * variance[i]
+        weight[GRID.bins], first[GRID.bins], second[GRID.bins] = max(rest, 0.0), 0.0, max(rest, 0.0) * variance[i]
         given += max(rest, 0.0) * np.log(sd)
         count = 0
-        for k in range(_BINS + 1):  # from sums to weight, mean and standard deviation, the empty bins left out
+        for k in range(GRID.bins + 1):  # from sums to weight, mean and standard deviation, the empty bins left out
             if weight[k] > 0.0:
                 mean = first[k] / weight[k]
                 spread = np.sqrt(max(second[k] / weight[k] - mean**2, 1e-12))
                 weight[count], first[count], second[count] = weight[k], mean, spread
-                low, high = min(low, mean - _REACH * spread), max(high, mean + _REACH * spread)
+                low, high = min(low, mean - GRID.reach_sd * spread), max(high, mean + GRID.reach_sd * spread)
                 count += 1
-        step = (high - low) / (_NODES - 1)
+        step = (high - low) / (GRID.nodes - 1)
         entropy = 0.0
-        for node in range(_NODES):
+        for node in range(GRID.nodes):
             y, density = low + node * step, 0.0
             for k in range(count):
                 density += weight[k] / (np.sqrt(2 * np.pi) * second[k]) * np.exp(-0.5 * ((y - first[k]) / second[k]) ** 2)

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose, capsules, inertias, link_names, mounted
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, capsules, inertias, link_names, mounted
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
@@ -83,8 +83,8 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
     arm, drawn, X_WB = arm_of(robot), drawn or nominal(robot), base_pose(robot)
     fixed: dict[str, Any] = {
         arm.link_names[-1]: arm.flange_m,
-        "ft_sensor": (0.0, 0.0, FLANGE_TO_FT_M),
-        "indenter": (0.0, 0.0, FT_TO_INDENTER_M),
+        "ft_sensor": (0.0, 0.0, TOOL.flange_to_ft_m),
+        "indenter": (0.0, 0.0, TOOL.ft_to_indenter_m),
     }
     spec = mujoco.MjSpec()
     spec.compiler.degree = False

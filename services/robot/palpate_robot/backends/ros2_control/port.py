@@ -9,7 +9,7 @@ from palpate_bus.messages.geometry import pose_message
 from palpate_bus.messages.stamps import header
 from palpate_errors import UserError
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import FT_TO_INDENTER_M, arm_of
+from palpate_models.robot.arm import TOOL, arm_of
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.arm_port import ArmPort, ZenohArmPort
@@ -33,7 +33,7 @@ class StackStatus(NamedTuple):
 def tool_load(mass_kg: float, up_S: Array) -> Array:
     """Return the wrench of a tool's weight on the F/T sensor, in its axes, shape (6,), with the mass half-way to the indenter."""
     force = -mass_kg * GRAVITY * up_S
-    return np.concatenate((force, np.cross((0.0, 0.0, FT_TO_INDENTER_M / 2), force)))
+    return np.concatenate((force, np.cross((0.0, 0.0, TOOL.ft_to_indenter_m / 2), force)))
 
 
 class Ros2Port(ArmPort):

@@ -12,7 +12,7 @@ from palpate_models.scenario.schema import Robot
 from palpate_models.section import Section
 from palpate_robot.backends.ros2_control.rules import Stack
 
-FOLDER: Final = Path(__file__).parent / "profiles"
+FOLDER: Final = Path(__file__).with_name("profiles")
 
 
 class Profile(Section):

@@ -14,7 +14,7 @@ from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.numerics.frames import Array
-from palpate_models.robot.arm import FLANGE_TO_FT_M, FT_TO_INDENTER_M, arm_of, base_pose
+from palpate_models.robot.arm import TOOL, arm_of, base_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
@@ -80,7 +80,7 @@ class Ros2ControlService(HardwareService):
             if active and self._setpoint is not None:
                 X_WI = _pose(self._setpoint)
             X_IF = np.eye(4)
-            X_IF[2, 3] = -FLANGE_TO_FT_M - FT_TO_INDENTER_M
+            X_IF[2, 3] = -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m
             self._port.pose(self._X_BW @ X_WI @ X_IF)
             self._commands += 1
         else:

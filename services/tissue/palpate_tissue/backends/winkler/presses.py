@@ -29,13 +29,21 @@ from palpate_tissue.contact import RIM
 
 ENDS_S: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, press.DURATION_S - 0.5 * press.READ_S)
 """Ends of the steps after the touch [s]: full depth, where the force is largest, and last the middle of the reading."""
-REACH_LENGTHS: Final = 3.0
-"""Reach of a press beyond the sphere in Pasternak lengths: displacement decays as K0(r / l) and acts back by its square."""
+
+
+class PressSweeps(NamedTuple):
+    """Settings of the compiled solution of presses."""
+
+    reach_lengths: float = 3.0
+    """Reach of a press beyond the sphere in Pasternak lengths: displacement decays as K0(r / l) and acts back by its square."""
+    over_relaxation: float = 1.5
+    close_m: float = 2e-6
+    """Convergence of sweeps: largest motion of a vertex."""
+    most: int = 200
+
+
+SWEEPS = PressSweeps()
 # Read by compiled functions.
-OVER_RELAXATION: Final = 1.5
-CLOSE_M: Final = 2e-6
-"""Convergence of sweeps: largest motion of a vertex."""
-MOST_SWEEPS: Final = 200
 
 
 class Course(NamedTuple):
@@ -86,7 +94,7 @@ def press_forces(
 
     Each press has its course of n steps; its forces, shape (n,), are those at their ends.
     """
-    reach = REACH_LENGTHS * stiffness.length_m + max((course.radius for course in courses), default=0.0)
+    reach = SWEEPS.reach_lengths * stiffness.length_m + max((course.radius for course in courses), default=0.0)
     reached = cKDTree(model.vertices).query_ball_point(places, reach)
     wall = implicit_wall(model, stiffness, 1.0, 1)
     skin = Skin(model.vertices, model.normals)
@@ -139,9 +147,9 @@ def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array
                 relaxed += e[b] * y[i, b] + prony[b, 0] * (r[b] - e[b]) * u[i]
             u[i] *= deeper  # initial guess
             s[i] = kept * u[i] - relaxed
-        stride = Stride(h, kept, OVER_RELAXATION)
-        for _ in range(MOST_SWEEPS):
-            if sweep(wall, part, room, activation, stride) < CLOSE_M:
+        stride = Stride(h, kept, SWEEPS.over_relaxation)
+        for _ in range(SWEEPS.most):
+            if sweep(wall, part, room, activation, stride) < SWEEPS.close_m:
                 break
         forces[step] = held(wall, skin, part, room, activation, h, p, normal)
         for k in range(len(part)):
