@@ -40,7 +40,7 @@ GROUPS = {
         "replay": "palpate.replay.command:replay",
         "compare": "palpate.comparison.command:compare",
         "fit": "palpate.twin.command:fit",
-        "perceive": "palpate.perceive.command:perceive",
+        "perceive": "palpate.perceive:perceive",
         "doctor": "palpate.live.doctor:doctor",
         "topics": "palpate.listings:topics",
         "topic": "palpate.live.topic:app",

@@ -14,6 +14,7 @@ from rich.text import Text
 
 from palpate.apart import guarded
 from palpate.console import SteadyConsole, refuse, wide_console
+from palpate.run.options import Settings
 
 if TYPE_CHECKING:
     from palpate_models.scenario.schema import Scenario
@@ -51,37 +52,29 @@ def build(
             "--platform", metavar="NAME", help="Platform of a binary, such as x86_64-linux; may be repeated. By default all."
         ),
     ] = None,
-    settings: Annotated[
-        list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a scenario's field; may be repeated.")
-    ] = None,
+    settings: Settings = None,
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print errors only.")] = False,
 ) -> None:
     """Write the abdomen as an FMU with sources and cross-compiled binaries."""
-    from palpate_fmu.compiling import CompileError, platforms
+    from palpate_fmu.compiling import platforms
     from palpate_fmu.export import build_scenario_fmu
-    from palpate_fmu.phantom_file import ExportError
-    from palpate_models.patient.mesh_file import MeshError
-    from palpate_models.scenario.load import ScenarioError
 
     console = SteadyConsole(stderr=True)
     columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    try:
-        chosen = platforms(fmi, only)
-        names = [platform.tuple_3 for platform in chosen]
-        scenario = _scenario(phantom, settings or [])
-        with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
-            task = bar.add_task("reading the phantom", total=len(names))
-            build_scenario_fmu(
-                scenario,
-                out,
-                fmi,
-                names,
-                compiling=lambda name: bar.update(
-                    task, advance=1, description=f"compiling for {name} (about a minute the first time)"
-                ),
-            )
-    except (ScenarioError, MeshError, ExportError, CompileError, ValueError, OSError) as error:
-        refuse(error)
+    chosen = platforms(fmi, only)
+    names = [platform.tuple_3 for platform in chosen]
+    scenario = _scenario(phantom, settings or [])
+    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
+        task = bar.add_task("reading the phantom", total=len(names))
+        build_scenario_fmu(
+            scenario,
+            out,
+            fmi,
+            names,
+            compiling=lambda name: bar.update(
+                task, advance=1, description=f"compiling for {name} (about a minute the first time)"
+            ),
+        )
     if not quiet:
         size = f"{out.stat().st_size / 1e6:.1f} MB"
         console.print(f"{out}: FMI {fmi}.0, {size}, for {', '.join(names)}", highlight=False, soft_wrap=True)
@@ -103,14 +96,11 @@ def info(file: Annotated[Path, typer.Argument(help="An FMU.")]) -> None:
     """Show an FMU's interface, variables and platforms."""
     import fmpy
 
-    from palpate_fmu.reading import FmuError, binary_folders, read_description, read_variables
+    from palpate_fmu.reading import binary_folders, read_description, read_variables
 
     console = SteadyConsole()
-    try:
-        description, findings = read_description(file)
-        platforms = binary_folders(file)
-    except FmuError as error:
-        refuse(error)
+    description, findings = read_description(file)
+    platforms = binary_folders(file)
     kinds = [kind for kind in ("coSimulation", "modelExchange", "scheduledExecution") if getattr(description, kind, None)]
     console.print(Text.assemble((description.modelName, "bold"), f" FMI {description.fmiVersion}, {', '.join(kinds)}"))
     console.print(f"{description.description or ''}\nplatforms: {', '.join(platforms) or 'none (sources only)'}", highlight=False)

@@ -40,14 +40,8 @@ from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario.load import exam_input, load_scenario, true_pose
 from palpate_models.scenario.schema import Scenario
 
-APART_S: Final = 3.0
-"""Measurements further apart in time share only the error of the surface."""
 _LAGS: Final = 100
 """Number of lags of the covariances in time, of PERIOD_S each."""
-_PAIRS: Final = 400_000
-"""Number of pairs of measurements per run for the covariance in space."""
-_HALF_VALUE: Final = 1.678
-"""(1 + x) exp(-x) is one half here."""
 _HEADER: Final = """\
 # Errors of whole examinations, by setting of the errors and kind of breathing; fields: palpate/quick/errors.py.
 # Written by `python -m research.loop_errors`; do not edit.
@@ -200,8 +194,8 @@ def _field(traces: Sequence[Trace], rests: Sequence[Array]) -> tuple[float, floa
     products, distances = [], []
     for number, (trace, rest) in enumerate(zip(traces, rests, strict=True)):
         rng = np.random.Generator(np.random.PCG64(number))
-        i, j = rng.integers(0, len(rest), (2, _PAIRS))
-        apart = np.abs(trace.time[i] - trace.time[j]) > APART_S
+        i, j = rng.integers(0, len(rest), (2, 400_000))
+        apart = np.abs(trace.time[i] - trace.time[j]) > 3.0  # those share only the error of the surface
         i, j = i[apart], j[apart]
         distances.append(np.linalg.norm(trace.place[i] - trace.place[j], axis=1))
         products.append(rest[i] * rest[j])
@@ -239,7 +233,7 @@ def _time_constant(covariance: Array) -> float:
     """Return T [s] of the covariance (1 + t / T) exp(-t / T) with the same half-value time."""
     below = np.flatnonzero(covariance < 0.5 * covariance[0])
     lag = int(below[0]) if len(below) else len(covariance)
-    return _round(max(lag, 1) * PERIOD_S / _HALF_VALUE)
+    return _round(max(lag, 1) * PERIOD_S / 1.678)  # (1 + x) exp(-x) is one half at 1.678
 
 
 def _normal(values: Array) -> Normal:

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from mcap.writer import CompressionType
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     Duration,
     JointState,
@@ -28,7 +28,7 @@ from palpate_bus.messages import (
     WrenchStamped,
     codec,
 )
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_recorder.bag import BagWriter
 from palpate_recorder.service import channels
 

@@ -22,10 +22,10 @@ from palpate.commands import COMMANDS, app_for
 from palpate.report.evidence import sample_columns
 from palpate.run.roles import checked, settings_of
 from palpate.study.statistics.reading import read_tables
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import JointState, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.runtime.lockstep import Stepper
 from palpate_bus.settings import Settings, variable
 from palpate_models.patient.phantom import build_phantom

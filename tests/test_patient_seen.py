@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService
 from palpate_models.numerics.frames import look_at

@@ -10,9 +10,9 @@ from typing import Any
 import pytest
 from toy_runs import APART, LOOP, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services, with_own_process
 
-from palpate_bus.contract import MS, Topic, contract
+from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import DiagnosticStatus, ServiceReport, codec
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages.stamps import MS, NS
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.service import Inbox, Outbox, Service

@@ -24,10 +24,10 @@ from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_benchmarks.struck import SETTINGS, Watched, kept_rate
-from palpate_bus.contract import MS, Edge, Topic, contract
+from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.contract.conformance import leaves
 from palpate_bus.messages import ExamState
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree

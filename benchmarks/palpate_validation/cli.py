@@ -57,14 +57,11 @@ def validate(
         refuse(f"--only {unknown[0]}: sections are {', '.join(SECTIONS)}")
     sections = []
     wanted = [name for name in SECTIONS if not only or name in only]
-    try:
-        with CaseDisplay(console, False, "sections") as display:
-            for number, name in enumerate(wanted):
-                display.show(number, len(wanted), f"measuring {name}")
-                sections.append(run_section(name))
-                write(sections, out)  # an error or Ctrl-C in a later section keeps these
-    except OSError as error:
-        refuse(error)
+    with CaseDisplay(console, False, "sections") as display:
+        for number, name in enumerate(wanted):
+            display.show(number, len(wanted), f"measuring {name}")
+            sections.append(run_section(name))
+            write(sections, out)  # an error or Ctrl-C in a later section keeps these
     wide_console(150).print(table(sections))
     console.print(f"plots and figures in {out}", highlight=False)
     missed = failures(sections)

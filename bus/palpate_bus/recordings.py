@@ -28,6 +28,7 @@ from rosbags.rosbag1 import reader as rosbag1_reader
 from rosbags.rosbag2 import storage_mcap
 
 from palpate_bus.contract import Contract, Topic
+from palpate_bus.messages.stamps import UNIX_NS
 from palpate_bus.messages.typestore import CodecError, definition_hash
 from palpate_bus.settings import KEPT_EVERY, RECORDING
 from palpate_errors import UserError
@@ -35,8 +36,6 @@ from palpate_inputs import MB, InputFile, bounds, over, read_yaml
 
 SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
-UNIX_NS = 10**17
-"""Stamps from here on [ns] are Unix time, as other recorders write it, not the simulated time of a run."""
 BROKEN = (
     McapError,
     EOFError,

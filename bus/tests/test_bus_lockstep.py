@@ -7,7 +7,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from toy_services import TOYS, Control, Robot
 
-from palpate_bus.contract import MS, Edge, contract
+from palpate_bus.contract import Edge, contract
+from palpate_bus.messages.stamps import MS
 from palpate_bus.runtime.lockstep import InputBuffer, LockstepError, Stepper
 
 TOPICS = contract().topics

@@ -10,12 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from message_strategies import messages
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.contract.conformance import leaves, numbers
 from palpate_bus.contract.port_check import Checker
 from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped, codec
-from palpate_bus.messages.stamps import duration_message, header
+from palpate_bus.messages.stamps import MS, duration_message, header
 from palpate_bus.monitor.health import RECENT_S, Violation, diagnostics
 from palpate_bus.monitor.monitor import Monitor
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, qos_token

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from message_strategies import messages
 from toy_services import TOYS, Robot
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import Checker, PortCheck, RefusedMessage
 from palpate_bus.messages import (
     Duration,
@@ -27,7 +27,7 @@ from palpate_bus.messages import (
     Wrench,
     codec,
 )
-from palpate_bus.messages.stamps import NS, header, nanoseconds
+from palpate_bus.messages.stamps import MS, NS, header, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import Packet, Stepper

@@ -14,7 +14,6 @@ from typing import Any
 import numpy as np
 import zenoh
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import (
     CameraTrigger,
     Image,
@@ -38,7 +37,7 @@ from palpate_bus.messages import (
     Wrench,
     WrenchStamped,
 )
-from palpate_bus.messages.stamps import NS, blank, duration_message, header
+from palpate_bus.messages.stamps import MS, NS, blank, duration_message, header
 from palpate_bus.run import Hosted, host
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings

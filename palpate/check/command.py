@@ -4,7 +4,8 @@ from typing import Annotated
 
 import typer
 
-from palpate.live.bus import Connect
+from palpate.live.bus import AsJson, Connect
+from palpate.run.options import Settings
 
 LISTEN = "tcp/127.0.0.1:7447"
 
@@ -21,14 +22,12 @@ def check_command(  # noqa: PLR0913 - the options of a command
         ),
     ] = None,
     scenario: Annotated[str, typer.Option(help="Its scenario; the patient holds their breath.")] = "clean",
-    given: Annotated[
-        list[str] | None, typer.Option("--set", metavar="FIELD=VALUE", help="Change a field of the scenario.")
-    ] = None,
+    given: Settings = None,
     motion: Annotated[bool, typer.Option("--motion", help="It may move; most checks of the robot need this.")] = False,
     domain: Annotated[int, typer.Option(envvar="ROS_DOMAIN_ID", help="ROS domain.")] = 0,
     slack: Annotated[float, typer.Option(min=0, help="Seconds that transport and scheduler may add to a reaction.")] = 0.15,
     wait: Annotated[float, typer.Option(min=1, help="Seconds to wait for it to join.")] = 60.0,
-    as_json: Annotated[bool, typer.Option("--json", help="Print JSON.")] = False,
+    as_json: AsJson = False,
     failures: Annotated[bool, typer.Option("--failures", help="Print only what failed.")] = False,
 ) -> None:
     """Test an implementation of a role: rates, ranges, signs, frames, limits, expiry, safe hold, invalid and missing messages.

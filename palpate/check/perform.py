@@ -23,10 +23,9 @@ from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
 from palpate.live.topic import TopicReader
 from palpate_bus import implementations
-from palpate_bus.contract import MS
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages.stamps import MS, NS
 from palpate_bus.runs.announcement import NoBus
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE, REPORT_TYPE
 from palpate_bus.runtime.member import Member

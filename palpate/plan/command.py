@@ -8,15 +8,13 @@ from typing import Annotated
 import typer
 
 from palpate.console import SteadyConsole
-from palpate.run.options import DEFAULT_SCENARIO, Settings
+from palpate.run.options import DEFAULT_SCENARIO, ScenarioName, Seed, Settings
 
 
 def plan(
-    scenario: Annotated[
-        str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")
-    ] = DEFAULT_SCENARIO,
+    scenario: ScenarioName = DEFAULT_SCENARIO,
     out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("plan.png"),
-    seed: Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")] = None,
+    seed: Seed = None,
     settings: Settings = None,
 ) -> None:
     """Draw the plan of an examination: its targets, their order, the duration, and targets out of reach.
@@ -37,7 +35,6 @@ def plan(
     from palpate.run.inputs import usable
     from palpate_models.patient.phantom import build_phantom
     from palpate_planning.motion.planner import NoPathError
-    from palpate_plugins import PluginError
 
     if out.suffix.lower() != ".png":
         refuse(f"--out {out}: want the name of a .png file")
@@ -48,7 +45,7 @@ def plan(
             check_tissue(chosen, phantom)
             planned = guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
             draw(out, chosen, phantom, planned)
-    except (NoPathError, PluginError, OSError) as error:
+    except NoPathError as error:
         refuse(error)
     console = SteadyConsole()
     console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)

@@ -1,7 +1,5 @@
 """Collected messages as arrays, for scores, report and figures."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from math import hypot
 from operator import attrgetter

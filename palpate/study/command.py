@@ -102,20 +102,16 @@ def run(  # noqa: PLR0913 - the options of a command
     from palpate.study.folder import default_folder, opened
     from palpate.study.runner import part_of
     from palpate.study.spec import load_study
-    from palpate_errors import UserError
 
     console = SteadyConsole(stderr=True, quiet=quiet)
-    try:
-        study = _chosen(load_study(name), method, services)
-        secret = None if seeds_file is None else secret_of(seeds_file, study)
-        request = Request(cast("Split", split), number, settings or (), secret)
-        cases = cases_of(study, request)
-        own = part_of(cases, shard) if shard else cases
-        path = out or default_folder(study.name, split)
-        folder, manifest = opened(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
-        _examine(console, folder, own, (workers, scheduler), runs)
-    except (UserError, OSError) as error:
-        refuse(error)
+    study = _chosen(load_study(name), method, services)
+    secret = None if seeds_file is None else secret_of(seeds_file, study)
+    request = Request(cast("Split", split), number, settings or (), secret)
+    cases = cases_of(study, request)
+    own = part_of(cases, shard) if shard else cases
+    path = out or default_folder(study.name, split)
+    folder, manifest = opened(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
+    _examine(console, folder, own, (workers, scheduler), runs)
     if shard and folder.missing(cases):
         console.print(f"shard {shard} is done; when all are: palpate study merge DIR...", highlight=False)
     else:
@@ -129,13 +125,8 @@ def merge_parts(
 ) -> None:
     """Merge the parts of a study and make its tables, figures and page."""
     from palpate.study.folder import merge
-    from palpate.study.spec import StudyError
 
-    try:
-        folder, manifest = merge(parts, out or parts[0])
-    except StudyError as error:
-        refuse(error)
-    _conclude(folder, manifest)
+    _conclude(*merge(parts, out or parts[0]))
 
 
 @app.command("scenario")

@@ -6,6 +6,7 @@ of what is known; the actor's last one gives each place and depth a logit: few w
 """
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Final
 
@@ -25,15 +26,27 @@ from torch import nn
 from palpate.search.environment import SearchEnv
 from palpate_search.posterior import LAYERS, policy
 
-WIDTH: Final = 16
-"""Channels of the hidden layers."""
-PRESSES: Final = 40
-"""Of an episode."""
-PATIENTS: Final = 100
-"""Tuning patients that are met: seeds from 0 on."""
-ENVIRONMENTS: Final = 8
+
+@dataclass(frozen=True)
+class Training:
+    """Extent of the training."""
+
+    presses: int = 40
+    """Of an episode."""
+    patients: int = 100
+    """Tuning patients that are met: seeds from 0 on."""
+    environments: int = 8
+    width: int = 16
+    """Channels of the hidden layers."""
+    astray: float = 0.15
+    """Share of the teacher's presses that go to a random place: it shows how to continue from there."""
+    passes: int = 8
+    """Through all that the teacher showed."""
+
+
+TRAINING: Final = Training()
 SETTINGS: Final[dict[str, Any]] = {
-    "n_steps": 2 * PRESSES,
+    "n_steps": 2 * TRAINING.presses,
     "batch_size": 320,
     "n_epochs": 4,
     "learning_rate": 3e-4,
@@ -42,10 +55,6 @@ SETTINGS: Final[dict[str, Any]] = {
     "target_kl": 0.03,
 }
 TEACHER: Final = "informed"
-ASTRAY: Final = 0.15
-"""Share of the teacher's presses that go to a random place: it shows how to continue from there."""
-PASSES: Final = 8
-"""Through all that the teacher showed."""
 
 
 class Presses(gymnasium.Env[NDArray[np.float32], int]):
@@ -89,11 +98,14 @@ class Network(nn.Module):
         super().__init__()
         layers, nx, ny = space.shape
         self.hidden = nn.Sequential(
-            nn.Conv2d(layers, WIDTH, 5, padding=2), nn.Tanh(), nn.Conv2d(WIDTH, WIDTH, 3, padding=1), nn.Tanh()
+            nn.Conv2d(layers, TRAINING.width, 5, padding=2),
+            nn.Tanh(),
+            nn.Conv2d(TRAINING.width, TRAINING.width, 3, padding=1),
+            nn.Tanh(),
         )
-        self.last = nn.Conv2d(WIDTH, 2, 1)
+        self.last = nn.Conv2d(TRAINING.width, 2, 1)
         nn.init.normal_(self.last.weight, std=0.05)
-        self.latent_dim_pi, self.latent_dim_vf = 2 * nx * ny, 2 * WIDTH
+        self.latent_dim_pi, self.latent_dim_vf = 2 * nx * ny, 2 * TRAINING.width
 
     def forward(self, maps: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
         """Both."""
@@ -105,7 +117,7 @@ class Network(nn.Module):
         return scores
 
     def forward_critic(self, maps: torch.Tensor) -> torch.Tensor:
-        """Mean and greatest value of each channel, shape (n, 2 WIDTH)."""
+        """Mean and greatest value of each channel, shape (n, 2 `TRAINING.width`)."""
         seen = self.hidden(maps).flatten(2)
         return torch.cat((seen.mean(dim=2), seen.amax(dim=2)), dim=1)
 
@@ -153,19 +165,19 @@ class LearningCurve(BaseCallback):
 
 def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.int64], NDArray[np.float32], float]:
     """Of the teacher with each patient: maps (n, layers, nx, ny), its actions (n,), rewards (n,), mean reward."""
-    env = Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))
+    env = Presses(SearchEnv(presses=TRAINING.presses, patients=TRAINING.patients, maps=True))
     seen: list[NDArray[np.float32]] = []
     chosen: list[int] = []
     returns: list[float] = []
     total = 0.0
-    for patient in range(PATIENTS):
+    for patient in range(TRAINING.patients):
         observed, _ = env.reset(options={"patient": patient})
         rewards: list[float] = []
         over = False
         while not over:
             seen.append(observed)
             chosen.append(env.shown())
-            astray = rng.random() < ASTRAY
+            astray = rng.random() < TRAINING.astray
             observed, reward, over, _, _ = env.step(int(rng.integers(env.choices)) if astray else chosen[-1])
             rewards.append(reward)
         total += sum(rewards)
@@ -173,7 +185,7 @@ def lessons(rng: np.random.Generator) -> tuple[NDArray[np.float32], NDArray[np.i
         for k in reversed(range(len(rewards))):
             to_come = rewards[k] = rewards[k] + SETTINGS["gamma"] * to_come
         returns += rewards
-    return np.array(seen), np.array(chosen), np.array(returns, dtype=np.float32), total / PATIENTS
+    return np.array(seen), np.array(chosen), np.array(returns, dtype=np.float32), total / TRAINING.patients
 
 
 def turned(maps: NDArray[np.float32], action: NDArray[np.int64], how: int) -> tuple[NDArray[np.float32], NDArray[np.int64]]:
@@ -194,8 +206,8 @@ def imitate(model: PPO, rng: np.random.Generator) -> float:
     """Fit actor and critic to what the teacher shows; return the teacher's mean reward."""
     maps, actions, returns, reward = lessons(rng)
     optimizer = torch.optim.Adam(model.policy.parameters(), lr=3e-3)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, PASSES)
-    for k in range(PASSES):
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, TRAINING.passes)
+    for k in range(TRAINING.passes):
         losses = []
         for batch in np.array_split(rng.permutation(len(maps)), len(maps) // 128):
             some, action = turned(maps[batch], actions[batch], int(rng.integers(8)))
@@ -206,7 +218,7 @@ def imitate(model: PPO, rng: np.random.Generator) -> float:
             optimizer.step()
             losses.append(-float(log_probability.detach().mean()))
         schedule.step()
-        print(f"pass {k + 1} of {PASSES}, loss {np.mean(losses):.3f}", flush=True)
+        print(f"pass {k + 1} of {TRAINING.passes}, loss {np.mean(losses):.3f}", flush=True)
     return reward
 
 
@@ -215,7 +227,7 @@ def drawn(rows: list[tuple[int, float]], teacher: float) -> Figure:
     figure = Figure(figsize=(6, 3.2), dpi=100, layout="constrained")
     axes = figure.subplots()
     axes.plot(*np.array(rows).T, label="mean of the latest 100 episodes")
-    axes.axhline(teacher, color="black", ls=":", label=f"the teacher, {100 * ASTRAY:.0f} % of whose presses go astray")
+    axes.axhline(teacher, color="black", ls=":", label=f"the teacher, {100 * TRAINING.astray:.0f} % of whose presses go astray")
     axes.set(xlabel="presses learned from after the imitation", ylabel="reward of an episode")
     axes.legend(fontsize=8)
     return figure
@@ -229,7 +241,11 @@ def main(
 ) -> None:
     """Train the policy on tuning patients."""
     torch.set_num_threads(1)
-    many = VecMonitor(DummyVecEnv([lambda: Presses(SearchEnv(presses=PRESSES, patients=PATIENTS, maps=True))] * ENVIRONMENTS))
+    many = VecMonitor(
+        DummyVecEnv(
+            [lambda: Presses(SearchEnv(presses=TRAINING.presses, patients=TRAINING.patients, maps=True))] * TRAINING.environments
+        )
+    )
     model = PPO(PlacePolicy, many, seed=seed, device="cpu", policy_kwargs={"features_extractor_class": Whole}, **SETTINGS)
     teacher = imitate(model, np.random.default_rng(seed))
     print(f"teacher: reward {teacher:.2f}", flush=True)

@@ -13,8 +13,8 @@ from palpate_benchmarks.fault_cases import LIE, FaultFinding, LieVerdict
 from palpate_benchmarks.liar import KINDS, Liar, Lie
 from palpate_benchmarks.lies import Healthy, cases, cells, judged, left_out, run_lies
 from palpate_benchmarks.struck import Watched
-from palpate_bus.contract import MS, Edge, contract
-from palpate_bus.messages.stamps import NS, nanoseconds
+from palpate_bus.contract import Edge, contract
+from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.lockstep import Stepper
 

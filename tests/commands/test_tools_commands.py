@@ -22,9 +22,9 @@ from palpate.live.doctor import doctor
 from palpate.live.graph import app as node
 from palpate.live.graph import missing
 from palpate.live.topic import app as topic
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import JointState, String, Vector3, Wrench, WrenchStamped, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.runs.announcement import Announcement, Run, live
 from palpate_bus.wire.liveliness import NodeTokens
 from palpate_bus.wire.rmw import topic_key

@@ -15,10 +15,8 @@ import yaml
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from palpate_bus.messages import codec
+from palpate_bus.messages.stamps import MS
 from palpate_bus.settings import Settings
-
-MS = 1_000_000
-"""Nanoseconds in a millisecond."""
 
 
 class Edge(StrEnum):

@@ -10,6 +10,10 @@ from palpate_bus.messages.typestore import array_dtype, message_type, store
 
 NS = 1_000_000_000
 """Nanoseconds per second."""
+MS = 1_000_000
+"""Nanoseconds per millisecond."""
+UNIX_NS = 10**17
+"""Stamps from here on [ns] are Unix time, not the simulated time of a run."""
 
 
 def time_message(t: int) -> Time:

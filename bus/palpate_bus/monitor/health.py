@@ -11,11 +11,11 @@ from dataclasses import dataclass, field
 from statistics import median
 from typing import NamedTuple
 
-from palpate_bus.contract import MS, Topic, contract
+from palpate_bus.contract import Topic, contract
 from palpate_bus.contract.conformance import MessageViolation
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 
 
 @dataclass(frozen=True)

@@ -21,10 +21,11 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.contract import MS, Contract, Topic
+from palpate_bus.contract import Contract, Topic
 from palpate_bus.contract.conformance import ViolationKind as Kind
 from palpate_bus.contract.port_check import Checker
 from palpate_bus.messages import RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import MS, UNIX_NS
 from palpate_bus.monitor.health import (
     TUNING,
     BusTime,
@@ -239,8 +240,6 @@ def _type(name: str, digest: str) -> str:
 
 ROOM = 1 << 15
 """Messages per topic that wait for a poll."""
-WALL_CLOCK_TICK = 10**17
-"""A grant beyond this [ns] is a wall time: the common start of a wall-clock run."""
 
 
 class LiveMonitor:
@@ -300,7 +299,7 @@ class LiveMonitor:
 
     def _receive_control(self) -> None:
         for message in _decoded(self._control, self._decode_control):
-            if message.command == RunControl.GRANT and message.tick > WALL_CLOCK_TICK:
+            if message.command == RunControl.GRANT and message.tick >= UNIX_NS:  # the common start of a wall-clock run
                 self.monitor.rate = self.monitor.rate or 1.0
 
     def _receive_reports(self, now: float) -> None:

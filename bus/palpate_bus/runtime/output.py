@@ -9,8 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import RecordChunk, codec
+from palpate_bus.messages.stamps import MS
 from palpate_bus.runtime.lockstep import Sent
 from palpate_bus.runtime.member import Member
 from palpate_bus.settings import Settings

@@ -15,10 +15,11 @@ from dataclasses import dataclass
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
 
-from palpate_bus.contract import MS, Edge, Topic, Visibility
+from palpate_bus.contract import Edge, Topic, Visibility
 from palpate_bus.contract.port_check import RefusedMessage
 from palpate_bus.messages import RunControl, ServiceReport
 from palpate_bus.messages.codec import CodecError
+from palpate_bus.messages.stamps import MS
 from palpate_bus.runtime.conductor_link import CONDUCTOR, RunAborted
 from palpate_bus.runtime.lockstep import NEVER, Packet, Sent, Stepper
 from palpate_bus.runtime.member import Member

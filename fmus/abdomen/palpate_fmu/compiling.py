@@ -50,14 +50,14 @@ class CompileError(UserError):
 def platforms(version: int, names: Sequence[str] | None = None) -> tuple[Platform, ...]:
     """Return the platforms that an FMI version has a folder for; those of `names` (of FMI 3.0), if given.
 
-    Raises ValueError naming one that is not known.
+    Raises CompileError naming one that is not known.
     """
     known = {target.tuple_3: target for target in PLATFORMS if version >= 3 or target.folder_2}
     if names is None:
         return tuple(known.values())
     for name in names:
         if name not in known:
-            raise ValueError(f"FMI {version} has no platform {name!r}; platforms are {', '.join(known)}")
+            raise CompileError(f"FMI {version} has no platform {name!r}; platforms are {', '.join(known)}")
     return tuple(known[name] for name in names)
 
 

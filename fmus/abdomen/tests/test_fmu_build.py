@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner
 
-from palpate.fmu import app
+from palpate.commands import app_for
 from palpate_fmu.compiling import WARNINGS, native, platforms
 from palpate_fmu.export import build_fmu, write_sources
 from palpate_fmu.instance import FmuInstance
@@ -115,12 +115,12 @@ BUILD = ("build", "healthy", "--platform", native(), "--set", "phantom.edge_m=0.
 
 def test_build_info_and_simulate(tmp_path: Path) -> None:
     path = tmp_path / "a.fmu"
-    built = runner.invoke(app, [*BUILD, "-o", str(path)])
+    built = runner.invoke(app_for("fmu"), ["fmu", *BUILD, "-o", str(path)])
     assert built.exit_code == 0, built.output
     assert len(built.output.splitlines()) == 1  # no bar where there is no terminal
-    silent = runner.invoke(app, [*BUILD, "-o", str(path), "--quiet"])
+    silent = runner.invoke(app_for("fmu"), ["fmu", *BUILD, "-o", str(path), "--quiet"])
     assert (silent.exit_code, silent.output) == (0, "")
-    shown = runner.invoke(app, ["info", str(path)])
+    shown = runner.invoke(app_for("fmu"), ["fmu", "info", str(path)])
     assert shown.exit_code == 0
     kinds = "FMI 3.0, coSimulation, modelExchange"
     for word in (
@@ -136,7 +136,9 @@ def test_build_info_and_simulate(tmp_path: Path) -> None:
     ):
         assert word in shown.output
     plot = tmp_path / "a.png"
-    probed = runner.invoke(app, ["simulate", str(path), "-o", str(plot), "--depth", "0.008", "--at", "0.02", "-0.03"])
+    probed = runner.invoke(
+        app_for("fmu"), ["fmu", "simulate", str(path), "-o", str(plot), "--depth", "0.008", "--at", "0.02", "-0.03"]
+    )
     assert probed.exit_code == 0, probed.output
     assert plot.read_bytes().startswith(b"\x89PNG")
     table = np.loadtxt(plot.with_suffix(".csv"), delimiter=",", skiprows=1)
@@ -149,9 +151,11 @@ def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
     mesh = tmp_path / "ball.stl"
     trimesh.creation.icosphere(subdivisions=4, radius=0.15).apply_translation((0, 0, -0.15)).export(mesh)
     path = tmp_path / "ball.fmu"
-    built = runner.invoke(app, ["build", str(mesh), "-o", str(path), "--platform", native(), "--fmi", "2"])
+    built = runner.invoke(app_for("fmu"), ["fmu", "build", str(mesh), "-o", str(path), "--platform", native(), "--fmi", "2"])
     assert built.exit_code == 0, built.output
-    probed = runner.invoke(app, ["simulate", str(path), "-o", str(tmp_path / "ball.png"), "--at", "0.01", "0.0"])
+    probed = runner.invoke(
+        app_for("fmu"), ["fmu", "simulate", str(path), "-o", str(tmp_path / "ball.png"), "--at", "0.01", "0.0"]
+    )
     assert probed.exit_code == 0, probed.output
 
 
@@ -167,7 +171,7 @@ def test_a_mesh_is_a_phantom(tmp_path: Path) -> None:
     ],
 )
 def test_bad_input_ends_with_status_2_and_says_what_is_wrong(arguments: list[str], words: tuple[str, ...]) -> None:
-    done = runner.invoke(app, arguments)
+    done = runner.invoke(app_for("fmu"), ["fmu", *arguments])
     assert done.exit_code == 2, done.output
     for word in words:
         assert word in done.output.replace("\n", " ")
@@ -190,7 +194,7 @@ def test_info_shows_what_a_strangers_fmu_is(version: str, status: int, words: tu
             archive.writestr(folder, "")  # as zip tools write them
         archive.writestr("binaries/linux64/one.so", "")
         archive.writestr("modelDescription.xml", FOREIGN.format(version))
-    shown = runner.invoke(app, ["info", str(path)])
+    shown = runner.invoke(app_for("fmu"), ["fmu", "info", str(path)])
     assert shown.exit_code == status, shown.output
     for word in words:
         assert word in shown.output

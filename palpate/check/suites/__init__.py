@@ -11,8 +11,9 @@ from typing import Final
 import numpy as np
 
 from palpate.check.rig import ConformanceReport, ReceivedMessage, Rig
-from palpate_bus.contract import MS, Topic
+from palpate_bus.contract import Topic
 from palpate_bus.contract.port_check import Checker
+from palpate_bus.messages.stamps import MS
 
 SUITES = {
     "robot": 9.0,

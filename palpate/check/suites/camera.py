@@ -1,25 +1,34 @@
 """Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, Final
 
 import numpy as np
 
 from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
-from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.geometry import transform_matrix
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_models.numerics.frames import Array
 
 IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
 SMALL_IMAGE, SMALL_INFO = "camera/follow/depth", "camera/follow/camera_info"
 SMALL_WIDTHS = (48, 192)
 FRAME = "camera_depth_optical_frame"
-FRAMES = 5
-HALF_M = 0.15
-"""Half the side of the plane."""
-PITCH_M = 0.01
+
+
+@dataclass(frozen=True)
+class ViewedPlane:
+    """The plane in front of the camera, and the burst."""
+
+    frames: int = 5
+    half_m: float = 0.15
+    """Half the side of the plane."""
+    pitch_m: float = 0.01
+
+
+PLANE: Final = ViewedPlane()
 
 
 def pose_of(message: Any) -> Array | None:
@@ -38,7 +47,7 @@ def depths(message: Any) -> Array:
 
 def plane(centre: Array) -> Source:
     """Return the source of a level square about `centre`, in world."""
-    return lambda t: level(t, HALF_M, PITCH_M, centre)
+    return lambda t: level(t, PLANE.half_m, PLANE.pitch_m, centre)
 
 
 def suite(rig: Rig) -> None:
@@ -56,11 +65,11 @@ def suite(rig: Rig) -> None:
     rig.equal("takes no full frame without a request", len(silent[IMAGE]), 0)
     burst = _burst(rig, feed)
     images, infos = burst[IMAGE], burst[INFO]
-    rig.equal("takes as many frames as asked", len(images), FRAMES)
+    rig.equal("takes as many frames as asked", len(images), PLANE.frames)
     rig.equal("intrinsics with every image, of the same stamp", _stamps(infos), stamps := _stamps(images))
     period = rig.rules.topics[IMAGE].period
     rig.below("at its rate", max(abs(np.diff(stamps) - period), default=0), rig.slack + 1, "ms off", 1 / MS)
-    rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), FRAMES)
+    rig.equal("a second burst too", len(_burst(rig, feed)[IMAGE]), PLANE.frames)
     if not images or not infos:
         return
     rig.section("images")
@@ -84,8 +93,8 @@ def _small(rig: Rig, images: list[ReceivedMessage], infos: list[ReceivedMessage]
 
 
 def _burst(rig: Rig, feed: dict[str, Source]) -> dict[str, list[ReceivedMessage]]:
-    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), FRAMES))
-    return rig.run(0.1 * FRAMES + 0.5 + rig.slack_s, feed)
+    rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), PLANE.frames))
+    return rig.run(0.1 * PLANE.frames + 0.5 + rig.slack_s, feed)
 
 
 def _format(rig: Rig, image: ReceivedMessage, info: ReceivedMessage) -> Array | None:
@@ -113,7 +122,11 @@ def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> 
     rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones(depth.shape)), axis=-1) @ X_WC[:3, :3].T
     expected = (centre[2] - X_WC[2, 3]) / rays[..., 2]
     hit = X_WC[:3, 3] + rays * expected[..., None]
-    on = (np.abs(hit[..., 0] - centre[0]) < 0.8 * HALF_M) & (np.abs(hit[..., 1] - centre[1]) < 0.8 * HALF_M) & (expected > 0)
+    on = (
+        (np.abs(hit[..., 0] - centre[0]) < 0.8 * PLANE.half_m)
+        & (np.abs(hit[..., 1] - centre[1]) < 0.8 * PLANE.half_m)
+        & (expected > 0)
+    )
     error = (depth - expected)[on & np.isfinite(depth)]
     most = error.size > 0.5 * max(int(on.sum()), 1)
     rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, 0.01, "mm off", 1e3)

@@ -5,10 +5,10 @@ from typing import Any
 import numpy as np
 
 from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, robot_status, sensed
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
-from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages.stamps import MS, duration_message, header, nanoseconds
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.chain import Arm

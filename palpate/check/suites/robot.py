@@ -6,10 +6,9 @@ from typing import Any, Final
 import numpy as np
 
 from palpate.check.rig import Feed, ReceivedMessage, Rig, Source
-from palpate_bus.contract import MS
 from palpate_bus.messages import JointTorqueCommand, OperatorRequest, RobotStatus, SupervisorState, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.geometry import rotation, vectors
-from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages.stamps import MS, duration_message, header, nanoseconds
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.chain import Arm

@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.errors import (
     BASELINE_M,

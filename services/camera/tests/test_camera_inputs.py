@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     CameraInfo,
     CameraTrigger,
@@ -21,7 +21,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.geometry import transform_matrix
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.recordings import open_recording
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox

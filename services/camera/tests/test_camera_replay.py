@@ -11,12 +11,12 @@ import trimesh
 from palpate.check.rig import ReceivedMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
-from palpate.perceive.perceive import perceived, write
+from palpate.perceive import perceived, write
 from palpate.run.roles import checked
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.stamps import header, nanoseconds, time_message
+from palpate_bus.messages.stamps import MS, header, nanoseconds, time_message
 from palpate_bus.recordings import RecordingError, open_recording
 from palpate_camera.backends.kinect.service import create as create_camera
 from palpate_camera.backends.replay import POSE, ReplayedCamera, create

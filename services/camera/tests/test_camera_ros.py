@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
 from palpate_bus.messages import (
     CameraInfo,
@@ -20,7 +20,7 @@ from palpate_bus.messages import (
     TransformStamped,
     Vector3,
 )
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions

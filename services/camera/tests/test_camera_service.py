@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 import trimesh
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, TFMessage
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.scene import Caster, Mesh, Scene
 from palpate_camera.backends.kinect.service import FRAME, CameraService, create, transform

@@ -6,10 +6,10 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import Clock, DiagnosticArray, Quaternion, TFMessage, Transform, TransformStamped, codec
 from palpate_bus.messages.geometry import transform_message
-from palpate_bus.messages.stamps import NS, header, nanoseconds, time_message
+from palpate_bus.messages.stamps import MS, NS, header, nanoseconds, time_message
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.robot.arm import arm_of
 from palpate_models.robot.kinematics import link_transforms

@@ -10,8 +10,7 @@ from dataclasses import dataclass
 from time import monotonic, time_ns
 from typing import Final
 
-from palpate_bus.contract import MS
-from palpate_bus.messages.stamps import NS
+from palpate_bus.messages.stamps import MS, NS
 from palpate_bus.runs.operator import TIME_REQUESTS
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.runtime.lockstep import NEVER

@@ -5,9 +5,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, RobotStatus, Twist, Vector3, Wrench
-from palpate_bus.messages.stamps import duration_message, header, nanoseconds
+from palpate_bus.messages.stamps import MS, duration_message, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_control import impedance, safety
 from palpate_control.service import ControlService, create

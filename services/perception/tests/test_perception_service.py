@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 from scipy.interpolate import LinearNDInterpolator
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import CameraTrigger, SurfaceMesh, SurfaceMotion, TFMessage
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_camera.backends.kinect.service import CameraService, transform
 from palpate_models.numerics.frames import apply, inverse, matrix

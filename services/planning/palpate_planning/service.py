@@ -7,7 +7,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     CameraTrigger,
     OperatorRequest,
@@ -19,7 +19,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, World, known
 
-from palpate_bus.contract import MS, contract
+from palpate_bus.contract import contract
 from palpate_bus.messages import (
     Findings,
     OperatorRequest,
@@ -20,7 +20,7 @@ from palpate_bus.messages import (
     Wrench,
     codec,
 )
-from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_bus.testing import HandInbox
 from palpate_models.robot import lbr

@@ -32,7 +32,8 @@ RIPPLES: Final = 320
 """Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear (assumed)."""
 SETTLING_S: Final = 0.02
 """Time constant of the joint deflection (assumed): motor inertia of 4 kg m^2 (at the joint) on a spring of 10 kN m/rad."""
-_NOISE_BLOCK: Final = 1024
+_BLOCK: Final = 1024
+"""Readings whose errors are drawn at once. Slow errors are exact at the ends of a block and linear in between."""
 
 
 @compiled
@@ -74,7 +75,7 @@ class JointSensor:
     def read(self) -> tuple[Array, Array]:
         """Return positions and velocities with white noise."""
         if not self._noise:
-            noise = self._deviation * self._rng.standard_normal((_NOISE_BLOCK, len(self._deviation)))
+            noise = self._deviation * self._rng.standard_normal((_BLOCK, len(self._deviation)))
             self._noise = list(noise.reshape(-1, len(self.q))[::-1])
         return self.q + self._noise.pop(), self.v + self._noise.pop()
 
@@ -93,11 +94,6 @@ class TorqueSensors:
         friction = (given.friction_nm + given.load_friction * np.abs(loaded)) * (v / (np.abs(v) + STICK_RADPS))
         noise = given.noise_nm / np.sqrt(readings) * self._rng.standard_normal(len(q))
         return np.asarray(drawn.gain * loaded + drawn.zero_nm + friction + noise)
-
-
-_BLOCK: Final = 1024
-"""Readings whose errors are drawn at once. Slow errors are exact at the ends of a block and linear in between."""
-_MINUTE_S: Final = 60.0
 
 
 class FtSensor:
@@ -148,7 +144,7 @@ class FtSensor:
         step = self._slow.standard_normal((2, 6))
         kept = np.exp(-self._length_s / given.tare_s)
         self._wander = kept * self._wander + given.tare_n * self._scale * np.sqrt(1 - kept**2) * step[0]
-        self._walk = self._walk + given.walk_n * self._scale * np.sqrt(self._length_s / _MINUTE_S) * step[1]
+        self._walk = self._walk + given.walk_n * self._scale * np.sqrt(self._length_s / 60.0) * step[1]
         path = np.outer(self._t / self._length_s, self._wander + self._walk - before)
         warm = np.outer(1 - np.exp(-t / given.warm_up_s), drawn.warm_up)
         return np.asarray(drawn.bias + before + path + warm)

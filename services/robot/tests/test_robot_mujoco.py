@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate_bus.contract import MS
+from palpate_bus.messages.stamps import MS
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import load_scenario

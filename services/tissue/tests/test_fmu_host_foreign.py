@@ -10,10 +10,10 @@ import pytest
 from foreign_fmu import build_lag
 from scipy.spatial.transform import Rotation
 
-from palpate_bus.contract import MS, Contract, contract, parse
+from palpate_bus.contract import Contract, contract, parse
 from palpate_bus.messages import Point, Pose, PoseStamped, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.stamps import MS, NS, header
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_fmu.compiling import native

@@ -6,11 +6,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import Point, Pose, Quaternion, ToolState, Twist, Vector3
 from palpate_bus.messages.codec import decode, encode
 from palpate_bus.messages.geometry import pose_matrix
-from palpate_bus.messages.stamps import header
+from palpate_bus.messages.stamps import MS, header
 from palpate_bus.service import Service
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import apply, matrix

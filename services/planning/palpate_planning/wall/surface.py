@@ -6,8 +6,7 @@ the single-point functions are compiled; the values are equal.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NdBSpline, NearestNDInterpolator, make_interp_spline
@@ -73,9 +72,8 @@ def _basis(knots: Array, x: float) -> tuple[int, Array]:
     return i - DEGREE, values
 
 
-@dataclass(frozen=True)
-class FieldTuning:
-    """Settings of the height field."""
+class FieldTuning(NamedTuple):
+    """Settings of the height field and its compiled search."""
 
     grid_m: float = 0.004
     """Spacing of the spline grid; finer than the perceived detail."""
@@ -88,7 +86,7 @@ class FieldTuning:
     """Largest motion of the foot in one iteration."""
 
 
-FIELD: Final = FieldTuning()
+FIELD = FieldTuning()
 
 
 class BicubicField:

@@ -14,9 +14,8 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.contract import MS
 from palpate_bus.messages import JointState, Vector3, Wrench, WrenchStamped, codec
-from palpate_bus.messages.stamps import NS, header
+from palpate_bus.messages.stamps import MS, NS, header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_errors import UserError

@@ -29,9 +29,6 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
 from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
 
-OVER_RELAXATION = 1.35
-"""Near optimal: 2 / (1 + sqrt(1 - rho^2)) with rho = 0.87, the spectral radius of Jacobi sweeps at 10 ms."""
-
 SWEEPS = 3
 """Over-relaxation sweeps per step near the sphere."""
 STILL_M = 1e-7
@@ -91,8 +88,9 @@ class Stride(NamedTuple):
     """Over-relaxation of a sweep [1]."""
 
 
-OWN = Stride(1.0, 1.0, OVER_RELAXATION)
-"""One step of the wall; branches are updated afterwards."""
+OWN = Stride(1.0, 1.0, over=1.35)
+"""One step of the wall; branches are updated afterwards. The over-relaxation is near optimal: 2 / (1 + sqrt(1 - rho^2)) with
+rho = 0.87, the spectral radius of Jacobi sweeps at 10 ms."""
 
 
 @compiled

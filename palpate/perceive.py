@@ -1,19 +1,57 @@
-"""The perceived surface of a depth recording: the perception pipeline on all its images."""
+"""`palpate perceive`: the perceived surface of a depth recording, by the perception pipeline on all its images."""
 
-from dataclasses import dataclass
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-import trimesh
-from matplotlib.figure import Figure
+import typer
 
-from palpate_camera.backends.replay import ReplayedCamera
+from palpate.console import output_folder, print_json
+from palpate.run.options import Settings
 from palpate_errors import RunError
-from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Scenario
-from palpate_perception.cloud import Intrinsics
-from palpate_perception.pipeline import Perceived, PerceivedMesh, Pipeline
+
+if TYPE_CHECKING:
+    from palpate_camera.backends.replay import ReplayedCamera
+    from palpate_models.numerics.frames import Array
+    from palpate_models.scenario.schema import Scenario
+    from palpate_perception.pipeline import Perceived
+
+
+def perceive(
+    bag: Annotated[Path, typer.Argument(metavar="BAG", help="Depth recording: rosbag2 folder, MCAP file or folder of a run.")],
+    scenario: Annotated[
+        str | None, typer.Option("--scenario", help="Place and size of the region; by default those of the run, or of `clean`.")
+    ] = None,
+    out: Annotated[Path, output_folder("Folder of surface.ply and surface.png.", "--out", "-o")] = Path("perceived"),
+    settings: Settings = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
+) -> None:
+    """Perceive a surface with its normals in a depth recording, without a run.
+
+    The recording needs camera/depth/image_raw, camera/depth/camera_info and tf_static with the camera's pose in world.
+    surface.ply is in the abdomen frame, so it can be a scenario's `phantom.mesh`.
+
+    [bold]Examples[/]
+
+      palpate perceive results/clean                          the scan of a run
+
+      palpate perceive bag --set exam.region_m=[0.1,0.1]      a region of another size
+    """
+    from palpate_bus.recordings import open_recording
+    from palpate_camera.backends.replay import ReplayedCamera
+    from palpate_models.scenario.load import load_scenario
+
+    own = bag / "exam.yaml"
+    chosen = load_scenario(scenario or (str(own) if own.is_file() else "clean"), settings or ())
+    seen = perceived(ReplayedCamera(open_recording(bag), whole=False), chosen)
+    figures = asdict(write(out, seen, chosen))
+    if as_json:
+        print_json(figures)
+    else:
+        print(", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
+        print(f"written to {out}: surface.ply, surface.png")
 
 
 @dataclass(frozen=True)
@@ -33,6 +71,12 @@ class SurfaceFigures:
 
 def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
     """Return the result of perception from all images of a recording. Raises RunError if there is no surface."""
+    import numpy as np
+
+    from palpate_models.scenario.load import exam_input
+    from palpate_perception.cloud import Intrinsics
+    from palpate_perception.pipeline import Pipeline
+
     pinhole = camera.frames[0].pinhole
     intrinsics = Intrinsics(pinhole.matrix, camera.X_WC, (pinhole.height, pinhole.width))
     pipeline = Pipeline(scenario.exam, np.array(exam_input(scenario).X_WA))
@@ -47,7 +91,13 @@ def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
 
 def write(folder: Path, found: Perceived, scenario: Scenario) -> SurfaceFigures:
     """Write surface.ply and surface.png, in the abdomen frame, and return the figures."""
-    assert isinstance(found.mesh, PerceivedMesh)
+    import numpy as np
+    import trimesh
+
+    from palpate_models.numerics.frames import apply, inverse
+    from palpate_models.scenario.load import exam_input
+
+    assert found.mesh is not None
     X_AW = inverse(np.array(exam_input(scenario).X_WA))
     vertices, normals = apply(X_AW, found.mesh.p_W), found.mesh.n_W @ X_AW[:3, :3].T
     mesh = trimesh.Trimesh(vertices, found.mesh.triangles.astype(np.int64), vertex_normals=normals, process=False)
@@ -65,6 +115,9 @@ def write(folder: Path, found: Perceived, scenario: Scenario) -> SurfaceFigures:
 
 def _draw(path: Path, vertices: Array, normals: Array) -> None:
     """Draw heights and normals over the plane of the abdomen frame."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
     x, y, z = 1e3 * vertices.T
     figure = Figure(figsize=(10.5, 4.6), layout="constrained")
     left, right = figure.subplots(1, 2)

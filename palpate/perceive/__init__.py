@@ -1,1 +1,0 @@
-"""Perception of a depth recording, without a run."""
