@@ -25,7 +25,7 @@ HELP = "A robot arm feels for lumps in a simulated abdomen. You can replace each
 GROUPS = {
     "Examine": {
         "run": "palpate.run.command:run",
-        "plan": "palpate.plan.command:plan",
+        "plan": "palpate.plan:plan",
         "scenarios": "palpate.listings:scenarios",
         "stop": "palpate.live.operator:stop",
         "release": "palpate.live.operator:release",

@@ -33,7 +33,7 @@ def topics() -> None:
             topic.name if topic.visibility == "public" else Text.assemble(topic.name, (f" ({topic.visibility})", "dim")),
             topic.type.replace("/msg/", "/"),
             topic.producer,
-            "latched" if topic.latched else f"{topic.period_ms} ms{' event' if topic.event else ''}",
+            topic.sent,
             topic.qos,
             "yes" if topic.hashed else "",
             ", ".join(f"{role} ({edge})" for role, edge in topic.readers.items() if edge.blocking),

@@ -1,9 +1,8 @@
-"""Arrays for drawing: messages as arrays, and mesh geometry (shading, transfer of values between meshes)."""
+"""Arrays for drawing: messages as arrays, and transfer of values between meshes."""
 
 from typing import Any
 
 import numpy as np
-import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
@@ -38,17 +37,6 @@ def cloud(message: Message) -> NDArray[np.float32]:
     rows = np.frombuffer(np.ascontiguousarray(message.data), dtype=layout, count=message.width * message.height)
     xyz = np.stack((rows["x"], rows["y"], rows["z"]), axis=1).astype(np.float32)
     return np.asarray(xyz[np.isfinite(xyz).all(axis=1)])
-
-
-def shaded(
-    vertices: Floats, triangles: Indices, crease_rad: float = 0.6
-) -> tuple[NDArray[np.float32], Indices, NDArray[np.float32]]:
-    """Return a rigid mesh for shading: smooth, but sharp where faces meet at more than `crease_rad`.
-
-    Vertices on a crease are doubled. Returns vertices, shape (k, 3), triangles, shape (m, 3), and unit normals, shape (k, 3).
-    """
-    mesh = trimesh.graph.smooth_shade(trimesh.Trimesh(vertices, triangles, process=False), angle=crease_rad)
-    return mesh.vertices.astype(np.float32), np.asarray(mesh.faces), mesh.vertex_normals.astype(np.float32)
 
 
 class Carry:

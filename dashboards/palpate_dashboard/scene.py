@@ -16,7 +16,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import depth_in_metres, quaternion, transform_matrix, vectors
 from palpate_dashboard import palette
-from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, shaded, transform, triples
+from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, transform, triples
 from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
 from palpate_models.patient.mesh import vertex_normals
 from palpate_models.robot import table
@@ -55,9 +55,11 @@ def _link_shapes(robot: Robot) -> dict[str, list[rr.Mesh3D]]:
     shapes: dict[str, list[rr.Mesh3D]] = {}
     for link, meshes in visual_meshes(robot).items():
         for mesh in meshes:
-            positions, triangles, normals = shaded(mesh.vertices, mesh.triangles)
+            normals = vertex_normals(mesh.vertices, mesh.triangles)
             color = [round(255 * channel) for channel in mesh.rgba]
-            shape = rr.Mesh3D(vertex_positions=positions, triangle_indices=triangles, vertex_normals=normals, albedo_factor=color)
+            shape = rr.Mesh3D(
+                vertex_positions=mesh.vertices, triangle_indices=mesh.triangles, vertex_normals=normals, albedo_factor=color
+            )
             shapes.setdefault(link, []).append(shape)
     return shapes
 
@@ -148,22 +150,11 @@ class SceneView:
         self._canvas.log("world/findings", shape, t)
 
     def camera(self, _t: int, message: Message) -> None:
-        """Draw the camera at the calibrated pose of its optical frame, with its tripod."""
+        """Draw the camera at the calibrated pose of its optical frame."""
         for item in message.transforms:
             if item.child_frame_id == CAMERA_FRAME:
-                self._camera(transform_matrix(item.transform))
-
-    def _camera(self, X_WC: Floats) -> None:
-        pose = rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3])
-        self._canvas.log("world/camera", pose)
-        self._canvas.log("world/furniture/camera", pose)
-        body = rr.Boxes3D(sizes=[(0.28, 0.06, 0.06)], centers=[(0, 0, -0.04)], colors=[palette.PLINTH], fill_mode="solid")
-        self._canvas.log("world/furniture/camera", body)
-        x, y, z = X_WC[:3, 3]
-        top, knee = np.array((x, y, z - 0.04)), np.array((x, y, min(0.9, 0.6 * z)))
-        feet = [(x + 0.38 * np.cos(a), y + 0.38 * np.sin(a), 0.0) for a in np.deg2rad((90, 210, 330))]
-        legs = rr.LineStrips3D([[top, knee], *([knee, foot] for foot in feet)], colors=[palette.PLINTH], radii=[0.011])
-        self._canvas.log("world/furniture/tripod", legs)
+                X_WC = transform_matrix(item.transform)
+                self._canvas.log("world/camera", rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3]))
 
     def lens(self, _t: int, message: Message) -> None:
         """Set the camera intrinsics."""

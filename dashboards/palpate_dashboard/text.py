@@ -41,7 +41,7 @@ LEGEND = """
 | red arrow next to the tool | measured normal force, 5 N are 15 cm |
 | violet outline | true lesion at half contrast, on the patient's true pose: hidden until the eye of `world/truth` is clicked |
 | white points | palpation targets; light blue: perceived points |
-| pyramid | view of the depth camera, on its tripod |
+| pyramid | view of the depth camera |
 
 | elsewhere | |
 |---|---|

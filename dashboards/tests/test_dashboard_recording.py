@@ -100,7 +100,6 @@ def test_everything_is_drawn(recording: Recording) -> None:
         "/map/mean/surface", "/map/band/surface", "/map/mean/findings",
     }  # fmt: skip
     assert expected <= recording.temporal.keys()
-    assert "/world/furniture/tripod" in recording.static
     for box in ("table_top", "table_column", "robot_base"):
         assert f"/world/furniture/{box}" in recording.static
     assert {"/world/truth/lesions", "/world/truth/axes", "/map/mean/truth", "/text/truth"} <= recording.static

@@ -2,14 +2,9 @@
 
 import numpy as np
 
-from palpate_bus.contract import contract
-from palpate_bus.messages.stamps import NS
-from palpate_models.patient.breathing import BreathingCurve
-from palpate_models.patient.phantom import build_phantom
 from palpate_models.scenario import press
-from palpate_models.scenario.load import true_pose
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.service import TissueService
+from palpate_tissue.service import simulated
 
 
 class Springs(TissueBackend):
@@ -59,8 +54,10 @@ class Springs(TissueBackend):
 
 def create(scenario):
     """Return the service of the role `tissue`."""
-    model = build_phantom(scenario.phantom, scenario.seed)
-    breathing = BreathingCurve(scenario.phantom.breathing, scenario.seed)
-    springs = Springs(model, breathing, dt=contract().roles["tissue"].period / NS)
-    springs.settle()
-    return TissueService(springs, model, true_pose(scenario), {})
+
+    def make(model, breathing, period_s):
+        springs = Springs(model, breathing, dt=period_s)
+        springs.settle()
+        return springs, {}
+
+    return simulated(scenario, make)

@@ -3,7 +3,7 @@
 from collections.abc import Container, Iterable
 
 from generate import table
-from palpate_bus.contract import Contract, Edge, Qos, Role, Topic, Visibility, contract
+from palpate_bus.contract import Contract, Edge, Qos, Role, Visibility, contract
 
 _HEAD = """\
 # Topics
@@ -24,12 +24,6 @@ _EDGES = {
     Edge.OBSERVE: "on arrival",
 }
 
-_VISIBILITY = {
-    Visibility.PUBLIC: "everyone",
-    Visibility.SIM: "the simulation only: hardware has no sensor for it",
-    Visibility.TRUTH: "scoring, dashboard, recorder and tests only",
-}
-
 
 def page(rules: Contract | None = None) -> str:
     """Return the page of a contract, by default the project's."""
@@ -39,12 +33,6 @@ def page(rules: Contract | None = None) -> str:
     parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
     parts.append(_internal(rules))
     return "\n".join(parts)
-
-
-def _milliseconds(topic: Topic) -> str:
-    if topic.latched:
-        return "once"
-    return f"at most every {topic.period_ms} ms" if topic.event else f"{topic.period_ms} ms"
 
 
 def _dataflow(rules: Contract) -> str:
@@ -124,32 +112,8 @@ def _producer(rules: Contract, role: Role) -> str:
     if inputs and not role.observer:
         parts += ["Reads:\n", table(("topic", "from", "when"), inputs)]
     for topic in rules.outputs(role.name):
-        parts += [f"### `{topic.name}`\n", topic.doc + ".\n", table(("", ""), _facts(topic))]
-        if topic.units or topic.ranges:
-            parts.append(table(("field", "unit", "range"), _fields(topic)))
+        parts += [f"### `{topic.name}`\n", topic.doc + ".\n", table(("", ""), topic.facts())]
     return "\n".join(parts)
-
-
-def _facts(topic: Topic) -> list[tuple[str, str]]:
-    readers = ", ".join(f"{role} ({_EDGES[edge]})" for role, edge in topic.readers.items())
-    rows = [("type", f"`{topic.type}`"), ("hash", f"`{topic.type_hash}`"), ("sent", _milliseconds(topic))]
-    rows += [("frame", f"`{topic.frame}`")] if topic.frame else []
-    rows += [("QoS class", f"`{topic.qos}`"), ("read by", readers), ("visible to", _VISIBILITY[topic.visibility])]
-    rows += [("in the run hash", "yes" if topic.hashed else "no")]
-    rows += [("may be sent by", "anyone, including a ROS 2 node")] if topic.open else []
-    rows += [("tagged", "in runs with a key")] if topic.tagged else []
-    rows += [("--record normal keeps", f"one message in {topic.record_ms} ms")] if topic.record_ms else []
-    rows += [("stale after", f"{topic.max_age_ms} ms")] if topic.max_age_ms else []
-    rows += [("expires after", f"{topic.expiry_ms} ms: the receiver then enters its safe state")] if topic.expiry_ms else []
-    return rows
-
-
-def _fields(topic: Topic) -> list[tuple[str, str, str]]:
-    rows = []
-    for path in dict.fromkeys([*topic.units, *topic.ranges]):
-        least, most = topic.ranges.get(path, (None, None))
-        rows.append((f"`{path}`", topic.units.get(path, ""), "" if least is None else f"{least:g} .. {most:g}"))
-    return rows
 
 
 def _internal(rules: Contract) -> str:

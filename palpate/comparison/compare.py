@@ -23,7 +23,7 @@ from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import map_of, sample_columns
 from palpate.report.scoring import Map
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array, apply
+from palpate_models.numerics.frames import Array, apply, rigid
 
 
 @dataclass(frozen=True)
@@ -205,10 +205,8 @@ def _registration(a: ComparedPalpation, b: ComparedPalpation) -> Array:
         return np.asarray(np.nan_to_num(np.clip(np.concatenate(rows), -3, 3), nan=1.0))  # a place off the map costs one SD
 
     motion = least_squares(misfit, start, x_scale=[0.002] * 3 + [0.05] * 3).x
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_rotvec(motion[3:]).as_matrix()
-    X[:3, 3] = middle + motion[:3] - X[:3, :3] @ middle
-    return X
+    R = Rotation.from_rotvec(motion[3:]).as_matrix()
+    return rigid(R, middle + motion[:3] - R @ middle)
 
 
 def _interval(inside: NDArray[np.bool_]) -> Interval:

@@ -60,7 +60,7 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
     out = table("topic", "type", "published by", "subscribed by", "in the contract")
     for topic in rows:
         row = contract().topics.get(topic["topic"])
-        known = Text("no", "yellow") if row is None else Text(_period(row))
+        known = Text("no", "yellow") if row is None else Text(row.sent)
         if row is not None and not topic["matches_contract"]:
             known = Text("other type or hash", "bold red")
         types = ", ".join(one["type"].replace("/msg/", "/") for one in topic["types"])
@@ -104,7 +104,8 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
         return
     out = table("", "")
     out.show_header = False
-    for key, value in _contract_rows(row):
+    about = [("contract", "does not have it")] if row is None else [("topic", name), ("", row.doc), *row.facts()]
+    for key, value in about:
         out.add_row(Text(key, "bold"), value)
     ends_table = table("node", "", "type", "hash")
     for entity, end in ends:
@@ -349,22 +350,3 @@ def _print_rate(rows: Sequence[tuple[int, int | None]], topic: Topic, as_json: b
     text += f" (contract {contract_hz:g} Hz)" if contract_hz else ""
     text += f"; spacing {facts['mean_ms']:.3g} ms mean, {facts['least_ms']:.3g} to {facts['most_ms']:.3g}"
     print(f"{text}, std {facts['std_ms']:.2g}; {facts['messages']} messages", flush=True)
-
-
-def _period(row: Topic) -> str:
-    return "latched" if row.latched else f"{row.period_ms} ms{' event' if row.event else ''}"
-
-
-def _contract_rows(row: Topic | None) -> list[tuple[str, str]]:
-    if row is None:
-        return [("contract", "does not have it")]
-    facts = [("topic", row.name), ("", row.doc), ("type", row.type), ("hash", row.type_hash), ("producer", row.producer)]
-    facts += [("sent", _period(row)), ("QoS", row.qos), ("may be known to", str(row.visibility))]
-    facts += [("frame", row.frame)] if row.frame else []
-    for path in dict.fromkeys([*row.units, *row.ranges]):
-        low, high = row.ranges.get(path, (None, None))
-        unit = f"[{row.units.get(path, '1')}]"
-        facts.append((path, unit + ("" if low is None else f" {low:g} .. {high:g}")))
-    facts += [("stale after", f"{row.max_age_ms} ms")] if row.max_age_ms else []
-    facts += [("expires after", f"{row.expiry_ms} ms")] if row.expiry_ms else []
-    return facts

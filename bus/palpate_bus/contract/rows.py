@@ -134,6 +134,27 @@ class Topic(_Row):
         """RIHS01 hash of the message type."""
         return codec.type_hash(self.type)
 
+    @property
+    def sent(self) -> str:
+        """When it is sent, as text."""
+        return "once, latched" if self.latched else f"{'at most every ' if self.event else ''}{self.period_ms} ms"
+
+    def facts(self) -> list[tuple[str, str]]:
+        """Return the row as pairs of a name and a text: the topic, then its fields with unit and range."""
+        facts = [("type", self.type), ("hash", self.type_hash), ("sent by", self.producer), ("sent", self.sent)]
+        facts += [("read by", ", ".join(f"{role} ({edge})" for role, edge in self.readers.items())), ("QoS", self.qos)]
+        facts += [("may be known to", str(self.visibility)), ("in the run hash", "yes" if self.hashed else "no")]
+        facts += [("frame", self.frame)] if self.frame else []
+        facts += [("may be sent by", "anyone, including a ROS 2 node")] if self.open else []
+        facts += [("tagged", "in runs with a key")] if self.tagged else []
+        facts += [("--record normal keeps", f"one message in {self.record_ms} ms")] if self.record_ms else []
+        facts += [("stale after", f"{self.max_age_ms} ms")] if self.max_age_ms else []
+        facts += [("expires after", f"{self.expiry_ms} ms: the receiver then enters its safe state")] if self.expiry_ms else []
+        for path in dict.fromkeys([*self.units, *self.ranges]):
+            low, high = self.ranges.get(path, (None, None))
+            facts.append((path, f"[{self.units.get(path, '1')}]" + ("" if low is None else f" {low:g} .. {high:g}")))
+        return facts
+
 
 def _given(row: Topic | Internal, field: str) -> int:
     value: int | None = getattr(row, field)

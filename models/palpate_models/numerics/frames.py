@@ -3,7 +3,7 @@
 from typing import Final
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 from scipy.spatial.transform import Rotation
 
 from palpate_models.section import Pose
@@ -11,12 +11,17 @@ from palpate_models.section import Pose
 Array = NDArray[np.float64]
 
 
+def rigid(R: ArrayLike, p: ArrayLike) -> Array:
+    """Return the homogeneous matrix, shape (4, 4), of a rotation, shape (3, 3), and a translation, shape (3,)."""
+    X = np.eye(4)
+    X[:3, :3] = R
+    X[:3, 3] = p
+    return X
+
+
 def matrix(pose: Pose) -> Array:
     """Return the homogeneous matrix, shape (4, 4), of a scenario pose (fixed-axis roll, pitch, yaw)."""
-    X = np.eye(4)
-    X[:3, :3] = Rotation.from_euler("xyz", pose.rpy_rad).as_matrix()
-    X[:3, 3] = pose.xyz_m
-    return X
+    return rigid(Rotation.from_euler("xyz", pose.rpy_rad).as_matrix(), pose.xyz_m)
 
 
 def pose_of(X: Array) -> Pose:
@@ -28,10 +33,7 @@ def pose_of(X: Array) -> Pose:
 
 def inverse(X_AB: Array) -> Array:
     """Return X_BA, shape (4, 4)."""
-    X_BA = np.eye(4)
-    X_BA[:3, :3] = X_AB[:3, :3].T
-    X_BA[:3, 3] = -X_AB[:3, :3].T @ X_AB[:3, 3]
-    return X_BA
+    return rigid(X_AB[:3, :3].T, -X_AB[:3, :3].T @ X_AB[:3, 3])
 
 
 def apply(X_AB: Array, p_B: Array) -> Array:
@@ -47,10 +49,7 @@ def look_at(position: Array, target: Array) -> Array:
     if np.linalg.norm(x) < 1e-9:  # straight up or down: world's y is up in the picture
         x = np.cross(z, (0.0, 1.0, 0.0))
     x = x / np.linalg.norm(x)
-    X = np.eye(4)
-    X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
-    X[:3, 3] = position
-    return X
+    return rigid(np.column_stack((x, np.cross(z, x), z)), position)
 
 
 GRAVITY: Final = 9.81

@@ -11,7 +11,7 @@ from typing import Final
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia, Point
 from palpate_models.robot.lbr import ARM
 from palpate_models.robot.urdf_arm import load_arm, read_arm
@@ -51,12 +51,8 @@ def checked_arm(name: str) -> tuple[Arm | None, list[str]]:
 
 def base_pose(robot: Robot) -> Array:
     """Return X_WL0 of the base link in world, shape (4, 4)."""
-    X = np.eye(4)
-    turn = Rotation.from_euler("z", robot.base_yaw_rad).as_matrix()
-    R_BL = arm_of(robot).R_BL
-    X[:3, :3] = turn if R_BL is None else turn @ R_BL
-    X[:3, 3] = (*robot.base_xy_m, robot.base_height_m)
-    return X
+    turn, R_BL = Rotation.from_euler("z", robot.base_yaw_rad).as_matrix(), arm_of(robot).R_BL
+    return rigid(turn if R_BL is None else turn @ R_BL, (*robot.base_xy_m, robot.base_height_m))
 
 
 def link_names(robot: Robot) -> tuple[str, ...]:

@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.arm import TOOL, arm_of, base_pose, link_names
 from palpate_models.scenario.schema import Robot
 
@@ -11,17 +11,9 @@ from palpate_models.scenario.schema import Robot
 def link_transforms(q: Array, robot: Robot) -> list[tuple[str, str, Array]]:
     """(parent, child, X_PC) of every link of the URDF, from `world` to `indenter`, at joint positions `q` [rad], shape (n,)."""
     arm = arm_of(robot)
-    found = [base_pose(robot)]
     turns = Rotation.from_rotvec(np.asarray(q)[:, None] * arm.axis).as_matrix()
-    for turn, origin in zip(turns, arm.origin_m, strict=True):
-        X = np.eye(4)
-        X[:3, :3] = turn
-        X[:3, 3] = origin
-        found.append(X)
-    for step in (arm.flange_m, (0.0, 0.0, TOOL.flange_to_ft_m), (0.0, 0.0, TOOL.ft_to_indenter_m)):
-        X = np.eye(4)
-        X[:3, 3] = step
-        found.append(X)
+    steps = (arm.flange_m, (0.0, 0.0, TOOL.flange_to_ft_m), (0.0, 0.0, TOOL.ft_to_indenter_m))
+    found = [base_pose(robot), *map(rigid, turns, arm.origin_m), *(rigid(np.eye(3), step) for step in steps)]
     links = link_names(robot)
     return list(zip(("world", *links[:-1]), links, found, strict=True))
 

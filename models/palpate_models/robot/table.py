@@ -5,7 +5,7 @@ from typing import Final
 
 import numpy as np
 
-from palpate_models.numerics.frames import Array, matrix
+from palpate_models.numerics.frames import Array, matrix, rigid
 from palpate_models.scenario.schema import Robot
 from palpate_models.section import Pose, Vec3
 
@@ -39,8 +39,7 @@ class Box:
 
 
 def _aligned(name: str, low: Vec3, high: Vec3) -> Box:
-    X_WB = np.eye(4)
-    X_WB[:3, 3] = (np.array(low) + np.array(high)) / 2
+    X_WB = rigid(np.eye(3), (np.array(low) + np.array(high)) / 2)
     return Box(name, X_WB, (high[0] - low[0], high[1] - low[1], high[2] - low[2]))
 
 

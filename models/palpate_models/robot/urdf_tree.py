@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError
 from palpate_inputs import read_text
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, rigid
 
 
 class UrdfTree:
@@ -84,10 +84,7 @@ class UrdfTree:
 
     def pose(self, element: ElementTree.Element | None) -> Array:
         """Return the pose of an `origin`, shape (4, 4)."""
-        X = np.eye(4)
-        X[:3, :3] = Rotation.from_euler("xyz", self.numbers(element, "rpy")).as_matrix()
-        X[:3, 3] = self.numbers(element, "xyz")
-        return X
+        return rigid(Rotation.from_euler("xyz", self.numbers(element, "rpy")).as_matrix(), self.numbers(element, "xyz"))
 
 
 def linked(joint: ElementTree.Element, end: str) -> str:

@@ -7,13 +7,14 @@ import numpy as np
 import pytest
 from planning_fakes import BASE, PERIOD_S, known, seen_dome
 
+from palpate_models.numerics.frames import rigid
 from palpate_models.robot import lbr
 from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
-from palpate_planning.strokes.path import centre, least_twist, pose
+from palpate_planning.strokes.path import centre, least_twist
 from palpate_planning.strokes.plan import ExamPlanner, look_postures
 from palpate_planning.strokes.segments import REACH, STRETCHED
 
@@ -28,7 +29,7 @@ def above(x: float, y: float, gap: float) -> np.ndarray:
     """Return a posture with the indenter's deepest point `gap` above the surface over (x, y) of A."""
     p, n = (a[0] for a in SEEN.surface.at(np.array([[x, y]])))
     R = least_twist(-n, KINEMATICS.pose(lbr.HOME)[:3, :3])
-    goal = pose(R, centre(p, n, BASE.indenter_radius_m, -gap))
+    goal = rigid(R, centre(p, n, BASE.indenter_radius_m, -gap))
     solution = KINEMATICS.solve(goal, np.array(lbr.HOME), spin_free=True)
     assert solution.ok
     return solution.q

@@ -4,7 +4,7 @@ The physics is behind `TissueBackend`. This module converts messages to arrays i
 """
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from math import hypot, sqrt
 from typing import Any, ClassVar
 
@@ -17,10 +17,16 @@ from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import pose_message, wrench_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
+from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply, inverse, matrix
-from palpate_models.patient.phantom import PhantomModel
+from palpate_models.patient.breathing import BreathingCurve
+from palpate_models.patient.phantom import PhantomModel, build_phantom
+from palpate_models.scenario.load import true_pose
+from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Pose
+from palpate_plugins import PluginError
 from palpate_tissue.backend import TissueBackend
+from palpate_tissue.moving import carried
 from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
@@ -177,3 +183,19 @@ def _flat(vectors: Array) -> NDArray[np.float32]:
     """Return the columns of an array of shape (3, n), concatenated, shape (3 n,)."""
     x, y, z = vectors.astype(np.float32)
     return np.stack((x, y, z), axis=1).ravel()
+
+
+def simulated(
+    scenario: Scenario, make: Callable[[PhantomModel, BreathingCurve, float], tuple[TissueBackend, Mapping[str, Any]]]
+) -> Service:
+    """Return the tissue of a scenario, on its moving body. Besides scoring, this is the only role that gets the phantom.
+
+    `make` returns the physics of a phantom that breathes, in steps of a period [s], and facts for log and report. Raises
+    PluginError if it cannot simulate this phantom.
+    """
+    model, breathing = build_phantom(scenario.phantom, scenario.seed), BreathingCurve(scenario.phantom.breathing, scenario.seed)
+    try:
+        backend, facts = make(model, breathing, contract().roles[TissueService.role].period / NS)
+    except UserError as error:
+        raise PluginError(f"services.tissue = {scenario.services.tissue}: {error}") from error
+    return carried(TissueService(backend, model, true_pose(scenario), facts), scenario)

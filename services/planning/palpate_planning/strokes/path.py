@@ -48,14 +48,6 @@ def frame(z: Array, x_near: Array) -> Array:
     return np.column_stack((x, np.cross(z, x), z))
 
 
-def pose(R: Array, p: Array) -> Array:
-    """Return the homogeneous matrix, shape (4, 4)."""
-    X = np.eye(4)
-    X[:3, :3] = R
-    X[:3, 3] = p
-    return X
-
-
 @compiled
 def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
     """Return w_W [rad/s], shape (3,), that turns R0 into R1 in dt [s], for turns of less than 90 degrees."""

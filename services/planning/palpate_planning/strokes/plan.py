@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_models.numerics.frames import Array, apply, inverse
+from palpate_models.numerics.frames import Array, apply, inverse, rigid
 from palpate_models.scenario.patterns import scan_of
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
@@ -15,7 +15,7 @@ from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.placement.redundancy import plan_redundancy, prepare
 from palpate_planning.reasons import Cause
 from palpate_planning.strokes.coverage import strokes, touches
-from palpate_planning.strokes.path import centre, pose
+from palpate_planning.strokes.path import centre
 from palpate_planning.strokes.requests import PressPlanner
 from palpate_planning.strokes.segments import REACH, STRETCHED, Segment, SegmentPlanner, collision
 from palpate_planning.wall.surface import PerceivedSurface
@@ -71,7 +71,7 @@ class ExamPlan:
             if segment.contact and not segment.touch:
                 step = max(1, len(segment.path.s) * 5 // max(1, round(segment.path.length * 1e3)))
                 centres = centre(segment.path.p, segment.path.n, radius, depth)
-                out += [pose(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
+                out += [rigid(segment.path.R[i], centres[i]) for i in range(0, len(centres), step)]
         return np.array(out)
 
 

@@ -6,14 +6,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, rigid
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.scene import CollisionScene
 from palpate_planning.motion.timing import JointTrajectory
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.strokes.coverage import Stroke, transfer
-from palpate_planning.strokes.path import SurfacePath, centre, frames_along, least_twist, pose
+from palpate_planning.strokes.path import SurfacePath, centre, frames_along, least_twist
 from palpate_planning.wall.surface import PerceivedSurface
 
 
@@ -142,7 +142,7 @@ class SegmentPlanner:
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
-            goal = pose(least_twist(-n, self._R_ref), centre(p, n, self._radius, -SEGMENTS.hover_m))
+            goal = rigid(least_twist(-n, self._R_ref), centre(p, n, self._radius, -SEGMENTS.hover_m))
             near = self._postures[piece.targets[end]]
             solution = self._kinematics.solve(goal, near, near)
             good = solution.ok and self._scene.free(solution.q)
@@ -183,7 +183,7 @@ class SegmentPlanner:
         q = np.empty((len(solved), known.shape[1]))
         infeasible: Infeasible = []
         for row, i in enumerate(solved):
-            solution = self._kinematics.solve(pose(R[i], centres[i]), near[i], near[i])
+            solution = self._kinematics.solve(rigid(R[i], centres[i]), near[i], near[i])
             q[row] = solution.q
             if not solution.ok:
                 infeasible.append((int(i), REACH))

@@ -23,7 +23,7 @@ import dartpy as dart
 import numpy as np
 
 from palpate_errors import RunError
-from palpate_models.numerics.frames import GRAVITY, Array
+from palpate_models.numerics.frames import GRAVITY, Array, rigid
 from palpate_models.robot.arm import arm_of, capsules, link_names, mounted, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.table import Box, boxes
@@ -88,10 +88,7 @@ def _pose_along(start: Array, end: Array) -> Array:
     z = (end - start) / np.linalg.norm(end - start)
     x = np.cross((0.0, 1.0, 0.0), z) if abs(z[1]) < 0.9 else np.cross((1.0, 0.0, 0.0), z)
     x /= np.linalg.norm(x)
-    X = np.eye(4)
-    X[:3, :3] = np.column_stack((x, np.cross(z, x), z))
-    X[:3, 3] = (start + end) / 2
-    return X
+    return rigid(np.column_stack((x, np.cross(z, x), z)), (start + end) / 2)
 
 
 def _add_shape(body: Any, shape: Any, X: Array) -> None:
@@ -131,9 +128,7 @@ class DartPlant:
         joints = slice(1, 1 + arm.joints)
         self._arm = _load_arm(robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass}))
         for joint, origin, error in zip(self._arm.getJoints()[joints], arm.origin_m, drawn.origin_m, strict=True):
-            X_PL = np.eye(4)
-            X_PL[:3, 3] = origin + error
-            joint.setTransformFromParentBodyNode(_isometry(X_PL))
+            joint.setTransformFromParentBodyNode(_isometry(rigid(np.eye(3), origin + error)))
         self._set_damping = tuple(self._arm.getDof(i).setDampingCoefficient for i in range(arm.joints))
         stops = (arm.lower_rad - END_STOP_MARGIN_RAD, arm.upper_rad + END_STOP_MARGIN_RAD)
         for joint, lowest, highest in zip(self._arm.getJoints()[joints], *stops, strict=True):
@@ -182,9 +177,7 @@ class DartPlant:
         if length > 0:
             _add_shape(body, dart.dynamics.CapsuleShape(capsule.radius, length), _pose_along(start, end))
         else:
-            X = np.eye(4)
-            X[:3, 3] = start
-            _add_shape(body, dart.dynamics.SphereShape(capsule.radius), X)
+            _add_shape(body, dart.dynamics.SphereShape(capsule.radius), rigid(np.eye(3), start))
 
     def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
         """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""

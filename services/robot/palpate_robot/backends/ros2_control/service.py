@@ -9,11 +9,11 @@ from typing import Any, Final
 
 import numpy as np
 
-from palpate_bus.messages.geometry import rotation, vector
+from palpate_bus.messages.geometry import pose_matrix
 from palpate_bus.service import Inbox, Outbox
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
-from palpate_models.numerics.frames import Array
+from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.arm import TOOL, arm_of, base_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
@@ -78,9 +78,8 @@ class Ros2ControlService(HardwareService):
         if self._level is CommandLevel.SETPOINT:
             X_WI = self._model.tool_pose(self._arm.q)
             if active and self._setpoint is not None:
-                X_WI = _pose(self._setpoint)
-            X_IF = np.eye(4)
-            X_IF[2, 3] = -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m
+                X_WI = pose_matrix(self._setpoint.pose)
+            X_IF = rigid(np.eye(3), (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
             self._port.pose(self._X_BW @ X_WI @ X_IF)
             self._commands += 1
         else:
@@ -95,7 +94,11 @@ class Ros2ControlService(HardwareService):
         if self._level is CommandLevel.SETPOINT:
             if self._setpoint is None:
                 return ""
-            command, measured, names = _pose(self._setpoint)[:3, 3], self._model.tool_pose(arm.q)[:3, 3], ["x", "y", "z"]
+            command, measured, names = (
+                pose_matrix(self._setpoint.pose)[:3, 3],
+                self._model.tool_pose(arm.q)[:3, 3],
+                ["x", "y", "z"],
+            )
             unit = "m"
         elif self._level is CommandLevel.POSITION:
             command, measured, names, unit = values, arm.q, self._names, "rad"
@@ -109,12 +112,6 @@ class Ros2ControlService(HardwareService):
         asked, got = f"{command[stray]:.3f} {unit}", f"{measured[stray]:.3f} {unit}"
         advice = "is the controller active, and does the arm accept commands?"
         return f"{names[stray]} does not follow: commanded {asked}, measured {got} for {TUNING.window_s:g} s: {advice}"
-
-
-def _pose(setpoint: Any) -> Array:
-    X = np.eye(4)
-    X[:3, :3], X[:3, 3] = rotation(setpoint.pose.orientation), vector(setpoint.pose.position)
-    return X
 
 
 def create(scenario: Scenario) -> Ros2ControlService:

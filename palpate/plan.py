@@ -1,29 +1,65 @@
-"""The plan of an examination on the true surface: strokes, touches, skipped targets, duration."""
+"""`palpate plan`: the plan of an examination on the true surface: strokes, touches, skipped targets, duration."""
 
+from __future__ import annotations
+
+import math
+from collections import Counter
 from dataclasses import dataclass
 from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
-from matplotlib.figure import Figure
-from scipy.spatial import Delaunay
+import typer
 
-from palpate.quick.patient import seen_lattice
-from palpate.run.inputs import Outlook, scan_over, surface_of
-from palpate_bus.contract import contract
-from palpate_bus.messages.stamps import NS
-from palpate_models.numerics.frames import Array, apply, inverse
-from palpate_models.patient.phantom import PhantomModel
-from palpate_models.robot.arm import arm_of
-from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.patterns import Scan
-from palpate_models.scenario.schema import Exam, Mode, Scenario
-from palpate_planning.reasons import Cause
-from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
-from palpate_planning.wall.surface import PerceivedSurface
-from palpate_tissue.backends.winkler.mechanics import assemble
+from palpate.console import SteadyConsole, refuse
+from palpate.run.options import DEFAULT_SCENARIO, ScenarioName, Seed, Settings
 
-PERIOD_S = 0.010
-"""Time step of the planner's trajectories."""
+if TYPE_CHECKING:
+    from palpate_models.numerics.frames import Array
+    from palpate_models.patient.phantom import PhantomModel
+    from palpate_models.scenario.patterns import Scan
+    from palpate_models.scenario.schema import Exam, Scenario
+    from palpate_planning.reasons import Cause
+
+
+def plan(
+    scenario: ScenarioName = DEFAULT_SCENARIO,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The picture, a PNG file.")] = Path("plan.png"),
+    seed: Seed = None,
+    settings: Settings = None,
+) -> None:
+    """Draw the plan of an examination: its targets, their order, the duration, and targets out of reach.
+
+    It is planned as in the examination, but on the patient's true surface; a camera has an error of some millimetres.
+
+    [bold]Examples[/]
+
+      palpate plan                                        the default examination
+
+      palpate plan --set exam.pattern=spiral.py           a custom scan pattern
+
+      palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
+    """
+    from palpate.apart import guarded
+    from palpate.run.inputs import usable
+    from palpate_models.patient.phantom import build_phantom
+    from palpate_planning.motion.planner import NoPathError
+
+    if out.suffix.lower() != ".png":
+        refuse(f"--out {out}: want the name of a .png file")
+    chosen = usable(scenario, settings, seed)
+    try:
+        with SteadyConsole(stderr=True).status("planning: about ten seconds"):
+            phantom = build_phantom(chosen.phantom, chosen.seed)
+            check_tissue(chosen, phantom)
+            planned = guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
+            draw(out, chosen, phantom, planned)
+    except NoPathError as error:
+        refuse(error)
+    console = SteadyConsole()
+    console.print(summary(chosen.exam, planned), highlight=False, soft_wrap=True)
+    for why, count in sorted(Counter(cause.text for cause in planned.skipped.values()).items()):
+        console.print(f"{count} targets are left out: {why}", highlight=False, soft_wrap=True)
+    console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
 
 
 @dataclass(frozen=True)
@@ -43,17 +79,34 @@ class Prospect:
     @property
     def length_m(self) -> float:
         """Path length in contact."""
+        import numpy as np
+
         return float(sum(np.linalg.norm(np.diff(stroke, axis=0), axis=1).sum() for stroke in self.strokes))
 
 
 def check_tissue(scenario: Scenario, phantom: PhantomModel) -> None:
     """Raise UserError if the default tissue could not be stepped on this phantom's mesh."""
+    from palpate_bus.contract import contract
+    from palpate_bus.messages.stamps import NS
+    from palpate_tissue.backends.winkler.mechanics import assemble
+
     if scenario.services.tissue == "winkler":
         assemble(phantom, scenario.phantom.stiffness).substeps(contract().roles["tissue"].period / NS)
 
 
 def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
     """Return the plan on the true rest surface, as registered. Raises PluginError, and NoPathError if no target is in reach."""
+    import numpy as np
+    from scipy.spatial import Delaunay
+
+    from palpate.quick.patient import PERIOD_S, seen_lattice
+    from palpate.run.inputs import Outlook, scan_over, surface_of
+    from palpate_models.numerics.frames import apply, inverse
+    from palpate_models.robot.arm import arm_of
+    from palpate_models.scenario.load import exam_input
+    from palpate_planning.strokes.plan import ExamPlanner, PerceivedAbdomen
+    from palpate_planning.wall.surface import PerceivedSurface
+
     scan = scan_over(scenario, phantom)
     known = exam_input(scenario)
     X_WA = np.array(known.X_WA)
@@ -73,6 +126,8 @@ def prospect(scenario: Scenario, phantom: PhantomModel) -> Prospect:
 
 def summary(exam: Exam, planned: Prospect) -> str:
     """Return the numbers of targets or presses, lines, strokes and touches, and the duration, as a line."""
+    from palpate_models.scenario.schema import Mode
+
     targets, touches = len(planned.scan.targets), _counted(len(planned.touches), "touch", "touches")
     if exam.searched:
         return (
@@ -91,39 +146,39 @@ def _counted(number: int, one: str, many: str = "") -> str:
     return f"{number} {one if number == 1 else many or one + 's'}"
 
 
-MM = 1e3
-CONTOURS = "#c9d1d4"
-
-
 def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospect) -> None:
     """Draw the plan on the body, seen from the front with the head at the top, into a PNG file. Raises OSError."""
+    import numpy as np
+    from matplotlib.figure import Figure
+
     figure = Figure(figsize=(8.5, 8.0), dpi=110, facecolor="white", layout="constrained")
     axes = figure.add_subplot()
+    mm, contours = 1e3, "#c9d1d4"
     front = phantom.normals[:, 2] > 0.1
-    x, y, z = phantom.vertices[front].T * MM
-    axes.tricontour(x, y, z, levels=10, colors=CONTOURS, linewidths=0.8)
-    axes.plot([], [], color=CONTOURS, linewidth=0.8, label="equal height of the skin")
+    x, y, z = phantom.vertices[front].T * mm
+    axes.tricontour(x, y, z, levels=10, colors=contours, linewidths=0.8)
+    axes.plot([], [], color=contours, linewidth=0.8, label="equal height of the skin")
     used = np.array([i not in planned.skipped for i in range(len(planned.scan.targets))])
     for k, stroke in enumerate(planned.strokes):
         label = "stroke, which may leave the region where it turns" if k == 0 else None
-        axes.plot(*(stroke.T * MM), color="#7a8c94", linewidth=1.2, zorder=2, label=label)
+        axes.plot(*(stroke.T * mm), color="#7a8c94", linewidth=1.2, zorder=2, label=label)
     order = np.flatnonzero(used)
-    targets = planned.scan.targets * MM
+    targets = planned.scan.targets * mm
     dots = axes.scatter(targets[used, 0], targets[used, 1], c=order, cmap="viridis", s=22, zorder=3)
     figure.colorbar(dots, ax=axes, label="number of the place" if scenario.exam.searched else "order of the targets", shrink=0.75)
     if len(planned.touches):
-        x, y = planned.touches.T * MM
+        x, y = planned.touches.T * mm
         axes.scatter(x, y, marker="o", s=130, facecolors="none", edgecolors="#d07000", label="touch", zorder=4)
     if not used.all():
         axes.scatter(targets[~used, 0], targets[~used, 1], marker="x", s=50, color="#c00000", label="left out", zorder=5)
     if len(planned.strokes):
         axes.plot(
-            *(planned.strokes[0][0] * MM), marker="*", markersize=15, color="#c000a0", linestyle="", label="begins here", zorder=6
+            *(planned.strokes[0][0] * mm), marker="*", markersize=15, color="#c000a0", linestyle="", label="begins here", zorder=6
         )
     (cx, cy), (width, height) = scenario.exam.centre_m, scenario.exam.region_m
     margin = 0.03
-    axes.set_xlim((cx - width / 2 - margin) * MM, (cx + width / 2 + margin) * MM)
-    axes.set_ylim((cy - height / 2 - margin) * MM, (cy + height / 2 + margin) * MM)
+    axes.set_xlim((cx - width / 2 - margin) * mm, (cx + width / 2 + margin) * mm)
+    axes.set_ylim((cy - height / 2 - margin) * mm, (cy + height / 2 + margin) * mm)
     axes.set_aspect("equal")
     axes.set_xlabel("x, to the patient's left [mm]")
     axes.set_ylabel("y, to the head [mm]")

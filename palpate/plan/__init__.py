@@ -1,1 +1,0 @@
-"""`palpate plan`: draws the plan of an examination."""
