@@ -8,12 +8,11 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 from rich.table import Table
 from rich.text import Text
 
 from palpate.apart import guarded
-from palpate.console import SteadyConsole, refuse, wide_console
+from palpate.console import CaseDisplay, SteadyConsole, refuse, wide_console
 from palpate.run.options import Settings
 
 if TYPE_CHECKING:
@@ -60,21 +59,14 @@ def build(
     from palpate_fmu.export import build_scenario_fmu
 
     console = SteadyConsole(stderr=True)
-    columns = (SpinnerColumn(), TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    chosen = platforms(fmi, only)
-    names = [platform.tuple_3 for platform in chosen]
+    names = [platform.tuple_3 for platform in platforms(fmi, only)]
     scenario = _scenario(phantom, settings or [])
-    with Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal) as bar:
-        task = bar.add_task("reading the phantom", total=len(names))
-        build_scenario_fmu(
-            scenario,
-            out,
-            fmi,
-            names,
-            compiling=lambda name: bar.update(
-                task, advance=1, description=f"compiling for {name} (about a minute the first time)"
-            ),
-        )
+    with CaseDisplay(console, quiet or not console.is_terminal, "platforms") as display:
+
+        def compiling(name: str) -> None:
+            display.show(names.index(name), len(names), f"compiling for {name}: about a minute the first time")
+
+        build_scenario_fmu(scenario, out, fmi, names, compiling=compiling)
     if not quiet:
         size = f"{out.stat().st_size / 1e6:.1f} MB"
         console.print(f"{out}: FMI {fmi}.0, {size}, for {', '.join(names)}", highlight=False, soft_wrap=True)

@@ -11,7 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from palpate.console import wide_console
+from palpate.console import number, wide_console
 
 Draw = Callable[[Figure], None]
 
@@ -91,15 +91,6 @@ def write_figure(draw: Draw, path: Path, size_in: tuple[float, float] = (7.0, 3.
 MARKS = {True: "[green]pass[/]", False: "[bold red]FAIL[/]", None: ""}
 
 
-def number(value: float) -> str:
-    """Return a number with about three significant digits."""
-    if value == 0:
-        return "0"
-    if abs(value) < 1e-3 or abs(value) >= 1e5:
-        return f"{value:.1e}"
-    return f"{value:.3g}" if abs(value) < 100 else f"{value:.0f}"
-
-
 def table(sections: Sequence[PageSection]) -> Table:
     """Return a table of all checks."""
     out = Table("check", "measured", "bound", "against", "", box=None, pad_edge=False)
@@ -107,8 +98,7 @@ def table(sections: Sequence[PageSection]) -> Table:
     for section in sections:
         out.add_row(f"[bold]{section.title}[/]")
         for check in section.checks:
-            value = f"{number(check.measured)} {check.unit}".strip()
-            out.add_row(f"  {check.name}", value, check.bound, check.against, MARKS[check.passed])
+            out.add_row(f"  {check.name}", number(check.measured, check.unit), check.bound, check.against, MARKS[check.passed])
     return out
 
 

@@ -5,7 +5,8 @@ from pathlib import Path
 from typing import Final
 
 from generate import table
-from palpate_validation.check import Check, number
+from palpate.console import number
+from palpate_validation.check import Check
 
 _HEAD: Final = """# Validation
 
@@ -21,7 +22,7 @@ def page() -> str:
     for name, facts in json.loads(FACTS.read_text(encoding="utf-8")).items():
         checks = [Check(**{key: value for key, value in check.items() if key != "passed"}) for check in facts["checks"]]
         rows = [
-            (c.name, f"{number(c.measured)} {c.unit}{' **missed**' if c.passed is False else ''}", c.bound, c.against)
+            (c.name, f"{number(c.measured, c.unit)}{' **missed**' if c.passed is False else ''}", c.bound, c.against)
             for c in checks
         ]
         parts.append(f"## {facts['title']}\n\n{facts['text']}\n\n{table(('', 'measured', 'bound', 'against'), rows)}")

@@ -1,8 +1,12 @@
 """Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
-from typing import Annotated, Final
+from pathlib import Path
+from typing import Annotated, Final, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, ValidationError
+
+from palpate_errors import UserError
+from palpate_inputs import read_yaml
 
 Positive = Annotated[float, Field(gt=0)]
 NonNegative = Annotated[float, Field(ge=0)]
@@ -42,3 +46,17 @@ class Pose(Section):
 def quadrant(x: float, y: float) -> str:
     """Return the quadrant of a point in A [m]: RUQ, LUQ, RLQ or LLQ. The patient's right is x < 0, lower is y < 0."""
     return ("R" if x < 0 else "L") + ("L" if y < 0 else "U") + "Q"
+
+
+_M = TypeVar("_M", bound=BaseModel)
+
+
+def read_model(path: Path, model: type[_M], error: type[UserError] = UserError) -> _M:
+    """Return the model in a YAML file. Raises `error` that names the file and each wrong field with what is allowed."""
+    try:
+        return model.model_validate(read_yaml(path, error))
+    except OSError as problem:
+        raise error(f"{path}: {problem}") from problem
+    except ValidationError as problem:
+        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in problem.errors())
+        raise error(f"{path}: {wrong}") from problem

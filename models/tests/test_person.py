@@ -184,7 +184,7 @@ def test_guarding_has_a_measured_ratio() -> None:
         ({"kind": "person", "draw": {"radius_m": (5, 40)}}, "radius_m = 5 to 40: want 0.005"),
         ({"kind": "person", "draw": {"contrast": (0.5, 2)}}, "both above 1, or both below"),
         ({"kind": "person", "draw": {"guarding": "voluntary"}, "guarding": [{"centre_m": (0, 0)}]}, "draw.guarding"),
-        ({"lesions": [{"centre_m": (0, 0), "contrast": 1}]}, "contrast = 1 is not a lump"),
+        ({"lesions": [{"centre_m": (0, 0), "contrast": 1}]}, "not 1"),
         ({"lesions": [{"centre_m": (0, 0), "contrast": 0.05}]}, "greater than or equal to 0.1"),
     ],
 )

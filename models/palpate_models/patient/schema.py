@@ -6,13 +6,21 @@ Marks of certainty: [V] read in the source, [C] computed from data, [M] from mem
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
-from pydantic import Field, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.motion import Motion
 from palpate_models.patient.wall import MEDIAN, Guarding
 from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
 
+
+def _changing(factor: float) -> float:
+    if factor == 1:
+        raise ValueError("1 changes nothing; want 0.1 to 20 and not 1")
+    return factor
+
+
+Change = Annotated[float, Field(ge=0.1, le=20), AfterValidator(_changing)]
 Factor = Annotated[float, Field(ge=0.2, le=5)]
 Correlation = Annotated[float, Field(ge=-1, le=1)]
 
@@ -144,19 +152,13 @@ class Lesion(Section):
     """Centre, x to the patient's left and y to the head, from the umbilicus."""
     radii_m: tuple[Length, Length] = (0.03, 0.03)
     """Half axes of the half-contrast outline."""
-    contrast: Annotated[float, Field(ge=0.1, le=20)] = 4.0
+    contrast: Change = 4.0
     """Stiffness at the centre relative to the stiffness without the lump; below 1 it is softer. Not 1."""
     edge_m: Positive = 0.008
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
     """Depth of the lump's top below the skin, for an ellipsoid whose vertical half axis is the smaller of `radii_m`. The surface
     tier uses its equivalent factor at the skin (`palpate_models.patient.field`). None: the lump reaches from the skin inward."""
-
-    @model_validator(mode="after")
-    def _contrast(self) -> Self:
-        if self.contrast == 1:
-            raise ValueError("contrast = 1 is not a lump; want 0.1 to 20 and not 1")
-        return self
 
 
 class StructureKind(StrEnum):
@@ -177,19 +179,13 @@ class Structure(Section):
     """Points of the polyline in the abdomen's xy plane, from the umbilicus. One point with `radii_m` is an ellipse."""
     radii_m: tuple[Length, Length] = (0.005, 0.005)
     """Half widths of the half-effect outline about the polyline, along x and along y."""
-    factor: Annotated[float, Field(ge=0.1, le=20)]
+    factor: Change
     """Stiffness relative to the stiffness without the structure. Not 1."""
     edge_m: Positive = 0.006
     """Width of the smooth edge."""
     depth_m: Annotated[float, Field(ge=0, le=0.15)] | None = None
     """Depth of its top below the skin; every tier takes what the skin shows of it (`palpate_models.patient.field`). None: it goes
     through the wall."""
-
-    @model_validator(mode="after")
-    def _factor(self) -> Self:
-        if self.factor == 1:
-            raise ValueError("factor = 1 is not a structure; want 0.1 to 20 and not 1")
-        return self
 
 
 class Background(Section):

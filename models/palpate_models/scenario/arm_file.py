@@ -5,11 +5,10 @@ from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, Final
 
-from pydantic import Field, ValidationError
+from pydantic import Field
 
 from palpate_errors import UserError
-from palpate_inputs import read_yaml
-from palpate_models.section import NonNegative, Section, Vec2, Vec3
+from palpate_models.section import NonNegative, Section, Vec2, Vec3, read_model
 
 FOLDER: Final = Path(__file__).with_name("arms")
 """YAML files of the arms that are known by name; their URDFs are in the package `example-robot-data`."""
@@ -82,14 +81,7 @@ def arm_path(name: str) -> Path:
 @cache
 def arm_file(name: str) -> ArmFile:
     """Return the YAML file of an arm. Raises UserError that names file, field and what is allowed."""
-    path = arm_path(name)
-    try:
-        return ArmFile.model_validate(read_yaml(path))
-    except OSError as error:
-        raise UserError(f"{path}: {error}") from error
-    except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc'])) or 'the file'}: {e['msg']}" for e in error.errors())
-        raise UserError(f"{path}: {wrong}") from error
+    return read_model(arm_path(name), ArmFile)
 
 
 def placement_of(name: str) -> dict[str, Any]:

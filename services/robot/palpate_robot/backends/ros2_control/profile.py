@@ -3,13 +3,10 @@
 from pathlib import Path
 from typing import Final, Literal
 
-from pydantic import ValidationError
-
 from palpate_errors import UserError
-from palpate_inputs import read_yaml
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.schema import Robot
-from palpate_models.section import Section
+from palpate_models.section import Section, read_model
 from palpate_robot.backends.ros2_control.rules import Stack
 
 FOLDER: Final = Path(__file__).with_name("profiles")
@@ -60,11 +57,7 @@ def profile_of(robot: Robot) -> Profile:
     path = Path(name) if name.endswith((".yaml", ".yml")) else FOLDER / f"{name}.yaml"
     if not path.is_file():
         raise UserError(f"robot.driver.profile: {name or 'not set'}: want {known}, or the path of a YAML file")
-    try:
-        profile = Profile.model_validate(read_yaml(path))
-    except ValidationError as error:
-        wrong = "; ".join(f"{'.'.join(map(str, e['loc']))}: {e['msg']}" for e in error.errors())
-        raise UserError(f"{path}: {wrong}") from error
+    profile = read_model(path, Profile)
     fields = ("namespace", "joint_states", "ft_topic", "ft_sign", "ft_weight")
     changes = {name: value for name in fields if (value := getattr(given, name)) is not None}
     if given.controller is not None:

@@ -17,9 +17,9 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, ValidationError, model_validator
+from pydantic import BaseModel, BeforeValidator, ConfigDict, FiniteFloat, model_validator
 
-from palpate_inputs import read_yaml
+from palpate_models.section import read_model
 from palpate_plugins import PluginError
 
 
@@ -85,10 +85,4 @@ class FmuMap(BaseModel):
 
 def load_map(path: Path) -> FmuMap:
     """Load a map from a YAML file. Raises MapError with the faulty entry."""
-    try:
-        return FmuMap.model_validate(read_yaml(path, MapError))
-    except OSError as error:
-        raise MapError(f"{path}: {error}") from error
-    except ValidationError as error:
-        first = error.errors()[0]
-        raise MapError(f"{path.name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from error
+    return read_model(path, FmuMap, MapError)
