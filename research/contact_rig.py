@@ -22,7 +22,7 @@ from palpate_bus.runtime.composed import Composed
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.setpoint import TOPIC
 from palpate_control.service import create as create_control
-from palpate_models.numerics.frames import Array, matrix
+from palpate_models.numerics.frames import Array, matrix, rigid
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.schema import Background, Phantom, Stiffness
 from palpate_models.robot.arm import arm_of
@@ -32,7 +32,7 @@ from palpate_models.scenario.load import plant_input, true_pose
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS, cartesian_setpoint, joint_setpoint
-from palpate_planning.strokes.path import least_twist, pose
+from palpate_planning.strokes.path import least_twist
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.plant import Plant
 from palpate_robot.service import RobotService
@@ -254,7 +254,7 @@ class _Script:
         self.ready = kinematics.solve(self._at(-ABOVE_M), home).q
 
     def _at(self, depth: float) -> Array:
-        return pose(self.R, self.top - (0.0, 0.0, depth))
+        return rigid(self.R, self.top - (0.0, 0.0, depth))
 
     def depth(self, t: float) -> float:
         """Depth of the set-point below the skin at rest [m] at time `t` [s]."""
