@@ -10,10 +10,13 @@ from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from trimesh.creation import box
 
+from palpate_bus.contract import contract
+from palpate_bus.messages import codec
 from palpate_bus.messages.geometry import transform_matrix
 from palpate_dashboard import arrays, palette
 from palpate_dashboard.arrays import Carry
-from palpate_dashboard.replay import RecordedInbox, messages
+from palpate_dashboard.replay import messages
+from palpate_dashboard.scene import SCENE
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import table
 from palpate_models.robot.visual import visual_meshes
@@ -24,8 +27,6 @@ TOPICS = ("sim/link_poses", "sim/surface", "assessment/map")
 LAMP = np.array((0.45, -0.55, 1.0)) / np.linalg.norm((0.45, -0.55, 1.0))
 """Direction to the lamp, in world."""
 AMBIENT = 0.45
-CARRY_M = 0.012
-"""Distance over which the map colours the vertices of the abdomen."""
 
 
 class Body(NamedTuple):
@@ -77,19 +78,20 @@ class Moment:
 
 def moments(recording: Sequence[Path], times_s: Sequence[float]) -> list[Moment]:
     """Return the scene at each of `times_s` from the files of a recording. Raises OSError, ValueError if it ends earlier."""
-    inbox = RecordedInbox()
+    latest: dict[str, bytes] = {}
     wanted, stamp = sorted(set(times_s)), 0
     found: dict[float, Moment] = {}
 
     def take(time: float) -> None:
-        poses, surface, known = (inbox.latest(topic) for topic in TOPICS)
+        rows = contract().topics
+        poses, surface, known = (codec.decode(latest[name], rows[name].type) if name in latest else None for name in TOPICS)
         found[time] = Moment(time, poses, surface, known)
 
     for stamp, topic, payload in messages(recording):
         while wanted and stamp / 1e9 > wanted[0]:
             take(wanted.pop(0))
         if topic in TOPICS:
-            inbox.put(topic, payload, stamp)
+            latest[topic] = payload
     if wanted and wanted[-1] > stamp / 1e9:
         raise ValueError(f"{recording}: ends at {stamp / 1e9:.1f} s, before {wanted[-1]:.1f} s")
     for time in wanted:
@@ -130,7 +132,7 @@ class Stage:
             ratio = apparent / (known.background if known.background > 0 else float(np.median(apparent[scanned])))
             places = apply(self._X_WA, arrays.triples(known.vertices).astype(np.float64))
             shades = np.where(scanned, palette.stiffness_colors(ratio), skin)
-            colors = Carry(places, self._rest, CARRY_M)(shades, skin).astype(np.uint32)
+            colors = Carry(places, self._rest, SCENE.carry_m)(shades, skin).astype(np.uint32)
         rgb = np.stack([(colors >> shift) & 255 for shift in (24, 16, 8)], axis=1) / 255
         vertices = arrays.triples(moment.surface.vertices).astype(np.float64)
         return Body(vertices[self._triangles], rgb[self._triangles].mean(axis=1))

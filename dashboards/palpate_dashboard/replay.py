@@ -19,10 +19,10 @@ from mcap.records import Message as McapMessage
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import RunControl, codec
-from palpate_bus.messages.codec import Message
 from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
 from palpate_bus.runs.announcement import Run, live
 from palpate_bus.runs.operator import OperatorKeys, order
+from palpate_bus.runtime.lockstep import Packet, Stepper
 from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.observer import LIMITS, ObservedService
 from palpate_bus.security.access import OPERATOR
@@ -35,41 +35,6 @@ from palpate_models.scenario.load import load_scenario
 
 DISORDER = 2_000_000_000
 """Greatest disorder of messages in a recording [ns]."""
-
-
-class RecordedInbox:
-    """Inbox over a recording: the latest message of each topic, decoded on access."""
-
-    def __init__(self) -> None:
-        self._types = {topic.name: topic.type for topic, _ in contract().inputs("dashboard")}
-        self._payloads: dict[str, bytes] = {}
-        self._messages: dict[str, Message] = {}
-        self._stamps: dict[str, int] = {}
-
-    def put(self, topic: str, payload: bytes, stamp: int) -> None:
-        """Store one message."""
-        self._payloads[topic] = payload
-        self._messages.pop(topic, None)
-        self._stamps[topic] = stamp
-
-    def latest(self, topic: str) -> Message | None:
-        """Return the latest message, or None before the first."""
-        if topic not in self._messages and topic in self._payloads:
-            self._messages[topic] = codec.decode(self._payloads[topic], self._types[topic])
-        return self._messages.get(topic)
-
-    def new(self, topic: str) -> list[Message]:
-        """Return at most the latest message: the dashboard uses no other."""
-        message = self.latest(topic)
-        return [] if message is None else [message]
-
-    def stamp(self, topic: str) -> int | None:
-        """Return the simulated time [ns] of the latest message."""
-        return self._stamps.get(topic)
-
-    def lost(self, role: str) -> bool:
-        """Return False: a recording does not contain this."""
-        return False
 
 
 def recording_of(folder: Path) -> tuple[Path, ...]:
@@ -133,13 +98,13 @@ def draw(
     `progress` receives the simulated time [ns].
     """
     period = contract().roles[service.role].period
-    inbox = RecordedInbox()
+    stepper = Stepper(service, contract())
     last = -1
     for tick, group in groupby(source, key=lambda item: -(-item[0] // period)):
         for stamp, topic, payload in group:
-            inbox.put(topic, payload, stamp)
+            stepper.buffers[topic].deliver(Packet(payload, stamp, 0, checked=True))
         last = tick * period
-        service.step(last, inbox)
+        stepper.step(last)
         if progress is not None:
             progress(last)
     return last
