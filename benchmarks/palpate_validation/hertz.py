@@ -8,6 +8,7 @@ from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
+from scipy.optimize import brentq
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.phantom import flat_phantom
@@ -51,11 +52,7 @@ def sneddon_force(depth: float, radius: float, young: float = HERTZ.young_pa, po
 
     d = a/2 ln((R + a) / (R - a)),  F = E* [(a^2 + R^2)/2 ln((R + a) / (R - a)) - a R].
     """
-    low, high = 0.0, radius * (1 - 1e-12)
-    a = 0.0
-    for _ in range(100):
-        a = (low + high) / 2
-        low, high = (a, high) if a * np.arctanh(a / radius) < depth else (low, a)
+    a = brentq(lambda a: a * np.arctanh(a / radius) - depth, 0.0, radius * (1 - 1e-12))
     modulus = young / (1 - poisson**2)
     return float(modulus * ((a**2 + radius**2) * np.arctanh(a / radius) - a * radius))
 

@@ -6,7 +6,7 @@ from functools import cache
 
 import numpy as np
 import pytest
-from scipy.optimize import brentq, nnls
+from scipy.optimize import nnls
 
 from palpate_errors import UserError
 from palpate_models.patient.breathing import Breathing, BreathingCurve
@@ -14,9 +14,10 @@ from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.elastic.compliance import Compliance, ComplianceTuning, LayerKernel, compliance
 from palpate_tissue.backends.elastic.patch import ContactSolver
-from palpate_tissue.backends.elastic.slab import FlatSlab, hertz_force
+from palpate_tissue.backends.elastic.slab import FlatSlab
 from palpate_tissue.backends.elastic.solid import graded_grid, skin_compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue, update_rule
+from palpate_validation.hertz import hertz_force, sneddon_force
 
 STILL = np.zeros(3)
 
@@ -190,19 +191,6 @@ OFFSETS = ((0.0, 0.0), (0.00075, 0.0), (0.0, 0.00087), (0.0004, 0.00025))
 """Place of the sphere relative to the lattice [m]: a result must not depend on it."""
 
 
-def sphere_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
-    """Force [N] on a true sphere at depth d in a half-space (Sneddon 1965): Hertz's, less 2 % at d = R/5 and less 6 % at 2R/3.
-
-    d = a/2 ln((R + a)/(R - a)),  F = E / (1 - nu^2) [(a^2 + R^2)/2 ln((R + a)/(R - a)) - a R].
-    """
-
-    def depth(a: float) -> float:
-        return 0.5 * a * math.log((radius_m + a) / (radius_m - a))
-
-    a = float(brentq(lambda a: depth(a) - depth_m, 0.0, radius_m * (1 - 1e-12), xtol=1e-12))
-    return young_pa / (1 - poisson**2) * (0.5 * (a**2 + radius_m**2) * math.log((radius_m + a) / (radius_m - a)) - a * radius_m)
-
-
 @cache
 def slab(edge_m: float = 0.0015, half_m: float = 0.025, thickness_m: float = np.inf) -> FlatSlab:
     return FlatSlab(young_pa=1e4, edge_m=edge_m, half_m=half_m, thickness_m=thickness_m)
@@ -213,7 +201,7 @@ def slab(edge_m: float = 0.0015, half_m: float = 0.025, thickness_m: float = np.
 def test_a_paraboloid_meets_hertz_and_a_sphere_sneddon(radius: float, depth: float) -> None:
     for xy in OFFSETS:
         s = slab()
-        by_hertz = s.press(radius, depth, xy, "paraboloid").force_n / hertz_force(s.young_pa, s.poisson, radius, depth)
-        by_sneddon = s.press(radius, depth, xy).force_n / sphere_force(s.young_pa, s.poisson, radius, depth)
+        by_hertz = s.press(radius, depth, xy, "paraboloid").force_n / hertz_force(depth, radius, s.young_pa, s.poisson)
+        by_sneddon = s.press(radius, depth, xy).force_n / sneddon_force(depth, radius, s.young_pa, s.poisson)
         assert by_hertz == pytest.approx(1, abs=0.02)
         assert by_sneddon == pytest.approx(1, abs=0.02)

@@ -1,8 +1,7 @@
 """A flat slab pressed by a sphere, for comparison of the elastic tissue with theory.
 
 slab = FlatSlab(young_pa=1e4)
-pressed = slab.press(radius_m=0.02, depth_m=0.005)
-pressed.force_n / hertz_force(slab.young_pa, slab.poisson, 0.02, 0.005)
+slab.press(radius_m=0.02, depth_m=0.005).force_n
 """
 
 import math
@@ -21,14 +20,6 @@ from palpate_tissue.backends.elastic.patch import ContactSolver
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
 Profile = Literal["sphere", "paraboloid"]
-
-
-def hertz_force(young_pa: float, poisson: float, radius_m: float, depth_m: float) -> float:
-    """Return the force [N] on a paraboloid of curvature radius R at depth d in a half-space (Hertz 1882).
-
-    4/3 E / (1 - nu^2) sqrt(R) d^(3/2).
-    """
-    return float(4 / 3 * young_pa / (1 - poisson**2) * math.sqrt(radius_m) * depth_m**1.5)
 
 
 @dataclass(frozen=True)
