@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from palpate_bus.contract import contract
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_in_metres, quaternion, transform_matrix, vectors
+from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame, quaternion, transform_matrix, vectors
 from palpate_dashboard import palette
 from palpate_dashboard.arrays import Carry, Floats, Indices, cloud, transform, triples
 from palpate_dashboard.sinks import Canvas, arrows, deformations, transforms
@@ -151,10 +151,9 @@ class SceneView:
 
     def camera(self, _t: int, message: Message) -> None:
         """Draw the camera at the calibrated pose of its optical frame."""
-        for item in message.transforms:
-            if item.child_frame_id == CAMERA_FRAME:
-                X_WC = transform_matrix(item.transform)
-                self._canvas.log("world/camera", rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3]))
+        X_WC = pose_of_frame(message, CAMERA_FRAME, "world")
+        if X_WC is not None:
+            self._canvas.log("world/camera", rr.Transform3D(translation=X_WC[:3, 3], mat3x3=X_WC[:3, :3]))
 
     def lens(self, _t: int, message: Message) -> None:
         """Set the camera intrinsics."""

@@ -11,7 +11,6 @@ from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import (
-    CameraInfo,
     Clock,
     DiagnosticArray,
     DiagnosticStatus,
@@ -31,7 +30,6 @@ from palpate_bus.messages import (
     Pose,
     PoseStamped,
     Quaternion,
-    RegionOfInterest,
     RobotStatus,
     StiffnessMap,
     SurfaceMesh,
@@ -42,6 +40,7 @@ from palpate_bus.messages import (
     Wrench,
     codec,
 )
+from palpate_bus.messages.geometry import camera_info
 from palpate_bus.messages.stamps import header, time_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
@@ -143,8 +142,7 @@ def look(t: int) -> Messages:
     image = np.full((480, 640), 1.05, dtype=np.float32)
     image += 0.1 * np.hypot(*np.meshgrid(np.linspace(-1, 1, 640), np.linspace(-1, 1, 480))).astype(np.float32)
     image[:20] = np.nan
-    k = np.array((585.0, 0, 319.5, 0, 585.0, 239.5, 0, 0, 1))
-    roi = RegionOfInterest(0, 0, 0, 0, False)
+    k = np.array(((585.0, 0, 319.5), (0, 585.0, 239.5), (0, 0, 1)))
     frame = "camera_depth_optical_frame"
     vertices, triangles = dome()
     world = (vertices + X_WA).astype(np.float32)
@@ -154,9 +152,7 @@ def look(t: int) -> Messages:
     packed = np.ascontiguousarray(cloud).view(np.uint8).ravel()
     targets = world[(np.abs(vertices[:, :2]) < 0.1).all(axis=1)][::3]
     return {
-        "camera/depth/camera_info": CameraInfo(
-            header(t, frame), 480, 640, "plumb_bob", np.zeros(5), k, np.eye(3).ravel(), np.zeros(12), 0, 0, roi
-        ),
+        "camera/depth/camera_info": camera_info(header(t, frame), (480, 640), k),
         "camera/depth/image_raw": Image(header(t, frame), 480, 640, "32FC1", 0, 2560, image.view(np.uint8).ravel()),
         "perception/points": PointCloud2(header(t, "world"), 1, len(cloud), fields, False, 12, 12 * len(cloud), packed, False),
         "perception/surface": surface(t, world, triangles, "world"),

@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from palpate_bus.messages import (
+    CameraInfo,
     Header,
     Image,
     Point,
@@ -18,7 +19,9 @@ from palpate_bus.messages import (
     PointField,
     Pose,
     Quaternion,
+    RegionOfInterest,
     SurfaceMesh,
+    TFMessage,
     Transform,
     Twist,
     Vector3,
@@ -89,6 +92,14 @@ def pose_matrix(message: Pose) -> Array:
 def transform_matrix(message: Transform) -> Array:
     """Return the homogeneous matrix, shape (4, 4). Raises ValueError as `rotation` does."""
     return _homogeneous(rotation(message.rotation), vector(message.translation))
+
+
+def pose_of_frame(message: TFMessage, frame: str | None, parent: str) -> Array | None:
+    """Return the pose of `frame` in `parent`, shape (4, 4); None if it is missing. Raises ValueError as `rotation` does."""
+    for item in message.transforms:
+        if item.child_frame_id == frame and item.header.frame_id == parent:
+            return transform_matrix(item.transform)
+    return None
 
 
 def _homogeneous(R: Array, p: Array) -> Array:
@@ -179,6 +190,12 @@ def cloud_message(header: Header, points: Array) -> PointCloud2:
     fields = [PointField(name, 4 * i, 7, 1) for i, name in enumerate("xyz")]  # 7: FLOAT32
     data = np.ascontiguousarray(points, "<f4").view(np.uint8).reshape(-1)
     return PointCloud2(header, 1, len(points), fields, False, 12, 12 * len(points), data, True)
+
+
+def camera_info(header: Header, size_px: tuple[int, int], K: Array) -> CameraInfo:
+    """Return the `CameraInfo` of images without distortion: `size_px` height and width, K [px], shape (3, 3)."""
+    P, whole = np.hstack((K, np.zeros((3, 1)))).ravel(), RegionOfInterest(0, 0, 0, 0, False)
+    return CameraInfo(header, *size_px, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
 
 
 def depth_message(header: Header, depth: NDArray[np.float32]) -> Image:

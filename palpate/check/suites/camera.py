@@ -8,7 +8,7 @@ import numpy as np
 from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
 from palpate_bus.messages import CameraTrigger
-from palpate_bus.messages.geometry import transform_matrix
+from palpate_bus.messages.geometry import pose_of_frame
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_models.numerics.frames import Array
 
@@ -31,14 +31,6 @@ class ViewedPlane:
 PLANE: Final = ViewedPlane()
 
 
-def pose_of(message: Any) -> Array | None:
-    """Return X_WC of the optical frame in a tf_static, shape (4, 4)."""
-    for item in message.transforms:
-        if item.child_frame_id == FRAME and item.header.frame_id == "world":
-            return transform_matrix(item.transform)
-    return None
-
-
 def depths(message: Any) -> Array:
     """Return depth [m], shape (height, width); NaN where invalid."""
     rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8).reshape(message.height, message.step)
@@ -57,7 +49,7 @@ def suite(rig: Rig) -> None:
     feed = {"sim/surface": plane(centre)}
     silent = rig.run(0.5, feed)
     calibrated = rig.last("tf_static")
-    X_WC = None if calibrated is None else pose_of(calibrated)
+    X_WC = None if calibrated is None else pose_of_frame(calibrated, FRAME, "world")
     rig.arrives("tf_static has the optical frame in world", X_WC, f"world -> {FRAME}")
     rig.section("small images")
     _small(rig, silent[SMALL_IMAGE], silent[SMALL_INFO])

@@ -7,16 +7,14 @@ import numpy as np
 
 from palpate.check import shapes
 from palpate.check.rig import Feed, Rig
-from palpate.check.suites.camera import FRAME
-from palpate_bus.messages import CameraInfo, CameraTrigger, RegionOfInterest, SurfaceMotion, TFMessage, TransformStamped
-from palpate_bus.messages.geometry import depth_message, mesh_arrays, transform_message, vectors
+from palpate.check.suites.camera import FRAME, IMAGE, INFO, SMALL_IMAGE, SMALL_INFO
+from palpate_bus.messages import CameraTrigger, SurfaceMotion, TFMessage, TransformStamped
+from palpate_bus.messages.geometry import camera_info, depth_message, mesh_arrays, transform_message, vectors
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array, apply, inverse, look_at
 from palpate_models.scenario.load import exam_input
 
-IMAGE, INFO = "camera/depth/image_raw", "camera/depth/camera_info"
-SMALL_IMAGE, SMALL_INFO, MOTION = "camera/follow/depth", "camera/follow/camera_info", "perception/motion"
-SURFACE, TARGETS = "perception/surface", "perception/targets"
+MOTION, SURFACE, TARGETS = "perception/motion", "perception/surface", "perception/targets"
 
 
 @dataclass(frozen=True)
@@ -84,14 +82,9 @@ def _tf(X_WC: Array) -> Any:
 
 def _frames(depth: Array, K: Array, image: str = IMAGE, info: str = INFO) -> Feed:
     """Return the feed of a depth image [m] and its intrinsics, shape (3, 3)."""
-    P = np.hstack((K, np.zeros((3, 1)))).ravel()
-    whole = RegionOfInterest(0, 0, 0, 0, False)
-    height, width = depth.shape
     pixels = depth.astype(np.float32)
     return {
-        info: lambda t: CameraInfo(
-            header(t, FRAME), height, width, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole
-        ),
+        info: lambda t: camera_info(header(t, FRAME), pixels.shape, K),
         image: lambda t: depth_message(header(t, FRAME), pixels),
     }
 

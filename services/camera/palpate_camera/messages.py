@@ -12,9 +12,8 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_bus.messages import CameraInfo, RegionOfInterest
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import depth_message
+from palpate_bus.messages.geometry import camera_info, depth_message
 from palpate_bus.messages.stamps import header
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Camera
@@ -72,12 +71,12 @@ def small_spacing(width: int) -> int:
 
 def whole(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
     """Return the messages by topic of a whole image at `t` [ns]; `depth` [m], shape (height, width), NaN where invalid."""
-    return {IMAGE: depth_message(header(t, FRAME), depth), INFO: camera_info(t, pinhole)}
+    return {IMAGE: depth_message(header(t, FRAME), depth), INFO: camera_info_message(t, pinhole)}
 
 
 def small(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
     """Return the messages by topic of a small image, as `whole`; `pinhole` is that of the small image."""
-    return {SMALL_IMAGE: depth_message(header(t, FRAME), depth), SMALL_INFO: camera_info(t, pinhole)}
+    return {SMALL_IMAGE: depth_message(header(t, FRAME), depth), SMALL_INFO: camera_info_message(t, pinhole)}
 
 
 def small_of(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
@@ -86,9 +85,6 @@ def small_of(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, 
     return small(t, depth[k // 2 :: k, k // 2 :: k], pinhole.every(k))
 
 
-def camera_info(t: int, pinhole: Pinhole) -> Message:
-    """Return the `sensor_msgs/CameraInfo`, without distortion, at `t` [ns]."""
-    K = pinhole.matrix
-    P = np.hstack((K, np.zeros((3, 1)))).ravel()
-    size, whole = (pinhole.height, pinhole.width), RegionOfInterest(0, 0, 0, 0, False)
-    return CameraInfo(header(t, FRAME), *size, "plumb_bob", np.zeros(5), K.ravel(), np.eye(3).ravel(), P, 0, 0, whole)
+def camera_info_message(t: int, pinhole: Pinhole) -> Message:
+    """Return the `sensor_msgs/CameraInfo` at `t` [ns]."""
+    return camera_info(header(t, FRAME), (pinhole.height, pinhole.width), pinhole.matrix)

@@ -1,6 +1,7 @@
 """Images, intrinsics and transforms of other cameras: the recording and the ROS bridge accept and refuse the same ones."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +10,6 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import (
-    CameraInfo,
     CameraTrigger,
     Image,
     Quaternion,
@@ -20,7 +20,7 @@ from palpate_bus.messages import (
     Vector3,
 )
 from palpate_bus.messages.codec import encode
-from palpate_bus.messages.geometry import transform_matrix
+from palpate_bus.messages.geometry import camera_info, transform_matrix
 from palpate_bus.messages.stamps import MS, header
 from palpate_bus.recordings import open_recording
 from palpate_bus.service import Service
@@ -56,9 +56,8 @@ class Seen:
 
     @property
     def info(self) -> Any:
-        P = np.hstack((self.k.reshape(3, 3), np.zeros((3, 1)))).ravel()
-        crop = self.binning_x, 0, self.roi
-        return CameraInfo(header(5, self.info_frame), *self.size, "plumb_bob", self.d, self.k, np.eye(3).ravel(), P, *crop)
+        plain = camera_info(header(5, self.info_frame), self.size, self.k.reshape(3, 3))
+        return replace(plain, d=self.d, binning_x=self.binning_x, roi=self.roi)
 
 
 class Port(CameraPort):

@@ -1,5 +1,6 @@
 """A ROS camera's images, intrinsics and transforms through the bridge, and over zenoh."""
 
+from dataclasses import replace
 from itertools import count
 from pathlib import Path
 from typing import Any
@@ -9,17 +10,8 @@ import pytest
 
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
-from palpate_bus.messages import (
-    CameraInfo,
-    CameraTrigger,
-    Image,
-    Quaternion,
-    RegionOfInterest,
-    TFMessage,
-    Transform,
-    TransformStamped,
-    Vector3,
-)
+from palpate_bus.messages import CameraTrigger, Image, Quaternion, TFMessage, Transform, TransformStamped, Vector3
+from palpate_bus.messages.geometry import camera_info
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.testing import HandInbox
 from palpate_bus.wire.ros_node import RosNode
@@ -46,10 +38,8 @@ def ros_image(encoding: str = "16UC1", big_endian: bool = False) -> Any:
 
 
 def ros_info(d: float = 0.0) -> Any:
-    K = np.array([600.0, 0, 1.0, 0, 610.0, 0.5, 0, 0, 1])
-    P = np.hstack((K.reshape(3, 3), np.zeros((3, 1)))).ravel()
-    roi = RegionOfInterest(0, 0, 0, 0, False)
-    return CameraInfo(header(5, FRAME), 2, 3, "plumb_bob", np.full(5, d), K, np.eye(3).ravel(), P, 0, 0, roi)
+    K = np.array(((600.0, 0, 1.0), (0, 610.0, 0.5), (0, 0, 1)))
+    return replace(camera_info(header(5, FRAME), (2, 3), K), d=np.full(5, d))
 
 
 def link(parent: str, child: str, x: float, z_turn: float = 0.0) -> Any:

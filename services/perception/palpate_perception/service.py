@@ -9,23 +9,31 @@ from typing import Any, ClassVar, Final
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import PalpationTargets
+from palpate_bus.messages import PalpationTargets, SurfaceCorrection, SurfaceMotion
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import cloud_message, depth_in_metres, mesh_message, point_message, vector_message
+from palpate_bus.messages.geometry import (
+    cloud_message,
+    depth_in_metres,
+    mesh_message,
+    point_message,
+    pose_of_frame,
+    vector_message,
+)
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
-from palpate_perception import messages
 from palpate_perception.cloud import Cloud, DepthFusion, Intrinsics
 from palpate_perception.follower import WATCH, Follower
-from palpate_perception.messages import FRAME
 from palpate_perception.pipeline import Perceived, Pipeline, Targets
 from palpate_perception.visibility import ViewReason
 from palpate_perception.wall import BreathingMode
 
 IMAGE: Final = "camera/depth/image_raw"
+FRAME: Final = contract().topics["perception/targets"].frame or ""
+"""Frame of the surface and the targets."""
+MOTION_FRAME: Final = contract().topics["perception/motion"].frame or ""
 
 
 @dataclass(frozen=True)
@@ -72,13 +80,15 @@ class PerceptionService(Service):
     def _follow(self, image: Message, inbox: Inbox) -> Message:
         """Return the motion message of a small image."""
         stamp, status = nanoseconds(image.header.stamp), inbox.latest("robot/status")
-        camera = messages.intrinsics(inbox, "camera/follow/camera_info", image)
+        camera = _intrinsics(inbox, "camera/follow/camera_info", image)
         try:
             depth = depth_in_metres("camera/follow/depth", image)
         except ValueError:  # unknown encoding: ignore the image
             depth, camera = np.empty((0, 0), np.float32), None
         q = None if status is None else np.asarray(status.position, np.float64)
-        return messages.motion(stamp, self._follower.take(stamp / NS, depth, camera, q))
+        wall = self._follower.take(stamp / NS, depth, camera, q)
+        state, shift = getattr(SurfaceMotion, wall.state.name), vector_message(wall.shift)
+        return SurfaceMotion(header(stamp, MOTION_FRAME), state, wall.displacement, wall.forecast, wall.sigma, shift)
 
     def _correction(self, t: int) -> dict[str, Message | list[Message]]:
         """Return the correction of the published surface by the mean of the images since, once per period."""
@@ -92,7 +102,8 @@ class PerceptionService(Service):
         if outward is None:
             return {}
         x, y, _ = apply(self._X_AW, last.mesh.p_W).T
-        return {"perception/correction": messages.correction(t, outward.height(x, y))}
+        offset = outward.height(x, y).astype(np.float32)
+        return {"perception/correction": SurfaceCorrection(header(t, MOTION_FRAME), offset, np.empty(0, np.float32))}
 
     def _answer(self, t: int, inbox: Inbox) -> dict[str, Message | list[Message]]:
         """Return the messages of the current scan; empty until it is complete."""
@@ -146,7 +157,7 @@ class PerceptionService(Service):
         if not burst.waiting:
             return
         if burst.camera is None:
-            burst.camera = messages.intrinsics(inbox, "camera/depth/camera_info", burst.waiting[0])
+            burst.camera = _intrinsics(inbox, "camera/depth/camera_info", burst.waiting[0])
             if burst.camera is None:
                 return
             burst.fusion = self._pipeline.fusion(burst.camera)
@@ -183,6 +194,18 @@ class _Burst:
 def create(scenario: Scenario) -> Service:
     """Perception of a scenario; it knows nothing of the phantom but where the patient is registered."""
     return PerceptionService(exam_input(scenario))
+
+
+def _intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
+    """Return intrinsics and pose for an image, from the newest camera_info on `topic` and tf_static; None until both arrived.
+
+    Raises ValueError for a quaternion that is not of unit length.
+    """
+    info, pose = inbox.latest(topic), inbox.latest("tf_static")
+    X_WC = None if pose is None else pose_of_frame(pose, image.header.frame_id, FRAME)
+    if info is None or X_WC is None:
+        return None
+    return Intrinsics(np.array(info.k, np.float64).reshape(3, 3), X_WC, (int(info.height), int(info.width)))
 
 
 def _disagreement(frame: Message, camera: Intrinsics) -> str:
