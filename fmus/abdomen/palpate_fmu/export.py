@@ -182,6 +182,13 @@ def _common(root: ET.Element) -> None:
     ET.SubElement(root, "DefaultExperiment", startTime="0.0", stopTime="1.0", stepSize=repr(STEP_S))
 
 
+def _root(version: str, about: str, **token: str) -> ET.Element:
+    facts = {"fmiVersion": version, "modelName": MODEL, **token, "description": about}
+    return ET.Element(
+        "fmiModelDescription", facts, generationTool="Palpate", license="Apache-2.0", variableNamingConvention="structured"
+    )
+
+
 def _text(root: ET.Element) -> bytes:
     ET.indent(root)
     return bytes(ET.tostring(root, encoding="utf-8", xml_declaration=True)) + b"\n"
@@ -189,16 +196,7 @@ def _text(root: ET.Element) -> bytes:
 
 def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes) -> bytes:
     """modelDescription.xml of FMI 3.0, where a variable is an array."""
-    root = ET.Element(
-        "fmiModelDescription",
-        fmiVersion="3.0",
-        modelName=MODEL,
-        instantiationToken=token,
-        description=about,
-        generationTool="Palpate",
-        license="Apache-2.0",
-        variableNamingConvention="structured",
-    )
+    root = _root("3.0", about, instantiationToken=token)
     can = {"modelIdentifier": MODEL, "canGetAndSetFMUState": "true", "canSerializeFMUState": "true"}
     ET.SubElement(root, "ModelExchange", can, providesDirectionalDerivatives="true")
     ET.SubElement(
@@ -225,16 +223,7 @@ def description_3(token: str, about: str, starts: Mapping[str, Array], sizes: Si
 
 def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Sizes, model: PhantomModel) -> bytes:
     """modelDescription.xml of FMI 2.0, where each element of an array is a scalar."""
-    root = ET.Element(
-        "fmiModelDescription",
-        fmiVersion="2.0",
-        modelName=MODEL,
-        guid=token,
-        description=about,
-        generationTool="Palpate",
-        license="Apache-2.0",
-        variableNamingConvention="structured",
-    )
+    root = _root("2.0", about, guid=token)
     can = {"modelIdentifier": MODEL, "canNotUseMemoryManagementFunctions": "true"}
     can |= {"canGetAndSetFMUstate": "true", "canSerializeFMUstate": "true"}
     exchange = {"completedIntegratorStepNotNeeded": "true", "providesDirectionalDerivative": "true"}
