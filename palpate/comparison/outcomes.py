@@ -7,7 +7,6 @@ SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S 
 (Angelopoulos, Duchi and Zrnic, PPI++, arXiv 2311.01453).
 """
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,6 +14,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from scipy.stats import pearsonr, t
 
+from palpate.recording.readings import read_table
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 
@@ -45,33 +45,22 @@ class SimToReal:
 def read_outcomes(path: Path) -> tuple[Array, Array, Array]:
     """Return real and simulated outcomes of the pairs, shapes (n,), and those of bodies that were only simulated, shape (m,).
 
-    The file is CSV with the columns `body`, `real` and `simulated`; `real` is empty without hardware. Raises UserError.
+    The table has the columns `body`, `real` and `simulated`; `real` is empty without hardware. Raises UserError.
     """
+    rows = read_table(path)
+    lacking = [name for name in COLUMNS if name not in rows]
+    if lacking:
+        raise UserError(f"{path}: lacks the column {lacking[0]}; want {', '.join(COLUMNS)}")
     try:
-        with path.open(encoding="utf-8", newline="") as file:
-            rows = list(csv.DictReader(file))
-    except (OSError, UnicodeDecodeError, csv.Error) as error:
-        raise UserError(f"{path}: cannot be read as CSV: {error}") from error
-    real, simulated = (_column(path, rows, name) for name in COLUMNS[1:])
+        real, simulated = (rows[name].to_numpy(float) for name in COLUMNS[1:])
+    except ValueError as error:
+        raise UserError(f"{path}: {error}; want numbers in the columns real and simulated") from None
     if not np.isfinite(simulated).all():
         raise UserError(f"{path}: column simulated has gaps; want a number for each body")
     paired = np.isfinite(real)
     if paired.sum() < LEAST_PAIRS:
         raise UserError(f"{path}: {paired.sum()} bodies with real and simulated; at least {LEAST_PAIRS} are needed")
     return real[paired], simulated[paired], simulated[~paired]
-
-
-def _column(path: Path, rows: list[dict[str, str]], name: str) -> Array:
-    """Return a column, NaN where it is empty. Raises UserError."""
-    values = []
-    for line, row in enumerate(rows, start=2):
-        if row.get(name) is None:
-            raise UserError(f"{path}, line {line}: lacks the column {name}; want {', '.join(COLUMNS)}")
-        try:
-            values.append(float(row[name] or "nan"))
-        except ValueError:
-            raise UserError(f"{path}, line {line}: {name} = {row[name]!r}: want a number") from None
-    return np.array(values)
 
 
 def sim_to_real(real: Array, simulated: Array, more: Array, confidence: float = 0.9) -> SimToReal:
