@@ -25,7 +25,7 @@ from palpate.report.results import truth_of_run
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, learned
 from palpate_assessment.detection import SURE, Candidate
-from palpate_assessment.findings import Kind, causes
+from palpate_assessment.findings import Kind, causes, marked_share
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
 from palpate_assessment.shapes import ridge
@@ -34,7 +34,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.person import drawn
 from palpate_models.patient.schema import Phantom, Structure, StructureKind
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Scenario
+from palpate_models.scenario.schema import Marked, Scenario
 from research.assessment_calibration import real, scenario
 
 NOTHING: Final = len(Kind)
@@ -64,6 +64,29 @@ def oblique_scar(rng: np.random.Generator) -> Structure:
     dx, dy = half * np.cos(angle), half * np.sin(angle)
     return Structure(
         kind=StructureKind.SCAR, line_m=((x - dx, y - dy), (x + dx, y + dy)), radii_m=(radius, radius), factor=rng.uniform(2, 4)
+    )
+
+
+def curved_scar(rng: np.random.Generator) -> Structure:
+    """Return a scar of 50 to 150 mm along an arc."""
+    length, points = rng.uniform(0.05, 0.15), 7
+    angle = rng.uniform(0, 2 * np.pi) + rng.uniform(-8, 8) * length * np.linspace(-0.5, 0.5, points)
+    steps = np.column_stack((np.cos(angle), np.sin(angle))) * length / points
+    line = tuple((x, y) for x, y in (rng.uniform(-0.08, 0.08, 2) + np.cumsum(steps, axis=0)).tolist())
+    radius = rng.uniform(0.003, 0.007)
+    return Structure(kind=StructureKind.SCAR, line_m=line, radii_m=(radius, radius), factor=rng.uniform(1.5, 4.5))
+
+
+def short_scar(rng: np.random.Generator) -> Structure:
+    """Return a scar of 4 to 20 mm, as of a trocar."""
+    (x, y), angle = rng.uniform((-0.09, -0.08), (0.09, 0.08)), rng.uniform(0, np.pi)
+    half, radius = rng.uniform(0.002, 0.010), rng.uniform(0.0025, 0.006)
+    dx, dy = half * np.cos(angle), half * np.sin(angle)
+    return Structure(
+        kind=StructureKind.SCAR,
+        line_m=((x - dx, y - dy), (x + dx, y + dy)),
+        radii_m=(radius, radius),
+        factor=rng.uniform(1.5, 4.5),
     )
 
 
@@ -102,6 +125,8 @@ PERSONS: Final[dict[str, Change]] = {
 STRUCTURES: Final[dict[str, tuple[Change, Kind]]] = {
     "oblique scar": (having(oblique_scar), Kind.RIDGE),
     "midline scar": (having(midline_scar), Kind.RIDGE),
+    "curved scar": (having(curved_scar), Kind.RIDGE),
+    "short scar": (having(short_scar), Kind.RIDGE),
     "hernia": (having(hernia), Kind.SOFT_DEFECT),
     "wide linea alba": (having(wide_linea_alba), Kind.SOFT_DEFECT),
 }
@@ -116,6 +141,8 @@ class Evidence:
     features: list[float]
     signs: list[float]
     structures: list[float]
+    marked: float
+    """Its overlap with the person's scars, marked 12 mm wider than they are."""
     true: list[int]
 
 
@@ -138,12 +165,25 @@ def evidence(name: str, seed: int) -> list[Evidence]:
     observations = observe(service.samples, USUAL)
     judged = None if observations is None else weigh_all(observations)
     assert judged is not None
+    marks = [
+        Marked(path_m=scar.line_m, width_m=2 * scar.radii_m[0] + 0.012)
+        for scar in patient.phantom.structures
+        if scar.kind is StructureKind.SCAR
+    ]
     rows = []
     for one in judged[1]:
         if one.beyond > -SURE:
             is_lump = known is not None and real(one, known)
             true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.structures))
-            rows.append(Evidence(one.features.tolist(), one.signs.features.tolist(), one.structures().tolist(), true))
+            rows.append(
+                Evidence(
+                    one.features.tolist(),
+                    one.signs.features.tolist(),
+                    one.structures().tolist(),
+                    marked_share(marks, one.bump),
+                    true,
+                )
+            )
     return rows
 
 
@@ -167,7 +207,7 @@ def along(structure: Structure, at: Array) -> float:
 
 
 FIELDS: Final = ("probability", "ridge", "bone", "soft")
-START: Final = {"ridge": (-4.0, 0.5, 0.7, 4.0), "bone": (-2.0, -1.0, 3.0, 2.0, 1.0), "soft": (-1.5, 3.0, 0.3, 0.3)}
+START: Final = {"ridge": (-4.0, 0.5, 0.7, 6.0), "bone": (-2.0, -1.0, 3.0, 2.0, 1.0), "soft": (-1.5, 3.0, 0.3, 0.3)}
 SPREAD: Final = np.array(
     (0.5, 0.1, 0.1, 0.2, 0.2, 0.3, 2.0, 0.3, 0.6, 0.01, 1.5, 1.0, 1.5, 1.5, 0.8, 1.5, 1.5, 0.3, 0.5), dtype=np.float64
 )
@@ -209,12 +249,14 @@ def kept(name: str, seed: int, folder: Path) -> list[Evidence]:
 def main(
     persons: Annotated[int, typer.Option(min=2, help="Persons of each variant, seeds 0 on; ten times as many as drawn.")] = 20,
     out: Annotated[Path, typer.Option("-o", "--out", help="Where evidence is kept.")] = Path("out/structures"),
+    only: Annotated[list[str] | None, typer.Option(help="Only this variant; may be repeated.")] = None,
+    marked: Annotated[bool, typer.Option("--marked", help="Scars are marked in `exam.marked`.")] = False,
     fit: Annotated[bool, typer.Option("--fit", help="Fit the weights and write them to calibration.yaml.")] = False,
 ) -> None:
     """Print how many persons of each variant have a finding, at 2 % false findings, and what structures are called."""
     out.mkdir(parents=True, exist_ok=True)
     rows: dict[str, list[list[Evidence]]] = {}
-    for name in (*PERSONS, *STRUCTURES):
+    for name in only or (*PERSONS, *STRUCTURES):
         rows[name] = [kept(name, seed, out) for seed in range(10 * persons if name == "as drawn" else persons)]
     calibration = learned()
     if fit:
@@ -226,6 +268,7 @@ def main(
         found, lumps, false, named, structures = 0, 0, 0, 0, 0
         for person in filter(None, group):
             features, signs, evidence = (np.array([getattr(r, f) for r in person]) for f in ("features", "signs", "structures"))
+            evidence[:, 2] = [marked * r.marked for r in person]
             logits, kinds = causes(calibration, features, signs, evidence)
             over, lump = logits > calibration.threshold(0.02), np.array([int(Kind.LUMP) in row.true for row in person])
             found, lumps, false = found + bool((over & lump).any()), lumps + bool(lump.any()), false + bool((over & ~lump).any())

@@ -169,7 +169,7 @@ class Candidate:
     def structures(self, marked: float = 0.0) -> Array:
         """Return the evidence for a ridge (3), bone (4) and a soft defect (3) instead of a lump, shape (10,).
 
-        `marked`: share of its area that the user has marked as scarred.
+        `marked`: overlap with skin that the user has marked as scarred (`marked_share`).
         """
         at = np.array([[self.disc.x, self.disc.y]])
         midline = float(np.exp(-0.5 * (self.disc.x / SEARCH.midline_m) ** 2))

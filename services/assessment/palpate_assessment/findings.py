@@ -145,17 +145,16 @@ def causes(calibration: Calibration, features: Array, signs: Array, evidence: Ar
 
 
 def marked_share(marked: Sequence[Marked], shape: Bump) -> float:
-    """Return the share of a shape's area that the user has marked as scarred."""
-    if not marked:
-        return 0.0
+    """Return the overlap coefficient of a shape and the skin that the user has marked as scarred: of the marking that fits best,
+    the common area over the smaller of both, so that a short scar is not lost in a wider shape.
+    """
     points = np.array(shape.path or ((shape.x, shape.y),))
     low, high = points.min(axis=0) - shape.radius, points.max(axis=0) + shape.radius
     xy = np.stack(np.meshgrid(*np.linspace(low, high, 25).T), axis=-1).reshape(-1, 2)
     inside = xy[shape.distance(xy) < shape.radius]
-    scarred = np.any(
-        [ridge(np.array(one.path_m), one.width_m / 2, 1e-3).distance(inside) < one.width_m / 2 for one in marked], axis=0
-    )
-    return float(scarred.mean()) if len(inside) else 0.0
+    scars = [ridge(np.array(one.path_m), one.width_m / 2, 1e-3) for one in marked] if len(inside) else []
+    common = [shape.area * float((scar.distance(inside) < scar.radius).mean()) / min(shape.area, scar.area) for scar in scars]
+    return min(max(common, default=0.0), 1.0)
 
 
 def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed: Mask, logit: float, kinds: Array) -> Area | None:

@@ -10,7 +10,7 @@ from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.calibration import learned
 from palpate_assessment.detection import Candidate, Signs, signs
-from palpate_assessment.findings import Kind, causes
+from palpate_assessment.findings import Kind, causes, marked_share
 from palpate_assessment.model import Regression, amplitudes
 from palpate_assessment.observations import observe
 from palpate_assessment.sampling import ForceSample
@@ -218,6 +218,16 @@ def test_a_ridge_is_named_and_marked_skin_is_believed() -> None:
         ridges.append(max(result.findings + result.candidates, key=lambda area: area.strength))
     assert ridges[0].kind is Kind.RIDGE
     assert ridges[1].ridge > ridges[0].ridge
+
+
+def test_a_short_scar_is_not_lost_in_a_wider_shape_and_a_long_one_counts_where_it_is() -> None:
+    shape = Bump(0.0, 0.0, 0.020)
+    short = Marked(path_m=((-0.004, 0.0), (0.004, 0.0)), width_m=0.010)
+    long = Marked(path_m=((-0.1, 0.0), (0.1, 0.0)), width_m=0.010)
+    aside = Marked(path_m=((-0.1, 0.03), (0.1, 0.03)), width_m=0.010)
+    assert marked_share((short,), shape) == pytest.approx(1.0, abs=0.15)
+    assert marked_share((long,), shape) == pytest.approx(0.32, abs=0.08)  # a band of 10 mm across a disc of 40 mm
+    assert marked_share((aside,), shape) == marked_share((), shape) == 0.0
 
 
 def test_bone_is_stiff_beyond_the_border_and_steeper() -> None:
