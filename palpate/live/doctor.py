@@ -79,7 +79,7 @@ class Diagnosis:
 
 
 def examine(bus: Joined, seconds: float) -> Diagnosis:
-    """Monitor a bus for `seconds` and returns the diagnosis."""
+    """Monitor a bus for `seconds` and return the diagnosis."""
     live = _monitor(bus)
     end = monotonic() + seconds
     try:

@@ -118,7 +118,7 @@ def _round(values: Any) -> Any:
 def write_recording(
     path: Path, rules: Contract, messages: Iterable[RecordedMessage], attachments: Mapping[str, tuple[str, bytes]]
 ) -> None:
-    """Write messages to an MCAP file and replaces an old file when the new one is complete.
+    """Write messages to an MCAP file and replace an old file when the new one is complete.
 
     `attachments`: media type and content by name.
     """
@@ -176,7 +176,7 @@ class GoldenCase:
 
 
 def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase:
-    """Open a recording and creates the service `choice`: ROLE with the scenario's implementation, or ROLE=NAME_OR_FILE.
+    """Open a recording and create the service `choice`: ROLE with the scenario's implementation, or ROLE=NAME_OR_FILE.
 
     The scenario is `scenario`, else the one in the recording, else the one in its folder. Raises RecordingError, PluginError or
     ScenarioError.
@@ -221,7 +221,7 @@ def _scenario_near(path: Path, role: str) -> str:
 
 
 def replay_service(case: GoldenCase, tolerance: Tolerance, reached: MutableSequence[int] | None = None) -> dict[str, TopicResult]:
-    """Re-runs the service and compares all its messages; the stamp of each [ns] is written into `reached`."""
+    """Run the service again and compare all its messages; the stamp of each [ns] is written into `reached`."""
 
     def sent() -> Iterator[RecordedMessage]:
         for message in rerun(case.service, case.rules, case.recording.messages(case.inputs), case.end):

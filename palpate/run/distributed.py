@@ -32,7 +32,7 @@ def run_distributed(
     absent: Absent | None = None,
     groups: Groups | None = None,
 ) -> RunResult:
-    """Start the local processes of the compose file and conducts them to the end; with `secure` over its router.
+    """Start the local processes of the compose file and conduct them to the end; with `secure` over its router.
 
     The user starts the roles of `absent`. `groups`: roles of each process, by default one each.
 

@@ -66,7 +66,7 @@ def set_aside(path: Path) -> Path | None:
 
 @contextmanager
 def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
-    """Make the folder and holds its lock until the run is over.
+    """Make the folder and hold its lock until the run is over.
 
     With `overwrite` the results of an earlier run are moved away, removed after this run, and restored if it leaves no folder,
     as a run that could not begin. Raises UserError if the folder is in use, not empty, or cannot be made.

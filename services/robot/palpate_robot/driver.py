@@ -38,8 +38,7 @@ class DriverTuning:
     """Longest validity of a command, as in the contract, and longest interval counted since the previous one."""
     ahead_ns: int = 500_000_000
     """A command stamped further ahead comes from a wrong clock, so its expiry is meaningless. Larger than the lag of a driver
-    behind
-    its own timer (`palpate_bus.runtime.wallclock.TIMES`) plus the validity."""
+    behind its own timer (`palpate_bus.runtime.wallclock.TIMES`) plus the validity."""
 
 
 TUNING: Final = DriverTuning()

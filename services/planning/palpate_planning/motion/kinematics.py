@@ -22,8 +22,7 @@ class KinematicLimits:
     """Error of the tool axis at which inverse kinematics is solved."""
     straight_rad: float = 0.2
     """Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
-    perceived
-    surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
+    perceived surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
     too_straight_rad: float = 0.15
     """Smallest elbow angle in contact, where the skin may be deeper than perceived."""
 

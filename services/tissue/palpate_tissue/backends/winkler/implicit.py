@@ -324,7 +324,7 @@ class ImplicitTissue(TissueBackend):
         self.activation = 1.0
 
     def _tick(self, t_s: float) -> None:
-        """Count a step, and advances the vertices far from the sphere when due."""
+        """Count a step, and advance the vertices far from the sphere when due."""
         self._excursion = self.excursion(t_s)
         if self._steps % self._every == 0 or self._steps < self._sprung:
             if self._patch is not None:
