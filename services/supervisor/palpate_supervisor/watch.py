@@ -31,8 +31,8 @@ class SupervisorTuning:
     """Free motion is planned up to `speed_mps`; the arm overshoots it by a few percent."""
     depth_margin_m: float = 0.025
     """Tolerated error of the perceived surface, from which depth is measured here. Its SD is about 7 mm for camera and arm
-    together (5.6 mm for the camera alone, 12 tuning patients; touches were up to 13 mm inward, 6 examinations). The margin is three
-    SD plus the tracking error. Planning measures depth from the touched skin; this check is independent of it."""
+    together (5.6 mm for the camera alone, 12 tuning patients; touches were up to 13 mm inward, 6 examinations). The margin is
+    three SD plus the tracking error. Planning measures depth from the touched skin; this check is independent of it."""
     contact_n: float = 5.0
     """Force that is certainly contact: tool inertia causes 1.4 N at 4 m/s^2, and a sensor that warms up drifts by 2 N."""
 
