@@ -9,7 +9,7 @@ from palpate_models.robot.lbr import HOME, POSITION_LIMIT, TORQUE_LIMIT
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_planning.placement import redundancy as placement
 from palpate_planning.placement.redundancy import RESOLUTION, PostureSequence, plan_redundancy, prepare
-from palpate_planning.placement.symbolic import REACH_LENGTH_M, arm, base_of
+from palpate_planning.placement.symbolic import COST, arm, base_of
 
 ROBOT = Robot()
 
@@ -46,7 +46,7 @@ def test_functions_agree_with_the_urdf(seed: int) -> None:
     press = J[:3].T @ (12.0 * pose.rotation[:, 2])
     torque = pin.computeGeneralizedGravity(model, data, q) + press
     np.testing.assert_allclose(np.array(functions.torque(q, base, 12.0))[:, 0], torque, atol=1e-9)
-    scaled = J / np.array([[REACH_LENGTH_M]] * 3 + [[1.0]] * 3)
+    scaled = J / np.array([[COST.reach_m]] * 3 + [[1.0]] * 3)
     assert float(functions.dexterity(q, base)) == pytest.approx(float(np.sqrt(np.linalg.det(scaled @ scaled.T))), abs=1e-9)
 
 

@@ -17,7 +17,7 @@ power-on, the warm-up a, and x(t), which a tare does not remove: an Ornstein-Uhl
 
 from collections.abc import Sequence
 from math import cos, exp, sin
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -28,12 +28,19 @@ from palpate_models.scenario.schema import Robot
 from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, STICK_RADPS
 
-RIPPLES: Final = 320
-"""Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear (assumed)."""
-SETTLING_S: Final = 0.02
-"""Time constant of the joint deflection (assumed): motor inertia of 4 kg m^2 (at the joint) on a spring of 10 kN m/rad."""
-_BLOCK: Final = 1024
-"""Readings whose errors are drawn at once. Slow errors are exact at the ends of a block and linear in between."""
+
+class SensorTuning(NamedTuple):
+    """Constants of the sensors, for the compiled function too."""
+
+    ripples: int = 320
+    """Ripple periods per joint revolution: two per turn of the wave generator of a 160 : 1 strain wave gear (assumed)."""
+    settling_s: float = 0.02
+    """Time constant of the joint deflection (assumed): motor inertia of 4 kg m^2 (at the joint) on a spring of 10 kN m/rad."""
+    block: int = 1024
+    """Readings whose errors are drawn at once. Slow errors are exact at the ends of a block and linear in between."""
+
+
+SENSORS: Final = SensorTuning()
 
 
 @compiled
@@ -44,11 +51,11 @@ def _read(table: Array, q: Array, v: Array, torque: Array, dt: float) -> Array:
     """
     out = np.empty((2, len(q)))
     for i in range(len(q)):
-        rate = (table[1, i] * torque[i] - table[4, i]) / SETTLING_S
+        rate = (table[1, i] * torque[i] - table[4, i]) / SENSORS.settling_s
         table[4, i] += dt * rate
-        angle = RIPPLES * q[i] + table[3, i]
+        angle = SENSORS.ripples * q[i] + table[3, i]
         out[0, i] = q[i] + (table[0, i] + table[4, i] + table[2, i] * sin(angle))
-        out[1, i] = v[i] + (rate + table[2, i] * RIPPLES * cos(angle) * v[i])
+        out[1, i] = v[i] + (rate + table[2, i] * SENSORS.ripples * cos(angle) * v[i])
     return out
 
 
@@ -75,7 +82,7 @@ class JointSensor:
     def read(self) -> tuple[Array, Array]:
         """Return positions and velocities with white noise."""
         if not self._noise:
-            noise = self._deviation * self._rng.standard_normal((_BLOCK, len(self._deviation)))
+            noise = self._deviation * self._rng.standard_normal((SENSORS.block, len(self._deviation)))
             self._noise = list(noise.reshape(-1, len(self.q))[::-1])
         return self.q + self._noise.pop(), self.v + self._noise.pop()
 
@@ -112,8 +119,8 @@ class FtSensor:
         self._rng = rng
         (slow,) = rng.bit_generator.seed_seq.spawn(1)  # type: ignore[attr-defined]  # white noise does not depend on drift
         self._slow = np.random.Generator(np.random.PCG64(slow))
-        self._t = period_s * np.arange(_BLOCK)
-        self._length_s = period_s * _BLOCK
+        self._t = period_s * np.arange(SENSORS.block)
+        self._length_s = period_s * SENSORS.block
         self._blocks = 0
         self._wander = given.tare_n * self._scale * self._slow.standard_normal(6)
         self._walk = np.zeros(6)
@@ -133,10 +140,10 @@ class FtSensor:
 
     def block(self) -> Array:
         """Return the additive errors of the next block of readings, shape (k, 6)."""
-        return np.asarray(self._drift() + self._deviation * self._rng.standard_normal((_BLOCK, 6)))
+        return np.asarray(self._drift() + self._deviation * self._rng.standard_normal((SENSORS.block, 6)))
 
     def _drift(self) -> Array:
-        """Return the errors of the next block without white noise, shape (_BLOCK, 6)."""
+        """Return the errors of the next block without white noise, shape (k, 6)."""
         given, drawn = self._drawn.given, self._drawn
         t = self._blocks * self._length_s + self._t
         self._blocks += 1

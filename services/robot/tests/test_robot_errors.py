@@ -20,7 +20,7 @@ from palpate_robot.backends.dart.service import create
 from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.plant import DT, Plant
-from palpate_robot.sensors import RIPPLES, SETTLING_S, FtSensor, JointSensor
+from palpate_robot.sensors import SENSORS, FtSensor, JointSensor
 
 QUIET: dict[str, float] = {"noise_n": 0.0, "noise_nm": 0.0, "bias_n": 0.0, "bias_nm": 0.0}
 STILL: dict[str, float] = {"position_noise_rad": 0.0, "velocity_noise_radps": 0.0}
@@ -102,10 +102,10 @@ def test_zero_elasticity_and_ripple_appear_in_measured_positions() -> None:
     np.testing.assert_allclose(JointSensor(drawn, rng(), q, torque).q - q, drawn.zero_rad, atol=1e-15)
     soft = JointSensor(arm(compliance_radpnm=1e-4), rng(), q, torque)
     np.testing.assert_allclose(soft.q - q, 1e-4 * torque, atol=1e-12)
-    for _ in range(round(SETTLING_S / DT)):
+    for _ in range(round(SENSORS.settling_s / DT)):
         soft.update(q, v, np.zeros(7))
     np.testing.assert_allclose(soft.q - q, 1e-4 * torque * np.exp(-1), rtol=0.05)
-    phase = np.linspace(0.0, 2 * np.pi / RIPPLES, 50)
+    phase = np.linspace(0.0, 2 * np.pi / SENSORS.ripples, 50)
     rough = JointSensor(arm(ripple_rad=1e-4), rng(), q, torque)
     ripples = []
     for turn in phase:

@@ -4,9 +4,10 @@ A task is a position of the indenter's origin and the direction of its z axis: f
 elbow swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
 """
 
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
-from typing import Any, NamedTuple
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,14 +16,26 @@ from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import TOOL, arm_of, inertias
 from palpate_models.scenario.schema import Robot
 
-ELBOW_CLEARANCE_M = 0.15
-"""Least height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
-REACH_LENGTH_M = 0.4
-"""Length scale of linear against angular rows of the Jacobian: upper arm and forearm."""
-_RIDGE = 1e-12
-"""Added to the Gram matrix of the Jacobian [1], so that no pivot is zero at a singularity."""
-WEIGHT_LIMITS, WEIGHT_TORQUE, WEIGHT_DEXTERITY, WEIGHT_ELBOW = 1.0, 1.0, 0.5, 5.0
-"""Weights of the cost terms, each term of order one (assumed)."""
+
+@dataclass(frozen=True)
+class PostureCost:
+    """Scales of the cost of a posture, and the weights of its terms, each of order one (assumed)."""
+
+    elbow_clearance_m: float = 0.15
+    """Least height of the elbow above the indenter, which keeps upper arm and forearm away from abdomen and table."""
+    elbow_softness_m: float = 0.03
+    """Height over which the cost of a low elbow begins."""
+    reach_m: float = 0.4
+    """Length scale of linear against angular rows of the Jacobian: upper arm and forearm."""
+    ridge: float = 1e-12
+    """Added to the Gram matrix of the Jacobian [1], so that no pivot is zero at a singularity."""
+    limits_weight: float = 1.0
+    torque_weight: float = 1.0
+    dexterity_weight: float = 0.5
+    elbow_weight: float = 5.0
+
+
+COST: Final = PostureCost()
 
 
 def casadi() -> Any:
@@ -64,7 +77,7 @@ def _axis_rotation(ca: Any, axis: Array | tuple[float, float, float], angle: Any
 
 def _determinant(ca: Any, A: Any) -> Any:
     """Return the determinant of a positive semi-definite matrix by A = L D L'; `ca.det` uses cofactors, many more operations."""
-    pivots, _, _ = ca.ldl(A + _RIDGE * ca.DM.eye(A.shape[0]), False)
+    pivots, _, _ = ca.ldl(A + COST.ridge * ca.DM.eye(A.shape[0]), False)
     determinant = 1
     for pivot in ca.vertsplit(pivots):
         determinant *= pivot
@@ -100,19 +113,19 @@ def arm(robot: Robot) -> ArmFunctions:
 
     tool_axis = R[:, 2]
     linear = ca.horzcat(*(ca.cross(axis, p - origin) for axis, origin in zip(axes, origins, strict=True)))
-    jacobian = ca.vertcat(linear / REACH_LENGTH_M, ca.horzcat(*axes))
+    jacobian = ca.vertcat(linear / COST.reach_m, ca.horzcat(*axes))
     gram = _determinant(ca, ca.mtimes(jacobian, jacobian.T))
     torque = ca.gradient(energy, q) + ca.mtimes(linear.T, tool_axis * force)
     residual = ca.vertcat(p - target, ca.mtimes(frame[:, :2].T, tool_axis))
     elbow = origins[model.elbow[0]]
 
     relative = (q - ca.DM(model.middle_rad)) / ca.DM(model.half_range_rad)
-    low = (p[2] + ELBOW_CLEARANCE_M - elbow[2]) / 0.03
+    low = (p[2] + COST.elbow_clearance_m - elbow[2]) / COST.elbow_softness_m
     cost = (
-        WEIGHT_LIMITS * ca.sum1(-ca.log(1 - relative**2))
-        + WEIGHT_TORQUE * ca.sumsqr(torque / ca.DM(model.torque_nm))
-        - WEIGHT_DEXTERITY * ca.log(gram + 1e-9)
-        + WEIGHT_ELBOW * ca.log1p(ca.exp(ca.fmin(low, 50)))
+        COST.limits_weight * ca.sum1(-ca.log(1 - relative**2))
+        + COST.torque_weight * ca.sumsqr(torque / ca.DM(model.torque_nm))
+        - COST.dexterity_weight * ca.log(gram + 1e-9)
+        + COST.elbow_weight * ca.log1p(ca.exp(ca.fmin(low, 50)))
     )
     return ArmFunctions(
         ca.Function("task", [q, base, target, frame], [residual, ca.jacobian(residual, q)]),
