@@ -1,29 +1,38 @@
-"""The runtimes against each other and against faults: toy services in real processes over zenoh, placed in any way."""
+"""The runtimes against each other and against faults: toy services in real processes over zenoh, placed in any way.
+
+A forged sender is distinguished from a lost service, and has no effect if the run has a key.
+"""
 
 import signal
+import socket
+import subprocess
+import sys
 import tempfile
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
+import numpy as np
 import pytest
+import zenoh
 from toy_runs import APART, LOOP, ROLES, Running, assert_failed, at, composed_hash, once, run_toys, toy_services, with_own_process
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.messages import DiagnosticStatus, ServiceReport, codec
-from palpate_bus.messages.stamps import MS, NS
+from palpate_bus.messages import DiagnosticStatus, JointTorqueCommand, RunControl, ServiceReport, codec
+from palpate_bus.messages.stamps import MS, NS, duration_message
 from palpate_bus.runtime.composed import Composed
+from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.wire.liveliness import NodeTokens
-from palpate_bus.wire.rmw import topic_key
+from palpate_bus.wire.rmw import AttachmentWriter, make_key, message_key, topic_key, unpack
 from palpate_bus.wire.transport import Subscription
 from palpate_bus.wire.zenoh_config import close_session, mesh, open_session
 from palpate_conductor.collector import Collector
 from palpate_conductor.conductor import Conductor
 from palpate_conductor.diagnostics import ContractWatchTuning
-from palpate_conductor.outcome import Patience, RunFailed
+from palpate_conductor.outcome import Patience, RunFailed, RunResult
 from palpate_errors import UserError
 
 
@@ -161,9 +170,12 @@ def test_by_the_wall_clock_nan_is_dropped_and_reported() -> None:
     assert sum("joint_states from robot refused" in text for text in outcome.trouble) == 1
 
 
-def test_a_violation_is_published_on_diagnostics() -> None:
+@pytest.fixture(scope="module")
+def meddled() -> tuple[RunResult, dict[str, Any]]:
+    """Return a run with a value that is not finite and a peer with another definition of a message; its last diagnostics."""
     topic = contract().topics["diagnostics"]
     subscriptions: list[Subscription] = []
+    tokens: list[NodeTokens] = []
     received: list[bytes] = []
 
     def listen(running: Running) -> None:
@@ -171,16 +183,30 @@ def test_a_violation_is_published_on_diagnostics() -> None:
             subscriptions.append(Subscription(running.session, topic_key(topic, 0)))
         while (sample := subscriptions[0].get(0)) is not None:
             received.append(sample.payload)
+        if not tokens and running.conductor.watchdog.progress["robot"].tick > NS // 5:
+            outdated = contract().topics["joint_states"].model_copy(update={"type": "geometry_msgs/msg/WrenchStamped"})
+            tokens.append(NodeTokens(running.session, "stranger", 0))
+            tokens[0].subscription(outdated, contract().qos["control"])
 
     outcome = run_toys(listen, {"TOY_END_S": "4"}, faults={"tissue": ("truth/patient", "nan", "1")})
-    assert outcome.failure is None  # it has observers only
-    statuses = {status.name: status for status in codec.decode(received[-1], topic.type).status}
+    return outcome, {status.name: status for status in codec.decode(received[-1], topic.type).status}
+
+
+def test_a_violation_is_published_on_diagnostics(meddled: tuple[RunResult, dict[str, Any]]) -> None:
+    outcome, statuses = meddled
+    assert outcome.failure is None  # the topic has observers only
     for name in ("palpate/topic/truth/patient", "palpate/tissue"):
         assert statuses[name].level == DiagnosticStatus.ERROR
         assert "from tissue: norm of a quaternion" in statuses[name].message
         assert statuses[name].hardware_id == "tissue"
     assert "truth/patient" in statuses["palpate/topic/truth/patient"].message
     assert statuses["palpate/topic/supervisor/state"].level == DiagnosticStatus.OK
+
+
+def test_a_peer_with_another_definition_of_a_message_is_named(meddled: tuple[RunResult, dict[str, Any]]) -> None:
+    (text,) = [text for text in meddled[0].trouble if "joint_states" in text]
+    assert "topic joint_states: robot publishes sensor_msgs/msg/JointState" in text
+    assert "stranger wants geometry_msgs/msg/WrenchStamped" in text
 
 
 def test_the_first_diagnostics_include_services_that_joined_late(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -228,16 +254,87 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
         close_session(session)
 
 
-def test_a_peer_with_another_definition_of_a_message_is_named() -> None:
-    tokens: list[NodeTokens] = []
+# --- forged senders, and a lost transport ------------------------------------------------------------------------------
 
-    def join(running: Running) -> None:
-        outdated = contract().topics["joint_states"].model_copy(update={"type": "geometry_msgs/msg/WrenchStamped"})
-        tokens.append(NodeTokens(running.session, "stranger", 0))
-        tokens[0].subscription(outdated, contract().qos["control"])
+CONTROL_KEY = message_key("palpate/control", CONTROL_TYPE, 0)
+TORQUE = contract().topics["control/joint_torque"]
 
-    outcome = run_toys(once(0.2, join), {"TOY_END_S": "4"})
+
+class Clone:
+    """Copies the identity of a sender and sends under it."""
+
+    def __init__(self, key: str, forge: Callable[[bytes], bytes]) -> None:
+        """`forge` makes the false payload of the latest true one."""
+        self._key, self._forge = key, forge
+        self._received: list[tuple[bytes, bytes]] = []
+        self._subscriber: object = None
+        self.struck: list[bool] = []
+
+    def listen(self, session: zenoh.Session) -> None:
+        if self._subscriber is None:
+            self._subscriber = session.declare_subscriber(
+                self._key,
+                zenoh.handlers.Callback(
+                    lambda s: self._received.append((s.attachment.to_bytes(), s.payload.to_bytes())), indirect=False
+                ),
+            )
+
+    def strike(self, session: zenoh.Session) -> None:
+        attachment, payload = self._received[-1]
+        sequence, sent, gid = unpack(attachment)
+        session.put(self._key, self._forge(payload), attachment=AttachmentWriter(gid).pack(sequence + 5, sent + 1))
+
+
+def abort() -> Clone:
+    return Clone(CONTROL_KEY, lambda _: codec.encode(RunControl(RunControl.ABORT, 0, False, "", "forged"), CONTROL_TYPE))
+
+
+def torque() -> Clone:
+    def forge(payload: bytes) -> bytes:
+        now = codec.decode(payload, TORQUE.type).header
+        return codec.encode(JointTorqueCommand(now, np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", ""), TORQUE.type)
+
+    return Clone(topic_key(TORQUE, 0), forge)
+
+
+def meddling(*clones: Clone) -> Callable[[Running], None]:
+    def meddle(running: Running) -> None:
+        for clone in clones:
+            clone.listen(running.session)
+            if at(running, 0.5, clone.struck):
+                clone.strike(running.session)
+
+    return meddle
+
+
+@pytest.mark.parametrize(("clone", "topic"), [(abort, "palpate/control"), (torque, "control/joint_torque")])
+def test_without_a_key_a_forged_sender_is_detected(clone: Callable[[], Clone], topic: str) -> None:
+    outcome = run_toys(meddling(clone()))
+    assert outcome.failure.code is FailureCode.FORGED, outcome.failure
+    assert topic in outcome.failure.topics
+
+
+def test_with_a_key_forged_messages_are_reported_and_ignored(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("PALPATE_KEY", str(make_key(tmp_path / "run.key")))
+    outcome = run_toys(meddling(abort(), torque()), {"TOY_END_S": "3"})
     assert outcome.failure is None
-    (text,) = [text for text in outcome.trouble if "joint_states" in text]
-    assert "topic joint_states: robot publishes sensor_msgs/msg/JointState" in text
-    assert "stranger wants geometry_msgs/msg/WrenchStamped" in text
+    assert outcome.run_hash == composed_hash(3 * NS)
+    assert outcome.counters["robot"]["forged"] == 1
+    for topic in ("palpate/control", "control/joint_torque"):
+        assert [line for line in outcome.trouble if line.startswith(f"{topic}: ") and "tag" in line], outcome.trouble
+
+
+def test_a_killed_router_is_a_loss_of_the_transport() -> None:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        where = f"tcp/127.0.0.1:{probe.getsockname()[1]}"
+    words = [sys.executable, "-m", "palpate_bus.wire.zenoh_config", where]
+    router = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    router.stdout.readline()
+    try:
+        outcome = run_toys(once(0.5, lambda _: router.kill()), router=where)
+    finally:
+        router.kill()
+        router.wait()
+    assert_failed(outcome, FailureCode.TRANSPORT_LOST)
+    assert not outcome.lost

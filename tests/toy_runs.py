@@ -67,7 +67,7 @@ def run_toys(
         patience: time limits of the conductor
         wallclock: run in wall-clock mode instead of lockstep
         faults: by role, a fault of its transport (topic, kind, simulated second)
-        groups: roles of each process; by default the 1 kHz loop apart and the rest together, by the wall clock each apart
+        groups: roles of each process; by default the 1 kHz loop apart and the rest together, in wall-clock mode each apart
         router: if given, all processes are clients of it
     """
     groups = groups or (APART if wallclock else LOOP_APART)

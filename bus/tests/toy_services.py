@@ -114,7 +114,7 @@ class Control(Service):
         if os.environ.get("TOY_CONTROL_FAILS_AT") == str(t // MS):
             raise ArithmeticError("toy failure")
         if os.environ.get("TOY_CONTROL_COMPUTES_AT") == str(t // MS):
-            end = time.monotonic() + 2.0
+            end = time.monotonic() + 1.2
             while time.monotonic() < end:
                 pass
         joints, setpoint = inbox.latest("joint_states"), inbox.latest("planning/setpoint")

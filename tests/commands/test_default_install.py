@@ -48,7 +48,7 @@ for number, words in enumerate(json.loads(sys.argv[1])):
 
 
 class Called(NamedTuple):
-    """How a command ended and what it printed."""
+    """Exit status and output of a command."""
 
     status: int
     out: str

@@ -2,15 +2,16 @@
 
 from itertools import pairwise
 from threading import Event
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from planning_fakes import BASE, PERIOD_S
 
 from palpate_bus.setpoint import Setpoint
-from palpate_models.robot.lbr import ARM
+from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings
-from palpate_models.scenario.schema import Limits
+from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
 from palpate_planning.motion.kinematics import ArmKinematics
@@ -19,6 +20,8 @@ from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import Reason
 from palpate_planning.stroke import StrokeStage
+from palpate_planning.stroke_motion import MOTION as STROKE_MOTION
+from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.path import SurfacePath
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.waits import WAIT
@@ -160,3 +163,29 @@ def test_an_arm_that_does_not_arrive_ends_the_strokes() -> None:
     assert steps[len(MOTION)].stage is StrokeStage.TRANSFER
     assert palpation.failed.reason is Reason.ARM_DISPLACED
     assert steps[-1].stage is StrokeStage.DONE
+
+
+class Turn:
+    """A free motion of two samples."""
+
+    q = np.array((HOME, HOME + 0.3))
+
+    def __len__(self) -> int:
+        return len(self.q)
+
+    def at(self, sample: float) -> tuple[np.ndarray, np.ndarray]:
+        return HOME + 0.3 * sample, np.zeros(7)
+
+
+def test_a_free_motion_waits_for_an_arm_that_is_behind() -> None:
+    """A pendant or a drive may slow it down."""
+    motion = StrokeMotion(ExamSettings(), Limits(), Robot(), 0.01, None)  # type: ignore[arg-type]  # no wall in free motion
+    motion.segment = SimpleNamespace(free=Turn())  # type: ignore[assignment]
+    motion._sample, motion._q_offset, motion._following = 0.0, None, True
+    motion.setpoint(0, SimpleNamespace(q=HOME, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
+    arrived = []
+    for behind in (0.3, STROKE_MOTION.behind_rad + 0.01, STROKE_MOTION.behind_rad - 0.01):
+        motion.follow_free_motion(1.0)
+        motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - behind, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
+        arrived.append(motion.follow_free_motion(1.0))
+    assert arrived == [False, False, True]

@@ -1,5 +1,6 @@
 """Limits that the supervisor watches, its latch, and the service."""
 
+from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
@@ -31,8 +32,18 @@ HOLDING = np.array(pin.computeGeneralizedGravity(_MODEL, _MODEL.createData(), np
 """Joint torques that hold the arm at home [N m]."""
 
 
+def watching() -> LimitWatch:
+    return LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+
+
+def forces(values: Iterable[float]) -> list[list[Breach]]:
+    """Return what is found at each of these forces on a tool that stands, 10 ms apart."""
+    watch = watching()
+    return [watch.judge(Tool(ABOVE, 0.0, float(f)), None, n * 10 * MS, n * 10 * MS) for n, f in enumerate(values)]
+
+
 def judge(force: float = 0.0, speed: float = 0.0, p_W: np.ndarray = ABOVE, depth: float | None = None) -> list[Breach]:
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = watching()
     for n in range(20):  # long enough for what needs patience, and without a rate
         found = watch.judge(Tool(p_W, speed, force), depth, n * 10 * MS, n * 10 * MS)
     return found
@@ -72,27 +83,26 @@ def test_what_an_examination_does_is_no_breach(values: dict[str, object]) -> Non
 
 
 def test_a_force_that_rises_fast_is_stopped_before_the_limit() -> None:
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
-    forces = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
-    first = next(f for n, f in enumerate(forces) if watch.judge(Tool(ABOVE, 0.0, f), None, n * 10 * MS, n * 10 * MS))
+    rising = 100.0 * 0.01 * np.arange(60)  # 100 N/s, as on something rigid
+    first = next(f for f, found in zip(rising, forces(rising), strict=True) if found)
     assert 14.0 < first <= 16.0
 
 
 def test_a_hole_in_the_measurements_makes_no_force_rise_faster() -> None:
     """At 20 N/s, slowly enough for planning; 60 ms are missing, which taken for one period would be 120 N/s."""
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = watching()
     times = [n * 10 * MS for n in (*range(80), *range(86, 110))]
     assert not any(watch.judge(Tool(ABOVE, 0.0, 20e-9 * t), None, t, t) for t in times)
 
 
 def test_a_stamp_that_comes_again_is_nothing_to_take_a_rate_from() -> None:
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = watching()
     stamps = [0, 10, 20, 30, 30, 30, 40]
     assert not any(watch.judge(Tool(ABOVE, 0.0, 0.2 * n), None, t * MS, n * 10 * MS) for n, t in enumerate(stamps))
 
 
 def test_a_force_that_stays_over_the_limit_is_stopped_however_often_its_stamp_comes_again() -> None:
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
+    watch = watching()
     found = [watch.judge(Tool(ABOVE, 0.0, 30.0), None, 0, n * 10 * MS) for n in range(20)]
     assert [breach.cause for breach in found[-1]] == [StopCause.FORCE]
 
@@ -103,9 +113,7 @@ def test_what_is_no_number_is_a_breach() -> None:
 
 
 def test_planning_is_left_a_moment_to_retreat_by_itself() -> None:
-    watch = LimitWatch(Limits(), np.linalg.inv(np.array(KNOWN.X_WA)))
-    for n, force in enumerate((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)):
-        assert watch.judge(Tool(ABOVE, 0.0, float(force)), None, n * 10 * MS, n * 10 * MS) == []
+    assert not any(forces((*np.linspace(10.0, 24.9, 100), 25.3, 25.4, 25.2, 24.0, 21.0)))
 
 
 def test_force_is_what_is_left_when_the_weight_is_taken_off() -> None:
@@ -133,6 +141,15 @@ def test_what_is_measured_before_the_arm_moves_is_bias() -> None:
     )
 
 
+def test_a_bias_at_the_start_is_neither_a_disagreement_nor_a_gain() -> None:
+    sense = ToolSense(KNOWN.robot)
+    reading = np.array([3.0, -2.0, 1.0 + KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
+    for _ in range(6):
+        sense.sense(Measurement(np.array(lbr.HOME), np.zeros(7), reading, HOLDING), 0.01)
+    assert sense.comparison.disagreement == pytest.approx(0.0, abs=0.01)
+    assert sense.comparison.excitation == pytest.approx(0.0, abs=0.01)
+
+
 def test_a_drift_while_the_arm_waits_is_no_bias() -> None:
     sense = ToolSense(KNOWN.robot)
     hanging = np.array([0.0, 0.0, KNOWN.robot.tool_mass_kg * GRAVITY, 0.0, 0.0, 0.0])
@@ -144,11 +161,8 @@ def test_a_drift_while_the_arm_waits_is_no_bias() -> None:
 
 
 def test_a_sensor_that_was_found_wrong_explains_an_earlier_stop() -> None:
-    latch, force = Latch(), Breach(Level.EMERGENCY, StopCause.FORCE, "external force 30 N")
-    latch.update(0, [force], release=False)
-    latch.update(
-        10 * MS, [force, Breach(Level.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")], release=False
-    )
+    force = Breach(Level.EMERGENCY, StopCause.FORCE, "external force 30 N")
+    latch = latch_after([force], [force, Breach(Level.SOFT_STOP, StopCause.SENSOR, "F/T sensor: 9 N off", culprit="ft/wrench")])
     assert (latch.level, latch.cause, latch.culprit) == (Level.EMERGENCY, StopCause.SENSOR, "ft/wrench")
     assert "external force 30 N" in latch.reason
 
@@ -193,47 +207,46 @@ def test_a_surface_that_is_none_says_so(bad: np.ndarray) -> None:
 
 
 SOFT = Breach(Level.SOFT_STOP, StopCause.FORCE, "26 N")
-
 EMERGENCY = Breach(Level.EMERGENCY, StopCause.FORCE, "41 N")
-
 DEPTH = Breach(Level.SOFT_STOP, StopCause.DEPTH, "27 mm")
-
 DRIVER = Breach(Level.EMERGENCY, StopCause.DRIVER, "the driver holds")
 
 
-def test_a_stop_stands_when_its_cause_has_gone() -> None:
+RELEASE = "the operator releases"
+
+
+def latch_after(*steps: list[Breach | str]) -> Latch:
+    """Return a latch that was given these breaches, and releases of the operator, in steps of 10 ms."""
     latch = Latch()
-    latch.update(0, [SOFT], False)
-    latch.update(10 * MS, [], False)
+    for n, step in enumerate(steps):
+        latch.update(n * 10 * MS, [item for item in step if isinstance(item, Breach)], RELEASE in step)
+    return latch
+
+
+def test_a_stop_stands_when_its_cause_has_gone() -> None:
+    latch = latch_after([SOFT], [])
     assert (latch.level, latch.cause, latch.reason) == (Level.SOFT_STOP, StopCause.FORCE, "26 N")
-    latch.update(20 * MS, [], True)
+    latch = latch_after([SOFT], [], [RELEASE])
     assert (latch.level, latch.releases) == (Level.OK, 1)
 
 
 def test_the_worst_counts_and_the_first_of_equals() -> None:
-    latch = Latch()
-    latch.update(0, [SOFT, EMERGENCY], False)
-    assert latch.level is Level.EMERGENCY
-    latch.update(10 * MS, [DRIVER, SOFT], False)
-    assert latch.cause is StopCause.FORCE
+    latch = latch_after([SOFT, EMERGENCY], [DRIVER, SOFT])
+    assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.FORCE)
     assert [stop.level for stop in latch.stops] == [Level.EMERGENCY]
 
 
 def test_a_soft_stop_that_does_not_help_becomes_an_emergency_stop() -> None:
-    latch = Latch()
-    for t in range(0, TUNING.soft_stop_timeout_ns + 1, 10 * MS):
-        latch.update(t, [SOFT], False)
-    assert latch.level is Level.SOFT_STOP
-    latch.update(TUNING.soft_stop_timeout_ns + 10 * MS, [SOFT], False)
+    steps = TUNING.soft_stop_timeout_ns // (10 * MS) + 1
+    assert latch_after(*[[SOFT]] * steps).level is Level.SOFT_STOP
+    latch = latch_after(*[[SOFT]] * (steps + 1))
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
     assert "26 N" in latch.reason
 
 
 def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
-    latch = Latch()
     rising = Breach(Level.SOFT_STOP, StopCause.FORCE, "20 N, rising", TUNING.rising_timeout_ns)
-    for t in range(0, TUNING.rising_timeout_ns + 20 * MS, 10 * MS):
-        latch.update(t, [rising], False)
+    latch = latch_after(*[[rising]] * (TUNING.rising_timeout_ns // (10 * MS) + 2))
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
@@ -265,40 +278,26 @@ def test_only_a_harmless_cause_that_is_over_is_released_alone_and_not_often(brea
 
 
 def test_a_release_is_refused_while_the_cause_stands() -> None:
-    latch = Latch()
-    latch.update(0, [EMERGENCY], False)
-    latch.update(10 * MS, [EMERGENCY], True)
-    assert latch.level is Level.EMERGENCY
-    assert latch.reason == "release refused: 41 N"
-    latch.update(20 * MS, [], False)
-    assert (latch.level, latch.refusals, latch.releases) == (Level.EMERGENCY, 1, 0)
-    latch.update(30 * MS, [], True)
-    assert (latch.level, latch.refusals, latch.releases) == (Level.OK, 1, 1)
+    refused = [[EMERGENCY], [EMERGENCY, RELEASE]]
+    assert (latch_after(*refused).level, latch_after(*refused).reason) == (Level.EMERGENCY, "release refused: 41 N")
+    for steps, expected in ([[]], (Level.EMERGENCY, 1, 0)), ([[], [RELEASE]], (Level.OK, 1, 1)):
+        latch = latch_after(*refused, *steps)
+        assert (latch.level, latch.refusals, latch.releases) == expected
 
 
 def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:
-    latch = Latch()
-    latch.update(0, [DEPTH], False)
-    latch.update(10 * MS, [DEPTH], True)
-    latch.update(20 * MS, [DEPTH], False)
-    assert latch.level is Level.OK
-    latch.update(30 * MS, [], False)
-    latch.update(40 * MS, [DEPTH], False)
-    assert latch.level is Level.SOFT_STOP
+    released = [[DEPTH], [DEPTH, RELEASE], [DEPTH]]
+    assert latch_after(*released).level is Level.OK
+    assert latch_after(*released, [], [DEPTH]).level is Level.SOFT_STOP
 
 
 def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
-    latch = Latch()
-    latch.update(0, [DEPTH], False)
-    latch.update(10 * MS, [DEPTH], True)
-    latch.update(20 * MS, [replace(DEPTH, level=Level.EMERGENCY)], False)
+    latch = latch_after([DEPTH], [DEPTH, RELEASE], [replace(DEPTH, level=Level.EMERGENCY)])
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.DEPTH)
 
 
 def test_a_cause_that_comes_and_goes_is_not_heeded() -> None:
-    latch = Latch()
-    for n in range(TUNING.soft_stop_timeout_ns // (10 * MS) + 4):
-        latch.update(n * 10 * MS, [SOFT] if n % 2 == 0 else [], False)
+    latch = latch_after(*([[SOFT], []] * (TUNING.soft_stop_timeout_ns // (20 * MS) + 2)))
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.UNHEEDED)
 
 
@@ -321,13 +320,10 @@ def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
 
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
-    latch = Latch()
     outside = Breach(Level.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
-    latch.update(0, [outside], False)
-    latch.update(10 * MS, [outside], True)
-    latch.update(20 * MS, [replace(outside, beyond_m=0.02 + 0.9 * latch_module.TUNING.further_m)], False)
-    assert latch.level is Level.OK
-    latch.update(30 * MS, [replace(outside, beyond_m=0.02 + 1.1 * latch_module.TUNING.further_m)], False)
+    near, far = (replace(outside, beyond_m=0.02 + share * latch_module.TUNING.further_m) for share in (0.9, 1.1))
+    assert latch_after([outside], [outside, RELEASE], [near]).level is Level.OK
+    latch = latch_after([outside], [outside, RELEASE], [near], [far])
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.WORKSPACE)
 
 
