@@ -1,9 +1,9 @@
 """Base of all scenario sections (frozen, validated, no unknown fields) and their quantities."""
 
 from pathlib import Path
-from typing import Annotated, Final, TypeVar
+from typing import Annotated, Any, Final, TypeVar
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, ValidationError
 
 from palpate_errors import UserError
 from palpate_inputs import read_yaml
@@ -26,6 +26,17 @@ UNITS: Final = {
     "px": "pixels",
 }
 """Units by the last part of a field's name."""
+_T = TypeVar("_T")
+
+
+def _ordered(ends: tuple[Any, Any]) -> tuple[Any, Any]:
+    if ends[0] > ends[1]:
+        raise ValueError("want the smaller value first")
+    return ends
+
+
+Ends = Annotated[tuple[_T, _T], AfterValidator(_ordered)]
+"""Least and greatest value of a range."""
 Vec2 = tuple[float, float]
 Vec3 = tuple[float, float, float]
 

@@ -21,10 +21,10 @@ from palpate.run.roles import OBSERVERS, WORKERS
 from palpate.study.shift import Family
 from palpate_errors import UserError
 from palpate_inputs import parse_yaml, read_text
-from palpate_models.patient.schema import MOST_LUMPS, Draw, Range
+from palpate_models.patient.schema import Count, Draw
 from palpate_models.scenario.errors import Errors, Level, table
 from palpate_models.scenario.load import explain
-from palpate_models.section import Length, Section
+from palpate_models.section import Ends, Length, Section
 
 Split = Literal["tune", "test", "shift"]
 """`tune`: patients for choosing thresholds. `test`: patients whose figures are reported. `shift`: patients and equipment from
@@ -33,6 +33,8 @@ Tier = Literal["whole", "quick"]
 """`whole`: the composed run of all services. `quick`: the indenter without an arm (`palpate.quick`)."""
 Runtime = Literal["lockstep", "wallclock"]
 Name = Annotated[str, Field(pattern=r"^[a-z0-9][a-z0-9_.-]{0,39}$")]
+Range = tuple[float, float]
+"""Least and greatest value, which `Draw` checks."""
 Settings = dict[str, Any]
 """Fields of a scenario by their path, such as `exam.depth_m: 0.008`."""
 
@@ -61,7 +63,7 @@ class Grid(Section):
 class Lumps(Section):
     """Lumps that are drawn for each patient from their seed. Ranges are (least, greatest), as in `phantom.draw`."""
 
-    count: tuple[Annotated[int, Field(ge=0, le=MOST_LUMPS)], Annotated[int, Field(ge=0, le=MOST_LUMPS)]] = (1, 1)
+    count: Ends[Count] = (1, 1)
     """Number of lumps per patient."""
     radius_m: Range | Grid = Draw().radius_m
     elongation: Range | Grid = Draw().elongation

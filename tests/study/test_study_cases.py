@@ -30,7 +30,7 @@ def written(tmp_path: Path, text: str) -> str:
         ("populations: {a: {scenario: person, number: {test: -1}}}", ("populations.a.number.test", "-1", "or equal to 0")),
         (
             "populations: {a: {scenario: person, lumps: {radius_m: [0.02, 0.01]}}}",
-            ("populations.a.lumps", "radius_m = 0.02 to 0.01", "0.005 <= minimum"),
+            ("populations.a.lumps.radius_m", "[0.02, 0.01]", "the smaller value first"),
         ),
         (PLAIN + "methods: {m: {services: {assesment: x.py}}}", ("methods.m", "assesment", "assessment")),
         (PLAIN + "errors: {bad: awful}", ("errors.bad", "awful", "typical")),

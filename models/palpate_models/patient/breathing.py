@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import Field, model_validator
 
 from palpate_models.numerics.frames import Array
-from palpate_models.section import NonNegative, Positive, Section
+from palpate_models.section import Ends, Positive, Section
 
 TABLE_S = 600.0
 """Minimum length of the table of breaths [s]; after it the breaths repeat."""
@@ -61,7 +61,7 @@ class Breathing(Section):
     """Duration of each hold (kind: held) [A]."""
     coughs_per_min: Annotated[float, Field(ge=0, le=20)] = 0.0
     """Bursts of two or three coughs per minute, at random times, each after the current breath."""
-    cough_m: tuple[NonNegative, Annotated[float, Field(le=MOST_M)]] = (0.010, 0.020)
+    cough_m: Ends[Annotated[float, Field(ge=0, le=MOST_M)]] = (0.010, 0.020)
     """Range of the displacement by a cough, uniform [A]. The tension of the wall during a cough is not modelled."""
 
     pulse_m: Annotated[float, Field(ge=0, le=0.005)] = 0.0
@@ -73,12 +73,6 @@ class Breathing(Section):
     @classmethod
     def _usual(cls, values: Any) -> Any:
         return _DEEP | values if isinstance(values, dict) and values.get("kind") == "deep" else values
-
-    @model_validator(mode="after")
-    def _order(self) -> Breathing:
-        if self.cough_m[0] > self.cough_m[1]:
-            raise ValueError(f"cough_m {self.cough_m}: want the smaller value first")
-        return self
 
 
 class BreathingCurve:

@@ -73,7 +73,7 @@ def _lump(draw: schema.Draw, rng: np.random.Generator, centre_m: tuple[float, fl
     )
 
 
-def _log_uniform(limits: schema.Range, rng: np.random.Generator) -> float:
+def _log_uniform(limits: tuple[float, float], rng: np.random.Generator) -> float:
     """Return a number from the log-uniform distribution between `limits`."""
     return float(np.clip(np.exp(rng.uniform(*np.log(limits))), *limits))
 

@@ -11,7 +11,7 @@ from pydantic import AfterValidator, Field, model_validator
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.motion import Motion
 from palpate_models.patient.wall import MEDIAN, Guarding
-from palpate_models.section import Length, NonNegative, Positive, Section, Vec2
+from palpate_models.section import Ends, Length, NonNegative, Positive, Section, Vec2
 
 
 def _changing(factor: float) -> float:
@@ -64,14 +64,8 @@ class Variation(Section):
     """Standard deviation of the stiffening [C]."""
     correlation: Correlation = 0.0
     """Correlation of log modulus and stiffening [C]."""
-    length_m: tuple[Length, Length] = (0.010, 0.150)
+    length_m: Ends[Length] = (0.010, 0.150)
     """Shortest and longest correlation length of the variation [A]."""
-
-    @model_validator(mode="after")
-    def _order(self) -> Self:
-        if self.length_m[0] > self.length_m[1]:
-            raise ValueError(f"length_m = {self.length_m}: want the shorter length first")
-        return self
 
 
 class Anatomy(Section):
@@ -92,8 +86,8 @@ class Anatomy(Section):
     """Stiffening of the wall over bone: 16 times the modulus from 6.5 mm [A]."""
 
 
-Range = tuple[float, float]
 MOST_LUMPS = 8
+Count = Annotated[int, Field(ge=0, le=MOST_LUMPS)]
 
 
 class Build(StrEnum):
@@ -108,15 +102,15 @@ class Build(StrEnum):
 class Draw(Section):
     """Sampling ranges for lumps and guarding of a person. Every range is (minimum, maximum)."""
 
-    lumps: tuple[Annotated[int, Field(ge=0, le=MOST_LUMPS)], Annotated[int, Field(ge=0, le=MOST_LUMPS)]] = (0, 0)
+    lumps: Ends[Count] = (0, 0)
     """Number of lumps; a pair counts as two."""
-    radius_m: Range = (0.005, 0.040)
+    radius_m: Ends[Annotated[float, Field(ge=0.005, le=0.04)]] = (0.005, 0.040)
     """Smaller half axis, log-uniform."""
-    elongation: Range = (1.0, 1.5)
+    elongation: Ends[Annotated[float, Field(ge=1, le=6)]] = (1.0, 1.5)
     """Ratio of the half axes, uniform; a ridge has 3 or more."""
-    depth_m: Range = (0.0, 0.040)
+    depth_m: Ends[Annotated[float, Field(ge=0, le=0.04)]] = (0.0, 0.040)
     """Depth of the lump's top below the skin, uniform."""
-    contrast: Range = (2.0, 10.0)
+    contrast: Ends[Annotated[float, Field(ge=0.1, le=20)]] = (2.0, 10.0)
     """Contrast, log-uniform; both limits above 1 or both below."""
     pairs: Annotated[float, Field(ge=0, le=1)] = 0.0
     """Probability that a lump has a second one next to it."""
@@ -128,18 +122,7 @@ class Draw(Section):
     """Kind of guarding; its force ratio is drawn from measurements on living people."""
 
     @model_validator(mode="after")
-    def _ranges(self) -> Self:
-        within = {
-            "lumps": (0, MOST_LUMPS),
-            "radius_m": (0.005, 0.04),
-            "elongation": (1, 6),
-            "depth_m": (0, 0.04),
-            "contrast": (0.1, 20),
-        }
-        for name, (lowest, highest) in within.items():
-            low, high = getattr(self, name)
-            if not lowest <= low <= high <= highest:
-                raise ValueError(f"{name} = {low:g} to {high:g}: want {lowest:g} <= minimum <= maximum <= {highest:g}")
+    def _either(self) -> Self:
         if self.contrast[0] <= 1 <= self.contrast[1]:
             raise ValueError(f"contrast = {self.contrast[0]:g} to {self.contrast[1]:g}: want both above 1, or both below")
         return self
