@@ -16,7 +16,14 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 FUSED = (*TINY, "phantom.edge_m=0.005", "camera.frames=10")
 """A tiny examination on a fine mesh, whose surface is perceived to a millimetre."""
-LONG_FILES = ("test_runtimes.py", "test_patient_seen.py", "test_library.py", "test_fmu_build.py")
+LONG_FILES = (
+    "test_runtimes.py",
+    "test_search.py",
+    "test_validation.py",
+    "test_fmu_build.py",
+    "test_patient_seen.py",
+    "test_library.py",
+)
 """Files whose tests take long. They begin early, so that no worker runs them alone at the end."""
 
 
