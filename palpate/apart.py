@@ -18,7 +18,7 @@ from multiprocessing import Pipe
 from multiprocessing.connection import Connection
 from queue import Empty, SimpleQueue
 from threading import Thread
-from time import monotonic
+from time import monotonic, sleep
 from types import FrameType
 from typing import Any, Final, NoReturn, TypeVar, cast
 
@@ -29,6 +29,8 @@ Send = Callable[[Any], None]
 """Sends what can be pickled from the child to its parent."""
 POLL_S: Final = 0.1
 SIGNALS: Final = frozenset({signal.SIGINT, signal.SIGTERM, signal.SIGHUP})
+PARENT_S: Final = 2.0
+"""Time within which the parent interrupts a child whose group of processes got a signal."""
 _LIBC: Final = ctypes.CDLL(None)
 _PR_SET_PDEATHSIG: Final = 1
 _OVER: Final = object()
@@ -113,6 +115,8 @@ class _Child:
         self._news: SimpleQueue[Any] = SimpleQueue()
         self._answer: tuple[str, Any] | None = None
         self._code: int | None = None
+        self._interrupted = shared_numbers()
+        """Its first number is 1 once the parent interrupts the child."""
         for stream in (sys.stdout, sys.stderr):
             with suppress(OSError, ValueError):
                 stream.flush()
@@ -124,7 +128,7 @@ class _Child:
                 self.pid = os.fork()
             if not self.pid:
                 self._pipe.close()
-                _serve(work, theirs, parent, mask)
+                _serve(work, theirs, parent, mask, self._interrupted)
         finally:
             signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         theirs.close()
@@ -142,7 +146,6 @@ class _Child:
         self._news.put(_OVER)
 
     def result(self, receive: Callable[[Any], None], check: Callable[[], None]) -> Any:
-        interrupted = False
         try:
             while True:
                 try:
@@ -152,9 +155,9 @@ class _Child:
                         break
                     check()
                 except KeyboardInterrupt:
-                    if interrupted:
+                    if self._interrupted[0]:
                         raise
-                    interrupted = True
+                    self._interrupted[0] = 1
                     with suppress(ProcessLookupError):
                         os.kill(self.pid, signal.SIGTERM)
             if self._answer is None:
@@ -188,22 +191,33 @@ class _Child:
         return self._code is not None
 
 
-def _serve(work: Callable[[Send], Any], pipe: Connection, parent: int, mask: Any) -> NoReturn:
+def _serve(work: Callable[[Send], Any], pipe: Connection, parent: int, mask: Any, interrupted: MutableSequence[int]) -> NoReturn:
     """Act in the child: work, send the result and exit."""
+
+    def interrupt(number: int, _: FrameType | None) -> NoReturn:
+        signal.signal(number, signal.SIG_IGN)  # once: a group of processes may be ended as one
+        end = monotonic() + PARENT_S
+        while not interrupted[0] and monotonic() < end:
+            sleep(0.01)
+        if interrupted[0]:
+            raise KeyboardInterrupt
+        raise ChildLost(f"raised signal {number} ({signal.Signals(number).name}) itself")
+
     try:
         _LIBC.prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
         if os.getppid() != parent:
             os._exit(1)
         for number in (signal.SIGINT, signal.SIGHUP):  # the parent gets them, too, and ends the child
             signal.signal(number, signal.SIG_IGN)
-        signal.signal(signal.SIGTERM, _interrupt)
+        signal.signal(signal.SIGTERM, interrupt)
         os.dup2(2, 1)
         sys.stdout = sys.stderr
         signal.pthread_sigmask(signal.SIG_SETMASK, mask)
         try:
             answer = ("done", work(lambda news: pipe.send(("news", news))))
         except BaseException as error:
-            answer = ("raised", _portable(error))
+            swallowed = interrupted[0] and not isinstance(error, UserError | RunError)  # by a library, which then failed
+            answer = ("raised", KeyboardInterrupt() if swallowed else _portable(error))
         pipe.send(answer)
     except BaseException as error:  # such as a result that cannot be pickled
         with suppress(OSError):
@@ -215,16 +229,9 @@ def _serve(work: Callable[[Send], Any], pipe: Connection, parent: int, mask: Any
         os._exit(0)
 
 
-def _interrupt(number: int, _: FrameType | None) -> NoReturn:
-    signal.signal(number, signal.SIG_IGN)  # once: a group of processes may be ended as one
-    raise KeyboardInterrupt
-
-
 def _portable(error: BaseException) -> BaseException:
     """Return an exception that can be sent; prints the traceback of an unexpected one."""
     if not isinstance(error, UserError | RunError | KeyboardInterrupt):
-        if signal.getsignal(signal.SIGTERM) is signal.SIG_IGN:  # a library swallowed the interruption
-            return KeyboardInterrupt()
         if not isinstance(error, SystemExit):
             traceback.print_exception(error)
         return ChildLost(f"raised {type(error).__name__}: {error}")

@@ -8,11 +8,13 @@ import sys
 from contextlib import suppress
 from pathlib import Path
 from threading import Timer
+from time import sleep
 
 import pytest
 from toy_runs import ROLES, composed_hash, run_toys, toy_services
 
-from palpate.apart import run_apart
+from palpate import apart
+from palpate.apart import ChildLost, Send, run_apart
 from palpate.check.perform import check_here
 from palpate.check.rig import RigSettings
 from palpate.run import composed
@@ -30,6 +32,7 @@ ENDS = [
     ("exit3", LOST, "left with status 3"),
     ("leave", FAILED, "SystemExit: 0"),
     ("crash", LOST, "killed by signal 11 (SIGSEGV)"),
+    ("terminate", FAILED, "ChildLost: raised signal 15 (SIGTERM) itself"),
     ("hang", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
     ("spin", BLOCKED, "did not return within 0.5 s in its step (PALPATE_STEP_LIMIT_S)"),
 ]
@@ -56,6 +59,7 @@ def toys(monkeypatch: pytest.MonkeyPatch) -> Toys:
     monkeypatch.setattr(composed, "workers", lambda _: ROLES)
     monkeypatch.setenv("PALPATE_STEP_LIMIT_S", "0.5")
     monkeypatch.setenv("PALPATE_START_LIMIT_S", "0.5")
+    monkeypatch.setattr(apart, "PARENT_S", 0.1)
     return made
 
 
@@ -132,16 +136,23 @@ def test_an_interruption_is_that_of_the_child(tmp_path: Path, monkeypatch: pytes
 
 
 def test_an_interruption_that_a_library_swallows_is_not_an_error_of_its_own() -> None:
-    def compile_it(_: object) -> None:
+    def compile_it(send: Send) -> None:
+        send("begun")
         with suppress(KeyboardInterrupt):  # as a callback of ctypes does
-            signal.raise_signal(signal.SIGTERM)
+            sleep(20)
         raise RuntimeError("no compiled object yet")
 
     with pytest.raises(KeyboardInterrupt):
-        run_apart(compile_it)
+        run_apart(compile_it, receive=lambda _: signal.raise_signal(signal.SIGINT))
 
 
-@pytest.mark.parametrize("how", ["exit0", "leave", "hang"])
+def test_a_signal_that_foreign_code_raises_is_no_interruption() -> None:
+    with pytest.raises(ChildLost, match=r"raised signal 15 \(SIGTERM\) itself"):
+        run_apart(lambda _: signal.raise_signal(signal.SIGTERM))
+    assert run_apart(lambda _: signal.raise_signal(signal.SIGINT) or "done") == "done"  # type: ignore[func-returns-value]
+
+
+@pytest.mark.parametrize("how", ["exit0", "leave", "terminate", "hang"])
 def test_separate_processes_name_it_too(how: str) -> None:
     rest = ("planning", *(role for role in ROLES if role not in ("tissue", "planning")))
     patience = Patience(foreign=frozenset({"tissue"}), foreign_step=2.0)

@@ -71,8 +71,8 @@ def misbehave(how: str) -> None:
         sys.exit(0)
     if how == "crash":
         ctypes.string_at(0)
-    if how == "kill":
-        os.kill(os.getpid(), signal.SIGKILL)
+    if how in ("kill", "terminate"):
+        os.kill(os.getpid(), signal.SIGKILL if how == "kill" else signal.SIGTERM)
     while how == "spin":
         pass
     if how == "hang":
