@@ -24,12 +24,18 @@ class MeshLimits:
     """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
     near_umbilicus_m: float = 0.03
     smallest_body_m: float = 0.15
+    widest_m: float = 0.9
+    """Width of the body across the umbilicus, and its thickness there."""
+    thickest_m: float = 0.5
     least_normal_z: float = 0.7
 
 
 LIMITS: Final = MeshLimits()
 
-UNITS_M = {"millimetres": 1e-3, "centimetres": 1e-2, "inches": 0.0254, "feet": 0.3048, "kilometres": 1e3}
+UNITS_M = {
+    **{"micrometres": 1e-6, "millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "kilometres": 1e3},
+    **{"inches": 0.0254, "feet": 0.3048, "yards": 0.9144},
+}
 
 
 @dataclass(frozen=True)
@@ -80,15 +86,8 @@ def check(vertices: Array, triangles: IntArray) -> None:
     """Raise MeshError unless the mesh is a manifold of sound triangles, in metres."""
     size = float(np.ptp(vertices, axis=0).max())
     if not LIMITS.smallest_m <= size <= LIMITS.largest_m:
-        fitting = [
-            f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
-            for unit, factor in UNITS_M.items()
-            if LIMITS.smallest_body_m <= size * factor <= LIMITS.largest_m
-        ]
-        raise MeshError(
-            f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; "
-            f"{', '.join(fitting) or 'no unit fits'}"
-        )
+        fitting = _fitting_units(vertices, triangles)
+        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; {fitting}")
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -116,8 +115,32 @@ def check(vertices: Array, triangles: IntArray) -> None:
     _check_fans(vertices, triangles)
 
 
+def _fitting_units(vertices: Array, triangles: IntArray) -> str:
+    """Return the units in which a surface can be a body, each with its size."""
+    size, (width, thickness) = float(np.ptp(vertices, axis=0).max()), _across(vertices, triangles)
+    fitting = [
+        f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
+        for unit, factor in UNITS_M.items()
+        if LIMITS.smallest_body_m <= size * factor <= LIMITS.largest_m
+        and width * factor <= LIMITS.widest_m
+        and thickness * factor <= LIMITS.thickest_m
+    ]
+    return ", ".join(fitting) or "no unit fits"
+
+
+def _across(vertices: Array, triangles: IntArray) -> tuple[float, float]:
+    """Return width and thickness of a surface in the plane y = 0, the transverse one through the umbilicus; 0 if next to it."""
+    ends = vertices[_half_edges(triangles)]
+    low, high = (points[(ends[:, 0, 1] <= 0) & (ends[:, 1, 1] > 0)] for points in (ends[:, 0], ends[:, 1]))
+    if not len(low):
+        return 0.0, 0.0
+    cut = low + (high - low) * (low[:, 1] / (low[:, 1] - high[:, 1]))[:, None]
+    width, _, thickness = np.ptp(cut, axis=0).tolist()
+    return width, thickness
+
+
 def check_place(vertices: Array, triangles: IntArray) -> None:
-    """Raise MeshError unless the surface passes through the origin of A, the umbilicus, and faces +z there."""
+    """Raise MeshError unless the surface passes through the origin of A, the umbilicus, as a body does, and faces +z there."""
     import trimesh  # noqa: PLC0415 - as in read_mesh
 
     frame = "abdomen frame: x to the patient's left, y to the head, z outward"
@@ -126,6 +149,12 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     if away.min() > LIMITS.near_umbilicus_m:
         place = _place(nearest[[away.argmin()]])
         raise MeshError(f"the umbilicus must be at the origin ({frame}), but the surface is nearest to it at {place}")
+    width, thickness = _across(vertices, triangles)
+    if width > LIMITS.widest_m or thickness > LIMITS.thickest_m:
+        raise MeshError(
+            f"at the umbilicus it is {width:.3g} m wide and {thickness:.3g} m thick, want up to {LIMITS.widest_m} and "
+            f"{LIMITS.thickest_m}; {_fitting_units(vertices, triangles)}"
+        )
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
     border = boundary_vertices(len(vertices), triangles)
