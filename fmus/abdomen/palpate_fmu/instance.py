@@ -172,6 +172,12 @@ class FmuInstance:
             raise FmuError(f"{path}: an FMU without co-simulation")
         self.version = 2 if self.description.fmiVersion == "2.0" else 3
         self.start_s = _default_start(self.description) if start_s is None else start_s
+        rest = dict(values or {})
+        sizes = {}
+        for variable in self.description.modelVariables:
+            if variable.causality == "structuralParameter" and variable.name in rest:
+                sizes[variable.name] = rest.pop(variable.name)
+                variable.start = str(sizes[variable.name])  # the shapes of arrays follow it
         self.variables = read_variables(self.description)
         self._scalars = read_scalars(self.description)
         places = binary_folders(self.path)
@@ -189,8 +195,11 @@ class FmuInstance:
         self._component = self._fmu.component
         self._bind()
         try:
-            for name, value in (values or {}).items():
-                self.set(name, value)
+            if sizes:
+                self._fmu.enterConfigurationMode()
+                self._set_all(sizes)
+                self._fmu.exitConfigurationMode()
+            self._set_all(rest)
             self._initialise(self.start_s)
         except BaseException:
             self.close()
@@ -285,6 +294,10 @@ class FmuInstance:
         port = self.port([name])
         port[name][...] = value
         port.push()
+
+    def _set_all(self, values: Mapping[str, ArrayLike]) -> None:
+        for name, value in values.items():
+            self.set(name, value)
 
     def step(self, t_s: float, dt_s: float) -> None:
         """Advance from `t_s` by `dt_s` [s].

@@ -72,6 +72,11 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
         name = element.get("modelIdentifier")
         if name is not None and not (name.isascii() and name.isidentifier()):  # FMI: it names the library and its functions
             raise FmuError(f"{path}: modelIdentifier = {brief(name)}: want an identifier of C")
+    starts = {variable.get("valueReference"): variable.get("start") for variable in root.iterfind("ModelVariables/*")}
+    for variable in root.iterfind("ModelVariables/*[Dimension]"):
+        for dimension in variable.iterfind("Dimension"):
+            if dimension.get("start", starts.get(dimension.get("valueReference"))) is None:
+                raise FmuError(f"{path}: variable {brief(variable.get('name', ''))}: a dimension has no size")
     try:
         return fmpy.read_model_description(str(path)), ()
     except Exception as error:

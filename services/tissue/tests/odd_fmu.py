@@ -36,7 +36,7 @@ SOURCE = """
 #include <stdlib.h>
 
 #define EXPORT __attribute__((visibility("default")))
-typedef struct { double z, f, odd, at, reached, a[4]; } Wall;
+typedef struct { double z, f, odd, at, reached, a[4]; unsigned long size; bool configuring; } Wall;
 
 static int start(Wall *w, double t) { return (int)w->odd == 13 && t != w->at ? 3 : 0; }
 
@@ -94,9 +94,17 @@ EXPORT void fmi3FreeInstance(void *c) { free(c); }
 EXPORT int fmi3GetFloat64(void *c, const unsigned *vr, size_t n, double *v, size_t room) {
     (void)room;
     for (size_t k = 0; k < n; k++) {
-        for (unsigned j = 0; j < (vr[k] == 10 ? 4 : 1); j++) *v++ = vr[k] == 10 ? ((Wall *)c)->a[j] : ((double *)c)[vr[k]];
+        const unsigned long many = ((Wall *)c)->size ? ((Wall *)c)->size : 4;
+        for (unsigned j = 0; j < (vr[k] == 10 ? many : 1); j++) *v++ = vr[k] == 10 ? ((Wall *)c)->a[j] : ((double *)c)[vr[k]];
     }
     return 0;
+}
+EXPORT int fmi3EnterConfigurationMode(void *c) { return ((Wall *)c)->configuring = true, 0; }
+EXPORT int fmi3ExitConfigurationMode(void *c) { return ((Wall *)c)->configuring = false, 0; }
+EXPORT int fmi3SetUInt64(void *c, const unsigned *vr, size_t n, const unsigned long *v, size_t room) {
+    (void)vr, (void)n, (void)room;
+    ((Wall *)c)->size = v[0];
+    return ((Wall *)c)->configuring ? 0 : 3;
 }
 EXPORT int fmi3SetFloat64(void *c, const unsigned *vr, size_t n, const double *v, size_t room) {
     (void)room;

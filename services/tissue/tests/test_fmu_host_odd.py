@@ -191,6 +191,28 @@ def test_an_array_of_fmi_3_is_read_as_a_whole(tmp_path: Path) -> None:
         assert fmu.get("a").tolist() == [1.0, 2.0, 3.0, 4.0]
 
 
+SIZED = (
+    '<UInt64 name="n" valueReference="11" causality="structuralParameter" variability="fixed"{}/>'
+    '<Float64 name="a" valueReference="10" causality="output"><Dimension valueReference="11"/></Float64>'
+)
+UNUSED = (
+    '<Clock name="tick" valueReference="50" causality="input" intervalVariability="constant" intervalDecimal="0.01"/>'
+    '<Float64 name="s" valueReference="51" causality="output" variability="discrete" clocks="50"/>'
+    '<Binary name="b" valueReference="52" causality="input" mimeType="image/png"><Start value="00ff"/></Binary>'
+)
+
+
+def test_a_structural_parameter_sizes_the_arrays_of_fmi_3(tmp_path: Path) -> None:
+    path = build_wall(tmp_path / "w.fmu", 3, description(3, SIZED.format(' start="4"') + UNUSED))
+    for values, wanted in (({}, 4), ({"n": 3}, 3)):
+        with FmuInstance(path, values=values) as fmu:
+            fmu.step(0.0, 0.01)
+            assert fmu.get("a").tolist() == [1.0, 2.0, 3.0, 4.0][:wanted]
+    path = build_wall(tmp_path / "w.fmu", 3, description(3, SIZED.format("")))
+    with pytest.raises(FmuError, match="variable 'a': a dimension has no size"):
+        FmuInstance(path)
+
+
 @VERSIONS
 def test_a_map_may_name_a_topic_without_variables_an_element_or_a_boolean(version: int, rules: Contract, tmp_path: Path) -> None:
     path = build_wall(tmp_path / "w.fmu", version, description(version, BOOLEAN[version], base=0))
