@@ -8,7 +8,6 @@ from typing import Final
 import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_closing, find_objects, label, median_filter
-from scipy.signal import find_peaks
 
 from palpate.recording.motion import TUNING
 from palpate_models.numerics.frames import Array
@@ -112,12 +111,29 @@ def cut(time: Array, height: Array, force: Array, sigma: float) -> Cut:
     if not touching:
         return Cut([], 0)
     inward = -height
-    lowest, shape = find_peaks(inward, prominence=0.3 * float(np.median([np.ptp(inward[one]) for one in touching])))
+    lowest, rise = peaks(inward, 0.3 * float(np.median([np.ptp(inward[one]) for one in touching])))
     near = np.zeros(len(time), bool)
     for one in touching:
         near[max(0, one.start - few) : one.stop + few] = True
-    usual = float(np.median(shape["prominences"][near[lowest]])) if near[lowest].any() else np.inf
-    return Cut(touching, int((~near[lowest] & (shape["prominences"] > 0.5 * usual)).sum()))
+    usual = float(np.median(rise[near[lowest]])) if near[lowest].any() else np.inf
+    return Cut(touching, int((~near[lowest] & (rise > 0.5 * usual)).sum()))
+
+
+def peaks(values: Array, least: float) -> tuple[NDArray[np.intp], Array]:
+    """Return the maxima that rise by `least` over the minima on both sides: their indices, and the lesser rise; shape (k,)."""
+    turns: list[tuple[int, float]] = []  # minima and maxima in turn, from a minimum to a minimum
+    sign, at, extreme = -1.0, 0, np.inf
+    for k, value in enumerate(values.tolist()):
+        if sign * (value - extreme) > 0:
+            at, extreme = k, value
+        elif sign * (extreme - value) >= least:
+            turns.append((at, extreme))
+            sign, at, extreme = -sign, k, value
+    if sign < 0:
+        turns.append((at, extreme))
+    index, height = np.array(turns).T
+    lesser = np.minimum(height[1::2] - height[:-1:2], height[1::2] - height[2::2])
+    return index[1::2].astype(int), lesser
 
 
 def _split(one: slice, at: NDArray[np.intp]) -> list[slice]:
@@ -145,7 +161,7 @@ def cycles(position: Array, inward: Array, force: Array, radius: float) -> list[
     by more than its least value within a footprint of the path. Position [m], shape (k, 3); `inward` [m], `force` [N], (k,).
     """
     low, high = np.quantile(force, (0.05, 0.95))
-    troughs = find_peaks(-force, prominence=0.5 * (high - low))[0]
+    troughs, _ = peaks(-force, 0.5 * (high - low))
     way = path_length(position)
     cycle = [slice(int(a), int(b) + 1) for a, b in pairwise(troughs) if b - a >= _FEW]
     if len(cycle) < _CYCLES or high < 2 * low:

@@ -11,6 +11,12 @@ class FaultCode(StrEnum):
     UNIT = "unit"
     FORCE_UNIT = "force_unit"
     TIME_UNIT = "time_unit"
+    SPEED = "speed"
+    STIFFNESS = "stiffness"
+    MISSING = "missing"
+    SPIKE = "spike"
+    GAP = "gap"
+    RESOLUTION = "resolution"
     FRAME = "frame"
     NO_FREE_AIR = "no_free_air"
     DRIFT = "drift"
@@ -37,9 +43,16 @@ class FaultCode(StrEnum):
 _TEXTS = {
     FaultCode.SIGN: "the force pulls where the tool presses: its sign is wrong, see force.on of the mapping",
     FaultCode.UNIT: "a contact travels {value:.3g} m, which does not suit the tool's radius: see units.length of the mapping",
-    FaultCode.FORCE_UNIT: "a press needs {value:.3g} N, which does not suit a soft body: see units.force of the mapping",
+    FaultCode.FORCE_UNIT: "a press needs {value:.3g} N, which does not suit a soft body: see units of the mapping",
+    FaultCode.STIFFNESS: "a press is as on a body of {value:.2g} kPa, which is rare: see units and tool.radius_m of the mapping",
+    FaultCode.SPEED: "the tool moves at {value:.3g} m/s: see units of the mapping",
+    FaultCode.MISSING: "{count} of {of} rows have {value:g} for a missing number",
+    FaultCode.SPIKE: "{count} of {of} forces jump by up to {value:.3g} N for one row or two",
     FaultCode.TIME_UNIT: "there is a row every {value:.3g} s: see units.time of the mapping",
-    FaultCode.FRAME: "the force is {value:.0f} deg off the direction of pressing: wrong frame, see force.axes of the mapping",
+    FaultCode.FRAME: "the force is {value:.0f} deg off the direction of pressing: wrong frame, see force.axes and "
+    "table.quaternion of the mapping",
+    FaultCode.GAP: "time jumps by up to {value:.3g} s at {count} of {of} rows",
+    FaultCode.RESOLUTION: "the force has steps of {value:.2g} N",
     FaultCode.NO_FREE_AIR: "no part of the recording is free of contact, so that the force cannot be tared",
     FaultCode.DRIFT: "the force drifts by {value:.2g} N between the first and the last free motion",
     FaultCode.CLIPPED: "{count} of {of} samples are at the end of the sensor's range ({value:.3g} N)",

@@ -10,8 +10,8 @@ from typing import Final
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.fft import irfft, next_fast_len, rfft
 from scipy.ndimage import median_filter, percentile_filter
-from scipy.signal import correlate, correlation_lags
 
 from palpate.recording.readings import Readings
 from palpate_models.numerics.frames import Array
@@ -136,13 +136,17 @@ def delay(time: Array, height: Array, force: Array) -> float:
     changes = np.abs(rise) > max(3 * noise(force), 1e-3 * float(np.abs(rise).max()))
     most = 2 * float(np.median(np.abs(rise[changes]))) if changes.any() else 0.0
     rise = np.where(changes, np.clip(rise, -most, most), 0.0)
-    lags = correlation_lags(len(rise), len(inward), "same")
-    product = correlate(rise, inward, "same", "fft")
-    energy = np.maximum(correlate(changes.astype(float), inward**2, "same", "fft"), 1e-9 * float(inward @ inward))
-    found = product / np.sqrt(energy * float(rise @ rise) + 1e-30)
-    near = np.flatnonzero(np.abs(lags) * step <= TUNING.delay_s)
-    best = near[np.argmax(found[near])]
-    if found[best] < TUNING.correlation or found[lags == 0][0] > TUNING.gain * found[best] or best in (near[0], near[-1]):
+    farthest = min(int(TUNING.delay_s / step), len(even) - 1)
+    lags = np.arange(-farthest, farthest + 1)
+    size = next_fast_len(2 * len(even))
+
+    def correlated(later: Array, earlier: Array) -> Array:
+        return np.asarray(irfft(rfft(later, size) * rfft(earlier, size).conj(), size)[lags])
+
+    energy = np.maximum(correlated(changes.astype(float), inward**2), 1e-9 * float(inward @ inward))
+    found = correlated(rise, inward) / np.sqrt(energy * float(rise @ rise) + 1e-30)
+    best = int(np.argmax(found))
+    if found[best] < TUNING.correlation or found[farthest] > TUNING.gain * found[best] or abs(lags[best]) == farthest:
         return 0.0
     return float(lags[best] * step)
 

@@ -36,6 +36,16 @@ class ReadingLimits:
     """Least end of a sensor's range, as a share of the greatest force."""
     clipped_count: float = 3.0
     """A force at the end of the range is at least this many times as frequent as the next one."""
+    missing: float = 3.0
+    """Distance of a number for missing values from all others, over the size of these."""
+    missing_count: int = 3
+    spike: float = 0.5
+    """Least size of a spike of the force, over the range of the force."""
+    gap_s: float = 600.0
+    """Longest time between rows: longer ones are shortened to it."""
+    resolution: float = 0.03
+    """Step of the force that is reported, over its range."""
+    few_values: int = 40
     coarse: float = 0.2
     """Share of rows with the time of another one from which the clock is too coarse for the rows."""
     disagree: float = 0.35
@@ -51,11 +61,18 @@ class ReadingLimits:
     """Mean way of probes along their normals, over its size, from which the normals point inward."""
     upright: float = 0.7
     """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
+    doubtful_frame_deg: float = 20.0
+    """Angle between force and motion that is reported,"""
     wrong_frame_deg: float = 40.0
+    """and from which on there is no map."""
     force_n: tuple[float, float] = (0.01, 200.0)
     """Change of the force in a recording."""
     young_pa: tuple[float, float] = (50.0, 3e6)
     """Modulus of the body."""
+    usual_young_pa: tuple[float, float] = (5e3, 5e5)
+    """The same of most organs and phantoms."""
+    speed_mps: float = 1.0
+    """Usual speed of the tool where it moves."""
     step_s: tuple[float, float] = (2e-5, 2.0)
     """Time between rows."""
 
@@ -75,6 +92,8 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
             faults.append(Fault(code, int(wrong.sum()), len(wrong), Remedy.LEFT_OUT, value))
             readings = readings.part(~wrong)
 
+    missing, value = _missing(np.column_stack((readings.position, readings.force)))
+    drop(FaultCode.MISSING, missing, value)
     known = [readings.position, readings.force, readings.normal, readings.touch, readings.time, readings.probe]
     valid = np.all([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in known if v is not None], axis=0)
     if readings.normal is not None:
@@ -82,18 +101,15 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
     drop(FaultCode.INVALID, ~valid)
     if readings.normal is not None:
         readings = replace(readings, normal=readings.normal / np.linalg.norm(readings.normal, axis=1)[:, None])
+    if not valid.any():
+        return readings, faults
     if readings.time is None:
         rows = np.column_stack((readings.position, readings.force))
-        drop(FaultCode.REPEATED, np.append(False, (np.diff(rows, axis=0) == 0).all(axis=1)))
+        repeated = np.ones(len(rows), bool)
+        repeated[np.unique(rows, axis=0, return_index=True)[1]] = False
+        drop(FaultCode.REPEATED, repeated)
     else:
-        late = readings.time < np.maximum.accumulate(readings.time)
-        if late.any():
-            faults.append(Fault(FaultCode.BACKWARD, int(late.sum()), len(late), Remedy.CORRECTED))
-            readings = readings.part(np.argsort(readings.time, kind="stable"))
-        assert readings.time is not None
-        if (coarse := _unlike_at_once(readings)) > LIMITS.coarse * len(late):
-            faults.append(Fault(FaultCode.COARSE, coarse, len(late), Remedy.CORRECTED))
-            readings = replace(readings, time=_spread(readings.time))
+        readings = _in_order(readings, readings.time, faults)
         assert readings.time is not None
         drop(FaultCode.REPEATED, np.append(False, np.diff(readings.time) == 0))
         drop(FaultCode.FROZEN, _frozen(readings.force, readings.position))
@@ -103,10 +119,58 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
         if usual > max(radius, 3 * second):  # every other row is of another tool
             faults.append(Fault(FaultCode.TWO_TOOLS, len(p), len(p), Remedy.REFUSED, usual))
         drop(FaultCode.JUMP, away > max(0.5 * radius, 10 * usual), float(away.max(initial=0.0)))
+        spike = np.abs(readings.force - median_filter(readings.force, (5, 1), mode="nearest")).max(axis=1)
+        most = LIMITS.spike * float(np.ptp(np.quantile(readings.force, (0.01, 0.99), axis=0), axis=0).max())
+        drop(FaultCode.SPIKE, spike > most, float(spike.max(initial=0.0)))
+    if (step := _resolution(readings.force)) > LIMITS.resolution * float(np.ptp(readings.force, axis=0).max(initial=0.0)):
+        faults.append(Fault(FaultCode.RESOLUTION, 1, 1, Remedy.KEPT, step))
     clipped, limit = _clipped(readings.force, readings.position)
     if clipped.any():
         faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
     return replace(readings, clipped=clipped), faults
+
+
+def _in_order(readings: Readings, time: Array, faults: list[Fault]) -> Readings:
+    """Return the readings with times that increase in steps of up to `LIMITS.gap_s`; adds faults. `time` is theirs [s], (n,)."""
+    late = time < np.maximum.accumulate(time)
+    if late.any():
+        faults.append(Fault(FaultCode.BACKWARD, int(late.sum()), len(late), Remedy.CORRECTED))
+        readings = readings.part(np.argsort(time, kind="stable"))
+        time = np.sort(time)
+    steps = np.diff(time)
+    wide = steps > LIMITS.gap_s
+    if 0 < wide.sum() < 0.5 * len(time):
+        faults.append(Fault(FaultCode.GAP, int(wide.sum()), len(time), Remedy.CORRECTED, float(steps.max())))
+        time = time[0] + np.append(0.0, np.cumsum(np.minimum(steps, LIMITS.gap_s)))
+    readings = replace(readings, time=time)
+    if (coarse := _unlike_at_once(readings)) > LIMITS.coarse * len(time):
+        faults.append(Fault(FaultCode.COARSE, coarse, len(time), Remedy.CORRECTED))
+        readings = replace(readings, time=_spread(time))
+    return readings
+
+
+def _missing(rows: Array) -> tuple[Mask, float]:
+    """Return True where a value repeats far outside of all others of its column, as -999 for a missing one, and the last such."""
+    missing, found = np.zeros(len(rows), bool), 0.0
+    for column in rows.T:
+        finite = column[np.isfinite(column)]
+        for end in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
+            others, count = finite[finite != end], np.count_nonzero(finite == end)
+            if (
+                len(others)
+                and count >= LIMITS.missing_count
+                and (np.abs(end - others).min() > LIMITS.missing * max(np.ptp(others), np.abs(others).max()))
+            ):
+                missing |= column == end
+                found = float(end)
+    return missing, found
+
+
+def _resolution(force: Array) -> float:
+    """Return the largest step between the values of a column that has few of them [N]; 0 if none has."""
+    values = [np.unique(column) for column in force.T]
+    few = [one for one in values if 2 < len(one) < LIMITS.few_values and len(one) < 0.1 * len(force)]
+    return max((float(np.median(np.diff(one))) for one in few), default=0.0)
 
 
 def _unlike_at_once(readings: Readings) -> int:
@@ -309,6 +373,8 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         )
     if axis.angle_deg > LIMITS.wrong_frame_deg:
         return _refused(name, mapping, [*faults, Fault(FaultCode.FRAME, 1, 1, Remedy.REFUSED, axis.angle_deg)])
+    if axis.angle_deg > LIMITS.doubtful_frame_deg:
+        faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.KEPT, axis.angle_deg))
     if axis.flipped:
         faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
         readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
@@ -369,13 +435,21 @@ def _implausible(readings: Readings) -> list[Fault]:
         step = float(np.median(np.diff(readings.time)))
         if not LIMITS.step_s[0] < step < LIMITS.step_s[1]:
             faults.append(Fault(FaultCode.TIME_UNIT, 1, 1, Remedy.REFUSED, step))
+        speed = np.linalg.norm(np.diff(readings.position, axis=0), axis=1) / np.diff(readings.time)
+        usual = float(np.median(speed[speed > 0])) if speed.any() else 0.0
+        if usual > LIMITS.speed_mps and not faults:
+            faults.append(Fault(FaultCode.SPEED, 1, 1, Remedy.REFUSED, usual))
     return faults
 
 
 def _implausible_force(contacts: list[Contact], radius: float) -> list[Fault]:
-    """Return the fault of forces in another unit."""
-    (low, high), (young, force) = LIMITS.young_pa, implied_young(contacts, radius)
-    return [] if low < young < high else [Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force)]
+    """Return the fault of forces or lengths in another unit: a body that cannot be is refused, one that is rare is a doubt."""
+    young, force = implied_young(contacts, radius)
+    low, high = LIMITS.young_pa
+    if not low < young < high:
+        return [Fault(FaultCode.FORCE_UNIT, 1, 1, Remedy.REFUSED, force)]
+    low, high = LIMITS.usual_young_pa
+    return [] if low < young < high else [Fault(FaultCode.STIFFNESS, 1, 1, Remedy.KEPT, 1e-3 * young)]
 
 
 def _body_frame(mapping: Mapping, axis: Axis, position: Array) -> Array:

@@ -1,4 +1,4 @@
-"""Twenty recordings, each spoiled in one way: each fault is named, and none of them makes a finding."""
+"""Recordings, each spoiled in one way: each fault is named, and none of them makes a finding."""
 
 import runpy
 from pathlib import Path
@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from scipy.spatial.transform import Rotation
 
 from palpate.interface.assessment import assess
 from palpate.recording.faults import FaultCode
@@ -17,7 +18,7 @@ from palpate_assessment.places import places_of
 
 EXAMPLE = Path(__file__).resolve().parents[2] / "docs" / "examples" / "make_recording.py"
 ZERO = np.array((0.4, -0.2, 1.1))
-P, F, N = ["x", "y", "z"], ["fx", "fy", "fz"], ["nx", "ny", "nz"]
+P, F, N, Q = ["x", "y", "z"], ["fx", "fy", "fz"], ["nx", "ny", "nz"], ["qx", "qy", "qz", "qw"]
 OVER_TIME = Mapping(table=MappedColumns(position=tuple(P), force=tuple(F), time="t"), tool=MappedTool(radius_m=0.015))
 PROBES = Mapping(
     table=MappedColumns(position=tuple(P), force=tuple(F), normal=tuple(N), probe="probe"), tool=MappedTool(radius_m=0.015)
@@ -153,6 +154,22 @@ def of_two_tools(t):
     return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 2))
 
 
+def with_number(t, number, names=F, length=1):
+    return t.assign(**{name: t[name].where(np.arange(len(t)) % 500 > length, number) for name in names})
+
+
+def in_tool_axes(t):
+    """The tool looks down, and its sensor gives the force in its own axes."""
+    turn = Rotation.from_euler("xz", (np.pi, 0.5))
+    force = turn.inv().apply(np.array(t[F]))
+    return t.assign(**dict(zip(Q, turn.as_quat(), strict=True)), **dict(zip(F, force.T, strict=True)))
+
+
+def oriented(order):
+    table = OVER_TIME.table.model_copy(update={"orientation": tuple(Q), "quaternion": order})
+    return mapped(OVER_TIME, table=table, force=ForceSource(axes="tool"))
+
+
 def mapped(mapping, **changes):
     return mapping.model_copy(update=changes)
 
@@ -169,6 +186,7 @@ MAPPED = {
     "on-the-body": (flipped, mapped(OVER_TIME, force=ForceSource(on="body"))),
     "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=MappedTool(radius_m=0.015, point="tip"))),
     "late": (late, mapped(OVER_TIME, force=ForceSource(delay_s=0.2))),
+    "tool-axes": (in_tool_axes, oriented("xyzw")),
 }
 
 
@@ -214,6 +232,27 @@ SPOILED = {
     "noise": (lambda t: t.assign(**{name: np.random.default_rng(0).normal(0, 1, len(t)) for name in F}), OVER_TIME, C.FRAME),
     "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
     "header-again": (header_again, OVER_TIME, C.INVALID),
+    "kilograms": (lambda t: t.assign(**{name: t[name] / 9.80665 for name in F}), OVER_TIME, C.STIFFNESS),
+    "probes-kilograms": (lambda t: t.assign(**{name: t[name] / 9.80665 for name in F}), PROBES, C.STIFFNESS),
+    "centimetres-as-millimetres": (
+        lambda t: t.assign(**{name: 100 * t[name] for name in P}),
+        mapped(OVER_TIME, units=Units(length="mm")),
+        C.STIFFNESS,
+    ),
+    "minutes": (lambda t: t.assign(t=t.t / 60), OVER_TIME, C.SPEED),
+    "milliseconds": (lambda t: t.assign(t=1e3 * t.t), OVER_TIME, C.TIME_UNIT),
+    "missing-number": (lambda t: with_number(t, -999.0), OVER_TIME, C.MISSING),
+    "missing-stretches": (lambda t: with_number(t, -999.0, P + F, 60), OVER_TIME, C.MISSING),
+    "probes-missing-number": (lambda t: with_number(t, 9999.0, F, 9), PROBES, C.MISSING),
+    "spikes": (lambda t: t.assign(fz=t.fz + 40 * (np.arange(len(t)) % 311 == 50)), OVER_TIME, C.SPIKE),
+    "whole-newtons": (lambda t: t.assign(fz=t.fz.astype(int)), OVER_TIME, C.RESOLUTION),
+    "clock-set": (lambda t: t.assign(t=t.t + 1.7e9 * (t.t > t.t.mean())), OVER_TIME, C.GAP),
+    "one-x": (lambda t: t.assign(x=0.0), OVER_TIME, C.LINE),
+    "x-for-z": (lambda t: t.assign(x=t.z, z=t.x), OVER_TIME, C.FRAME),
+    "xyzw-as-wxyz": (in_tool_axes, oriented("wxyz"), C.SIGN),
+    "tool-axes-as-recording": (in_tool_axes, OVER_TIME, C.SIGN),
+    "probes-listed-twice": (lambda t: pd.concat((t, t[t.press % 5 == 1])), PROBES, C.REPEATED),
+    "probes-numbered-twice": (lambda t: pd.concat((t, t[t.press % 5 == 1].assign(probe=t.probe + 1000))), PROBES, C.REPEATED),
     "probes-flipped": (flipped, PROBES, C.SIGN),
     "probes-turned": (turned, PROBES, C.FRAME),
     "probes-no-normal": (no_normal, PROBES, C.INVALID),
