@@ -38,6 +38,29 @@ def test_every_format_gives_the_same_phantom(tmp_path, suffix):
     assert model.fixed[model.vertices[:, 2] < -0.195].all()
 
 
+def test_an_stl_whose_header_reads_like_text_is_binary(tmp_path):
+    file = tmp_path / "belly.stl"
+    trimesh.Trimesh(*dome(3), process=False).export(file)
+    file.write_bytes(b"solid facet".ljust(80) + file.read_bytes()[80:])
+    assert len(build_phantom(Phantom(kind="mesh", mesh=str(file)), 0).vertices) > 642
+
+
+def test_a_triangle_that_is_there_twice_counts_once(tmp_path):
+    vertices, faces = dome(3)
+    once, twice = (build_phantom(write(tmp_path / "belly.ply", vertices, f), 0) for f in (faces, [*faces, *faces[:9, ::-1]]))
+    assert len(once.vertices) == len(twice.vertices)
+
+
+def test_a_ply_without_triangles_is_refused_for_that(tmp_path):
+    file = tmp_path / "belly.ply"
+    trimesh.Trimesh(*dome(2), process=False).export(file, encoding="ascii")
+    text = file.read_text()
+    file.write_text(text.replace("vertex_indices", "tristrips"))
+    refused(file, "no list vertex_indices")
+    file.write_text(text.replace("property float z\n", ""))
+    refused(file, "no property z")
+
+
 def test_refinement_leaves_no_hanging_vertices():
     vertices, faces = dome(3)
     surface = refine(vertices, faces.astype(np.int32), 0.005)

@@ -158,21 +158,28 @@ def from_table(table: pd.DataFrame, mapping: Mapping, name: str) -> Readings:
         (columns.time,) if columns.time else None, "s" if columns.time in table and is_date(table[columns.time]) else units.time
     )
     quaternion = values(columns.orientation)
-    if quaternion is not None:
-        quaternion = np.roll(quaternion, -1, axis=1) if columns.quaternion == "wxyz" else quaternion
-        norm = np.linalg.norm(np.nan_to_num(quaternion), axis=1)
-        if not 0.9 < (usual := float(np.median(norm))) < 1.1:
-            raise ReadingError(f"{name}: table.orientation: its norm is {usual:.3g}; want a quaternion, whose norm is 1")
-        quaternion[~(norm > 0)] = (0, 0, 0, 1)
+    if quaternion is not None and columns.quaternion == "wxyz":
+        quaternion = np.roll(quaternion, -1, axis=1)
     return Readings(
         position=values(columns.position, units.length),
         force=values(columns.force, units.force),
         time=None if times is None else times[:, 0],
         probe=None if columns.probe is None else numbers_or_names(columns.probe),
-        rotation=None if quaternion is None else Rotation.from_quat(np.nan_to_num(quaternion)),
+        rotation=None if quaternion is None else _turn(quaternion, f"{name}: table.orientation"),
         normal=values(columns.normal),
         touch=values(columns.touch, units.length),
     )
+
+
+def _turn(quaternion: Array, name: str) -> Rotation | None:
+    """Return orientations, of those that are 0 or no number none; None if there is no other. Raises ReadingError."""
+    quaternion = np.nan_to_num(quaternion)
+    norm = np.linalg.norm(quaternion, axis=1)
+    if not norm.any():
+        return None
+    if not 0.9 < (usual := float(np.median(norm[norm > 0]))) < 1.1:
+        raise ReadingError(f"{name}: its norm is {usual:.3g}; want a quaternion, whose norm is 1")
+    return Rotation.from_quat(np.where(norm[:, None] > 0, quaternion, (0.0, 0.0, 0.0, 1.0)))
 
 
 def from_bag(path: Path, mapping: Mapping) -> Readings:
@@ -194,7 +201,8 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
         )
     times, force = times[inside], force[inside]
     between = np.column_stack([np.interp(times, stamps, position[first, k]) for k in range(3)])
-    return Readings(between, force, times - times[0], rotation=Slerp(stamps, rotation[first])(times))
+    turn = None if rotation is None else Slerp(stamps, rotation[first])(times)
+    return Readings(between, force, times - times[0], rotation=turn)
 
 
 def _averaged(rows: Array) -> tuple[Array, Array]:
@@ -213,6 +221,8 @@ def opened(path: Path) -> Iterator[AnyReader]:
     try:
         with AnyReader([path], default_typestore=store) as bag:
             yield bag
+    except ReadingError:
+        raise
     except UserError as error:
         raise ReadingError(f"{path}: {error}") from None
     except Exception as error:  # damaged bags raise many kinds
@@ -231,15 +241,15 @@ def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tup
         yield (stamp or logged) / NS, message
 
 
-def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tuple[Array, Array, Rotation]:
-    """Return stamps [s], positions [m] and orientations of the tool."""
+def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tuple[Array, Array, Rotation | None]:
+    """Return stamps [s], positions [m] and orientations of the tool, None if they are all 0."""
     if isinstance(source, Transform):
         return _transforms(bag, path, source)
     if isinstance(source, Joints):
         return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
     poses = ((t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
     rows: Array = np.fromiter(((t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for t, p, q in poses), np.dtype((float, 8))).view(float)
-    return rows[:, 0], rows[:, 1:4], Rotation.from_quat(rows[:, 4:])
+    return rows[:, 0], rows[:, 1:4], _turn(rows[:, 4:], f"{path}: orientation of {source}")
 
 
 def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, Array, Rotation]:

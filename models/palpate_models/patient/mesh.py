@@ -69,7 +69,7 @@ def load_mesh(path: Path, edge_m: float) -> TriangleMesh:
 
 
 def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
-    """Return the mesh with equal vertices joined (STL repeats them) and unused ones dropped."""
+    """Return the mesh with equal vertices joined (STL repeats them), each triangle once, and unused vertices dropped."""
     if not len(triangles):
         raise MeshError("it has no triangles")
     if not np.isfinite(vertices).all():
@@ -78,6 +78,7 @@ def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
     scale = float(np.ptp(vertices, axis=0).max()) or 1.0
     _, first, inverse = np.unique(np.round(vertices / (scale * 1e-7)), axis=0, return_index=True, return_inverse=True)
     triangles = inverse.reshape(-1)[triangles].astype(np.int32)
+    triangles = triangles[np.sort(np.unique(np.sort(triangles, axis=1), axis=0, return_index=True)[1])]
     used, inverse = np.unique(triangles, return_inverse=True)
     return vertices[first][used], inverse.reshape(-1, 3).astype(np.int32)
 

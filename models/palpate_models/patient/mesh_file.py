@@ -46,9 +46,9 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     content = read_bytes(path, MeshError)
     try:
         if path.suffix.lower() == ".stl":
-            if content[:5].lower() == b"solid" and b"facet" in content[:1000].lower():
-                content = _utf8(content.lower())
-            _check_stl(content)
+            as_text = _is_text_stl(content)
+            content = _utf8(content.lower()) if as_text else content
+            _check_stl(content, as_text)
         elif path.suffix.lower() == ".obj":
             content = _utf8(content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "))  # lines may be continued
             _check_obj(content.decode())
@@ -92,6 +92,12 @@ def _check_ply_header(header: bytes, body: bytes) -> None:
     if not (header.startswith(b"ply") and len(counts) == len(re.findall(rb"^element\b", header, re.MULTILINE))):
         raise MeshError("its header, from `ply` to `end_header`, is not whole")
     _check_counts(*counts)
+    if missing := [
+        axis.decode() for axis in (b"x", b"y", b"z") if not re.search(rb"^property\s+\w+\s+%b\s*$" % axis, header, re.M)
+    ]:
+        raise MeshError(f"its vertices have no property {', '.join(missing)}")
+    if not re.search(rb"^property\s+list\s+\w+\s+\w+\s+vertex_ind(ex|ices)\s*$", header, re.MULTILINE):
+        raise MeshError("its faces have no list vertex_indices: triangles are read, not strips or points")
     if re.search(rb"^format\s+ascii", header, re.MULTILINE) and (rows := len(re.findall(rb"\S.*", body))) > sum(counts):
         raise MeshError(f"its header promises {sum(counts)} rows, {rows} are there")
 
@@ -109,9 +115,14 @@ def _check_ply(loaded: trimesh.Trimesh) -> None:
             raise MeshError(f"a face names {len(short[0])} vertices, want at least 3: the file is not whole")
 
 
-def _check_stl(content: bytes) -> None:
+def _is_text_stl(content: bytes) -> bool:
+    """Return True for an STL of text: a binary one has zeros, and its header may begin with `solid` too."""
+    return content[:5].lower() == b"solid" and b"facet" in content[:1000].lower() and b"\0" not in content[:1000]
+
+
+def _check_stl(content: bytes, as_text: bool) -> None:
     """Raise MeshError if an STL file ends early."""
-    if content[:5] == b"solid" and b"facet" in content[:1000]:
+    if as_text:
         begun, ended = len(re.findall(rb"^[ \t]*facet\s", content, re.MULTILINE)), content.count(b"endfacet")
         if begun != ended or b"endsolid" not in content[-1000:]:
             raise MeshError(f"{begun} triangles begin and {ended} end, and it has no endsolid: the file is not whole")

@@ -23,6 +23,8 @@ ASPECT: Final = (0.5, 2.0)
 """Ratio of the focal lengths."""
 OFF_CENTRE: Final = 0.2
 """Distance of the principal point from the centre, as a share of the image's size; that of half the size is farther away."""
+USUAL_DEPTH_M: Final = (0.05, 20.0)
+"""Median depth of an image."""
 LARGEST_DISTORTION: Final = 1e-9
 """Greatest distortion coefficient of an image that counts as undistorted."""
 
@@ -99,9 +101,15 @@ class CameraInput:
         return Pinhole(width, height, fx, fy, cx, cy)
 
     def check_seen(self, frames: Iterable[Frame]) -> None:
-        """Raise CameraError if no image measures anything."""
-        if not any(np.isfinite(frame.depth).any() for frame in frames):
+        """Raise CameraError if no image measures anything, or their depth is not that of a camera."""
+        depth = np.concatenate([frame.depth[np.isfinite(frame.depth)] for frame in frames])
+        if not len(depth):
             raise CameraError(f"{self.image}: no pixel has a depth of 0 to {NO_DEPTH_M:g} m: want 32FC1 in m or 16UC1 in mm")
+        low, high = USUAL_DEPTH_M
+        if not low < (usual := float(np.median(depth))) < high:
+            raise CameraError(
+                f"{self.image}: its median depth is {usual:.3g} m, want {low:g} to {high:g} m: see encoding, unit, is_bigendian"
+            )
 
 
 class StaticTransforms:

@@ -150,6 +150,10 @@ def test_wrong_intrinsics_are_refused_at_the_start(camera: Camera, tmp_path: Pat
             ("data", np.full(WIDTH * HEIGHT, depth, "<f4").view(np.uint8), "no pixel has a depth of 0 to 65.5 m")
             for depth in (0.0, NAN, 750.0, 65.535, -0.75, np.inf)
         ),
+        ("is_bigendian", 1, r"median depth is 2\.3e-41 m, want 0\.05 to 20 m: see encoding, unit, is_bigendian"),
+        ("data", np.full(WIDTH * HEIGHT, 0.75, ">f4").view(np.uint8), "see encoding, unit, is_bigendian"),
+        ("data", np.full(WIDTH * HEIGHT, 0.0075, "<f4").view(np.uint8), "median depth is 0.0075 m"),
+        ("data", np.full(WIDTH * HEIGHT, 28.0, "<f4").view(np.uint8), "median depth is 28 m"),
     ],
 )
 def test_wrong_images_are_refused_at_the_start(camera: Camera, tmp_path: Path, field: str, value: Any, found: str) -> None:
@@ -157,6 +161,20 @@ def test_wrong_images_are_refused_at_the_start(camera: Camera, tmp_path: Path, f
     setattr(seen.image, field, value)
     with pytest.raises(UserError, match=found):
         camera(seen, tmp_path / "recording_mcap")
+
+
+@both
+@pytest.mark.parametrize("encoding", ["32FC1", "16UC1", "mono16"])
+@pytest.mark.parametrize("order", "<>")
+def test_either_byte_order_and_padded_rows_are_read(camera: Camera, tmp_path: Path, encoding: str, order: str) -> None:
+    seen = Seen()
+    pixels = np.full((HEIGHT, WIDTH), 0.75, f"{order}f4") if encoding == "32FC1" else np.full((HEIGHT, WIDTH), 750, f"{order}u2")
+    rows = np.full((HEIGHT, pixels.itemsize * WIDTH + 6), 7, np.uint8)
+    rows[:, :-6] = pixels.view(np.uint8)
+    seen.image.encoding, seen.image.step, seen.image.is_bigendian = encoding, rows.shape[1], int(order == ">")
+    seen.image.data = rows.ravel()
+    image = shown(camera(seen, tmp_path / "recording_mcap"))
+    np.testing.assert_allclose(np.frombuffer(image.data, "<f4"), 0.75)
 
 
 @both
