@@ -187,10 +187,12 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     topics = mapping.topics
     assert isinstance(topics, Topics)
     with opened(path) as bag:
-        forces = ((t, w.wrench.force) for t, w in _messages(bag, path, topics.wrench, "wrench"))
-        times, force = _averaged(np.fromiter(((t, f.x, f.y, f.z) for t, f in forces), np.dtype((float, 4))))
-        stamps, position, rotation = _poses(bag, path, topics.pose)
-    stamps, first = np.unique(stamps, return_index=True)
+        forces = ((*t, w.wrench.force) for t, w in _messages(bag, path, topics.wrench, "wrench"))
+        rows = np.fromiter(((t, log, f.x, f.y, f.z) for t, log, f in forces), np.dtype((float, 5)))
+        clocks, position, rotation = _poses(bag, path, topics.pose)
+    repeats = any(2 * len(np.unique(stamps)) < len(stamps) for stamps in (rows[:, 0], clocks[:, 0]))
+    times, force = _averaged(rows[:, [int(repeats), 2, 3, 4]])
+    stamps, first = np.unique(clocks[:, int(repeats)], return_index=True)
     if len(stamps) < 2:
         raise ReadingError(f"{path}: {len(stamps)} poses; want at least 2")
     inside = (times >= stamps[0]) & (times <= stamps[-1])
@@ -208,7 +210,8 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
 def _averaged(rows: Array) -> tuple[Array, Array]:
     """Return stamps [s] and forces [N], averaged over _SHORTEST_S where they are more frequent; rows of both, shape (n, 4)."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
-    together = max(1, round(_SHORTEST_S / max(float(np.median(np.diff(rows[:, 0]))), 1e-6))) if len(rows) > 1 else 1
+    step = float(np.ptp(rows[:, 0])) / (len(rows) - 1) if len(rows) > 1 else 0.0
+    together = max(1, round(_SHORTEST_S / step)) if step > 0 else 1
     rows = rows[: len(rows) // together * together].reshape(-1, together, 4).mean(axis=1)
     return rows[:, 0], rows[:, 1:]
 
@@ -229,8 +232,8 @@ def opened(path: Path) -> Iterator[AnyReader]:
         raise ReadingError(f"{path}: cannot be read: {str(error) or type(error).__name__}") from error
 
 
-def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tuple[float, Any]]:
-    """Yield stamp [s] and message of a topic: the header's stamp if it has one."""
+def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tuple[tuple[float, float], Any]]:
+    """Yield the header's stamp [s], the time of the log [s], which replaces a stamp of 0, and the message of a topic."""
     chosen = [c for c in bag.connections if c.topic.strip("/") == topic.strip("/") and c.msgtype == KINDS[kind]]
     if not chosen:
         has = ", ".join(sorted({c.topic for c in bag.connections if c.msgtype == KINDS[kind]})) or "none"
@@ -238,18 +241,18 @@ def _messages(bag: AnyReader, path: Path, topic: str, kind: str) -> Iterator[tup
     for connection, logged, data in bag.messages(chosen):
         message = bag.deserialize(data, connection.msgtype)
         stamp = nanoseconds(message.header.stamp) if hasattr(message, "header") else 0
-        yield (stamp or logged) / NS, message
+        yield ((stamp or logged) / NS, logged / NS), message
 
 
 def _poses(bag: AnyReader, path: Path, source: str | Transform | Joints) -> tuple[Array, Array, Rotation | None]:
-    """Return stamps [s], positions [m] and orientations of the tool, None if they are all 0."""
+    """Return stamps and times of the log [s], shape (n, 2), positions [m] and orientations of the tool, None if all are 0."""
     if isinstance(source, Transform):
         return _transforms(bag, path, source)
     if isinstance(source, Joints):
         return _kinematics(list(_messages(bag, path, source.topic, "joints")), source)
-    poses = ((t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
-    rows: Array = np.fromiter(((t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for t, p, q in poses), np.dtype((float, 8))).view(float)
-    return rows[:, 0], rows[:, 1:4], _turn(rows[:, 4:], f"{path}: orientation of {source}")
+    poses = ((*t, m.pose.position, m.pose.orientation) for t, m in _messages(bag, path, source, "pose"))
+    rows: Array = np.fromiter(((*t, p.x, p.y, p.z, q.x, q.y, q.z, q.w) for *t, p, q in poses), np.dtype((float, 9))).view(float)
+    return rows[:, :2], rows[:, 2:5], _turn(rows[:, 5:], f"{path}: orientation of {source}")
 
 
 def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, Array, Rotation]:
@@ -280,10 +283,10 @@ def _transforms(bag: AnyReader, path: Path, source: Transform) -> tuple[Array, A
         turned = Slerp(known, turn)(within) if len(known) > 1 else turn[np.zeros(len(stamps), int)]
         moved = np.column_stack([np.interp(within, known, rows[first, k]) for k in (1, 2, 3)])
         position, rotation = moved + turned.apply(position), turned * rotation
-    return stamps, position, rotation
+    return np.column_stack((stamps, stamps)), position, rotation
 
 
-def _kinematics(states: list[tuple[float, Any]], source: Joints) -> tuple[Array, Array, Rotation]:
+def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -> tuple[Array, Array, Rotation]:
     """Return the poses of a frame of an arm by its joint positions."""
     import pinocchio  # noqa: PLC0415 - only for joint positions
 

@@ -1,6 +1,7 @@
 """Bags of other writers: MCAP and SQLite, poses as topic, tf or joints; the same as a table."""
 
 import runpy
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -12,6 +13,7 @@ from scipy.spatial.transform import Rotation
 from palpate.recording.cutting import cycles, onset
 from palpate.recording.mapping import Joints, MappedTool, Mapping, Topics, Transform
 from palpate.recording.read import read_recording
+from palpate.recording.readings import ReadingError
 from palpate.recording.recording import Contact, ContactKind, loading
 from palpate_bus.messages import (
     JointState,
@@ -48,24 +50,31 @@ def few() -> pd.DataFrame:
     return runpy.run_path(str(EXAMPLE))["recording"](spacing=0.05)
 
 
-def write(folder: Path, table: pd.DataFrame, plugin: StoragePlugin) -> None:
+def write(
+    folder: Path,
+    table: pd.DataFrame,
+    plugin: StoragePlugin,
+    stamp: Callable[[int], int] = lambda t: t,
+    logged: Callable[[int], int] = lambda t: t,
+    oriented: bool = True,
+) -> None:
     """Poses at 50 Hz, wrenches at 100 Hz in the axes of a tool that is turned about z, with its weight."""
     turn = Rotation.from_euler("z", 0.7)
-    q = Quaternion(*turn.as_quat())
+    q = Quaternion(*(turn.as_quat() if oriented else np.zeros(4)))
     weighed = turn.inv().apply(table[["fx", "fy", "fz"]].to_numpy() + np.array((0.0, 0.0, -9.81 * TOOL.mass_kg)))
     with Writer(folder, version=9, storage_plugin=plugin) as bag:
         types = {"/wrench": WrenchStamped, "/tool_pose": PoseStamped, "/tf": TFMessage, "/joints": JointState}
         topics = {name: bag.add_connection(name, kind.__msgtype__, typestore=store) for name, kind in types.items()}
 
         def send(name: str, message: object, t: int) -> None:
-            bag.write(topics[name], t, store.serialize_cdr(message, types[name].__msgtype__))
+            bag.write(topics[name], logged(t), store.serialize_cdr(message, types[name].__msgtype__))
 
         for k, (row, force) in enumerate(zip(table.itertuples(), weighed, strict=True)):
             t = round((row.t + 1000) * NS)
-            send("/wrench", WrenchStamped(header(t, "tool"), Wrench(Vector3(*force), Vector3(0.0, 0.0, 0.0))), t)
+            send("/wrench", WrenchStamped(header(stamp(t), "tool"), Wrench(Vector3(*force), Vector3(0.0, 0.0, 0.0))), t)
             if k % 2 == 0:
                 p = (row.x, row.y, row.z)
-                send("/tool_pose", PoseStamped(header(t, "world"), Pose(Point(*p), q)), t)
+                send("/tool_pose", PoseStamped(header(stamp(t), "world"), Pose(Point(*p), q)), t)
                 send("/tf", TFMessage([TransformStamped(header(t, "world"), "tool", TransformMessage(Vector3(*p), q))]), t)
                 names = list("xyz" if k % 4 else "zxy")  # the order changes
                 q_now = np.array([getattr(row, name) for name in names])
@@ -89,6 +98,42 @@ def test_a_bag_gives_the_contacts_of_its_table(few: pd.DataFrame, tmp_path: Path
     assert not recording.faults
     assert len(recording.touches) == 9
     assert abs(recording.depth_m - 0.010) < 0.0008
+
+
+STAMPS = {
+    "none": (lambda t: 0, lambda t: t),
+    "whole seconds": (lambda t: t // NS * NS, lambda t: t),
+    "a log that goes back": (lambda t: t, lambda t: 10**13 - t),
+    "a log without time": (lambda t: t, lambda t: 0),
+}
+
+
+@pytest.mark.parametrize(("stamp", "logged"), STAMPS.values(), ids=STAMPS)
+def test_stamps_that_repeat_are_replaced_by_the_times_of_the_log(
+    few: pd.DataFrame, tmp_path: Path, stamp: Callable[[int], int], logged: Callable[[int], int]
+) -> None:
+    write(tmp_path / "bag", few, StoragePlugin.MCAP, stamp, logged)
+    mapping = Mapping.model_validate(
+        {"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL, "force": {"axes": "tool"}}
+    )
+    recording = read_recording(tmp_path / "bag", mapping)
+    assert not recording.faults
+    assert len(recording.touches) == 9
+
+
+def test_poses_without_an_orientation_are_positions(few: pd.DataFrame, tmp_path: Path) -> None:
+    write(tmp_path / "bag", few, StoragePlugin.MCAP, oriented=False)
+    fields = {"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL}
+    assert len(read_recording(tmp_path / "bag", Mapping.model_validate(fields)).touches) == 9
+    with pytest.raises(ReadingError, match="the recording has no orientation"):
+        read_recording(tmp_path / "bag", Mapping.model_validate({**fields, "force": {"axes": "tool"}}))
+
+
+def test_a_bag_without_messages_is_refused(few: pd.DataFrame, tmp_path: Path) -> None:
+    write(tmp_path / "bag", few[:0], StoragePlugin.MCAP)
+    mapping = Mapping.model_validate({"topics": {"wrench": "/wrench", "pose": "/tool_pose"}, "tool": TOOL})
+    with pytest.raises(ReadingError, match="0 poses; want at least 2"):
+        read_recording(tmp_path / "bag", mapping)
 
 
 def pressed(depth: np.ndarray, force: np.ndarray, noise: float) -> Contact:
