@@ -127,6 +127,15 @@ def test_a_service_may_send_only_what_the_contract_gives_it() -> None:
         Stepper(Intruder(), contract()).step(0)
 
 
+@pytest.mark.parametrize("returned", [None, [None], "ft/wrench", 3, iter(())])
+def test_what_is_no_outbox_is_named(returned: object) -> None:
+    for method, call in (("step", lambda stepper: stepper.step(0)), ("start", lambda stepper: stepper.start())):
+        toy = TOYS["robot"]()
+        setattr(toy, method, lambda *_: returned)
+        with pytest.raises(LockstepError, match=f"robot returned {type(returned).__name__}; want an outbox"):
+            call(Stepper(toy, contract()))
+
+
 def test_a_message_off_its_tick_is_an_error() -> None:
     stepper = Stepper(OffTick(), contract())
     stepper.step(0)

@@ -76,7 +76,7 @@ class PortCheck:
             alone = Checker(self._topic)(message)
             return alone[0] if alone else next(broken_past(self._topic, self._past, message, t))
         except Exception as error:  # a field has a value of another type
-            return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error))
+            return MessageViolation(ViolationKind.TYPE, "", self._topic.type, str(error) or "a field of another type")
 
 
 _CONFUSED: dict[str, tuple[tuple[str, float], ...]] = {

@@ -321,7 +321,7 @@ class Stepper:
     def start(self) -> list[Sent]:
         """Return the latched messages, packed, with stamp zero."""
         sent = []
-        for name, message in self.service.start().items():
+        for name, message in self._items(self.service.start()):
             port = self._port(name)
             if not port.latched:
                 raise LockstepError(f"{self.role.name} sent {name} before the first tick, which is not a latched topic")
@@ -377,10 +377,18 @@ class Stepper:
     def _missing(self, port: OutputPort, t: int) -> LockstepError:
         return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: it is due every {port.period} ns")
 
+    def _items(self, outbox: Outbox) -> Iterable[tuple[str, Message | list[Message]]]:
+        """Return the topics and messages of what the service returned. Raises LockstepError if that is no outbox."""
+        try:
+            return outbox.items()
+        except AttributeError:
+            kind = type(outbox).__name__
+            raise LockstepError(f"{self.role.name} returned {kind}; want an outbox: a dict of topics and messages") from None
+
     def _pack(self, outbox: Outbox, t: int) -> list[Sent]:
         sent: list[Sent] = []
         ports = self.ports
-        for name, message in outbox.items():
+        for name, message in self._items(outbox):
             port = ports.get(name) or self._port(name)
             if port.event:
                 sent += self._packed(port, message if isinstance(message, list) else (message,), t)
