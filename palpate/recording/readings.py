@@ -188,7 +188,7 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     assert isinstance(topics, Topics)
     with opened(path) as bag:
         forces = ((*t, w.wrench.force) for t, w in _messages(bag, path, topics.wrench, "wrench"))
-        rows = np.fromiter(((t, log, f.x, f.y, f.z) for t, log, f in forces), np.dtype((float, 5)))
+        rows: Array = np.fromiter(((t, log, f.x, f.y, f.z) for t, log, f in forces), np.dtype((float, 5))).view(float)
         clocks, position, rotation = _poses(bag, path, topics.pose)
     repeats = any(2 * len(np.unique(stamps)) < len(stamps) for stamps in (rows[:, 0], clocks[:, 0]))
     times, force = _averaged(rows[:, [int(repeats), 2, 3, 4]])

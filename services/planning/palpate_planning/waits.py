@@ -35,9 +35,9 @@ def _wait(reason: Reason, text: str, end: Reason, why: str, culprit: str = "") -
 
 FOR_WALL: Final = _wait(
     Reason.WAITS_FOR_WALL,
-    "waiting above the skin: the wall is not tracked",
+    "waiting above the skin: the wall is not tracked in camera/follow/depth",
     Reason.WALL_NOT_TRACKED,
-    "the wall could not be tracked",
+    "the wall could not be tracked in camera/follow/depth",
     "camera/follow/depth",
 )
 FOR_BREATH: Final = _wait(
