@@ -61,7 +61,7 @@ class ReadingLimits:
     """Mean way of probes along their normals, over its size, from which the normals point inward."""
     upright: float = 0.7
     """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
-    doubtful_frame_deg: float = 20.0
+    doubtful_frame_deg: float = 25.0
     """Angle between force and motion that is reported,"""
     wrong_frame_deg: float = 40.0
     """and from which on there is no map."""

@@ -378,7 +378,7 @@ class Stepper:
         return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: it is due every {port.period} ns")
 
     def _items(self, outbox: Outbox) -> Iterable[tuple[str, Message | list[Message]]]:
-        """Return the topics and messages of what the service returned. Raises LockstepError if that is no outbox."""
+        """Return the topics and messages of what the service returned. Raises LockstepError if that is not an outbox."""
         try:
             return outbox.items()
         except AttributeError:
