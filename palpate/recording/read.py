@@ -39,6 +39,9 @@ class ReadingLimits:
     missing: float = 3.0
     """Distance of a number for missing values from all others, over the size of these."""
     missing_count: int = 3
+    """Least number of times that it is there."""
+    missing_others: int = 10
+    """Least number of different other values: a raster of two lines has two."""
     spike: float = 0.5
     """Least size of a spike of the force, over the range of the force."""
     gap_s: float = 600.0
@@ -157,8 +160,8 @@ def _missing(rows: Array) -> tuple[Mask, float]:
         for end in (finite.min(initial=np.inf), finite.max(initial=-np.inf)):
             others, count = finite[finite != end], np.count_nonzero(finite == end)
             if (
-                len(others)
-                and count >= LIMITS.missing_count
+                count >= LIMITS.missing_count
+                and len(np.unique(others)) >= LIMITS.missing_others
                 and (np.abs(end - others).min() > LIMITS.missing * max(np.ptp(others), np.abs(others).max()))
             ):
                 missing |= column == end
