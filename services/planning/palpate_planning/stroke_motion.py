@@ -38,6 +38,9 @@ class MotionTuning:
     """Fraction of the acceleration with which the motion along a path brakes."""
     behind_rad: float = 0.1
     """A free motion has arrived when no joint is this far behind: a real arm may be slowed down by its own controller."""
+    posture_radps: float = 10.0
+    """Greatest speed of the posture in set-points of contact: near a singular wrist, that at the end of a path and that at the
+    start of the next stroke are far apart."""
     stopped_speed_fraction: float = 0.1
     """Below this fraction of its speed the descent counts as stopped by force."""
 
@@ -76,6 +79,8 @@ class StrokeMotion:
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
         self.depth = self._depth_axis(-SEGMENTS.hover_m)
         """Target depth [m], negative above the surface."""
+        self._posture: Array | None = None
+        """Posture of the last set-point [rad], shape (n,)."""
         self.joined = False
         """True if the commanded depth continues that of the arm; after a free motion it has to be measured first."""
 
@@ -216,6 +221,8 @@ class StrokeMotion:
         `in_contact` enables the integral of the error, `pushing` the feed-forward of force: above the skin the tool does not
         push back.
         """
+        if self.segment.free is not None:  # the stroke after it begins where the arm is then
+            self.depth = self._depth_axis(contact.depth)
         force = contact.force if pushing else 0.0
         self.regulation = self._regulator.update(self.depth.position, contact.depth, force, contact.load, in_contact)
 
@@ -234,7 +241,9 @@ class StrokeMotion:
         outward = self.wall.outward(point.p, t)
         rising = (self.wall.outward(point.p + point.dp * speed * dt, t + round(dt * SECOND)) - outward) / dt
         distance = self._radius + outward - regulation.depth
-        return stroke_setpoint(t, point, speed, distance, regulation.rate - rising, regulation.force)
+        before, step = contact.q if self._posture is None else self._posture, MOTION.posture_radps * dt
+        self._posture = np.clip(point.q, before - step, before + step)
+        return stroke_setpoint(t, point._replace(q=self._posture), speed, distance, regulation.rate - rising, regulation.force)
 
     def _free_setpoint(self, t: int, contact: ContactMeasurement, rate: float) -> Setpoint:
         """Return a free motion that starts where the arm is and fades to the planned one: s(x) = 1 - x^2 (3 - 2 x) of the gap.
@@ -252,4 +261,5 @@ class StrokeMotion:
         share, fading = 1 - x * x * (3 - 2 * x), -6 * x * (1 - x) / (max(last, 1) * self.period_s)
         q_now, qd_now = q + share * self._q_offset, rate * (qd + fading * self._q_offset)
         self._behind_rad = float(np.abs(q_now - contact.q).max())
+        self._posture = q_now
         return joint_setpoint(t, tool_pose(q_now, self._robot), q_now, qd_now, self._arm.stiffness_nmprad)
