@@ -51,6 +51,8 @@ class SensesTuning(NamedTuple):
     torque_sd_share: float = 0.005
     """The same over the torque of a joint with a torque sensor, for friction, and over its change from the mean of the last
     `tare_s` in free air, for errors of mass: after a fast motion the offset is still that of another posture."""
+    damping_nms: float = 2.0
+    """Error of the joints' damping [N m s/rad], twice that of typical equipment: in fast motion the joints feel less exactly."""
     force_max_n: float = 100.0
     """Prior of the force by the joints."""
     lag_s: float = 1 / GAIN_PER_S
@@ -118,7 +120,7 @@ class ForceSenses:
         """Rows: offset, friction, the late sign of the speed, its mean, and the mean load in free air."""
         self._tool = np.zeros((11, 3))
         """Rows of `_compare`."""
-        self._sums = np.zeros(4)
+        self._sums = np.zeros(5)
         self._started = False
 
     def compare(
@@ -172,7 +174,7 @@ def _compare(
 
     `tool`: F/T bias, first bias and late F/T force (S), difference and force by the joints (W), smooth reading, smooth load and
     their means in free air, last reading (S). `sums`: reading times load, load squared, squared change of the reading, and the
-    same at rest [N^2].
+    same at rest [N^2]; smooth speed of the fastest joint [rad/s].
     """
     (joints, tool, sums), (qd, residual, J_W, load), (reading_S, load_S, R_WS) = state, motion, ft
     offset, friction, sign, mean_sign, usual = joints[0], joints[1], joints[2], joints[3], joints[4]
@@ -220,6 +222,7 @@ def _compare(
     gain = sums[0] / sums[1] if sums[1] > 0.0 else 1.0
     drift = _norm(bias_S - first_S)
     noise, rest_noise = np.sqrt(max(sums[2], 0.0)), np.sqrt(max(sums[3], 0.0))
-    joint_sd = 1 / np.sqrt(np.linalg.eigvalsh(information)[0])
+    sums[4] += smooth * (np.abs(qd).max() - sums[4])
+    joint_sd = np.hypot(1.0, tuning.damping_nms * sums[4] / tuning.torque_sd_nm) / np.sqrt(np.linalg.eigvalsh(information)[0])
     forces = _norm(joints_W), _norm(difference_W), remainder, np.abs(offset).max(), drift
     return *forces, gain, sums[1], noise, rest_noise, joint_sd
