@@ -22,7 +22,7 @@ from palpate_planning.reasons import Reason
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import MOTION as STROKE_MOTION
 from palpate_planning.stroke_motion import StrokeMotion
-from palpate_planning.strokes.path import SurfacePath
+from palpate_planning.strokes.path import PathPoint, SurfacePath
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.waits import WAIT
 from palpate_planning.wall.surface import Foot
@@ -189,3 +189,26 @@ def test_a_free_motion_waits_for_an_arm_that_is_behind() -> None:
         motion.setpoint(0, SimpleNamespace(q=Turn.q[-1] - behind, X_WI=np.eye(4)), 1.0)  # type: ignore[arg-type]
         arrived.append(motion.follow_free_motion(1.0))
     assert arrived == [False, False, True]
+
+
+def test_a_stroke_after_a_free_motion_begins_at_the_depth_of_the_arm() -> None:
+    motion = StrokeMotion(ExamSettings(), Limits(), Robot(), 0.01, None)  # type: ignore[arg-type]
+    contact = SimpleNamespace(depth=-0.034, force=0.0, load=0.0)
+    for free in (Turn(), None):
+        motion.segment = SimpleNamespace(free=free)  # type: ignore[assignment]
+        motion.regulate(contact, in_contact=False, pushing=False)  # type: ignore[arg-type]
+    assert motion.regulation.reference == pytest.approx(-0.034, abs=1e-4)
+
+
+def test_the_posture_of_a_setpoint_moves_no_faster_than_its_limit() -> None:
+    """At a singular wrist the postures at the end of a path and at the start of the next stroke are far apart."""
+    wall = SimpleNamespace(outward=lambda p, t: 0.0)
+    motion, postures = StrokeMotion(ExamSettings(), Limits(), Robot(), 0.01, wall), []  # type: ignore[arg-type]
+    motion.along = SimpleNamespace(position=0.0, velocity=0.0)  # type: ignore[assignment]
+    for q in (HOME, HOME + 0.5):
+        still = np.zeros(3)
+        point = PathPoint(still, np.array((0.0, 0.0, 1.0)), np.eye(3), q, still, still, still, np.zeros(7))
+        motion.segment = SimpleNamespace(free=None, path=SimpleNamespace(at=lambda s, point=point: point))  # type: ignore[assignment]
+        postures += [motion.setpoint(0, SimpleNamespace(q=HOME), 1.0).q for _ in range(8)]  # type: ignore[arg-type]
+    assert np.abs(np.diff(postures, axis=0)).max() <= STROKE_MOTION.posture_radps * 0.01 + 1e-9
+    np.testing.assert_array_equal(postures[-1], HOME + 0.5)

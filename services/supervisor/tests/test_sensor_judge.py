@@ -130,6 +130,17 @@ def test_joints_whose_load_changed_fast_are_trusted_less_until_their_offset_is_l
     assert sd[-1] == pytest.approx(0.4 / 0.6, rel=0.1)
 
 
+def test_joints_that_turn_fast_are_trusted_less() -> None:
+    sd = []
+    for speed in (0.0, 0.3):
+        senses = ForceSenses(6)
+        reading = Measurement(np.zeros(6), np.full(6, speed), np.zeros(6), np.zeros(6))
+        for _ in range(50):
+            told = senses.compare(reading, np.zeros(6), 0.6 * np.eye(3, 6), np.zeros(3), np.eye(3), 0.0, DT, (False, True))
+        sd.append(told.joint_sd)
+    assert sd[1] > 2 * sd[0]
+
+
 @pytest.mark.parametrize(("lie", "seen"), [("", False), ("stuck", True), ("gain", True), ("sign", True)])
 def test_positions_agree_with_velocities(lie: str, seen: bool) -> None:
     agreement, rng = MotionAgreement(), np.random.default_rng(2)
