@@ -75,7 +75,9 @@ def misbehave(how: str) -> None:
         os.kill(os.getpid(), signal.SIGKILL if how == "kill" else signal.SIGTERM)
     while how == "spin":
         pass
-    if how == "hang":
+    if how == "interrupt":
+        os.kill(os.getppid(), signal.SIGINT)
+    if how in ("hang", "interrupt"):
         time.sleep(600)
 
 

@@ -1,5 +1,6 @@
 """Interruptions of the strokes: a wall that cannot be tracked, too much force, a pause; and how the strokes continue."""
 
+from collections import deque
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Final
@@ -57,8 +58,35 @@ class RecoveryTuning:
     return_acceleration_mps2: float = 0.8
 
 
+@dataclass(frozen=True)
+class SurgeTuning:
+    """A force that rises as no stroke of the arm lets it: the patient coughs or tenses."""
+
+    over: int = 3
+    """Periods over which the rate is measured."""
+    least_nps: float = 60.0
+    """Twice the rate in the fastest descent into a stiff wall."""
+    ahead_s: float = 0.1
+    """The arm retreats if the force would pass its working limit within this time: a cough lifts the skin for as long."""
+
+
 WALL: Final = WallTuning()
+SURGE: Final = SurgeTuning()
 RECOVERY: Final = RecoveryTuning()
+
+
+class ForceWatch:
+    """Foresees the force; one `step` each planning period."""
+
+    def __init__(self, period_s: float) -> None:
+        self._period_s = period_s
+        self._loads: deque[float] = deque(maxlen=SURGE.over + 1)
+
+    def step(self, load: float) -> float:
+        """Return the force [N] in `SURGE.ahead_s` if it rises suddenly, else the present one."""
+        self._loads.append(load)
+        rate = (load - self._loads[0]) / (SURGE.over * self._period_s)
+        return load + rate * SURGE.ahead_s if rate > SURGE.least_nps else load
 
 
 class WallWatch:

@@ -20,7 +20,7 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Exam, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.interruptions import RECOVERY, Recovery, WallWatch
+from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
 from palpate_planning.reasons import Cause, Reason
 from palpate_planning.stroke import (
     PRESSING,
@@ -58,6 +58,7 @@ TUNING = PalpationTuning()
 
 HIDDEN = Cause(Reason.WALL_HIDDEN, "the arm hides the wall from the camera", "camera/follow/depth")
 NOT_TRACKED = Cause(Reason.WALL_NOT_TRACKED, "the wall could not be tracked", "camera/follow/depth")
+SURGED = Cause(Reason.FORCE, "the force rose suddenly")
 REPLANNED = frozenset({Reason.ARM_STRETCHED, Reason.WALL_HIDDEN})
 """Reasons after which the rest of the targets is planned again."""
 
@@ -121,6 +122,7 @@ class Palpation:
         """True if the surface was scanned again because no tissue was felt."""
         self._blind_places = 0
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
+        self._forces = ForceWatch(period_s)
         self._recovery = Recovery(exam, limits, period_s)
         self._waits, self._strokes_before = StrokeWaits(period_s), strokes
         self.ahead: frozenset[int] = frozenset()
@@ -379,9 +381,13 @@ class Palpation:
         self._continue_with(self._interrupted())
 
     def _check_force(self, contact: ContactMeasurement) -> None:
-        """Lift off at the soft-stop force and skip the targets there."""
+        """Lift off at the soft-stop force and skip the targets there; before a sudden force, and press there again."""
+        foreseen = self._forces.step(contact.load)
         if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
             self._recovery.soft_stop(contact.load, self._motion.segment, self._motion.along.position)
+            self._interrupt()
+        elif foreseen > self._limits.force_working_n and self.stage in PRESSING:
+            self._recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, SURGED)
             self._interrupt()
 
     def _check_elbow(self, contact: ContactMeasurement) -> None:

@@ -280,3 +280,17 @@ def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> No
         assert np.abs(world.step().setpoint.q - before).max() < 0.01
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
+
+
+def test_the_arm_lifts_before_a_sudden_force_and_presses_there_again() -> None:
+    world = World(known(**SMALL))
+    reached(world, StrokeStage.SLIDE, stroke=2)
+    tissue, begun = world.force, len(world.rows)
+    world.force = lambda depth: tissue(depth) + 1.2 * (len(world.rows) - begun)  # a cough: 120 N/s
+    while world.exam.status.message == StrokeStage.SLIDE.value:
+        world.step()
+    assert world.pressed < 11.0
+    world.force = tissue
+    world.run()
+    assert world.exam.status.phase is Phase.DONE, world.exam.status.message
+    assert world.exam.status.targets_skipped == 0
