@@ -136,8 +136,8 @@ def test_joints_that_turn_fast_are_trusted_less() -> None:
         senses = ForceSenses(6)
         reading = Measurement(np.zeros(6), np.full(6, speed), np.zeros(6), np.zeros(6))
         for _ in range(50):
-            told = senses.compare(reading, np.zeros(6), 0.6 * np.eye(3, 6), np.zeros(3), np.eye(3), 0.0, DT, (False, True))
-        sd.append(told.joint_sd)
+            compared = senses.compare(reading, np.zeros(6), 0.6 * np.eye(3, 6), np.zeros(3), np.eye(3), 0.0, DT, (False, True))
+        sd.append(compared.joint_sd)
     assert sd[1] > 2 * sd[0]
 
 
