@@ -45,7 +45,7 @@ _TEXTS = {
     FaultCode.UNIT: "a contact travels {value:.3g} m, which does not suit the tool's radius: see units.length of the mapping",
     FaultCode.FORCE_UNIT: "a press needs {value:.3g} N, which does not suit a soft body: see units of the mapping",
     FaultCode.STIFFNESS: "a press is as on a body of {value:.2g} kPa, which is rare: see units and tool.radius_m of the mapping",
-    FaultCode.SPEED: "the tool moves at {value:.3g} m/s: see units of the mapping",
+    FaultCode.SPEED: "the tool moves at {value:.3g} m/s: see units.length and units.time of the mapping",
     FaultCode.MISSING: "{count} of {of} rows have {value:g} for a missing number",
     FaultCode.SPIKE: "{count} of {of} forces jump by up to {value:.3g} N for one row or two",
     FaultCode.TIME_UNIT: "there is a row every {value:.3g} s: see units.time of the mapping",

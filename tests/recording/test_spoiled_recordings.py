@@ -205,7 +205,7 @@ def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, change, 
 C = FaultCode
 SPOILED = {
     "flipped": (flipped, OVER_TIME, C.SIGN),
-    "millimetres": (in_mm, OVER_TIME, C.UNIT),
+    "millimetres": (in_mm, OVER_TIME, C.SPEED),
     "metres": (lambda t: t, OVER_TIME.model_copy(update={"units": Units(length="mm")}), C.UNIT),
     "turned": (turned, OVER_TIME, C.FRAME),
     "only-contact": (only_contact, OVER_TIME, C.NO_FREE_AIR),
