@@ -20,7 +20,7 @@ from toy_runs import APART, LOOP, ROLES, Running, assert_failed, at, composed_ha
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import DiagnosticStatus, JointTorqueCommand, RunControl, ServiceReport, codec
-from palpate_bus.messages.stamps import MS, NS, duration_message
+from palpate_bus.messages.stamps import MS, NS, duration_message, nanoseconds, time_message
 from palpate_bus.runtime.composed import Composed
 from palpate_bus.runtime.conductor_link import CONTROL_TYPE
 from palpate_bus.runtime.failure import FailureCode
@@ -258,6 +258,8 @@ def test_the_report_of_an_observer_right_before_it_exits_is_received(monkeypatch
 
 CONTROL_KEY = message_key("palpate/control", CONTROL_TYPE, 0)
 TORQUE = contract().topics["control/joint_torque"]
+AHEAD = 50
+"""Messages by which a forged one is ahead of the latest true one."""
 
 
 class Clone:
@@ -282,7 +284,7 @@ class Clone:
     def strike(self, session: zenoh.Session) -> None:
         attachment, payload = self._received[-1]
         sequence, sent, gid = unpack(attachment)
-        session.put(self._key, self._forge(payload), attachment=AttachmentWriter(gid).pack(sequence + 5, sent + 1))
+        session.put(self._key, self._forge(payload), attachment=AttachmentWriter(gid).pack(sequence + AHEAD, sent + 1))
 
 
 def abort() -> Clone:
@@ -291,8 +293,11 @@ def abort() -> Clone:
 
 def torque() -> Clone:
     def forge(payload: bytes) -> bytes:
-        now = codec.decode(payload, TORQUE.type).header
-        return codec.encode(JointTorqueCommand(now, np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", ""), TORQUE.type)
+        header = codec.decode(payload, TORQUE.type).header
+        header.stamp = time_message(nanoseconds(header.stamp) + AHEAD * TORQUE.period)
+        return codec.encode(
+            JointTorqueCommand(header, np.full(7, 50.0), np.zeros(0), duration_message(10**9), "", ""), TORQUE.type
+        )
 
     return Clone(topic_key(TORQUE, 0), forge)
 

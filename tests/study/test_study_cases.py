@@ -49,7 +49,7 @@ def test_a_wrong_study_is_refused_by_file_field_and_value(tmp_path: Path, text: 
 
 
 def test_an_unknown_study_is_answered_with_the_known_ones() -> None:
-    with pytest.raises(StudyError, match="known are arms, detectability"):
+    with pytest.raises(StudyError, match="known are arms, coughs, detectability"):
         load_study("nosuch")
 
 
