@@ -388,7 +388,6 @@ class Palpation:
             self._interrupt()
         elif foreseen > self._limits.force_working_n and self.stage in PRESSING:
             self._recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, SURGED)
-            self._motion.hasten()
             self._interrupt()
 
     def _check_elbow(self, contact: ContactMeasurement) -> None:

@@ -26,8 +26,6 @@ class MotionTuning:
     """Speeds and accelerations of the commanded indenter."""
 
     depth_acceleration_mps2: float = 0.5
-    retreat_acceleration_mps2: float = 2.0
-    """Of the lift from a sudden force: a cough presses within 0.1 s, in which the usual one lifts the tool by 2 mm."""
     plunge_mps: float = 0.015
     """Speed of the descent in tissue."""
     transfer_mps: float = 0.15
@@ -123,11 +121,6 @@ class StrokeMotion:
         """Continue the segment from rest where it was left, at the present depth of the arm."""
         self.depth = self._depth_axis(contact.depth)
         self.along = self._path_axis(self.along.position)
-
-    def hasten(self) -> None:
-        """Change depth faster until the next stroke joins the arm."""
-        fast = MOTION.retreat_acceleration_mps2
-        self.depth, self.joined = JerkLimitedAxis(self.depth.position, fast, fast / 0.05, self.period_s), False
 
     def shift(self, outward: float) -> None:
         """Count depth from a wall that is `outward` [m] of the previous estimate; the commanded position stays."""
