@@ -65,9 +65,9 @@ class ReadingLimits:
     upright: float = 0.7
     """Cosine of the angle between z and outward up to which the frame of the positions is that of the body."""
     doubtful_frame_deg: float = 25.0
-    """Angle between force and motion that is reported,"""
+    """Angle between force and motion from which it is reported."""
     wrong_frame_deg: float = 40.0
-    """and from which on there is no map."""
+    """The same from which there is no map."""
     force_n: tuple[float, float] = (0.01, 200.0)
     """Change of the force in a recording."""
     young_pa: tuple[float, float] = (50.0, 3e6)
