@@ -7,7 +7,7 @@ another timer between a joint state and its torque.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Final
 
 import numpy as np
@@ -337,8 +337,8 @@ class HardwareService(Service):
             self._port.contact(contact)
         tool, links = self._port.physics()
         self._tool = self._tool if tool is None else tool
-        if self._tool is not None:
-            outbox["sim/tool_state"] = self._tool
+        if self._tool is not None:  # the emulator has a clock of its own
+            outbox["sim/tool_state"] = replace(self._tool, header=header(t, "world"))
         self._links = self._links if links is None else links
         if self._links is not None and not t % LINKS_PERIOD:
             outbox["sim/link_poses"] = self._links
