@@ -18,6 +18,8 @@ from palpate_robot.backends.lbr.emulator import Emulator, Options
 from palpate_robot.backends.lbr.service import lbr_service
 
 MS = 1_000_000
+UNIX = 1_700_000_000_000_000_000
+"""The emulator's clock at the start [ns]: it is not the run's."""
 
 
 class DirectPort(ArmPort):
@@ -69,7 +71,7 @@ class DirectPort(ArmPort):
 
     def physics(self) -> tuple[Any | None, Any | None]:
         moved, self._moved = self._moved, False
-        return (self.emulator.tool(self.t), self.emulator.links(self.t)) if moved else (None, None)
+        return (self.emulator.tool(UNIX + self.t), self.emulator.links(UNIX + self.t)) if moved else (None, None)
 
     def close(self) -> None:
         pass

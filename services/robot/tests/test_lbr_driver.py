@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from lbr_bench import MS, SCENARIO, Rig, active_rig
 
+from palpate_bus.contract import contract
+from palpate_bus.contract.port_check import PortCheck
 from palpate_bus.messages import OperatorRequest, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import header, nanoseconds
 from palpate_models.robot import lbr
@@ -26,6 +28,18 @@ def test_until_the_session_commands_the_driver_waits_and_says_for_what() -> None
     assert rig.status.mode == RobotStatus.MODE_IDLE
     assert "MONITORING" in rig.status.reason
     assert rig.outbox["joint_states"].position == pytest.approx(lbr.HOME, abs=1e-4)
+
+
+def test_what_the_driver_sends_keeps_the_contract() -> None:
+    rig = Rig()
+    checks = {topic.name: PortCheck(topic, sends=True) for topic in contract().outputs("robot")}
+    sent = set()
+    for _ in range(700):
+        rig.tick(1)
+        for name, message in rig.outbox.items():
+            checks[name](message, rig.t)
+        sent |= rig.outbox.keys()
+    assert sent >= {"joint_states", "robot/status", "sim/tool_state", "sim/link_poses"}
 
 
 def test_positive_torque_turns_a_joint_the_positive_way(rig: Rig) -> None:
