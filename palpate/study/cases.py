@@ -9,6 +9,7 @@ import json
 import shlex
 from collections.abc import Iterator, Mapping, Sequence
 from functools import cache
+from itertools import count as count_from
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -96,20 +97,20 @@ def patient_seeds(study: str, population: str, split: Split, count: int, salt: s
     first, room = (0, TUNE_SEEDS) if split == "tune" else (TUNE_SEEDS, MOST_SEEDS - TUNE_SEEDS)
     found: dict[int, None] = {}
     for number in range(count):
-        attempt = 0
-        while True:
+        for attempt in count_from(0):
             words = [study, population, split, number, "" if split == "tune" else salt, *([attempt] if attempt else [])]
             seed = first + int.from_bytes(hashlib.sha256(canonical(words)).digest()[:8], "big") % room
             if seed not in found:
+                found[seed] = None
                 break
-            attempt += 1
-        found[seed] = None
     return list(found)
 
 
 def cases_of(study: Study, request: Request = Request()) -> list[Case]:  # noqa: B008 - immutable
     """Return the cases in the order of the study. Raises StudyError that names the invalid field of the study."""
-    _check_secret(study, request)
+    if study.seeds_sha256 is not None and request.split != "tune" and request.secret is None:
+        needed = f"the split {request.split} needs the file of that hash, --seeds-file FILE"
+        raise StudyError(f"{study.name}: seeds_sha256 = {study.seeds_sha256}: {needed}")
     found: dict[str, Case] = {}
     for case in _cases(study, request):
         twin = found.setdefault(case.case_id, case)
@@ -132,14 +133,6 @@ def secret_of(path: Path, study: Study) -> str:
     if not content.strip():
         raise StudyError(f"--seeds-file {path}: is empty; want a secret of any kind, such as 32 random bytes")
     return content.hex()
-
-
-def _check_secret(study: Study, request: Request) -> None:
-    if study.seeds_sha256 is not None and request.split != "tune" and request.secret is None:
-        raise StudyError(
-            f"{study.name}: seeds_sha256 = {study.seeds_sha256}: "
-            f"the split {request.split} needs the file of that hash, --seeds-file FILE"
-        )
 
 
 def _cases(study: Study, request: Request) -> Iterator[Case]:

@@ -158,14 +158,12 @@ def scenario_of_case(
 def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:
     """Return the study with the chosen methods and one of the given services. Raises UserError."""
     from palpate.run.roles import settings_of
-    from palpate.study.spec import Method, checked_study, with_methods
+    from palpate.study.spec import with_methods, with_services
 
-    methods: dict[str, Any] = {name: method.model_dump(mode="json") for name, method in study.methods.items()}
     if services:
         settings_of(services)
-        roles = dict(option.split("=", 1) for option in services)
-        methods[Path(next(iter(roles.values()))).stem.lower()] = Method(services=roles).model_dump(mode="json")
-    return with_methods(checked_study({**study.model_dump(mode="json"), "methods": methods}, study.name, Path()), only)
+        study = with_services(study, dict(option.split("=", 1) for option in services))
+    return with_methods(study, only)
 
 
 def _examine(console: Console, folder: Folder, cases: Sequence[Case], where: tuple[int | None, str | None], runs: bool) -> None:

@@ -94,7 +94,6 @@ class Attempt(BaseModel):
     """Part of it that the assessment took."""
     core_s: float = 0.0
     """Processor time."""
-    host: str = ""
     loop_examinations: int | None = None
     """Number of whole examinations that the error model of a quick case was fitted to; null for a whole one."""
 

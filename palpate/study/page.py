@@ -2,7 +2,7 @@
 
 import io
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from functools import partial
 from typing import Any, Final, Literal
 
 import numpy as np
@@ -17,7 +17,7 @@ from palpate.report.figures import INK, QUIET
 from palpate.report.page_figures import GRID, plain
 from palpate.study.statistics.accuracy import Agreement, FindingCalibration
 from palpate.study.statistics.analysis import MethodRow
-from palpate.study.statistics.comparison import QUANTITIES, Comparison, Difference
+from palpate.study.statistics.comparison import QUANTITIES
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, MADE, Surface
 from palpate.study.statistics.detection import GRID as ROC_GRID
 from palpate.study.statistics.detection import RATES
@@ -40,34 +40,16 @@ COVARIATES: Final = {
 }
 
 
-@dataclass(frozen=True)
-class HumanExaminers:
-    """Detection of lumps by hand, for plots of detection: published figures with sources and limits."""
-
-    source: str = (
-        "Fletcher et al., Physicians' abilities to detect lumps in silicone breast models, JAMA 1985;253:2224-2228,"
-        " doi:10.1001/jama.1985.03350390066027"
-    )
-    caveat: str = (
-        "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no breathing."
-        " The line shows what trained hands achieved there; it is not a comparison on equal patients."
-    )
-    found: float = 0.44
-    """Mean share of lumps found by the 80 physicians (range 0.17 to 0.83)."""
-    by_hardness: Mapping[str, float] = field(default_factory=lambda: {"hard": 0.56, "soft": 0.40})
-    by_size: tuple[tuple[float, float], ...] = ((0.003, 0.14), (0.010, 0.87))
-    """Size of the lumps [m] and share found; taken as their diameter, by which lumps of models are sold."""
-    residents: str = (
-        "How do women compare with internal medicine residents in breast lump detection?, J Gen Intern Med,"
-        " doi:10.1007/BF02597396"
-    )
-    residents_sensitivity: float = 0.58
-    """Share of 18 lumps in six silicone models that 62 residents found."""
-    residents_specificity: float = 0.52
-    """Share of the models that they examined without a false finding."""
-
-
-HUMANS: Final = HumanExaminers()
+HUMANS: Final[dict[str, Any]] = {
+    "found": 0.44,
+    "by_size": ((0.003, 0.14), (0.010, 0.87)),
+    "source": "Fletcher et al., Physicians' abilities to detect lumps in silicone breast models, JAMA 1985;253:2224-2228,"
+    " doi:10.1001/jama.1985.03350390066027",
+    "caveat": "80 physicians searched silicone breast models by hand: another organ, smaller lumps, no breathing."
+    " The line shows what trained hands achieved there; it is not a comparison on equal patients.",
+}
+"""Detection of lumps by hand, for plots of detection: mean share of lumps found by the 80 physicians (range 0.17 to 0.83), and
+share found by size [m], taken as their diameter, by which lumps of models are sold."""
 MANY: Final = 400
 """Points from which a cloud is drawn as an image."""
 
@@ -101,8 +83,8 @@ def _legend(axes: Axes, place: Literal["best", "upper left", "lower right"] = "b
 
 def _human(axes: Axes) -> None:
     """Draw the detection rate of human examiners."""
-    label = f"80 physicians, breast models: {HUMANS.found:.0%} (Fletcher 1985)"
-    axes.axhline(HUMANS.found, color=HUMAN, ls="--", lw=1.2, label=label)
+    label = f"80 physicians, breast models: {HUMANS['found']:.0%} (Fletcher 1985)"
+    axes.axhline(HUMANS["found"], color=HUMAN, ls="--", lw=1.2, label=label)
 
 
 def _title(axes: Axes, words: str) -> None:
@@ -129,8 +111,6 @@ def roc(methods: Sequence[MethodRow]) -> Markup | None:
         axes.fill_between(ROC_GRID, curve.low, curve.high, color=color, alpha=0.13, lw=0)
     axes.plot([0, 1], [0, 1], color=QUIET, lw=0.8, ls=":")
     _human(axes)
-    at = 1 - HUMANS.residents_specificity
-    axes.plot(at, HUMANS.residents_sensitivity, "D", color=HUMAN, ms=6, label="62 residents, breast models: 58 % of lumps")
     plain(axes, "patients with a lump above the threshold", "persons without a lump above it")
     _percent(axes, both=True)
     axes.set_xlim(-0.01, 1)
@@ -180,7 +160,7 @@ def detectability(method: MethodRow, names: Sequence[str]) -> Markup | None:
         _errorbar(axes, [scale * at for at in x], rows, INK, "found, in bins of equal number")
         _human(axes)
         if name == "radius_m":
-            sizes, shares = zip(*HUMANS.by_size, strict=True)
+            sizes, shares = zip(*HUMANS["by_size"], strict=True)
             radii = [scale * size / 2 for size in sizes]
             axes.plot(radii, shares, "D", color=HUMAN, ms=6, label="physicians, by size of lump")
         plain(axes, "probability of detection" if name == names[0] else "", words)
@@ -277,65 +257,21 @@ def effort(methods: Sequence[MethodRow]) -> Markup:
     return _svg(figure)
 
 
-def tornado(comparisons: Sequence[Comparison], name: str, rows: int = 20) -> Markup | None:
-    """Return the paired differences of one quantity from the reference, greatest first; None if none is known.
-
-    Levels of one error, `error=level`, share a row.
-    """
-    known: dict[str, list[tuple[str, Difference]]] = {}
-    for comparison in comparisons:
-        source, _, level = comparison.other.rpartition("=")
-        difference = comparison.quantities[name]
-        if difference.mean.value is not None:
-            known.setdefault(source or level, []).append((level if source else "difference", difference))
-    if not known:
-        return None
-    shown = sorted(known.items(), key=lambda row: -max(abs(d.mean.value or 0) for _, d in row[1]))[:rows][::-1]
-    words, unit, margin = QUANTITIES[name]
-    scale, unit = (1e3, "mm") if unit == "m" else (1.0, unit)
-    levels = list(dict.fromkeys(level for row in known.values() for level, _ in row))
-    figure, (axes,) = _figure(9.0, 1.6 + 0.34 * len(shown))
-    height = 0.7 / len(levels)
-    for i, level in enumerate(levels):
-        bars = [
-            (y + (i - (len(levels) - 1) / 2) * height, d.mean)
-            for y, (_, row) in enumerate(shown)
-            for own, d in row
-            if own == level
-        ]
-        at, means = [y for y, _ in bars], [mean for _, mean in bars]
-        color = COLOURS[i % MOST]
-        axes.barh(at, [scale * (mean.value or 0) for mean in means], height=height, color=color, alpha=0.55, label=level)
-        for y, mean in bars:
-            if mean.low is not None and mean.high is not None:
-                axes.plot([scale * mean.low, scale * mean.high], [y, y], color=INK, lw=1.3)
-    axes.axvspan(-scale * margin, scale * margin, color=QUIET, alpha=0.12, lw=0, label="margin of equivalence")
-    axes.axvline(0, color=QUIET, lw=0.8)
-    plain(axes, "", f"{words}, difference from {comparisons[0].reference}{f' [{unit}]' if unit else ''}")
-    axes.set_yticks(range(len(shown)), [f"{source} (n = {min(d.mean.n for _, d in row)})" for source, row in shown])
-    _legend(axes, "lower right")
-    return _svg(figure)
-
-
 def _percent(axes: Axes, both: bool = False) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if both:
         axes.xaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
 
 
-TORNADOES = ("lumps_found", "false_findings", "score", "place_error_m")
-FEWEST_FOR_TORNADO = 2
-"""Number of compared methods from which differences are drawn as a tornado plot."""
-
-
-def render(summary: Mapping[str, Any], methods: Sequence[MethodRow], comparisons: Sequence[Comparison]) -> str:
+def render(summary: Mapping[str, Any], methods: Sequence[MethodRow]) -> str:
     """Return the page as HTML. `summary` has the content of study.json."""
     loader = ChoiceLoader([PackageLoader("palpate.study"), PackageLoader("palpate.report")])
     environment = Environment(loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True, lstrip_blocks=True)
-    environment.filters |= {"figure": figure, "percent": percent, "mm": millimetres, "p": p_value, "words": covariate_words}
+    environment.filters |= {"figure": figure, "p": p_value, "words": lambda name: COVARIATES[name][0]}
+    environment.filters["percent"] = partial(figure, scale=100.0, digits=1, unit=" %")
+    environment.filters["mm"] = partial(figure, scale=1e3, digits=1, unit=" mm")
     shown = methods[:MOST]
     calibrated = [(a.name, a.calibration) for a in shown if a.calibration is not None]
-    many = len(comparisons) >= FEWEST_FOR_TORNADO
     return environment.get_template("study.html.j2").render(
         s=summary,
         shown=[a.name for a in shown],
@@ -349,7 +285,6 @@ def render(summary: Mapping[str, Any], methods: Sequence[MethodRow], comparisons
         errors={a.name: errors(a) for a in shown},
         reliability=reliability(calibrated),
         effort=effort(methods),
-        tornadoes=[plot for name in TORNADOES if many and (plot := tornado(comparisons, name))],
     )
 
 
@@ -365,21 +300,6 @@ def figure(estimate: Mapping[str, Any] | None, scale: float = 1.0, digits: int =
     return template.format(value, unit, f"{estimate['n']} {estimate['of']}; {estimate['interval']}", ends, estimate["n"])
 
 
-def percent(estimate: Mapping[str, Any] | None, digits: int = 1) -> Markup:
-    """Return a rate in per cent."""
-    return figure(estimate, 100.0, digits, " %")
-
-
-def millimetres(estimate: Mapping[str, Any] | None, digits: int = 1) -> Markup:
-    """Return a length in millimetres."""
-    return figure(estimate, 1e3, digits, " mm")
-
-
 def p_value(value: float | None) -> str:
     """Return a p value as text."""
     return "" if value is None else "p < 0.001" if value < 0.001 else f"p = {value:.3f}"
-
-
-def covariate_words(name: str) -> str:
-    """Return the label of a covariate."""
-    return COVARIATES[name][0]

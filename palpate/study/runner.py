@@ -10,7 +10,6 @@ import os
 import re
 import resource
 import shutil
-import socket
 import subprocess
 import sys
 import tempfile
@@ -19,6 +18,8 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
+from itertools import groupby
+from operator import attrgetter
 from pathlib import Path
 from threading import Thread
 from time import monotonic, perf_counter, process_time, sleep
@@ -114,7 +115,6 @@ def examine(case: Case, runs: Path | None = None) -> Attempt:
         wall_time_s=perf_counter() - begin,
         assess_time_s=assess_s,
         core_s=_core_s() - used,
-        host=socket.gethostname(),
         loop_examinations=examinations,
     )
 
@@ -190,13 +190,6 @@ class Workers:
     executor: Executor
     count: int
     """Cases at a time, as known at the start: a cluster may grow."""
-    killed: type[Exception]
-    """Raised for a task whose worker was lost repeatedly."""
-
-    @property
-    def alive(self) -> bool:
-        """True if the client is connected; one without a scheduler would wait for ever."""
-        return bool(self.client.status == "running")
 
 
 def cores() -> int:
@@ -210,7 +203,7 @@ def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
 
     Local workers are threads because each case is examined in a process of its own.
     """
-    from distributed import Client, KilledWorker, LocalCluster  # noqa: PLC0415 - takes a second
+    from distributed import Client, LocalCluster  # noqa: PLC0415 - takes a second
 
     with ExitStack() as stack:
         stack.enter_context(warnings.catch_warnings())
@@ -237,7 +230,7 @@ def cluster(count: int, scheduler: str | None = None) -> Iterator[Workers]:
         if scheduler is None:
             stack.callback(_end_cases)
         stack.callback(executor.shutdown, wait=False)
-        yield Workers(client, executor, known, KilledWorker)
+        yield Workers(client, executor, known)
 
 
 def _end_cases() -> None:
@@ -263,68 +256,56 @@ def run_cases(
     `runs`: keep the results of whole examinations in the folder `runs`.
     """
     begin, finished = monotonic(), 0
-
-    def count(outcome: Outcome) -> None:
-        nonlocal finished
-        finished += 1
-        done(outcome)
-
-    try:
-        _run(folder, cases, workers, count, runs)
-    finally:
-        if finished:
-            session = Session(workers=workers.count, cases=finished, elapsed_s=round(monotonic() - begin, 1))
-            folder.write_sessions([*folder.sessions(), session])
-
-
-def _run(folder: Folder, cases: Sequence[Case], workers: Workers, done: Callable[[Outcome], None], runs: bool) -> None:
     todo, kept = folder.missing(cases), str((folder.path / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
 
     def submit(batch: list[Case]) -> None:
         running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch], kept)] = batch
 
-    size = max(1, min(BATCH[todo[0].tier], len(todo) // (POOL.tasks_per_worker * workers.count))) if todo else 1
-    for batch in _batches(todo, size):
-        submit(batch)
-    while running:
-        ended, _ = wait(running, timeout=POOL.poll_s, return_when=FIRST_COMPLETED)
-        if not ended and not workers.alive:
-            raise StudyStopped("connection to the scheduler lost")
-        for future in ended:
-            batch = running.pop(future)
-            attempts = _attempts(future, batch, workers)
-            for case, attempt in zip(batch, attempts, strict=False):
-                outcome = _outcome(folder, case, attempt)
-                if outcome is None:
-                    submit([case])
-                else:
-                    folder.write(outcome)
-                    done(outcome)
-            if rest := batch[len(attempts) :]:
-                submit(rest)
+    try:
+        for batch in _batches(todo, workers.count):
+            submit(batch)
+        while running:
+            ended, _ = wait(running, timeout=POOL.poll_s, return_when=FIRST_COMPLETED)
+            if not ended and workers.client.status != "running":  # a client without a scheduler would wait for ever
+                raise StudyStopped("connection to the scheduler lost")
+            for future in ended:
+                batch = running.pop(future)
+                attempts = _attempts(future, batch)
+                for case, attempt in zip(batch, attempts, strict=False):
+                    outcome = _outcome(folder, case, attempt)
+                    if outcome is None:
+                        submit([case])
+                    else:
+                        folder.write(outcome)
+                        finished += 1
+                        done(outcome)
+                if rest := batch[len(attempts) :]:
+                    submit(rest)
+    finally:
+        if finished:
+            session = Session(workers=workers.count, cases=finished, elapsed_s=round(monotonic() - begin, 1))
+            folder.write_sessions([*folder.sessions(), session])
 
 
-def _batches(cases: Sequence[Case], size: int) -> Iterator[list[Case]]:
-    """Yield up to `size` consecutive cases with the same periods, which are set for a whole process."""
-    batch: list[Case] = []
-    for case in cases:
-        if batch and (len(batch) == size or case.periods != batch[0].periods):
-            yield batch
-            batch = []
-        batch.append(case)
-    if batch:
-        yield batch
+def _batches(cases: Sequence[Case], workers: int) -> Iterator[list[Case]]:
+    """Yield consecutive cases with the same periods, which are set for a whole process, enough batches for all workers."""
+    for _, group in groupby(cases, key=attrgetter("periods")):
+        same = list(group)
+        size = max(1, min(BATCH[same[0].tier], len(cases) // (POOL.tasks_per_worker * workers)))
+        yield from (same[k : k + size] for k in range(0, len(same), size))
 
 
-def _attempts(future: Future[list[str]], batch: Sequence[Case], workers: Workers) -> list[Attempt]:
+def _attempts(future: Future[list[str]], batch: Sequence[Case]) -> list[Attempt]:
     """Return the attempts of a batch. A batch whose workers are lost repeatedly counts as their cause."""
+    from distributed import KilledWorker  # noqa: PLC0415 - takes a second
+
     if future.cancelled():
         raise StudyStopped("connection to the scheduler lost")
     error = future.exception()
     if error is None:
         return [Attempt.model_validate_json(text) for text in future.result()]
-    if isinstance(error, workers.killed):
+    if isinstance(error, KilledWorker):
         return [Attempt(why=f"its workers were lost: {error}")] * len(batch)
     raise StudyStopped(f"a worker cannot examine: {type(error).__name__}: {error}") from error
 

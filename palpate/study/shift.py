@@ -4,7 +4,7 @@ Each patient is a drawn person with one thing changed, by family. The variants o
 drawn from the seed. docs/studies.md lists the ranges with their sources, with these marks: [V] read in the source, [A] assumed.
 """
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from enum import StrEnum
 from typing import Any, Final
 
@@ -21,6 +21,7 @@ from palpate_models.section import Vec2
 
 Rng = np.random.Generator
 Settings = dict[str, Any]
+Span = tuple[float, float]
 
 
 class Family(StrEnum):
@@ -42,14 +43,9 @@ def shifted(scenario: Scenario, family: Family, number: int) -> Settings:
     """
     if scenario.phantom.anatomy is None:
         raise UserError(f"phantom.kind = {scenario.phantom.kind}: the split shift changes persons; want person")
-    variants = list(_FAMILIES[family].values())
+    variants = list(FAMILIES[family].values())
     change = variants[number % len(variants)]
     return change(scenario.phantom, scenario.phantom.anatomy, generator(scenario.seed, f"shift {family}"))
-
-
-def variants_of(family: Family) -> tuple[str, ...]:
-    """Return the names of a family's variants, in the order of the patients."""
-    return tuple(_FAMILIES[family])
 
 
 def _log(rng: Rng, low: float, high: float) -> float:
@@ -93,22 +89,17 @@ def _box_spectrum(rng: Rng) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return _prony((1 + c * (exp1(_FITTED_S / long) - exp1(_FITTED_S / short))) / (1 + c * np.log(long / short)))
 
 
-def _muscle(rng: Rng) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (float(rng.uniform(0.40, 0.60)),), (_log(rng, 3.0, 12.0),)
-
-
-def _short(rng: Rng) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (float(rng.uniform(0.40, 0.65)), float(rng.uniform(0.05, 0.15))), (_log(rng, 0.2, 0.8), _log(rng, 20.0, 60.0))
-
-
-def _long(rng: Rng) -> tuple[tuple[float, ...], tuple[float, ...]]:
-    return (float(rng.uniform(0.15, 0.50)),), (_log(rng, 60.0, 300.0),)
+def _branches(shares: Sequence[Span], times_s: Sequence[Span]) -> Callable[..., Settings]:
+    """A Prony series with shares and time constants [s] from these ranges."""
+    return _relaxing(
+        lambda rng: (tuple(float(rng.uniform(*span)) for span in shares), tuple(_log(rng, *span) for span in times_s))
+    )
 
 
 # --- speed and radius -----------------------------------------------------------------------------------------------------
 
 
-def _contact(speed_mps: tuple[float, float] | None, radius_m: tuple[float, float] | None) -> Callable[..., Settings]:
+def _contact(speed_mps: Span | None, radius_m: Span | None) -> Callable[..., Settings]:
     def change(_: Phantom, __: Anatomy, rng: Rng) -> Settings:
         ranges = {"exam.speed_mps": speed_mps, "robot.indenter_radius_m": radius_m}
         return {name: _log(rng, *limits) for name, limits in ranges.items() if limits is not None}
@@ -261,7 +252,7 @@ def _pulse(phantom: Phantom, _: Anatomy, rng: Rng) -> Settings:
 # --- variation of the wall ------------------------------------------------------------------------------------------------
 
 
-def _varying(correlation_m: tuple[float, float], natural_m: tuple[float, float]) -> Callable[..., Settings]:
+def _varying(correlation_m: Span, natural_m: Span) -> Callable[..., Settings]:
     """A Gaussian field that replaces most of the drawn one, of other lengths."""
 
     def change(phantom: Phantom, anatomy: Anatomy, rng: Rng) -> Settings:
@@ -297,13 +288,13 @@ def _askew(_: Phantom, __: Anatomy, rng: Rng) -> Settings:
     return {"errors.chosen.askew_rad": [about_x, about_y], "errors.chosen.indenter_m": aside}
 
 
-_FAMILIES: Final[Mapping[Family, Mapping[str, Callable[..., Settings]]]] = {
+FAMILIES: Final[Mapping[Family, Mapping[str, Callable[..., Settings]]]] = {
     Family.RELAXATION: {
         "power-law": _relaxing(_power_law),
         "box-spectrum": _relaxing(_box_spectrum),
-        "muscle": _relaxing(_muscle),
-        "short": _relaxing(_short),
-        "long": _relaxing(_long),
+        "muscle": _branches([(0.40, 0.60)], [(3.0, 12.0)]),
+        "short": _branches([(0.40, 0.65), (0.05, 0.15)], [(0.2, 0.8), (20.0, 60.0)]),
+        "long": _branches([(0.15, 0.50)], [(60.0, 300.0)]),
     },
     Family.CONTACT: {
         "slow": _contact((0.008, 0.018), None),

@@ -138,8 +138,6 @@ class Study(Section):
     each_error_at: tuple[Level, ...] = ()
     """Levels of `each_error`; all other errors are those of the first entry of `errors`."""
     methods: Annotated[dict[Name, Method], Field(min_length=1)] = Field(default_factory=lambda: {"palpate": Method()})
-    record: Literal["none"] = "none"
-    """Nothing is recorded: the recording of one examination has 57 MB."""
 
     @model_validator(mode="after")
     def _each(self) -> Self:
@@ -190,7 +188,16 @@ def load_study(source: str) -> Study:
     raw = parse_yaml(text, source, StudyError)
     if not isinstance(raw, Mapping):
         raise StudyError(f"{source}: want a mapping of fields, not {type(raw).__name__}")
-    return checked_study({"name": path.stem, **raw}, source, path.parent, text)
+    try:
+        study = Study.model_validate({"name": path.stem, **raw})
+    except ValidationError as error:
+        raise StudyError(explain(source, text, (), Study, error)) from error
+    populations = {
+        key: population.model_copy(update={"scenario": _file(population.scenario, path.parent, SUFFIX)})
+        for key, population in study.populations.items()
+    }
+    methods = {key: _absolute(method, path.parent) for key, method in study.methods.items()}
+    return study.model_copy(update={"populations": populations, "methods": methods})
 
 
 def with_methods(study: Study, only: Sequence[str] | None) -> Study:
@@ -200,21 +207,14 @@ def with_methods(study: Study, only: Sequence[str] | None) -> Study:
     return study.model_copy(update={"methods": {name: own for name, own in study.methods.items() if not only or name in only}})
 
 
-def checked_study(raw: Mapping[str, Any], name: str, folder: Path, text: str = "") -> Study:
-    """Return the study of these fields, from the file `name` in `folder` with the content `text`. Raises StudyError."""
-    try:
-        study = Study.model_validate(raw)
-    except ValidationError as error:
-        raise StudyError(explain(name, text, (), Study, error)) from error
-    populations = {
-        key: population.model_copy(update={"scenario": _file(population.scenario, folder, SUFFIX)})
-        for key, population in study.populations.items()
-    }
-    methods = {
-        key: method.model_copy(update={"services": {role: _file(word, folder, ".py") for role, word in method.services.items()}})
-        for key, method in study.methods.items()
-    }
-    return study.model_copy(update={"populations": populations, "methods": methods})
+def with_services(study: Study, services: Mapping[str, str]) -> Study:
+    """Return the study with a further method of these services, which has the name of the first one. Raises StudyError."""
+    name, own = Path(next(iter(services.values()))).stem.lower(), _absolute(Method(services=dict(services)), Path())
+    return study.model_copy(update={"methods": {**study.methods, name: own}})
+
+
+def _absolute(method: Method, folder: Path) -> Method:
+    return method.model_copy(update={"services": {role: _file(word, folder, ".py") for role, word in method.services.items()}})
 
 
 def _file(word: str, folder: Path, suffix: str) -> str:

@@ -1,7 +1,6 @@
 """Results of a study: its tables as Parquet (one row per case, per finding and per lump), study.json and study.html."""
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict
 from importlib.metadata import version
 from math import pi, sqrt
 from pathlib import Path
@@ -18,7 +17,7 @@ from palpate.study.real_time import write_real_time
 from palpate.study.statistics.analysis import MethodRow, analyse
 from palpate.study.statistics.comparison import Comparison, compare
 from palpate.study.statistics.estimate import FOLDS, LEVEL, Row
-from palpate.study.statistics.reading import Tables, read_tables
+from palpate.study.statistics.reading import read_tables
 from palpate_errors import UserError
 from palpate_models.scenario.schema import Scenario
 
@@ -194,29 +193,20 @@ def summarise(folder: Path, command: str, folds: int = FOLDS) -> None:
         folds: resamplings of the bootstrap.
     """
     tables = read_tables(folder, folds)
-    summary = _summary(tables, command)
-    write_text(folder / JSON, summary.model_dump_json(indent=1) + "\n")
-    write_text(folder / PAGE, render(summary.model_dump(), tuple(summary.methods.values()), summary.comparisons))
-
-
-def _summary(tables: Tables, command: str) -> StudySummary:
     reference, *others = tables.variants
-    return StudySummary(
+    summary = StudySummary(
         study=tables.study,
         splits=tables.splits,
         version=version("palpate"),
         command=command,
-        patients=_patients(tables),
+        patients={str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()},
         reference=reference.name,
         methods={own.name: analyse(own, tables.bootstrap) for own in tables.variants},
         comparisons=tuple(compare(reference, other, tables.bootstrap) for other in others),
         assumed=any((variant.cases["loop_examinations"] < LEAST_EXAMINATIONS).any() for variant in tables.variants),
         level=LEVEL,
         bootstrap_folds=tables.folds,
-        human=asdict(HUMANS),
+        human=HUMANS,
     )
-
-
-def _patients(tables: Tables) -> dict[str, int]:
-    """Return the number of patients by population."""
-    return {str(name): int(n) for name, n in tables.patients["population"].value_counts(sort=False).items()}
+    write_text(folder / JSON, summary.model_dump_json(indent=1) + "\n")
+    write_text(folder / PAGE, render(summary.model_dump(), tuple(summary.methods.values())))

@@ -69,7 +69,7 @@ def finding(case_id: str, confidence: float, lump: int, **fields: Any) -> dict[s
         "case_id": case_id, "index": 0, "reported": confidence >= 0.5, "x_m": 0.0, "y_m": 0.0, "z_m": 0.0, "area_m2": 1.1e-3,
         "ratio": 1.6, "ratio_lower": 1.3, "ratio_upper": 1.9, "confidence": confidence, "lump": lump,
         "place_error_m": 4e-3 if lump >= 0 else np.nan, "area_true_m2": 1e-3 if lump >= 0 else np.nan,
-        "ratio_true": 1.5 if lump >= 0 else np.nan, "guarding": 0.0, "on_guarding": False,
+        "ratio_true": 1.5 if lump >= 0 else np.nan,
     }  # fmt: skip
     return row | fields
 

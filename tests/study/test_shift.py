@@ -7,7 +7,7 @@ import pytest
 from synthetic import study
 
 from palpate.study.cases import Request, cases_of, patient_seeds
-from palpate.study.shift import Family, shifted, variants_of
+from palpate.study.shift import FAMILIES, Family, shifted
 from palpate.study.spec import StudyError, load_study
 from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.breathing import Breathing, BreathingCurve
@@ -18,7 +18,7 @@ from palpate_models.scenario.load import as_settings, load_scenario
 from palpate_models.scenario.schema import Scenario
 from palpate_robot.sensors import FtSensor
 
-EVERY = [(family, number) for family in Family for number in range(len(variants_of(family)))]
+EVERY = [(family, number) for family in Family for number in range(len(FAMILIES[family]))]
 PATIENTS = 2
 
 
@@ -38,12 +38,12 @@ def model(scenario: Scenario) -> PhantomModel:
 def test_every_variant_is_valid_and_another_one_than_the_drawn_person(family: Family, number: int) -> None:
     for seed in range(PATIENTS):
         one = changed(family, number, seed)
-        assert one == changed(family, number + len(variants_of(family)), seed) != person(seed)
+        assert one == changed(family, number + len(FAMILIES[family]), seed) != person(seed)
         assert np.isfinite(model(one).stiffness).all()
     assert shifted(person(0), family, number) != shifted(person(1), family, number) or family is Family.EQUIPMENT
 
 
-@pytest.mark.parametrize("number", range(len(variants_of(Family.STRUCTURES)) - 1))
+@pytest.mark.parametrize("number", range(len(FAMILIES[Family.STRUCTURES]) - 1))
 def test_a_structure_changes_the_wall_where_it_is_and_nowhere_else(number: int) -> None:
     scenario = changed(Family.STRUCTURES, number, 3)
     after, before = model(scenario), model(person(3))
@@ -58,7 +58,7 @@ def test_a_structure_changes_the_wall_where_it_is_and_nowhere_else(number: int) 
 
 def test_bones_are_where_no_drawn_person_has_them() -> None:
     def share(family: str | None, seed: int) -> Any:
-        scenario = person(seed) if family is None else changed(Family.BONES, variants_of(Family.BONES).index(family), seed)
+        scenario = person(seed) if family is None else changed(Family.BONES, list(FAMILIES[Family.BONES]).index(family), seed)
         assert scenario.phantom.anatomy is not None
         x, y = np.meshgrid(*(np.linspace(-0.1, 0.1, 21),) * 2)
         return bone_share(x, y, scenario.phantom.anatomy.skeleton)

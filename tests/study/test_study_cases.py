@@ -37,7 +37,6 @@ def written(tmp_path: Path, text: str) -> str:
         (PLAIN + "errors: {t: typical}\neach_error: [force.x]\neach_error_at: [poor]", ("force.x", "force.gain")),
         (PLAIN + "populations: {b: {scenario: person}}", ("mine.yaml", "populations is given twice")),
         (PLAIN + "tier: quick\nmethods: {m: {runtime: wallclock}}", ("mine.yaml", "wallclock", "tier: whole")),
-        (PLAIN + "record: all", ("record", "'all'", "'none'")),
         ("[1, 2]", ("mine.yaml", "mapping")),
     ],
 )  # fmt: skip

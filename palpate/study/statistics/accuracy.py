@@ -5,13 +5,12 @@ from typing import Final
 from zlib import crc32
 
 import numpy as np
-import pandas as pd
 from numpy.typing import NDArray
 from scipy.special import logit
 from sklearn.metrics import brier_score_loss
 
 from palpate.study.statistics.detectability import fit
-from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Drawn, Estimate, Row, bounded, estimate
+from palpate.study.statistics.estimate import FOLDS, LEVEL, Array, Bootstrap, Drawn, Estimate, Row, estimate
 from palpate.study.statistics.reading import Variant
 
 NORMAL: Final = 1.959964
@@ -99,8 +98,6 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
         np.isfinite(ratio_true), (column("ratio_lower") <= ratio_true) & (ratio_true <= column("ratio_upper")), np.nan
     )
     held, place = sample(inside), sample(column("place_error_m"))
-    patients = len(np.unique(held.patient))
-    share = float(held.values.mean()) if len(held.values) else np.nan
     return FindingErrors(
         place_mean_m=place.mean(bootstrap),
         place_median_m=place.quantile(0.5, bootstrap),
@@ -109,7 +106,7 @@ def finding_errors(variant: Variant, bootstrap: Bootstrap) -> FindingErrors:
         ratio_mean=sample(stiffness).mean(bootstrap),
         radius_m=agreement(np.sqrt(area / np.pi), np.sqrt(area_true / np.pi), patient, bootstrap),
         log_ratio=agreement(*logs, patient, bootstrap),
-        ratio_held=bounded(share, held.mean_replicates(bootstrap), len(held.values), "findings", patients),
+        ratio_held=bootstrap.share(held.values, held.patient, "findings"),
         place_m=place.values,
     )
 
@@ -189,27 +186,11 @@ class FindingCalibration(Row):
 
 def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
     """Return the calibration of one method's confidences; None without areas with a confidence."""
-    areas = variant.findings.dropna(subset=["confidence"])
-    return None if areas.empty else _calibration(areas, "confidence", (areas["lump"] >= 0).to_numpy(), bootstrap)
-
-
-def guarding(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | None:
-    """Return the calibration of the probabilities of a tensed muscle, over areas that are stiffer than their surroundings.
-
-    None if no area lies on a muscle or none has a probability.
-    """
-    areas = variant.findings.dropna(subset=["guarding", "on_guarding"])
-    areas = areas[areas["ratio"] > 1]
-    tensed = areas["on_guarding"].to_numpy(dtype=bool)
-    return _calibration(areas, "guarding", tensed, bootstrap) if tensed.any() else None
-
-
-def _calibration(areas: pd.DataFrame, column: str, hit: NDArray[np.bool_], bootstrap: Bootstrap) -> FindingCalibration:
-    """Return the calibration of the probabilities in `column` of n areas against their hits, shape (n,)."""
-    p = areas[column].to_numpy(dtype=np.float64)
+    areas = variant.findings.dropna(subset=["confidence"]).sort_values("confidence", kind="stable")
+    if areas.empty:
+        return None
+    p, hit = areas["confidence"].to_numpy(dtype=np.float64), (areas["lump"] >= 0).to_numpy()
     patient = areas["patient"].to_numpy(dtype=np.intp)
-    order = np.argsort(p, kind="stable")
-    p, hit, patient = p[order], hit[order], patient[order]
     drawn = bootstrap.counts[:, patient].astype(np.float64)
     label = _bins(p)
     slope, slopes = _slope(p, hit, drawn)
@@ -237,8 +218,7 @@ def _bins(p: Array) -> NDArray[np.intp]:
 
 
 def _bin(p: Array, hit: NDArray[np.bool_], patient: NDArray[np.intp], bootstrap: Bootstrap) -> tuple[float, Estimate]:
-    hits, seen = (bootstrap.sums(values, patient) for values in (hit, np.ones(len(p))))
-    return float(p.mean()), bounded(float(hit.mean()), bootstrap.ratio(hits, seen), len(p), "areas", int((seen > 0).sum()))
+    return float(p.mean()), bootstrap.share(hit, patient, "areas")
 
 
 def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], drawn: Array) -> Array:

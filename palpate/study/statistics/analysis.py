@@ -11,7 +11,6 @@ from palpate.study.statistics.accuracy import (
     calibration,
     coverage,
     finding_errors,
-    guarding,
     spread,
 )
 from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
@@ -44,8 +43,6 @@ class MethodRow(Row):
     """Detectability by the lumps themselves."""
     errors: FindingErrors
     calibration: FindingCalibration | None
-    guarding: FindingCalibration | None = None
-    """Calibration of the probabilities of a tensed muscle; None without an area on one."""
     effort: dict[str, Spread]
     coverage: dict[str, Estimate]
 
@@ -70,7 +67,6 @@ def analyse(variant: Variant, bootstrap: Bootstrap) -> MethodRow:
         made=surface(variant, MADE, bootstrap),
         errors=finding_errors(variant, bootstrap),
         calibration=calibration(variant, bootstrap),
-        guarding=guarding(variant, bootstrap),
         effort={name: spread(variant, name, bootstrap) for name in MEASURED},
         coverage={name: coverage(variant, name, bootstrap) for name in COVERED},
     )

@@ -103,14 +103,15 @@ def compare(reference: Variant, other: Variant, bootstrap: Bootstrap) -> Compari
 
 def _curves(a: Variant, b: Variant, bootstrap: Bootstrap) -> dict[str, Estimate | None]:
     """Return the differences of figures of the curves."""
-    found: dict[str, Estimate | None] = {"auc": None, "froc_mean": None, "sensitivity_at_zero": None}
-    if (roc_a := roc(a, bootstrap)) and (roc_b := roc(b, bootstrap)):
+    roc_a, roc_b = roc(a, bootstrap), roc(b, bootstrap)
+    froc_a, froc_b = froc(a, bootstrap), froc(b, bootstrap)
+    found: dict[str, Estimate | None] = dict.fromkeys(("auc", "froc_mean", "sensitivity_at_zero"))
+    if roc_a and roc_b:
         found["auc"] = _curve_difference(roc_b.auc, roc_a.auc, roc_b.replicates - roc_a.replicates)
-    if (froc_a := froc(a, bootstrap)) and (froc_b := froc(b, bootstrap)):
+    if froc_a and froc_b:
+        zeros = froc_b.zero_replicates - froc_a.zero_replicates
         found["froc_mean"] = _curve_difference(froc_b.mean, froc_a.mean, froc_b.mean_replicates - froc_a.mean_replicates)
-        found["sensitivity_at_zero"] = _curve_difference(
-            froc_b.at_zero, froc_a.at_zero, froc_b.zero_replicates - froc_a.zero_replicates
-        )
+        found["sensitivity_at_zero"] = _curve_difference(froc_b.at_zero, froc_a.at_zero, zeros)
     return found
 
 

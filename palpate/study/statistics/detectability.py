@@ -15,7 +15,7 @@ from pydantic import computed_field
 from scipy.optimize import minimize
 from scipy.special import expit, logit
 
-from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Drawn, Estimate, Row, bounded, percentiles
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Drawn, Estimate, Row, percentiles
 from palpate.study.statistics.reading import Variant
 
 FELT: Final = ("felt_contrast", "felt_radius_m", "depth_m")
@@ -198,13 +198,8 @@ def observed(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -
     if lumps.empty:
         return []
     edges = pd.qcut(lumps[name].astype(float), bins, labels=False, duplicates="drop")
-    rows = []
-    for _, part in lumps.groupby(edges):
-        found, seen = (bootstrap.sums(values, part["patient"]) for values in (part["found"], np.ones(len(part))))
-        value = float(found.sum() / seen.sum())
-        patients = int((seen > 0).sum())
-        rows.append((float(part[name].mean()), bounded(value, bootstrap.ratio(found, seen), len(part), "lumps", patients)))
-    return rows
+    parts = [part for _, part in lumps.groupby(edges)]
+    return [(float(part[name].mean()), bootstrap.share(part["found"], part["patient"], "lumps")) for part in parts]
 
 
 def _covariate(lumps: pd.DataFrame, name: str) -> Array:

@@ -66,7 +66,7 @@ def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
         left_out=int((~cases["ill"] & ~cases["healthy"]).sum()),
         sensitivity=wilson(int((ill["found"] > 0).sum()), len(ill), "patients"),
         specificity=wilson(int((healthy["false_alarms"] == 0).sum()), len(healthy), "patients"),
-        lump_sensitivity=_of_lumps(cases, bootstrap),
+        lump_sensitivity=bootstrap.share(cases["found"], cases["patient"], "lumps", cases["lumps"]),
         false_findings=_each(cases, bootstrap),
         false_findings_of_healthy=_each(healthy, bootstrap),
         sure_on_structures=wilson(int(healthy["patient"].isin(sure["patient"]).sum()), len(healthy), "patients"),
@@ -78,13 +78,6 @@ def by_population(variant: Variant, bootstrap: Bootstrap) -> dict[str, Rates]:
     populations = variant.cases["population"]
     parts = ((str(name), variant.only(part["patient"].to_numpy())) for name, part in variant.cases.groupby(populations))
     return {name: rates(part, bootstrap) for name, part in parts}
-
-
-def _of_lumps(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
-    found, lumps = (bootstrap.sums(cases[column], cases["patient"]) for column in ("found", "lumps"))
-    n = int(lumps.sum())
-    value = found.sum() / n if n else np.nan
-    return bounded(float(value), bootstrap.ratio(found, lumps), n, "lumps", int((lumps > 0).sum()))
 
 
 def _each(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
@@ -278,19 +271,12 @@ def by_contrast(variant: Variant, bootstrap: Bootstrap) -> dict[str, ContrastRow
     rows = {}
     for name, (low, high) in CLASSES.items():
         own = lumps[(lumps["contrast"] >= low) & (lumps["contrast"] < high)]
+        wide = own[own["felt_radius_m"] >= COUNTED.wide_m]
         patients = clearest.index[(clearest >= low) & (clearest < high)]
         curve = roc(variant.only(np.union1d(patients, healthy).astype(np.intp)), bootstrap)
         rows[name] = ContrastRow(
-            found=_found(own, bootstrap),
-            found_wide=_found(own[own["felt_radius_m"] >= COUNTED.wide_m], bootstrap),
+            found=bootstrap.share(own["found"], own["patient"], "lumps"),
+            found_wide=bootstrap.share(wide["found"], wide["patient"], "lumps"),
             auc=None if curve is None else curve.auc,
         )
     return rows
-
-
-def _found(lumps: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
-    """Return the share of lumps that were found."""
-    found, made = (bootstrap.sums(values, lumps["patient"]) for values in (lumps["found"], np.ones(len(lumps))))
-    n = len(lumps)
-    value = float(found.sum() / n) if n else np.nan
-    return bounded(value, bootstrap.ratio(found, made), n, "lumps", int((made > 0).sum()))

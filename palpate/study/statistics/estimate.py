@@ -86,6 +86,14 @@ class Bootstrap:
         with np.errstate(invalid="ignore", divide="ignore"):
             return np.asarray((self.counts @ above) / (self.counts @ below), dtype=np.float64)
 
+    def share(self, hits: ArrayLike, patient: ArrayLike, of: str, out_of: ArrayLike | None = None) -> Estimate:
+        """Return sum(hits) / sum(out_of), which is ones by default; values have the index of their patient, shapes (m,)."""
+        found = self.sums(hits, patient)
+        made = self.sums(np.ones(len(np.asarray(patient))) if out_of is None else out_of, patient)
+        n = int(made.sum())
+        value = float(found.sum() / n) if n else np.nan
+        return bounded(value, self.ratio(found, made), n, of, int((made > 0).sum()))
+
     def quantile(self, values: Array, patient: NDArray[np.intp], q: float) -> Array:
         """Return replicates of the quantile `q`, shape (folds,), of values with the index of their patient, shapes (m,)."""
         order = np.argsort(values)

@@ -23,8 +23,6 @@ COLUMNS: Final = {
     "lumps": "case_id lump felt_contrast felt_radius_m depth_m radius_m contrast palpable found confidence",
 }
 """Columns that the statistics read from each table."""
-LATER: Final = ("guarding", "on_guarding", "on_structure")
-"""Columns of findings that are missing in tables of an earlier version."""
 PATIENT: Final = ["study", "population", "split", "number"]
 """Columns that identify a patient: methods, tiers and levels of errors examine the same patients."""
 VARIANT: Final = ["method", "tier", "errors"]
@@ -104,7 +102,9 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
         raise UserError(f"cases.parquet has two cases of {row['variant']} for one patient ({where}): want one per patient")
     facts = cases[["case_id", "patient", "failed"]]
     findings, lumps = findings.merge(facts, on="case_id"), lumps.merge(facts, on="case_id")
-    findings = findings[~findings["failed"]].assign(**{name: None for name in LATER if name not in findings})
+    findings = findings[~findings["failed"]]
+    if "on_structure" not in findings:  # tables of an earlier version
+        findings = findings.assign(on_structure=None)
     lumps = lumps.assign(
         palpable=lumps["palpable"].eq(True),
         found=lumps["found"].eq(True) & ~lumps["failed"],
@@ -113,10 +113,10 @@ def tables_of(cases: pd.DataFrame, findings: pd.DataFrame, lumps: pd.DataFrame, 
     hit = lumps[lumps["found"] & lumps["palpable"]].groupby("case_id").size()
     cases["found"] = cases["case_id"].map(hit).fillna(0).astype(int)
     variants = []
-    for name in _order(cases):
+    for name in cases["variant"].unique():  # in the order of the table, which is that of the study's file
         own = cases[cases["variant"] == name].sort_values("patient").reset_index(drop=True)
         ids = own["case_id"]
-        variants.append(Variant(name, own, findings[findings["case_id"].isin(ids)], lumps[lumps["case_id"].isin(ids)]))
+        variants.append(Variant(str(name), own, findings[findings["case_id"].isin(ids)], lumps[lumps["case_id"].isin(ids)]))
     study = " + ".join(sorted(cases["study"].unique()))
     return Tables(study, tuple(sorted(cases["split"].unique())), patients, tuple(variants), folds)
 
@@ -154,8 +154,3 @@ def _names(cases: pd.DataFrame) -> pd.Series:
     for column in parts[1:]:
         names = names + ", " + cases[column].astype(str)
     return names
-
-
-def _order(cases: pd.DataFrame) -> list[str]:
-    """Return the variants in the order of the table, which is that of the study's file."""
-    return [str(name) for name in cases["variant"].unique()]
