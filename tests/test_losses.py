@@ -103,7 +103,7 @@ def assert_lifted(struck: Struck) -> None:
     assert forces[-1][1] == 0.0
     assert states[-1][1].depth < -CLEAR_M
     assert states[-1][1].phase == ExamState.PHASE_ABORTED
-    print(f"before {before:.2f} N, after {after:.2f} N, left after {struck.left_after_s:.1f} s")
+    print(f"before {before:.2f} N, after {after:.2f} N")
 
 
 @pytest.mark.parametrize("blow", [kill, freeze])

@@ -31,31 +31,23 @@ def bench(
     quiet: Annotated[bool, typer.Option("--quiet", "-q", help="Print the tables only.")] = False,
 ) -> None:
     """Measure the speed of whole runs; print tables and write bench.json."""
-    from palpate.report.files import fingerprint
+    from palpate.report.files import fingerprint, write_text
     from palpate.run.inputs import usable
 
     screen, console = Console(stderr=True), wide_console(160)
-    chosen = usable(scenario, settings)
+    cases = run_cases(usable(scenario, settings))
     figures: dict[str, Any] = {"platform": fingerprint(), "runs": {}}
     try:
         with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:
-            measure(chosen, display, out, figures)
+            for done, (name, case) in enumerate(cases.items()):
+                display.show(done, len(cases), name)
+                figures["runs"][name] = case()
+                write_text(out, json.dumps(figures, indent=2))
     finally:  # an error or Ctrl-C keeps what was measured
         for table in tables(figures):
             console.print(table)
         if out.is_file():
             console.print(f"{platform.platform()}, written to {out}", highlight=False)
-
-
-def measure(scenario: Scenario, display: CaseDisplay, out: Path, figures: dict[str, Any]) -> None:
-    """Measure all ways to run into `figures`; write `out` after each."""
-    from palpate.report.files import write_text
-
-    cases = run_cases(scenario)
-    for done, (name, case) in enumerate(cases.items()):
-        display.show(done, len(cases), name)
-        figures["runs"][name] = case()
-        write_text(out, json.dumps(figures, indent=2))
 
 
 def run_cases(scenario: Scenario) -> dict[str, Callable[[], dict[str, Any]]]:

@@ -63,6 +63,8 @@ FIXED: Final = (
 ENDING: Final = ("kill", "freeze")
 PARTITION: Final = "partition"
 MACHINE: Final = "machine"
+NETWORK: Final = f"palpate-{os.getpid()}"
+"""Name of the network namespace of a partition."""
 LATE: Final = frozenset(
     {
         ("driver", RobotStatus.CAUSE_COMMAND_EXPIRED),
@@ -219,29 +221,25 @@ def _ip(*arguments: str) -> None:
     subprocess.run(["ip", *arguments], check=True)
 
 
-def _network_name() -> str:
-    return f"palpate-{os.getpid()}"
-
-
 @contextmanager
 def _network(case: FaultCase) -> Iterator[str]:
     """Yield the name of a new network namespace for a partition, else an empty one. Needs root, as `ip netns` does."""
     if case.kind != PARTITION:
         yield ""
         return
-    _ip("netns", "add", _network_name())
+    _ip("netns", "add", NETWORK)
     try:
-        _ip("-n", _network_name(), "link", "set", "lo", "up")
-        yield _network_name()
+        _ip("-n", NETWORK, "link", "set", "lo", "up")
+        yield NETWORK
     finally:
-        _ip("netns", "del", _network_name())
+        _ip("netns", "del", NETWORK)
 
 
 def _part(seconds: float) -> None:
     """Take the network down for some time [s]."""
-    _ip("-n", _network_name(), "link", "set", "lo", "down")
+    _ip("-n", NETWORK, "link", "set", "lo", "down")
     sleep(seconds)
-    _ip("-n", _network_name(), "link", "set", "lo", "up")
+    _ip("-n", NETWORK, "link", "set", "lo", "up")
 
 
 def judge(finding: FaultFinding, struck: Struck, culprits: Sequence[str]) -> None:

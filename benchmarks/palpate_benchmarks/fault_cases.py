@@ -36,8 +36,6 @@ class CampaignLimits:
     """Largest rise above the peak before the fault, if the run ends early."""
     in_contact_n: float = 1.0
     """Peak before the fault above which the limit on the rise applies."""
-    hang_s: float = 90.0
-    """Wall time after the fault beyond which a case has hung."""
 
 
 LIMITS: Final = CampaignLimits()

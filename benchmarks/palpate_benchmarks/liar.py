@@ -104,6 +104,7 @@ class LyingTopic:
         self._lie = lie
         self._past: deque[tuple[int, Message]] = deque(maxlen=1000)
         self._first: Message | None = None
+        self._sent_until, self._odd = 0, False
 
     def messages(self, t: int, sent: list[Message], event: bool) -> list[Message]:
         """Return the messages to send at `t` [ns] instead of `sent`."""
@@ -115,12 +116,10 @@ class LyingTopic:
             return sent
         if lie.kind == "late" and event:
             late = t - round(lie.amount * 1e6)
-            due = [message for stamp, message in self._past if stamp <= late and stamp >= (self._sent_until or 0)]
+            due = [message for stamp, message in self._past if stamp <= late and stamp >= self._sent_until]
             self._sent_until = late + 1
             return due
         return [self._ordered(t, message) for message in sent]
-
-    _sent_until: int | None = None
 
     def _ordered(self, t: int, message: Message) -> Message:
         lie = self._lie
@@ -134,8 +133,6 @@ class LyingTopic:
             return stamped(message, -lie.amount)
         old = [one for stamp, one in self._past if stamp <= t - lie.amount * 1e6] or [self._past[0][1]]
         return old[-1] if lie.kind == "late" else filled(message, lie.field, numbers(old[-1], lie.field))
-
-    _odd = False
 
     def _changed(self, t: int, message: Message) -> Message:
         lie = self._lie

@@ -125,7 +125,8 @@ def cells() -> Iterator[tuple[Topic, str, str, float]]:
             yield from ((topic, "displacement,forecast", kind, FACTORS.get(kind, 0.0)) for kind in ("sign", "gain", "zero"))
         if not topic.latched and not why:
             yield from ((topic, WHOLE, "late", float(delay)) for delay in DELAYS_MS)
-            kinds = ("repeated", "disordered", *(("stale",) if _has(topic, "header") else ()))
+            stamped = any(leaf.path.startswith("header.") for leaf in leaves(topic.type))
+            kinds = ("repeated", "disordered", *(("stale",) if stamped else ()))
             yield from ((topic, WHOLE, kind, FACTORS.get(kind, 0.0)) for kind in kinds)
 
 
@@ -137,14 +138,9 @@ def left_out(topic: Topic) -> str:
     return LEFT_OUT.get(topic.name, "") if read else "no service reads it"
 
 
-def _has(topic: Topic, name: str) -> bool:
-    return any(leaf.path.split(".")[0] == name for leaf in leaves(topic.type))
-
-
 def _quaternions(topic: Topic) -> list[str]:
-    return list(
-        dict.fromkeys(leaf.path[:-2] for leaf in leaves(topic.type) if leaf.path.endswith(("orientation.w", "rotation.w")))
-    )
+    paths = (leaf.path for leaf in leaves(topic.type))
+    return list(dict.fromkeys(path[:-2] for path in paths if path.endswith(("orientation.w", "rotation.w"))))
 
 
 def _codes(topic: Topic) -> list[str]:
@@ -160,18 +156,9 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
         yield from (("frozen", 0.0), ("zero", 0.0))
         return
     bias = AMOUNTS.get(topic.units[path].split(",")[0], 0.3)
-    varied = (("drift", bias / 10), ("spike", 4 * bias), ("delayed", FACTORS["delayed"]), ("frozen", 0.0))
-    for kind, amount in (
-        ("zero", 0.0),
-        ("nan", 0.0),
-        ("infinite", 0.0),
-        ("gain", FACTORS["gain"]),
-        ("sign", 0.0),
-        ("bias", bias),
-        *varied,
-    ):
-        if not (topic.latched and kind in dict(varied)):
-            yield kind, amount
+    yield from (("zero", 0.0), ("nan", 0.0), ("infinite", 0.0), ("gain", FACTORS["gain"]), ("sign", 0.0), ("bias", bias))
+    if not topic.latched:
+        yield from (("drift", bias / 10), ("spike", 4 * bias), ("delayed", FACTORS["delayed"]), ("frozen", 0.0))
     if path in topic.varies:
         live = NOISE[topic.units[path]]
         yield from (("noise", 20 * live), ("dead", live), ("stuck", live))
@@ -212,9 +199,8 @@ def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
     for _ in range(count):
         topic, path, kind, amount = draw.choice(known)
         amount = float(f"{amount * 10 ** draw.uniform(-1, 0.5):.2g}")
-        yield FaultCase(
-            LIE, f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}", draw.choice(modes) == "wallclock"
-        )
+        where = f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}"
+        yield FaultCase(LIE, where, draw.choice(modes) == "wallclock")
 
 
 def lie_of(where: str, healthy: Healthy) -> Lie:

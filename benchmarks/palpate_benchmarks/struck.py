@@ -144,8 +144,6 @@ class Struck:
     """None if the conductor was killed."""
     struck_s: float
     """Simulated time of the fault."""
-    left_after_s: float
-    """Wall time from the fault until the last service left."""
     staying: list[str] = field(default_factory=list)
     """Services that hung."""
 
@@ -200,7 +198,7 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
     with log.open("w") as stderr:
         child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
     assert child.stdout is not None
-    own, at, struck_s = Path(), 0.0, 0.0
+    own, struck_s = Path(), 0.0
     processes: dict[str, psutil.Process] = {}
     hung = threading.Event()
 
@@ -215,7 +213,7 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
                 own, pids = TypeAdapter(tuple[Path, dict[str, int]]).validate_json(line.removeprefix(PROCESSES))
                 processes = {CONDUCTOR: psutil.Process(child.pid), **{role: psutil.Process(pid) for role, pid in pids.items()}}
             elif line.startswith(DUE):
-                struck_s, at = float(line.removeprefix(DUE)), time.monotonic()
+                struck_s = float(line.removeprefix(DUE))
                 blow(processes)
                 alarm.start()
         code = child.wait()
@@ -228,7 +226,6 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
             child.kill()
     services = {role: process for role, process in processes.items() if role != CONDUCTOR}
     _, staying = psutil.wait_procs(services.values(), timeout=TIMES.services_leave_s)
-    left = time.monotonic() - at
     stuck = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
     for process in staying:
         process.kill()
@@ -237,10 +234,10 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
         watched = pickle.loads((run.folder / FILE).read_bytes())
     if watched is not None and watched.result.interrupted:
         raise KeyboardInterrupt
-    if not at:
+    if not struck_s:
         print(f"the fault was never due: {watched and watched.result.failure}", file=sys.stderr)
         return None
-    return Struck(run.folder, own, None if hung.is_set() else code, watched, struck_s, left, stuck)
+    return Struck(run.folder, own, None if hung.is_set() else code, watched, struck_s, stuck)
 
 
 class FaultWatch:

@@ -8,7 +8,7 @@ from matplotlib.figure import Figure
 
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import TABLE_S, Breathing, BreathingCurve
-from palpate_models.patient.phantom import build_phantom
+from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom
 from palpate_validation.check import COLOURS, INK, Check, PageSection
 
@@ -34,29 +34,6 @@ KINDS = {
 }
 
 
-@dataclass(frozen=True)
-class Measured:
-    """Breaths of several patients, and one curve of each kind."""
-
-    quiet: pd.DataFrame
-    """A row per breath, as `read` returns it, with the number of the patient."""
-    deep: pd.DataFrame
-    time: Array
-    """[s], shape (m,)."""
-    curves: dict[str, Array]
-    """Excursion [m] by kind, shape (m,) each."""
-    jump: float
-    """Largest change of speed in one step, relative to the largest speed, quiet breathing [1]."""
-    border: float
-    """Largest mode of a vertex of the border or the back."""
-    largest_at_m: float
-    """Distance of the vertex with the largest mode from the navel [m]."""
-    across: tuple[Array, Array]
-    """x [m] and mode of the vertices near y = 0."""
-    along: tuple[Array, Array]
-    """y [m] and mode of the vertices near x = 0."""
-
-
 def sampled(breathing: Breathing, seed: int, until_s: float = TABLE_S) -> Array:
     """Return the excursion [m] of a patient at every `SETUP.step_s` [s]."""
     curve = BreathingCurve(breathing, seed)
@@ -78,55 +55,27 @@ def read(excursion: Array) -> pd.DataFrame:
     return breaths.assign(depth=excursion[top], share=breaths["inspiration"] / breaths["duration"])
 
 
-def _of_patients(kind: str, patients: int) -> pd.DataFrame:
-    """Return the breaths of several patients."""
-    return pd.concat([read(sampled(KINDS[kind], seed)).assign(patient=seed) for seed in range(patients)], ignore_index=True)
-
-
-def measure(patients: int = SETUP.patients) -> Measured:
-    """Measure the breaths of `patients` patients, and the mode over the default body."""
+def section() -> PageSection:
+    """Return the comparison of breathing curves of several patients with measurements on people, with bounds."""
+    breaths = {
+        kind: pd.concat([read(sampled(KINDS[kind], seed)).assign(patient=seed) for seed in range(SETUP.patients)])
+        for kind in ("quiet", "deep")
+    }
     curves = {name: sampled(breathing, 0, SETUP.shown_s) for name, breathing in KINDS.items()}
     speed = np.diff(curves["quiet"])
+    jump = float(np.abs(np.diff(speed)).max() / np.abs(speed).max())
     body = build_phantom(Phantom(), 0)
-    x, y = body.vertices[:, 0], body.vertices[:, 1]
-    front = body.normals[:, 2] > 0
-    lines = []
-    for at, other in ((x, y), (y, x)):
-        near = np.flatnonzero((np.abs(other) < 0.004) & front)
-        near = near[np.argsort(at[near])]
-        lines.append((at[near], body.breathing[near]))
-    return Measured(
-        quiet=_of_patients("quiet", patients),
-        deep=_of_patients("deep", patients),
-        time=np.arange(0, SETUP.shown_s, SETUP.step_s),
-        curves=curves,
-        jump=float(np.abs(np.diff(speed)).max() / np.abs(speed).max()),
-        border=float(body.breathing[body.fixed].max()),
-        largest_at_m=float(np.hypot(x, y)[np.argmax(body.breathing)]),
-        across=lines[0],
-        along=lines[1],
-    )
-
-
-def section(found: Measured | None = None) -> PageSection:
-    """Return the comparison of breathing curves with measurements on people, with bounds."""
-    found = found or measure()
-    quiet, deep = found.quiet.mean(), found.deep.mean()
-    of_one = found.quiet.groupby("patient")
+    largest_at_m = float(np.hypot(*body.vertices[np.argmax(body.breathing), :2]))
+    quiet, deep = breaths["quiet"].mean(), breaths["deep"].mean()
+    of_one = breaths["quiet"].groupby("patient")
     variation = 100 * (of_one.std(ddof=0) / of_one.mean()).mean()
     memory = float(of_one["depth"].apply(lambda depth: np.corrcoef(depth[:-1], depth[1:])[0, 1]).mean())
-    depth_mm, pause = 1e3 * quiet["depth"], 100 * float((found.quiet["pause"] / found.quiet["duration"]).mean())
+    depth_mm, pause = 1e3 * quiet["depth"], 100 * float((breaths["quiet"]["pause"] / breaths["quiet"]["duration"]).mean())
     checks = (
         Check("breaths a minute, quiet", 60 / quiet["duration"], "", 13.5, 14.5, "14, n = 100 (Ragnarsdottir 2006)"),
         Check("breaths a minute, deep", 60 / deep["duration"], "", 7.1, 7.7, "7.4 (Ragnarsdottir 2006)"),
-        Check(
-            "expiration over inspiration",
-            quiet["expiration"] / quiet["inspiration"],
-            "",
-            1.14,
-            1.26,
-            "1.21 men, 1.14 women (Ragnarsdottir 2006)",
-        ),
+        Check("expiration over inspiration", quiet["expiration"] / quiet["inspiration"], "", 1.14, 1.26,
+              "1.21 men, 1.14 women (Ragnarsdottir 2006)"),
         Check("pause, of a breath", pause, "%", against="assumed"),
         Check("depth at the navel, quiet", depth_mm, "mm", 5, 12, "5 to 12 mm, assumed"),
         Check("quiet over deep", quiet["depth"] / deep["depth"], "", None, 1 / 3, "less than a third, n = 100 (Kaneko 2012)"),
@@ -134,31 +83,35 @@ def section(found: Measured | None = None) -> PageSection:
         Check("variation of depth from breath to breath", variation["depth"], "%", 28, 38, "33 % (Tobin 1988)"),
         Check("variation of inspiration's share of a breath", variation["share"], "%", 15, 21, "17.9 % (Tobin 1988)"),
         Check("correlation of depth with the breath before", memory, "", 0.15, 0.45, "0.30 (Tobin 1995)"),
-        Check("change of speed in 10 ms, of the greatest", 100 * found.jump, "%", None, 5, "a curve without corners"),
-        Check("share of the excursion at the body's border", found.border, "", None, 0, "none"),
-        Check("distance of the largest excursion from the navel", 1e3 * found.largest_at_m, "mm", None, 30, "the navel"),
+        Check("change of speed in 10 ms, of the greatest", 100 * jump, "%", None, 5, "a curve without corners"),
+        Check("share of the excursion at the body's border", float(body.breathing[body.fixed].max()), "", None, 0, "none"),
+        Check("distance of the largest excursion from the navel", 1e3 * largest_at_m, "mm", None, 30, "the navel"),
     )  # fmt: skip
     text = (
         f"{len(of_one)} patients breathe for {TABLE_S:g} s each; their breaths are read from the curve, sampled at "
         f"{1 / SETUP.step_s:g} Hz, without access to the table of breaths. Duration and depth are log-normal and correlated "
         "from breath to breath; pause, depth in millimetres and coughs are assumed. Sighs are not modelled."
     )
-    return PageSection("breathing", "Breathing", text, checks, lambda f: draw(f, found), (7.0, 5.0))
+    return PageSection("breathing", "Breathing", text, checks, lambda f: draw(f, curves, breaths["quiet"], body), (7.0, 5.0))
 
 
-def draw(figure: Figure, found: Measured) -> None:
+def draw(figure: Figure, curves: dict[str, Array], quiet: pd.DataFrame, body: PhantomModel) -> None:
     """Draw a minute of each kind, duration against depth of quiet breaths, and the mode over the body."""
     grid = figure.add_gridspec(2, 2, height_ratios=(1.5, 1))
     axes = figure.add_subplot(grid[0, :])
-    for k, (name, curve) in enumerate(found.curves.items()):
-        axes.plot(found.time, 1e3 * curve + 30 * (len(found.curves) - 1 - k), color=COLOURS[k], lw=0.9, label=name)
+    for k, (name, curve) in enumerate(curves.items()):
+        time = SETUP.step_s * np.arange(len(curve))
+        axes.plot(time, 1e3 * curve + 30 * (len(curves) - 1 - k), color=COLOURS[k], lw=0.9, label=name)
     axes.set(xlabel="time [s]", ylabel="excursion [mm], 30 mm apart", ylim=(None, 135))
     axes.legend(ncols=4, loc="upper right")
     axes = figure.add_subplot(grid[1, 0])
-    axes.plot(found.quiet["duration"], 1e3 * found.quiet["depth"], ".", color=COLOURS[0], ms=1.5)
+    axes.plot(quiet["duration"], 1e3 * quiet["depth"], ".", color=COLOURS[0], ms=1.5)
     axes.set(xlabel="duration of a breath [s]", ylabel="depth [mm]")
     axes = figure.add_subplot(grid[1, 1])
-    for (at, share), name, colour in ((found.across, "across", COLOURS[1]), (found.along, "along", INK)):
-        axes.plot(1e3 * at, share, color=colour, lw=0.9, label=name)
+    x, y, _ = body.vertices.T
+    for at, other, name, colour in ((x, y, "across", COLOURS[1]), (y, x, "along", INK)):
+        near = np.flatnonzero((np.abs(other) < 0.004) & (body.normals[:, 2] > 0))
+        near = near[np.argsort(at[near])]
+        axes.plot(1e3 * at[near], body.breathing[near], color=colour, lw=0.9, label=name)
     axes.set(xlabel="from the navel [mm]", ylabel="share of the excursion")
     axes.legend()

@@ -131,17 +131,11 @@ def section(found: GuardingFelt | None = None) -> PageSection:
     first, last = (found.slid_ratio("voluntary", stroke) for stroke in (0, SETUP.strokes - 1))
     staying = found.slid_ratio("involuntary", SETUP.strokes - 1)
     left = float(found.strokes["voluntary"].contracted[found.sliding == SETUP.strokes - 1].mean())
+    low, high = BY_HAND - 0.01, BY_HAND + 0.01
     checks = (
         Check("press, involuntary: over the relaxed wall", involuntary, "times", 2.0, 3.0, f"{RATIO:g} with the sphere of 10 mm"),
         Check("press, voluntary: over the relaxed wall", voluntary, "times", 1.5, involuntary, "between relaxed and involuntary"),
-        Check(
-            "contraction of the muscle at the reading of the press",
-            level,
-            "",
-            BY_HAND - 0.01,
-            BY_HAND + 0.01,
-            f"{BY_HAND:.3f}, by hand",
-        ),
+        Check("contraction of the muscle at the reading of the press", level, "", low, high, f"{BY_HAND:.3f}, by hand"),
         Check("stroke, involuntary: over the relaxed wall", staying, "times", 0.9 * involuntary, 1.15 * involuntary, "the press"),
         Check("first stroke, voluntary: over the relaxed wall", first, "times", 1.0, voluntary, "the press"),
         Check(f"stroke {SETUP.strokes}, voluntary: over the relaxed wall", last, "times", 1.0, first, "the first stroke"),

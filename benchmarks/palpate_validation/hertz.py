@@ -3,8 +3,8 @@
 Surface tier: the range in which a Winkler-Pasternak wall behaves as a half-space. Elastic tier: a half-space.
 """
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -79,11 +79,8 @@ class HertzCurves:
         middle = int(np.searchsorted(fine, 0.010))
         if middle in bad:
             return (float("nan"), float("nan"))
-        below, above = bad[bad < middle], bad[bad > middle]
-        return (
-            float(fine[below[-1]]) if len(below) else float(fine[0]),
-            float(fine[above[0]]) if len(above) else float(fine[-1]),
-        )
+        below, above = np.append(0, bad[bad < middle])[-1], np.append(bad[bad > middle], len(fine) - 1)[0]
+        return float(fine[below]), float(fine[above])
 
 
 def measure(radii: tuple[float, ...] = HERTZ.radii_m, depths: Array = DEPTHS_M) -> HertzCurves:
@@ -99,28 +96,17 @@ def section(curves: HertzCurves | None = None) -> PageSection:
     calibrated = curves.error[curves.radii.index(HERTZ.calibrated_radius_m)]
     inside = (curves.depths >= HERTZ.range_m[0] - 1e-9) & (curves.depths <= HERTZ.range_m[1] + 1e-9)
     low_mm, high_mm, radius_mm = (1e3 * x for x in (*HERTZ.range_m, HERTZ.calibrated_radius_m))
-    checks = [
-        Check(
-            f"largest error over {low_mm:g} to {high_mm:g} mm at R = {radius_mm:g} mm",
-            100 * float(np.abs(calibrated[inside]).max()),
-            "%",
-            high=100 * HERTZ.tolerance,
-            against="Hertz, 10 kPa, nu 0.49",
-        )
-    ]
-    ranges = {}
-    for radius in curves.radii:
-        low, high = curves.within(radius)
-        ranges[f"{radius * 1e3:g} mm"] = [low, high]
-        at_ten = float(np.interp(0.010, curves.depths, curves.error[curves.radii.index(radius)]))
-        checks.append(Check(f"error at 10 mm depth, R = {radius * 1e3:g} mm", 100 * at_ten, "%", against="Hertz"))
-    ranges_text = ", ".join(
-        f"{low * 1e3:.1f} to {high * 1e3:.1f} mm at R = {name}" if np.isfinite(low) else f"nowhere near 10 mm at R = {name}"
-        for name, (low, high) in ranges.items()
-    )
+    largest, most = 100 * float(np.abs(calibrated[inside]).max()), 100 * HERTZ.tolerance
+    name = f"largest error over {low_mm:g} to {high_mm:g} mm at R = {radius_mm:g} mm"
+    checks, ranges = [Check(name, largest, "%", high=most, against="Hertz, 10 kPa, nu 0.49")], []
+    for radius, error in zip(curves.radii, curves.error, strict=True):
+        (low, high), name = curves.within(radius), f"R = {radius * 1e3:g} mm"
+        at_ten = float(np.interp(0.010, curves.depths, error))
+        checks.append(Check(f"error at 10 mm depth, {name}", 100 * at_ten, "%", against="Hertz"))
+        ranges += [f"{low * 1e3:.1f} to {high * 1e3:.1f} mm at {name}" if np.isfinite(low) else f"nowhere near 10 mm at {name}"]
     text = (
         "A rigid sphere held in the flat surface of the default wall, force as a mean over five places on the vertex lattice, "
-        f"against an elastic half-space of 10 kPa. Within {100 * HERTZ.tolerance:g} %: {ranges_text} (largest tested "
+        f"against an elastic half-space of 10 kPa. Within {100 * HERTZ.tolerance:g} %: {', '.join(ranges)} (largest tested "
         "depth: 25 mm). "
         "A surface of springs has a characteristic length, l = 15 mm; a half-space has none. Shallow contacts, smaller than l, "
         "are too stiff; deep contacts of a small sphere are too soft, and beyond about half a radius Hertz's small strains "
@@ -151,16 +137,14 @@ def elastic_section() -> PageSection:
     """Press a half-space at rest, between its vertices; return the comparison with its bounds."""
     slab = FlatSlab(young_pa=HERTZ.young_pa)
 
-    def press(profile: Literal["paraboloid", "sphere"]) -> Array:
-        return np.array(
-            [[slab.press(r, float(d), (0.0004, 0.00025), profile).force_n for d in ELASTIC_DEPTHS_M] for r in HERTZ.radii_m]
-        )
+    def forces(of: Callable[[float, float], float]) -> Array:
+        """Return forces [N] by radius and depth."""
+        return np.array([[of(radius, depth) for depth in ELASTIC_DEPTHS_M.tolist()] for radius in HERTZ.radii_m])
 
-    paraboloid, sphere = press("paraboloid"), press("sphere")
+    paraboloid = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "paraboloid").force_n)
+    sphere = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "sphere").force_n)
     hertz = np.array([hertz_force(ELASTIC_DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in HERTZ.radii_m])
-    sneddon = np.array(
-        [[sneddon_force(float(d), r, HERTZ.young_pa, slab.poisson) for d in ELASTIC_DEPTHS_M] for r in HERTZ.radii_m]
-    )
+    sneddon = forces(lambda radius, depth: sneddon_force(depth, radius, HERTZ.young_pa, slab.poisson))
     by_hertz, by_sneddon = 100 * (paraboloid / hertz - 1), 100 * (sphere / sneddon - 1)
     at, most = int(np.argmin(np.abs(ELASTIC_DEPTHS_M - 0.005))), HERTZ.elastic_percent
     power = float(np.polyfit(np.log(HERTZ.radii_m), np.log(paraboloid[:, at]), 1)[0])
@@ -177,14 +161,8 @@ def elastic_section() -> PageSection:
         "The elastic tier as a half-space of 10 kPa. Hertz's solution is for a paraboloid. The force of a "
         "sphere is some percent smaller at depths of half a radius, in agreement with Sneddon's solution."
     )
-    return PageSection(
-        "elastic",
-        "Elastic tier on a flat half-space: Hertz",
-        text,
-        checks,
-        lambda f: draw_elastic(f, paraboloid / hertz, sphere / sneddon),
-        (4.5, 2.8),
-    )
+    title, ratios = "Elastic tier on a flat half-space: Hertz", (paraboloid / hertz, sphere / sneddon)
+    return PageSection("elastic", title, text, checks, lambda f: draw_elastic(f, *ratios), (4.5, 2.8))
 
 
 def draw_elastic(figure: Figure, paraboloid: Array, sphere: Array) -> None:

@@ -205,13 +205,8 @@ def _errors(found: People) -> Iterator[Check]:
             name = f"place {number}: largest RMS relative error of the force, 1 to 20 mm"
             yield Check(name, max(errors), "%", high=BOUNDS.within_percent, against=f"{len(errors)} people")
     share = float(np.mean([p.rms_percent <= BOUNDS.mostly_within_percent for p in found.places]))
-    yield Check(
-        f"curves within {BOUNDS.mostly_within_percent:g} %",
-        share,
-        "of all",
-        low=BOUNDS.share_mostly,
-        against=f"{len(found.places)} curves",
-    )
+    name = f"curves within {BOUNDS.mostly_within_percent:g} %"
+    yield Check(name, share, "of all", low=BOUNDS.share_mostly, against=f"{len(found.places)} curves")
     off = rms_percent(found.median_simulated, found.median_measured)
     yield Check("the median person: RMS error", off, "%", high=BOUNDS.mostly_within_percent, against="median of all curves")
 

@@ -57,10 +57,9 @@ def section() -> PageSection:
     fractions, constants = fitted.reshape(2, 2)[np.argsort(fitted[1::2])].T
     checks = []
     for k, (g, tau) in enumerate(zip(WALL.prony_g, WALL.prony_tau_s, strict=True)):
-        checks.append(Check(f"relaxing fraction g{k + 1} read from the force", fractions[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
-        checks.append(
-            Check(f"time constant tau{k + 1} read from the force", constants[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s")
-        )
+        names = (f"relaxing fraction g{k + 1} read from the force", f"time constant tau{k + 1} read from the force")
+        checks.append(Check(names[0], fractions[k], "", 0.98 * g, 1.02 * g, f"{g:g}"))
+        checks.append(Check(names[1], constants[k], "s", 0.98 * tau, 1.02 * tau, f"{tau:g} s"))
     left = 1 - sum(WALL.prony_g)
     checks.append(Check("remaining ratio", float(1 - fractions.sum()), "", 0.98 * left, 1.02 * left, f"{left:g}"))
     text = (

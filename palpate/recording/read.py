@@ -100,10 +100,10 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
     known = [readings.position, readings.force, readings.normal, readings.touch, readings.time, readings.probe]
     valid = np.all([np.isfinite(v).reshape(len(v), -1).all(axis=1) for v in known if v is not None], axis=0)
     if readings.normal is not None:
-        valid &= np.linalg.norm(readings.normal, axis=1) > 0.5
+        size = np.linalg.norm(readings.normal, axis=1)
+        valid &= size > 0.5
+        readings = replace(readings, normal=readings.normal / np.maximum(size, 0.5)[:, None])
     drop(FaultCode.INVALID, ~valid)
-    if readings.normal is not None:
-        readings = replace(readings, normal=readings.normal / np.linalg.norm(readings.normal, axis=1)[:, None])
     if not valid.any():
         return readings, faults
     if readings.time is None:

@@ -80,20 +80,6 @@ def test_a_transport_is_faulty_in_its_topic_only_and_from_the_signal_on() -> Non
         assert JUMP_NS <= late.now() - before < 2 * JUMP_NS
 
 
-@pytest.mark.parametrize(
-    ("topic", "kind", "at", "allowed"),
-    [
-        ("joint_states", "melt", None, "duplicate"),
-        ("joint_stakes", "nan", None, "joint_states"),
-        ("joint_states", "jump", None, "clock"),
-        ("exam/findings", "nan", 0, "joint_states"),
-    ],
-)
-def test_an_unknown_fault_is_answered_with_the_allowed_ones(topic: str, kind: str, at: int | None, allowed: str) -> None:
-    with pytest.raises(ValueError, match=allowed):
-        InjectedFault(topic, kind, at=at)
-
-
 def watch(**options: Any) -> FaultWatch:
     """Return the watch of a run whose fault was due long ago."""
     due = FaultWatch(StruckRun(Path(), **{"early": True, **options}))
@@ -110,7 +96,7 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
 
 def judged(watched: Watched | None, folder: Path, kind: str, where: str, status: int = 0) -> FaultFinding:
     finding = FaultFinding(kind, where, "lockstep")
-    judge(finding, Struck(folder, folder / "gone", status, watched, 8.0, 1.0), where.split("+"))
+    judge(finding, Struck(folder, folder / "gone", status, watched, 8.0), where.split("+"))
     return finding
 
 
