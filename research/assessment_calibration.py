@@ -104,7 +104,7 @@ def weigh(seed: int) -> WeighedPatient:
     return WeighedPatient(
         seed=seed,
         features=[candidate.features.tolist() for candidate in candidates],
-        signs=[candidate.signs.features.tolist() for candidate in candidates],
+        signs=[list(candidate.signs) for candidate in candidates],
         structures=[candidate.structures().tolist() for candidate in candidates],
         real=[real(candidate, known) for candidate in candidates],
         contrast=max((float(np.exp(abs(np.log(lump.contrast)))) for lump in palpable), default=1.0),

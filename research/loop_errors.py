@@ -28,8 +28,8 @@ from palpate.report import archive
 from palpate.report.archive import read_evidence
 from palpate.report.evidence import points
 from palpate.truth.pressed import TrueBody, TrueSurface
-from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.seen_breath import BreathingShares, depth_seen
+from palpate_assessment.service import SEEN, skin_of
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.geometry import vectors
 from palpate_bus.messages.stamps import NS, nanoseconds

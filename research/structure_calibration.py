@@ -176,13 +176,7 @@ def evidence(name: str, seed: int) -> list[Evidence]:
             is_lump = known is not None and real(one, known)
             true = [int(Kind.LUMP)] if is_lump else sorted(_other_causes(name, one, patient.phantom.structures))
             rows.append(
-                Evidence(
-                    one.features.tolist(),
-                    one.signs.features.tolist(),
-                    one.structures().tolist(),
-                    marked_share(marks, one.bump),
-                    true,
-                )
+                Evidence(one.features.tolist(), list(one.signs), one.structures().tolist(), marked_share(marks, one.bump), true)
             )
     return rows
 

@@ -1,5 +1,6 @@
 """Colour scales of the maps, and the colour of each drawn item."""
 
+from collections.abc import Iterable
 from typing import Any, Final
 
 import numpy as np
@@ -36,18 +37,19 @@ def stiffness_colors(ratio: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
     """
     x = np.log(np.clip(ratio, _RATIOS[0], _RATIOS[-1]))
     knots = np.log(_RATIOS)
-    channels = [np.interp(x, knots, _RAMP[:, i]).astype(np.uint32) for i in range(3)]
-    packed = (channels[0] << 24) | (channels[1] << 16) | (channels[2] << 8) | 255
-    return np.asarray(packed, dtype=np.uint32)
+    return _opaque(np.interp(x, knots, channel) for channel in _RAMP.T)
 
 
 def spread_colors(spread: NDArray[np.floating[Any]]) -> NDArray[np.uint32]:
     """Return colours of the half width of the 90 % band over the mean [1]: dark if narrow, light from 0.6. 0xRRGGBBAA."""
     x = np.clip(spread / 0.6, 0.0, 1.0)
     low, high = np.array((30, 60, 70)), np.array((250, 235, 130))
-    channels = [(low[i] + x * (high[i] - low[i])).astype(np.uint32) for i in range(3)]
-    packed = (channels[0] << 24) | (channels[1] << 16) | (channels[2] << 8) | 255
-    return np.asarray(packed, dtype=np.uint32)
+    return _opaque(a + x * (b - a) for a, b in zip(low, high, strict=True))
+
+
+def _opaque(channels: Iterable[NDArray[np.floating[Any]]]) -> NDArray[np.uint32]:
+    red, green, blue = (channel.astype(np.uint32) for channel in channels)
+    return np.asarray((red << 24) | (green << 16) | (blue << 8) | 255, dtype=np.uint32)
 
 
 def packed(color: Rgba) -> int:

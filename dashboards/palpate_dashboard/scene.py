@@ -258,10 +258,8 @@ class MapView:
     def _frame(self, w: float, h: float, x: float, y: float) -> None:
         left, right, low, high = x - w / 2, x + w / 2, y - h / 2, y + h / 2
         strips = [[(left, low, 0.002), (right, low, 0.002), (right, high, 0.002), (left, high, 0.002), (left, low, 0.002)]]
-        if left < 0 < right:
-            strips.append([(0, low, 0.002), (0, high, 0.002)])
-        if low < 0 < high:
-            strips.append([(left, 0, 0.002), (right, 0, 0.002)])
+        strips += [[(0, low, 0.002), (0, high, 0.002)]] if left < 0 < right else []
+        strips += [[(left, 0, 0.002), (right, 0, 0.002)]] if low < 0 < high else []
         lines = rr.LineStrips3D(strips, colors=[(150, 150, 150, 255)], radii=[rr.Radius.ui_points(0.7)])
         quadrants = {"RUQ": (-1, 1), "LUQ": (1, 1), "RLQ": (-1, -1), "LLQ": (1, -1)}
         here = {name: (a, b) for name, (a, b) in quadrants.items() if max(a * left, a * right) > 0 < max(b * low, b * high)}

@@ -273,12 +273,8 @@ class DashboardService(Service):
             self._map.findings(t, centroids, labels)
             self._scene.findings(t, apply(self._X_WA, centroids), labels)
         if message.final:
-            self._plots.log(
-                t,
-                "log/findings",
-                "; ".join(self._unassessed + (lines or ["no area found"])),
-                "WARN" if lines or self._unassessed else "INFO",
-            )
+            what = "; ".join(self._unassessed + (lines or ["no area found"]))
+            self._plots.log(t, "log/findings", what, "WARN" if lines or self._unassessed else "INFO")
 
     def _diagnostics(self, t: int, message: Message) -> None:
         rows = [text.Health.of(status) for status in message.status]

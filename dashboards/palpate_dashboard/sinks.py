@@ -147,10 +147,7 @@ class Canvas:
 
     def add(self, entity: str, kind: Kind, t: int, row: Row) -> None:
         """Add a row of `entity` at simulated time `t` [ns]. An entity has one kind."""
-        try:
-            _, times, rows = self._rows[entity]
-        except KeyError:
-            _, times, rows = self._rows.setdefault(entity, (kind, [], []))
+        _, times, rows = self._rows.setdefault(entity, (kind, [], []))
         times.append(t)
         rows.append(row)
 

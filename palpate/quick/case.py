@@ -2,7 +2,7 @@
 
 import gc
 import hashlib
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from time import perf_counter, process_time
@@ -24,6 +24,7 @@ from palpate_bus.messages.geometry import mesh_message, pose_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
 from palpate_bus.runtime.lockstep import run_hash
 from palpate_bus.service import Service
+from palpate_bus.testing import HandInbox
 from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult
 from palpate_models.numerics.frames import apply
@@ -173,15 +174,12 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     """
     states = gathered.exam_states
     first, last = (nanoseconds(state.header.stamp) for state in (states[0], states[-1]))
-    inputs: tuple[tuple[int, dict[str, Sequence[Message]]], ...] = (
-        (first, {"perception/surface": [gathered.surface]}),
-        (last, {"exam/state": states}),
-    )
-    latest: dict[str, Sequence[Message]] = {}
+    inbox = _Inbox()
     service.start()
-    for t, new in inputs:
-        latest |= new
-        outbox = service.step(t, _Inbox(new, latest))
+    for t, topic, messages in ((first, "perception/surface", [gathered.surface]), (last, "exam/state", states)):
+        inbox.messages[topic], inbox.events = messages[-1], {topic: messages}
+        inbox.stamps[topic] = nanoseconds(messages[-1].header.stamp)
+        outbox = service.step(t, inbox)
         samples = outbox.get("assessment/samples", [])
         gathered.samples += samples if isinstance(samples, list) else [samples]
         gathered.stiffness_map = outbox.get("assessment/map", gathered.stiffness_map)
@@ -189,24 +187,11 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     return dict(service.finish())
 
 
-class _Inbox:
-    """An inbox of messages by topic: new ones, and all until now."""
+class _Inbox(HandInbox):
+    """An inbox whose new messages may be read more than once in a step."""
 
-    def __init__(self, new: dict[str, Sequence[Message]], latest: dict[str, Sequence[Message]]) -> None:
-        self._new, self._latest = new, latest
-
-    def latest(self, topic: str) -> Message | None:
-        return self._latest[topic][-1] if topic in self._latest else None
-
-    def new(self, topic: str) -> Iterable[Message]:
-        return self._new.get(topic, [])
-
-    def stamp(self, topic: str) -> int | None:
-        message = self.latest(topic)
-        return None if message is None else nanoseconds(message.header.stamp)
-
-    def lost(self, _: str) -> bool:
-        return False
+    def new(self, topic: str) -> list[Message]:
+        return self.events.get(topic, [])
 
 
 def _digest(topic: str, gathered: Collected) -> str | None:

@@ -282,11 +282,8 @@ def _truth(truth: scoring.Truth | None) -> TruthRow:
     rows = []
     for lump in truth.felt.lumps:
         x, y = map(float, lump.centroid)
-        rows.append(
-            LumpRow(
-                centroid_m=(x, y), quadrant=quadrant(x, y), area_m2=lump.area, felt_contrast=lump.contrast, palpable=lump.palpable
-            )
-        )
+        felt: dict[str, Any] = {"area_m2": lump.area, "felt_contrast": lump.contrast, "palpable": lump.palpable}
+        rows.append(LumpRow(centroid_m=(x, y), quadrant=quadrant(x, y), **felt))
     return TruthRow(felt=True, lumps=rows)
 
 
@@ -300,12 +297,8 @@ def _depth(known: Known) -> DepthRow:
     regulation = scoring.depth_errors(contact.true, contact.wanted, in_lump)
     perception = scoring.depth_errors(contact.measured, contact.true, in_lump)
     return DepthRow(
-        true_against_setpoint_m=regulation["all"],
-        true_against_setpoint_beside_m=regulation["outside"],
-        true_against_setpoint_lump_m=regulation["lump"],
-        measured_against_true_m=perception["all"],
-        measured_against_true_beside_m=perception["outside"],
-        measured_against_true_lump_m=perception["lump"],
+        **{f"true_against_setpoint{part}_m": error for part, error in regulation.items()},
+        **{f"measured_against_true{part}_m": error for part, error in perception.items()},
         force_limited=float(contact.limited.mean()),
     )
 

@@ -50,16 +50,10 @@ def finding_rows(areas: Iterable[Any]) -> list[FindingRow]:
     return [
         FindingRow(
             centroid_m=(f.centroid.x, f.centroid.y, f.centroid.z),
-            quadrant=f.quadrant,
             area_m2=f.area,
-            ratio=f.ratio,
             ratio_90=(f.ratio_lower, f.ratio_upper),
-            confidence=f.confidence,
-            guarding=f.guarding,
-            ridge=f.ridge,
-            bone=f.bone,
-            soft=f.soft,
             kind=KINDS[f.kind],
+            **{name: getattr(f, name) for name in ("quadrant", "ratio", "confidence", *OTHERS)},
         )
         for f in areas
     ]

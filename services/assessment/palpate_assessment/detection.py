@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import Bounds, minimize
@@ -94,19 +95,13 @@ class ShapeSearch:
 MUSCLE, SEARCH = Muscle(), ShapeSearch()
 
 
-@dataclass(frozen=True)
-class Signs:
+class Signs(NamedTuple):
     """Signs of a muscle around a candidate, in logarithms of stiffness."""
 
     rise: float
     """Stiffness over a hand's breadth relative to the softest part of the region."""
     fade: float
     """Part of it that fades under contact."""
-
-    @property
-    def features(self) -> Array:
-        """Both, shape (2,)."""
-        return np.array((self.rise, self.fade))
 
 
 def signs(regression: Regression, lump: Bump) -> Signs:
@@ -267,13 +262,9 @@ def preferred(regression: Regression, disc: Bump, instead: Bump | None) -> Bump:
 
 def ridge_instead(regression: Regression, disc: Bump) -> Bump | None:
     """Return the strongest ridge that may be there instead of a disc, under a regression without it."""
-    lengths = regression.observations.standard.lengths
     (stiffer,) = np.sign(matched(regression, [disc])[0])
-    angles = np.linspace(0.0, np.pi, SEARCH.angles, endpoint=False)
-    halves = np.array([h * lengths.radii_m[-1] * np.array((np.cos(a), np.sin(a))) for a in angles for h in SEARCH.half_lengths])
     centres = np.array([(disc.x + x, disc.y + y) for x in SEARCH.rival_offsets_m for y in SEARCH.rival_offsets_m])
-    ridges = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
-    return _best(regression, ridges, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])), SEARCH.rival_tries, stiffer)[0]
+    return _best_ridge(regression, centres, SEARCH.rival_tries, stiffer)[0]
 
 
 def gained(before: Regression, after: Regression) -> float:
@@ -329,13 +320,19 @@ def strongest(regression: Regression) -> tuple[Bump | None, float]:
 
 def strongest_ridge(regression: Regression) -> tuple[Bump | None, float]:
     """Return the ridge that stands out most from what the regression explains, and how much (t)."""
+    band, t = _best_ridge(regression, _centres(regression))
+    return (band, t) if band is None else _grown(regression, band, t)
+
+
+def _best_ridge(
+    regression: Regression, centres: Array, tries: int = SEARCH.tries, sign: float = 0.0
+) -> tuple[Bump | None, float]:
+    """Return the strongest ridge about centres [m], shape (k, 2), as `_best` does."""
     lengths = regression.observations.standard.lengths
     angles = np.linspace(0.0, np.pi, SEARCH.angles, endpoint=False)
     halves = np.array([h * lengths.radii_m[-1] * np.array((np.cos(a), np.sin(a))) for a in angles for h in SEARCH.half_lengths])
-    centres = _centres(regression)
-    bumps = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
-    band, t = _best(regression, bumps, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])))
-    return (band, t) if band is None else _grown(regression, band, t)
+    ridges = [ridge(np.array((c - half, c + half)), lengths.radii_m[0], lengths.edge_m) for c in centres for half in halves]
+    return _best(regression, ridges, lambda p: ridge(p[:4].reshape(2, 2), *np.exp(p[4:])), tries, sign)
 
 
 def _centres(regression: Regression) -> Array:

@@ -105,7 +105,7 @@ def areas(
         logits = np.array([stated(c) for c in candidates])
         kinds = np.column_stack((expit(logits), np.zeros((len(logits), len(Kind) - 1))))
     else:
-        features, signs = np.array([c.features for c in candidates]), np.array([c.signs.features for c in candidates])
+        features, signs = np.array([c.features for c in candidates]), np.array([c.signs for c in candidates])
         evidence = np.array([c.structures(marked_share(marked, c.bump)) for c in candidates])
         logits, kinds = causes(regression.observations.standard.calibration, features, signs, evidence, shift)
     found: list[Area] = []

@@ -10,13 +10,12 @@ import numpy as np
 from palpate_assessment.assess import AssessedMap, assess, growing
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
-from palpate_assessment.messages import SEEN, skin_of
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
 from palpate_assessment.seen_breath import SeenBreath
 from palpate_assessment.skin import KnownSkin
 from palpate_assessment.standard import USUAL, PressStandard
 from palpate_bus.contract import contract
-from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap
+from palpate_bus.messages import ExamState, Finding, Findings, PalpationSample, Point, StiffnessMap, SurfaceMotion
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import point_message, vector_message
 from palpate_bus.messages.stamps import NS, header, nanoseconds
@@ -54,6 +53,10 @@ NOTICED_S = 1.0
 """A patient who moves is noticed within this time."""
 SCANNING = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 FINISHED = frozenset({ExamState.PHASE_ASSESS, ExamState.PHASE_DONE, ExamState.PHASE_ABORTED})
+
+
+SEEN = frozenset({SurfaceMotion.QUIET, SurfaceMotion.SPOILED})
+"""States of `perception/motion` in which the wall was seen, and where it was expected."""
 
 
 class AssessmentService(Service):
@@ -225,6 +228,16 @@ class AssessmentService(Service):
 def create(scenario: Scenario) -> Service:
     """Return the assessment of a scenario; it knows nothing of the phantom but where the patient is registered."""
     return AssessmentService(exam_input(scenario), read_checkpoint(Settings.read().checkpoint))
+
+
+def skin_of(perceived: Message, correction: Message, X_AW: Array) -> KnownSkin | None:
+    """Return the skin by `perception/surface` and `exam/correction`; None where one is not of the other. `X_AW`: shape (4, 4)."""
+    p_W, n_W = (np.asarray(values, dtype=np.float64).reshape(-1, 3) for values in (perceived.vertices, perceived.normals))
+    outward, sigma = (np.asarray(values, dtype=np.float64) for values in (correction.outward, correction.uncertainty))
+    if not len(p_W) == len(n_W) == len(outward) == len(sigma):
+        return None
+    p_A = apply(X_AW, p_W + outward[:, np.newaxis] * n_W)
+    return KnownSkin(p_A, sigma, nanoseconds(perceived.header.stamp) / NS)
 
 
 def sample_message(sample: ForceSample) -> Message:

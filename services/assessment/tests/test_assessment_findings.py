@@ -178,9 +178,7 @@ def test_lump_muscle_and_neither_compete() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     stiff, soft = (Candidate(bump, e, 6.0, Signs(0.8, 0.2), bump, inside_m=0.05) for e in (0.5, -0.5))
     alone = replace(stiff, signs=Signs(0.0, -0.1))
-    features, muscles = (
-        np.array(rows) for rows in zip(*((c.features, c.signs.features) for c in (stiff, soft, alone)), strict=True)
-    )
+    features, muscles = (np.array(rows) for rows in zip(*((c.features, c.signs) for c in (stiff, soft, alone)), strict=True))
     evidence = np.array([c.structures() for c in (stiff, soft, alone)])
     logits, kinds = causes(learned(), features, muscles, evidence)
     guarding = kinds[:, Kind.MUSCLE]

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
-from palpate_assessment.assess import AssessedMap, assess
-from palpate_assessment.check import contradicted
+from palpate_assessment.assess import AssessedMap, assess, contradicted
 from palpate_assessment.detection import agreed, matched, strongest
 from palpate_assessment.grid import map_grid
 from palpate_assessment.model import Regression, amplitudes, usual_amplitudes

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from palpate_assessment.grid import map_grid
-from palpate_assessment.messages import skin_of
 from palpate_assessment.sampling import TRAVEL, ContactState, ForceSample, Sampler
 from palpate_assessment.seen_breath import SeenBreath, depth_seen
+from palpate_assessment.service import skin_of
 from palpate_bus.messages import SurfaceCorrection, SurfaceMesh
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, header
