@@ -47,6 +47,21 @@ class Flesh:
         return x * y * z - (x - 2) * (y - 2) * (z - 2)
 
 
+@dataclass(frozen=True)
+class DropSetup:
+    """The dropped indenter."""
+
+    mass_kg: float = 0.35
+    """Stand-off and indenter of the default tool."""
+    radius_m: float = 0.015
+    height_m: float = 0.006
+    step_s: float = 4e-4
+    steps: int = 2000
+    surface_edge_m: float = 0.0025
+
+
+SETUP = DropSetup()
+
 _SCENE = """<?xml version="1.0"?>
 <skel version="1.0"><world name="world">
   <physics><time_step>{dt}</time_step><gravity>0 0 0</gravity><collision_detector>dart</collision_detector></physics>
@@ -73,15 +88,16 @@ _GROUND = """<skeleton name="flesh"><mobile>false</mobile>
 class DartScene:
     """A sphere on a vertical rail over flesh, or over a rigid block without flesh."""
 
-    def __init__(self, flesh: Flesh | None, radius: float, dt: float, mass: float, height: float) -> None:
-        """The sphere of `radius` [m] and `mass` [kg] starts `height` [m] above z = 0, the flesh's top; `dt` [s]."""
+    def __init__(self, flesh: Flesh | None) -> None:
+        """The sphere starts above z = 0, the flesh's top."""
         body = _GROUND
         if flesh is not None:
             body = _FLESH.format(
                 centre=-flesh.size_m[2] / 2, heavy=HEAVY_KG, total=flesh.mass * flesh.vertices, k_v=flesh.k_v,
                 size=" ".join(map(str, flesh.size_m)), counts=" ".join(map(str, flesh.counts)), damping=flesh.damping,
             )  # fmt: skip
-        xml = _SCENE.format(dt=dt, flesh=body, start=radius + height, mass=mass, d=2 * radius)
+        start, d = SETUP.radius_m + SETUP.height_m, 2 * SETUP.radius_m
+        xml = _SCENE.format(dt=SETUP.step_s, flesh=body, start=start, mass=SETUP.mass_kg, d=d)
         self.world: Any = dart.utils.SkelParser.readWorldXML(xml)
         if self.world is None:
             raise RuntimeError("DART could not read the scene")
@@ -89,7 +105,6 @@ class DartScene:
         awake.mEnabled = False
         self.world.setDeactivationOptions(awake)
         self._probe = self.world.getSkeleton("probe")
-        self._height = height
         for name in ("flesh", "probe"):
             node = self.world.getSkeleton(name).getBodyNode(0)
             for k in range(node.getNumShapeNodes()):
@@ -99,7 +114,7 @@ class DartScene:
     @property
     def depth(self) -> float:
         """Depth of the sphere's lowest point below z = 0 [m]."""
-        return -(self._height + float(self._probe.getPositions()[0]))
+        return -(SETUP.height_m + float(self._probe.getPositions()[0]))
 
     def force(self) -> float:
         """Return the upward force on the sphere in the last step [N]."""
@@ -111,21 +126,6 @@ class DartScene:
         self._probe.setForces([-weight])
         self.world.step()
 
-
-@dataclass(frozen=True)
-class DropSetup:
-    """The dropped indenter."""
-
-    mass_kg: float = 0.35
-    """Stand-off and indenter of the default tool."""
-    radius_m: float = 0.015
-    height_m: float = 0.006
-    duration_s: float = 0.8
-    step_s: float = 4e-4
-    surface_edge_m: float = 0.0025
-
-
-SETUP = DropSetup()
 
 SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
 """Surface of Palpate in the figure."""
@@ -167,52 +167,48 @@ class Drop:
         return float(self.force[self.time > self.time[-1] - 0.1].mean())
 
 
-def drop_on_tissue(
-    surface: Stiffness = SURFACE, mass: float = SETUP.mass_kg, height: float = SETUP.height_m, seconds: float = SETUP.duration_s
-) -> Drop:
-    """Drop a sphere of `mass` [kg] from `height` [m] on Palpate's tissue; semi-implicit Euler at 0.4 ms."""
-    tissue = WinklerTissue(flat_phantom(0.035, SETUP.surface_edge_m, surface.k_w_n_per_m3), surface, dt=SETUP.step_s)
-    z, v, contact = height, 0.0, 0.0
-    p = np.array((0.0, 0.0, SETUP.radius_m + height))
+def drop_on_tissue() -> Drop:
+    """Drop the sphere on Palpate's tissue; semi-implicit Euler at 0.4 ms."""
+    tissue = WinklerTissue(flat_phantom(0.035, SETUP.surface_edge_m, SURFACE.k_w_n_per_m3), SURFACE, dt=SETUP.step_s)
+    z, v, contact = SETUP.height_m, 0.0, 0.0
+    p = np.array((0.0, 0.0, SETUP.radius_m + z))
     velocity = np.zeros(3)
     depth, force = [], []
-    for k in range(round(seconds / SETUP.step_s)):
-        v += SETUP.step_s * (contact / mass - GRAVITY)
+    for k in range(SETUP.steps):
+        v += SETUP.step_s * (contact / SETUP.mass_kg - GRAVITY)
         z += SETUP.step_s * v
         p[2], velocity[2] = SETUP.radius_m + z, v
         contact = float(tissue.step(k * SETUP.step_s, p, velocity, SETUP.radius_m)[0][2])
         depth.append(-z)
         force.append(contact)
-    return _since_contact("soft, Palpate", np.array(depth), np.array(force), SETUP.step_s)
+    return _since_contact("soft, Palpate", np.array(depth), np.array(force))
 
 
-def drop_in_dart(
-    flesh: Flesh | None, mass: float = SETUP.mass_kg, height: float = SETUP.height_m, seconds: float = SETUP.duration_s
-) -> Drop:
+def drop_in_dart(flesh: Flesh | None) -> Drop:
     """Drop the sphere in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
-    scene = DartScene(flesh, SETUP.radius_m, SETUP.step_s, mass, height)
+    scene = DartScene(flesh)
     depth, force = [], []
-    for _ in range(round(seconds / SETUP.step_s)):
-        scene.fall(mass * GRAVITY)
+    for _ in range(SETUP.steps):
+        scene.fall(SETUP.mass_kg * GRAVITY)
         depth.append(scene.depth)
         force.append(scene.force())
-    return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force), SETUP.step_s)
+    return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force))
 
 
-def _since_contact(name: str, depth: Array, force: Array, dt: float) -> Drop:
-    time = dt * np.arange(len(depth))
+def _since_contact(name: str, depth: Array, force: Array) -> Drop:
+    time = SETUP.step_s * np.arange(len(depth))
     first = int(np.argmax(force > 0))
     return Drop(name, time - time[first], depth, force)
 
 
-def measure(seconds: float = SETUP.duration_s) -> tuple[Drop, Drop, Drop]:
+def measure() -> tuple[Drop, Drop, Drop]:
     """Return the drops on Palpate's tissue, on the soft body of DART and on a rigid block in DART."""
-    return drop_on_tissue(seconds=seconds), drop_in_dart(FLESH, seconds=seconds), drop_in_dart(None, seconds=seconds)
+    return drop_on_tissue(), drop_in_dart(FLESH), drop_in_dart(None)
 
 
-def section(drops: tuple[Drop, ...] | None = None) -> PageSection:
+def section() -> PageSection:
     """Return the comparison with the paper's figures as bounds."""
-    drops = drops or measure()
+    drops = measure()
     soft, flesh, rigid = drops
     weight = SETUP.mass_kg * GRAVITY
     checks = (

@@ -53,20 +53,15 @@ class Person:
         return np.asarray(self.model.normals[:, 2] > 0.3)
 
 
-def measure() -> tuple[Person, ...]:
-    """Return the persons of `SEEDS`."""
-    return tuple(_person(build, seed) for build, seed in SEEDS)
-
-
 def _person(build: Build, seed: int) -> Person:
     phantom = drawn(Phantom(kind="person", build=build), seed)
     model = build_phantom(phantom, seed)
     return Person(build, phantom, model, force_at_10_mm(model, phantom.stiffness))
 
 
-def section(found: tuple[Person, ...] | None = None) -> PageSection:
+def section() -> PageSection:
     """Return the persons with their bounds."""
-    found = found or measure()
+    found = tuple(_person(build, seed) for build, seed in SEEDS)
     checks = []
     for person in found:
         belly = person.front & (person.bone < 0.01) & (np.abs(person.model.vertices[:, :2]) < SETUP.region_m).all(axis=1)

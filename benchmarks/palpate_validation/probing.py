@@ -29,19 +29,13 @@ def hold(
     return float(force[2])
 
 
-def static_curve(
-    model: PhantomModel,
-    depths: Array,
-    radius: float,
-    stiffness: Stiffness = ELASTIC,
-    offsets: Sequence[tuple[float, float]] = OFFSETS,
-) -> Array:
+def static_curve(model: PhantomModel, depths: Array, radius: float) -> Array:
     """Return the static force [N] at increasing `depths` [m], of their shape, as a mean over positions on the lattice.
 
     Without relaxation the equilibrium does not depend on the path, so one tissue is pressed deeper and deeper.
     """
     forces = np.zeros(len(depths))
-    for xy in offsets:
-        tissue = WinklerTissue(model, stiffness)
+    for xy in OFFSETS:
+        tissue = WinklerTissue(model, ELASTIC)
         forces += [hold(tissue, float(depth), radius, xy) for depth in depths]
-    return forces / len(offsets)
+    return forces / len(OFFSETS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import StrEnum
 
@@ -78,3 +79,8 @@ class Fault:
     def text(self) -> str:
         """One line for the user."""
         return f"{self.code.text.format(count=self.count, of=self.of, value=self.value)}; {self.remedy}"
+
+
+def refused(faults: Iterable[Fault]) -> bool:
+    """Return True if nothing is assessed for one of the faults."""
+    return any(fault.remedy is Remedy.REFUSED for fault in faults)

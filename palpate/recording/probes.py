@@ -11,7 +11,6 @@ from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Palpated, width
 from palpate.recording.skin import fitted, grid_over
 from palpate.recording.timed import implausible_unit, normal_force
-from palpate_models.numerics.frames import Array
 
 _AWAY: Final = 3.0
 """A probe that goes this many times as far as the usual one, or so far aside, has jumped."""
@@ -81,7 +80,8 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
         sd = min(scatter, _DOUBT * usual) if given or begin is None else begin.sd
         down = slice(one.start, one.start + cutting.before_lift(s).stop)
         depth = (s - (at if given or begin is None else begin.at))[: down.stop - down.start]
-        contacts.append(_contact(p[down], n[down], force[down], depth, (radius, sd, sigma)))
+        place = p[down] + (depth - radius)[:, None] * n[down]
+        contacts.append(Contact(ContactKind.PROBE, place, n[down], depth, force[down], sd, sigma))
     points = np.array([contact.position[0] for contact in contacts]).reshape(-1, 3)
     reach = float(np.sqrt(radius * usual))
     if not contacts:
@@ -91,8 +91,3 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
         return Palpated(contacts, points, at, power, len(kept) - len(contacts))
     skin = fitted(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
     return Palpated(contacts, *skin.points(), power, len(kept) - len(contacts))
-
-
-def _contact(p: Array, n: Array, force: Array, depth: Array, tool: tuple[float, float, float]) -> Contact:
-    radius, sd, sigma = tool
-    return Contact(ContactKind.PROBE, p + (depth - radius)[:, None] * n, n, depth, force, sd, sigma)

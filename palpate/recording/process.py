@@ -75,12 +75,9 @@ class PlaceProcess:
 
     def sd(self, places: Array) -> Array:
         """Return the SD of the mean at places, shape (k, 2) -> (k,)."""
-        explained = np.concatenate([self._explained(part) for part in _parts(places)])
+        parts = (solve_triangular(self.cholesky, self._covariance(part).T, lower=True) for part in _parts(places))
+        explained = np.concatenate([(part**2).sum(axis=0) for part in parts])
         return np.asarray(np.sqrt(np.maximum(np.exp(self.log_parameters[0]) - explained, 0)))
-
-    def _explained(self, places: Array) -> Array:
-        """Return the variance that the observations take away at places, shape (k, 2) -> (k,)."""
-        return np.asarray((solve_triangular(self.cholesky, self._covariance(places).T, lower=True) ** 2).sum(axis=0))
 
     def _covariance(self, places: Array) -> Array:
         """Return the covariance of values at places with the process at its own, shape (k, 2) -> (k, n)."""

@@ -9,7 +9,7 @@ import numpy as np
 from scipy.ndimage import find_objects, label, median_filter
 from scipy.spatial import cKDTree
 
-from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.faults import Fault, FaultCode, Remedy, refused
 from palpate.recording.mapping import Mapping, MappingError, read_mapping
 from palpate.recording.motion import Axis, Mask, blocks, pressing_axis
 from palpate.recording.probes import contacts_of_probes, probes
@@ -146,8 +146,10 @@ def _in_order(readings: Readings, time: Array, faults: list[Fault]) -> Readings:
         faults.append(Fault(FaultCode.GAP, int(wide.sum()), len(time), Remedy.CORRECTED, float(steps.max())))
         time = time[0] + np.append(0.0, np.cumsum(np.minimum(steps, LIMITS.gap_s)))
     readings = replace(readings, time=time)
-    if (coarse := _unlike_at_once(readings)) > LIMITS.coarse * len(time):
-        faults.append(Fault(FaultCode.COARSE, coarse, len(time), Remedy.CORRECTED))
+    rows = np.column_stack((readings.position, readings.force))
+    at_once = (np.diff(time) == 0) & (np.diff(rows, axis=0) != 0).any(axis=1)
+    if at_once.sum() > LIMITS.coarse * len(time):
+        faults.append(Fault(FaultCode.COARSE, int(at_once.sum()), len(time), Remedy.CORRECTED))
         readings = replace(readings, time=_spread(time))
     return readings
 
@@ -176,13 +178,6 @@ def _resolution(force: Array) -> float:
     return max((float(np.median(np.diff(one))) for one in few), default=0.0)
 
 
-def _unlike_at_once(readings: Readings) -> int:
-    """Return the number of rows that have the time of the row before, but not its values."""
-    assert readings.time is not None
-    rows = np.column_stack((readings.position, readings.force))
-    return int(np.count_nonzero((np.diff(readings.time) == 0) & (np.diff(rows, axis=0) != 0).any(axis=1)))
-
-
 def _spread(time: Array) -> Array:
     """Return times [s] with rows of equal time spread evenly up to the next one, shape (n,)."""
     known, first = np.unique(time, return_index=True)
@@ -192,8 +187,7 @@ def _spread(time: Array) -> Array:
 
 def _runs(same: Mask) -> list[slice]:
     """Return the stretches of equal neighbours, each with the reading that it repeats."""
-    found: list[slice] = [one[0] for one in find_objects(label(same)[0])]
-    return [slice(one.start - 1, one.stop) for one in found]
+    return [slice(one.start - 1, one.stop) for (one,) in find_objects(label(same)[0])]
 
 
 def _frozen(values: Array, others: Array) -> Mask:
@@ -319,9 +313,8 @@ def _disagreeing(contacts: list[Contact], depth: float, radius: float) -> set[in
     force = np.log(np.maximum(loads.force, 1e-9))
     wrong: set[int] = set()
     for k, near in enumerate(cKDTree(places).query_ball_point(places, 0.3 * np.sqrt(radius * depth))):
-        if len(near) > 1 and abs(force[k] - np.median(force[near])) > (
-            LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree
-        ):
+        most = LIMITS.disagree if len(near) > 2 else 0.5 * LIMITS.disagree
+        if len(near) > 1 and abs(force[k] - np.median(force[near])) > most:
             wrong.add(still[k])
     return wrong
 
@@ -362,7 +355,7 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
     if len(readings.position) < LIMITS.rows:
         raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LIMITS.rows}")
     faults += _implausible(readings)
-    if any(fault.remedy is Remedy.REFUSED for fault in faults):
+    if refused(faults):
         return _refused(name, mapping, faults)
     parts = probes(readings) if readings.time is None else blocks(readings.time)
     if readings.normal is not None and _inward(readings, parts):
@@ -394,13 +387,9 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         if in_A.time is None
         else contacts_over_time(in_A, axis, mapping, X_WA, faults)
     )
-    if palpated.contacts and not any(fault.remedy is Remedy.REFUSED for fault in faults):
+    if palpated.contacts and not refused(faults):
         faults += _implausible_force(palpated.contacts, mapping.tool.radius_m)
-    touches = (
-        []
-        if any(fault.remedy is Remedy.REFUSED for fault in faults)
-        else usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
-    )
+    touches = [] if refused(faults) else usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
     return PalpationRecording(
         name=name,
         indenter_radius_m=mapping.tool.radius_m,
@@ -476,14 +465,8 @@ def _in_frame(readings: Readings, X_WA: Array) -> Readings:
     R, p = X_AW[:3, :3], X_AW[:3, 3]
 
     def turned(v: Array | None, by: Array | float = 0.0) -> Array | None:
-        return None if v is None or v.shape[1] == 1 else v @ R.T + by
+        return None if v is None else v @ R.T + by
 
     force = readings.force if readings.force.shape[1] == 1 else readings.force @ R.T
-    return replace(
-        readings,
-        position=readings.position @ R.T + p,
-        force=force,
-        normal=turned(readings.normal),
-        touch=turned(readings.touch, p),
-        rotation=None,
-    )
+    normal, touch = turned(readings.normal), turned(readings.touch, p)
+    return replace(readings, position=readings.position @ R.T + p, force=force, normal=normal, touch=touch, rotation=None)

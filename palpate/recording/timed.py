@@ -10,7 +10,7 @@ from scipy.interpolate import make_interp_spline
 
 from palpate.recording import cutting
 from palpate.recording.cutting import ContactOnset, across
-from palpate.recording.faults import Fault, FaultCode, Remedy
+from palpate.recording.faults import Fault, FaultCode, Remedy, refused
 from palpate.recording.mapping import SCALES, Mapping
 from palpate.recording.motion import TUNING, Axis, delay, free_air, noise, shifted, tared
 from palpate.recording.readings import Readings
@@ -157,8 +157,12 @@ class _Measured:
             self.skin, kept = self.skin.through(points, sd), {}
         begun = sum(begin is not None for begin in onsets)
         off = (points[:, 2] - self.skin.at(points[:, :2])[0])[begun:]
-        refused = any(fault.remedy is Remedy.REFUSED for fault in faults)
-        if kept and len(off) and not refused and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean()):
+        if (
+            kept
+            and len(off)
+            and not refused(faults)
+            and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean())
+        ):
             faults.append(Fault(FaultCode.MOVES, 1, 1, Remedy.ONE_DEPTH, apart))
             kept = dict.fromkeys(kept, float(np.median(list(kept.values()))))
             self.skin = fitted(*self._skin_points(loads, onsets, kept), self.stations, 2 * self.reach)

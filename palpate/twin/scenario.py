@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from palpate.recording.recording import PalpationRecording
 from palpate.report.files import write_text
 from palpate.report.scoring import Map
-from palpate.twin.fit import FittedWall, fit_wall, skin_at
-from palpate.twin.presses import simulated
+from palpate.twin.fit import FittedWall, fit_wall, simulated, skin_at
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.field import lesion_field

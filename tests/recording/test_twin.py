@@ -8,7 +8,7 @@ import pytest
 
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.scoring import Map
-from palpate.twin.presses import presses_of, simulated
+from palpate.twin.fit import presses_of, simulated
 from palpate.twin.scenario import write_twin
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array

@@ -131,12 +131,12 @@ def pieces(o: Observations) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(group.ravel() == g) for g in range(int(group.max()) + 1)]
 
 
-def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float, standard: PressStandard = USUAL) -> AssessedMap | None:
+def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
     """Return the cheap variant for a growing map: with usual amplitudes, and without findings."""
-    o = observe(samples, standard)
+    o = observe(samples, USUAL)
     if o is None:
         return None
-    apart = distance_to_samples(grid.nodes[:, :2], samples, standard)
+    apart = distance_to_samples(grid.nodes[:, :2], samples, USUAL)
     unassessed = np.where(apart <= reach, UnassessedReason.ASSESSED, UnassessedReason.NOT_REACHED).astype(np.uint8)
     return _assessment(Regression(o, (), usual_amplitudes(o)), grid, unassessed, [], [])
 

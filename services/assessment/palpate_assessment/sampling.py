@@ -98,8 +98,7 @@ class ForceSample:
 class Sampler:
     """Thins states to samples. Feed every state in order; a sample comes out now and then."""
 
-    def __init__(self, travel: float = TRAVEL) -> None:
-        self._travel = travel
+    def __init__(self) -> None:
         self._block: list[ContactState] = []
         self._before: deque[ContactState] = deque(maxlen=PRESS.states)
         self._onset: float | None = None
@@ -120,7 +119,7 @@ class Sampler:
             return self._press(state)
         first = self._block[0]
         way = state.position - first.position
-        complete = sqrt(way.dot(way)) >= self._travel or state.time - first.time >= LONGEST
+        complete = sqrt(way.dot(way)) >= TRAVEL or state.time - first.time >= LONGEST
         return self._average() if complete else None
 
     def forget(self) -> None:
