@@ -29,30 +29,10 @@ def page(rules: Contract | None = None) -> str:
     """Return the page of a contract, by default the project's."""
     rules = rules or contract()
     senders = {role.name: role for role in rules.roles.values() if rules.outputs(role.name)}
-    parts = [_HEAD, _dataflow(rules), _delays(rules), _secrets(rules), _qos(rules.qos.values())]
+    parts = [_HEAD, _delays(rules), _secrets(rules), _qos(rules.qos.values())]
     parts += [_roles(rules.roles.values(), senders), *(_producer(rules, role) for role in senders.values())]
     parts.append(_internal(rules))
     return "\n".join(parts)
-
-
-def _dataflow(rules: Contract) -> str:
-    """Return a mermaid diagram of the data flow between services, without observers."""
-    lines = ["## Dataflow\n", "Thick arrows: same tick. Thin arrows: one period late. Dotted arrows: no service waits for them."]
-    lines += [
-        "The recorder and the dashboard read every topic that they may read and are not drawn.\n",
-        "```mermaid",
-        "flowchart LR",
-    ]
-    drawn = [name for name, role in rules.roles.items() if not role.observer]
-    lines += [f"  {name}([{name}<br/>{rules.roles[name].period_ms} ms])" for name in drawn]
-    arrows: dict[tuple[str, str, str], list[str]] = {}
-    for topic in rules.topics.values():
-        for reader, edge in topic.readers.items():
-            if topic.producer in drawn and reader in drawn:
-                arrow = {Edge.SAME_TICK: "==>", Edge.PREVIOUS: "-->"}.get(edge, "-.->")
-                arrows.setdefault((topic.producer, arrow, reader), []).append(topic.name)
-    lines += [f'  {source} {arrow}|"{"<br/>".join(names)}"| {target}' for (source, arrow, target), names in arrows.items()]
-    return "\n".join([*lines, "```\n"])
 
 
 def _delays(rules: Contract) -> str:

@@ -242,21 +242,6 @@ def reliability(rows: Sequence[tuple[str, FindingCalibration]]) -> Markup | None
     return _svg(figure)
 
 
-def effort(methods: Sequence[MethodRow]) -> Markup:
-    """Return the distributions of greatest force and duration of the first MOST methods."""
-    figure, columns = _figure(11, 4.2, 2)
-    for axes, column, words in zip(
-        columns, ("peak_force_n", "exam_time_s"), ("greatest force [N]", "time of the examination [s]"), strict=True
-    ):
-        for color, method in zip(COLOURS, methods, strict=False):
-            x = np.sort(method.cases[column][~method.cases["failed"]].dropna().to_numpy(dtype=float))
-            axes.step(x, np.arange(1, len(x) + 1) / max(len(x), 1), where="post", color=color, lw=1.6, label=method.name)
-        plain(axes, "part of the examinations", words)
-        _percent(axes)
-        _legend(axes, "lower right")
-    return _svg(figure)
-
-
 def _percent(axes: Axes, both: bool = False) -> None:
     axes.yaxis.set_major_formatter(PercentFormatter(1.0, decimals=0))
     if both:
@@ -284,7 +269,6 @@ def render(summary: Mapping[str, Any], methods: Sequence[MethodRow]) -> str:
         made={a.name: detectability(a, MADE) for a in shown},
         errors={a.name: errors(a) for a in shown},
         reliability=reliability(calibrated),
-        effort=effort(methods),
     )
 
 

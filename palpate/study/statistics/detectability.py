@@ -70,16 +70,6 @@ class Surface(Row, allow_inf_nan=False):
         """Value of each covariate from which 90 % of lumps are found, the others at their medians."""
         return {name: self.threshold(name) for name in self.covariates}
 
-    @computed_field  # type: ignore[prop-decorator]
-    @property
-    def smallest_90(self) -> dict[str, Estimate]:
-        """Radius [m] from which 90 % of lumps are found, by quartile of contrast, depth at its median."""
-        radius = next((name for name in self.covariates if name.endswith("radius_m")), None)
-        contrast = next((name for name in self.covariates if name in LOGARITHMIC), None)
-        if radius is None or contrast is None:
-            return {}
-        return {f"{contrast} {level:.3g}": self.threshold(radius, **{contrast: level}) for level in self.quartiles[contrast]}
-
     def typical(self, name: str) -> float:
         """Return the median of a covariate."""
         return self.quartiles[name][1]

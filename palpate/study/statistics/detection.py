@@ -12,19 +12,10 @@ from statsmodels.stats.rates import confint_poisson
 from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate, percentiles, wilson
 from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
-
-@dataclass(frozen=True)
-class DetectionTuning:
-    """Thresholds of the counts, and the length of the curve."""
-
-    sure: float = 0.5
-    shown: int = 200
-    """Points of the curve that are kept for its plot."""
-    wide_m: float = 0.015
-    """Felt radius from which a lump also counts as large."""
-
-
-COUNTED: Final = DetectionTuning()
+SURE: Final = 0.5
+"""Confidence from which a finding on a structure of the wall is sure."""
+SHOWN: Final = 200
+"""Points of the curve that are kept for its plot."""
 
 
 class Rates(Row):
@@ -49,7 +40,7 @@ class Rates(Row):
     false_findings_of_healthy: Estimate
     """Per examination of a person without a lump."""
     sure_on_structures: Estimate | None = None
-    """Share of persons without a lump who had a finding on a structure of the wall with a confidence above `COUNTED.sure`."""
+    """Share of persons without a lump who had a finding on a structure of the wall with a confidence above `SURE`."""
 
 
 def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
@@ -57,7 +48,7 @@ def rates(variant: Variant, bootstrap: Bootstrap) -> Rates:
     cases = variant.cases
     ill, healthy = cases[cases["ill"]], cases[cases["healthy"]]
     findings = variant.findings
-    sure = findings[findings["reported"] & findings["on_structure"].eq(True) & (findings["confidence"] > COUNTED.sure)]
+    sure = findings[findings["reported"] & findings["on_structure"].eq(True) & (findings["confidence"] > SURE)]
     done = cases["status"] == "done"
     return Rates(
         completed=wilson(int((~cases["failed"]).sum()), len(cases), "patients"),
@@ -200,7 +191,7 @@ def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
     all_false, all_sensitivity = _froc_curves(marks, bootstrap, examined, lumps)
     at = np.array([np.interp(RATES, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     zero = np.max(np.where(all_false == 0, all_sensitivity, 0), axis=1)
-    shown = np.union1d(false[np.linspace(0, len(false) - 1, COUNTED.shown).astype(int)], RATES)
+    shown = np.union1d(false[np.linspace(0, len(false) - 1, SHOWN).astype(int)], RATES)
     pointwise = np.array([np.interp(shown, x, y) for x, y in zip(all_false, all_sensitivity, strict=True)])
     band = np.array([percentiles(column) or (np.nan, np.nan) for column in pointwise.T])
     here = np.interp(RATES, false, sensitivity)
@@ -255,8 +246,6 @@ class ContrastRow(Row):
 
     found: Estimate
     """Share of lumps found."""
-    found_wide: Estimate
-    """Share of lumps found with a felt radius of 15 mm or more."""
     auc: Estimate | None
     """AUC of patients whose lump of greatest felt contrast is in this class against persons without a lump; None if either is
     missing."""
@@ -271,12 +260,9 @@ def by_contrast(variant: Variant, bootstrap: Bootstrap) -> dict[str, ContrastRow
     rows = {}
     for name, (low, high) in CLASSES.items():
         own = lumps[(lumps["contrast"] >= low) & (lumps["contrast"] < high)]
-        wide = own[own["felt_radius_m"] >= COUNTED.wide_m]
         patients = clearest.index[(clearest >= low) & (clearest < high)]
         curve = roc(variant.only(np.union1d(patients, healthy).astype(np.intp)), bootstrap)
         rows[name] = ContrastRow(
-            found=bootstrap.share(own["found"], own["patient"], "lumps"),
-            found_wide=bootstrap.share(wide["found"], wide["patient"], "lumps"),
-            auc=None if curve is None else curve.auc,
+            found=bootstrap.share(own["found"], own["patient"], "lumps"), auc=None if curve is None else curve.auc
         )
     return rows
