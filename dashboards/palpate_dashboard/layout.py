@@ -116,7 +116,6 @@ def blueprint(region_m: tuple[float, float], centre_m: tuple[float, float], dept
             rrb.StateTimelineView(name="Health", origin="/health"),
             rrb.TextLogView(name="Log", origin="/log"),
             rrb.TextDocumentView(name="Legend", origin="/text/legend"),
-            rrb.TextDocumentView(name="TRUTH", origin="/text/truth"),
         ),
         rrb.StateTimelineView(name="Phase and driver", origin="/state"),
         _plot("Normal force [N]", "/plots/force", hidden=("true", "limit")),

@@ -145,14 +145,13 @@ def depth_mm(depth_m: float) -> float:
 class Plots:
     """Draws plots, states and log."""
 
-    def __init__(self, canvas: Canvas, legend: str, truth: str) -> None:
-        """`legend` and `truth`: pages in Markdown."""
+    def __init__(self, canvas: Canvas, legend: str) -> None:
+        """`legend`: a page in Markdown."""
         self._canvas = canvas
         self._states: dict[str, str] = {}
         self._texts: dict[str, str] = {}
         self._health_lines: set[str] = set()
-        for name, page in (("legend", legend), ("truth", truth)):
-            canvas.log(f"text/{name}", rr.TextDocument(page, media_type=rr.MediaType.MARKDOWN))
+        canvas.log("text/legend", rr.TextDocument(legend, media_type=rr.MediaType.MARKDOWN))
         for path, (name, color, width) in SERIES.items():
             canvas.log(f"plots/{path}", rr.SeriesLines(names=[name], colors=[color], widths=[width]))
         for path, names in (("torque/joints", [f"A{i + 1} [% of limit]" for i in range(7)]), ("waits/roles", AWAITED)):

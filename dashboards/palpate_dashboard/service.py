@@ -67,7 +67,7 @@ class DashboardService(Service):
     role = "dashboard"
 
     def __init__(self, scenario: Scenario, path: Path | None, live: Live, *, paced: bool = True, full: bool = True) -> None:
-        """The truth in `scenario` is used for one page only. `paced`: show the real-time factor.
+        """The truth in `scenario` is not used. `paced`: show the real-time factor.
 
         Without a `path` no file is written. Unless `full`, meshes and images are sparse while no viewer is connected.
 
@@ -87,7 +87,7 @@ class DashboardService(Service):
         self._send_period = PERIODS.send_live_ns if paced and live != Live() else PERIODS.send_ns
         self._scene = scene = SceneView(self._canvas, given.robot, given.camera)
         self._map = MapView(self._canvas, exam.region_m, exam.centre_m)
-        self._plots = Plots(self._canvas, text.LEGEND, text.truth_page(scenario))
+        self._plots = Plots(self._canvas, text.LEGEND)
         self._waits = np.zeros(len(plots.AWAITED))
         self._producers = {topic.name: topic.producer for topic in contract().topics.values()}
         self._seen: dict[str, Message] = {}

@@ -2,7 +2,6 @@
 
 import os
 import pty
-import re
 import select
 import signal
 import sys
@@ -22,13 +21,7 @@ from palpate_bus.runs.operator import OperatorKeys
 from palpate_bus.wire.zenoh_config import TLS_FILES, BusOptions
 from palpate_dashboard import arrays, replay, text
 from palpate_dashboard.sinks import Live
-from palpate_dashboard.text import truth_page
 from palpate_models.numerics.maps import level_lines
-from palpate_models.patient.breathing import Breathing, BreathingCurve
-from palpate_models.patient.motion import BodyMotion, Motion
-from palpate_models.patient.schema import Phantom
-from palpate_models.scenario.errors import Errors, draw_errors
-from palpate_models.scenario.schema import Scenario
 
 
 @pytest.mark.parametrize("level", [0.03, 0.05, 0.071])
@@ -64,26 +57,6 @@ def test_viewer_setting() -> None:
     for wrong in ("window", "serve:x", "serve:80", "serve:0.0.0.0:80"):
         with pytest.raises(ValueError, match="PALPATE_VIEWER"):
             Live.parse(wrong)
-
-
-def numbers(scenario: Scenario, row: str) -> list[float]:
-    (line,) = [line for line in truth_page(scenario).splitlines() if line.startswith(f"| {row} |")]
-    return [float(found) for found in re.findall(r"[-+]?\d+\.?\d*", line.removeprefix(f"| {row} |"))]
-
-
-def test_truth_page_states_the_drawn_values() -> None:
-    phantom = Phantom(breathing=Breathing(kind="quiet"), motion=Motion(kind="shift"))
-    scenario = Scenario(seed=7, phantom=phantom, errors=Errors(level="poor"))
-    drawn = draw_errors(scenario.errors, 7)
-    np.testing.assert_allclose(numbers(scenario, "force, bias"), drawn.force.bias[:3], atol=0.006)
-    true = numbers(scenario, "patient, off by [mm]")
-    np.testing.assert_allclose(true, 1e3 * drawn.X_AAt[:3, 3], atol=0.006)
-    np.testing.assert_allclose(numbers(scenario, "tool, true over nominal mass"), drawn.arm.tool_mass, atol=6e-4)
-    assert numbers(scenario, "breathing")[-1] == round(1e3 * BreathingCurve(phantom.breathing, 7).largest_m, 1)
-    moved = numbers(scenario, "motion")
-    motion = BodyMotion(phantom.motion, 7)
-    np.testing.assert_allclose(moved, (motion.at_s, motion.until_s), atol=0.06)
-    np.testing.assert_allclose(numbers(scenario, "moved [mm]"), 1e3 * motion.pose(1e3)[:3, 3], atol=0.006)
 
 
 def test_unassessed_places_are_listed_by_reason() -> None:

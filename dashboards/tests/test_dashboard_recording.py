@@ -102,7 +102,7 @@ def test_everything_is_drawn(recording: Recording) -> None:
     assert expected <= recording.temporal.keys()
     for box in ("table_top", "table_column", "robot_base"):
         assert f"/world/furniture/{box}" in recording.static
-    assert {"/world/truth/lesions", "/world/truth/axes", "/map/mean/truth", "/text/truth"} <= recording.static
+    assert {"/world/truth/lesions", "/world/truth/axes", "/map/mean/truth"} <= recording.static
     assert {"/map/mean/legend", "/world/camera"} <= recording.static
 
 
@@ -211,11 +211,9 @@ def _parts(part: Any) -> list[Any]:
 def test_the_truth_about_the_patient_is_not_shown_at_first() -> None:
     parts = _parts(blueprint((0.2, 0.2), (0.0, 0.0), 0.01, ((0.0, 1.0), (0.0, 1.0))).root_container)
     tabs = [part for part in parts if type(part).__name__ == "Tabs"]
-    secret = [part for part in parts if getattr(part, "origin", "") in ("/plots/truth", "/text/truth")]
-    assert len(secret) == 2
-    for view in secret:
-        (holder,) = [tab for tab in tabs if view in tab.contents]
-        assert holder.contents[0] is not view  # the first tab is in front
+    (secret,) = [part for part in parts if getattr(part, "origin", "") == "/plots/truth"]
+    (holder,) = [tab for tab in tabs if secret in tab.contents]
+    assert holder.contents[0] is not secret  # the first tab is in front
     (scene,) = [part for part in parts if getattr(part, "origin", "") == "/world"]
     (mean,) = [part for part in parts if getattr(part, "origin", "") == "/map/mean"]
     curves = {f"{part.origin}/true": part for part in parts if getattr(part, "origin", "") in ("/plots/force", "/plots/depth")}
