@@ -53,28 +53,24 @@ def some(table: pd.DataFrame, every: int = 7) -> pd.Series:
     return table.press % every == 3
 
 
-def flipped(t):
-    return t.assign(**{name: -t[name] for name in F})
+def scaled(names: list[str], by: float):
+    return lambda t: t.assign(**{name: by * t[name] for name in names})
 
 
-def in_mm(t):
-    return t.assign(**{name: 1e3 * t[name] for name in P})
+def zero_at_some(names: list[str]):
+    return lambda t: t.assign(**{name: t[name].where(~some(t), 0.0) for name in names})
 
 
-def turned(t):
-    return t.assign(fx=t.fz, fz=t.fx)
+def mapped(mapping, **changes):
+    return mapping.model_copy(update=changes)
 
 
-def only_contact(t):
-    return t[np.linalg.norm(t[F] - ZERO, axis=1) > 0.5]
+def late(t):
+    return t.assign(**{name: t[name].shift(20, fill_value=t[name].iloc[0]) for name in F})
 
 
-def drifting(t):
-    return t.assign(fz=t.fz + np.linspace(0, 2, len(t)))
-
-
-def clipped(t):
-    return t.assign(fz=t.fz.clip(upper=5.0))
+def of_two_tools(t):
+    return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 2))
 
 
 def frozen(t):
@@ -82,26 +78,10 @@ def frozen(t):
     return t.assign(**{name: held.groupby("at")[name].transform("first").where(held["at"] % 9 == 4, t[name]) for name in F})
 
 
-def twice(t):
-    return pd.concat((t, t.iloc[1000:1200])).sort_values("t", kind="stable")
-
-
-def late(t):
-    return t.assign(**{name: t[name].shift(20, fill_value=t[name].iloc[0]) for name in F})
-
-
-def backward(t):
-    return pd.concat((t.iloc[:500], t.iloc[800:1000], t.iloc[500:800], t.iloc[1000:]))
-
-
 def in_air(t):
     lifted = some(t)
     free = ZERO + np.random.default_rng(1).normal(0.0, 0.02, (len(t), 3))
     return t.assign(z=t.z + 0.02 * lifted, **{name: t[name].where(~lifted, free[:, k]) for k, name in enumerate(F)})
-
-
-def jumping(t):
-    return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 400 == 50))
 
 
 def unlike(t):
@@ -115,22 +95,6 @@ def grazing(t):
     return t.assign(**{name: t[name].where(~deep).ffill() for name in P + F})
 
 
-def holes(t):
-    return t.assign(fz=t.fz.where(np.arange(len(t)) % 50 != 7))
-
-
-def no_normal(t):
-    return t.assign(**{name: t[name].where(~some(t), 0.0) for name in N})
-
-
-def no_force(t):
-    return t.assign(**{name: t[name].where(~some(t), 0.0) for name in F})
-
-
-def shifted(t):
-    return t.assign(x=t.x + 0.06 * (some(t) & (np.arange(len(t)) % 10 > 5)))
-
-
 def resampled(t, rate):
     at = np.arange(t.t.min(), t.t.max(), 1 / rate)
     return pd.DataFrame({name: np.interp(at, t.t, t[name]) for name in ("t", *P, *F)})
@@ -140,18 +104,6 @@ def header_again(t):
     t = t.astype(object)
     t.iloc[1000] = t.columns
     return t
-
-
-def in_newtons_as_mN(t):
-    return t.assign(**{name: 1e-3 * t[name] for name in F})
-
-
-def in_grams(t):
-    return t.assign(**{name: t[name] / 9.80665e-3 for name in F})
-
-
-def of_two_tools(t):
-    return t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 2))
 
 
 def with_number(t, number, names=F, length=1):
@@ -170,20 +122,16 @@ def oriented(order):
     return mapped(OVER_TIME, table=table, force=ForceSource(axes="tool"))
 
 
-def mapped(mapping, **changes):
-    return mapping.model_copy(update=changes)
-
-
 MAPPED = {
     "20-hz": (lambda t: resampled(t, 20), OVER_TIME),
     "500-hz": (lambda t: resampled(t, 500), OVER_TIME),
-    "millimetres": (in_mm, mapped(OVER_TIME, units=Units(length="mm"))),
+    "millimetres": (scaled(P, 1e3), mapped(OVER_TIME, units=Units(length="mm"))),
     "centimetres-kgf": (
-        lambda t: t.assign(**{name: 100 * t[name] for name in P}, **{name: t[name] / 9.80665 for name in F}),
+        lambda t: scaled(F, 1 / 9.80665)(scaled(P, 100)(t)),
         mapped(OVER_TIME, units=Units(length="cm", force="kgf")),
     ),
     "dates": (lambda t: t.assign(t=(pd.Timestamp("2026-01-01") + pd.to_timedelta(t.t, unit="s")).astype(str)), OVER_TIME),
-    "on-the-body": (flipped, mapped(OVER_TIME, force=ForceSource(on="body"))),
+    "on-the-body": (scaled(F, -1), mapped(OVER_TIME, force=ForceSource(on="body"))),
     "tip": (lambda t: t.assign(z=t.z - 0.015), mapped(OVER_TIME, tool=MappedTool(radius_m=0.015, point="tip"))),
     "late": (late, mapped(OVER_TIME, force=ForceSource(delay_s=0.2))),
     "tool-axes": (in_tool_axes, oriented("xyzw")),
@@ -204,41 +152,37 @@ def test_a_correct_mapping_gives_the_same_result(pressed: pd.DataFrame, change, 
 
 C = FaultCode
 SPOILED = {
-    "flipped": (flipped, OVER_TIME, C.SIGN),
-    "millimetres": (in_mm, OVER_TIME, C.SPEED),
+    "flipped": (scaled(F, -1), OVER_TIME, C.SIGN),
+    "millimetres": (scaled(P, 1e3), OVER_TIME, C.SPEED),
     "metres": (lambda t: t, OVER_TIME.model_copy(update={"units": Units(length="mm")}), C.UNIT),
-    "turned": (turned, OVER_TIME, C.FRAME),
-    "only-contact": (only_contact, OVER_TIME, C.NO_FREE_AIR),
-    "drifting": (drifting, OVER_TIME, C.DRIFT),
-    "clipped": (clipped, OVER_TIME, C.CLIPPED),
+    "turned": (lambda t: t.assign(fx=t.fz, fz=t.fx), OVER_TIME, C.FRAME),
+    "only-contact": (lambda t: t[np.linalg.norm(t[F] - ZERO, axis=1) > 0.5], OVER_TIME, C.NO_FREE_AIR),
+    "drifting": (lambda t: t.assign(fz=t.fz + np.linspace(0, 2, len(t))), OVER_TIME, C.DRIFT),
+    "clipped": (lambda t: t.assign(fz=t.fz.clip(upper=5.0)), OVER_TIME, C.CLIPPED),
     "frozen": (frozen, OVER_TIME, C.FROZEN),
-    "twice": (twice, OVER_TIME, C.REPEATED),
+    "twice": (lambda t: pd.concat((t, t.iloc[1000:1200])).sort_values("t", kind="stable"), OVER_TIME, C.REPEATED),
     "late": (late, OVER_TIME, C.CLOCK),
-    "backward": (backward, OVER_TIME, C.BACKWARD),
+    "backward": (lambda t: t.iloc[np.r_[:500, 800:1000, 500:800, 1000 : len(t)]], OVER_TIME, C.BACKWARD),
     "in-air": (in_air, OVER_TIME, C.NO_CONTACT),
-    "jumping": (jumping, OVER_TIME, C.JUMP),
+    "jumping": (lambda t: t.assign(x=t.x + 0.06 * (np.arange(len(t)) % 400 == 50)), OVER_TIME, C.JUMP),
     "unlike": (unlike, OVER_TIME, C.DISAGREE),
     "grazing": (grazing, OVER_TIME, C.SHALLOW),
-    "holes": (holes, OVER_TIME, C.INVALID),
-    "millinewtons": (in_newtons_as_mN, mapped(OVER_TIME, units=Units(force="mN")), C.FORCE_UNIT),
-    "grams": (in_grams, OVER_TIME, C.FORCE_UNIT),
-    "probes-grams": (in_grams, PROBES, C.FORCE_UNIT),
+    "holes": (lambda t: t.assign(fz=t.fz.where(np.arange(len(t)) % 50 != 7)), OVER_TIME, C.INVALID),
+    "millinewtons": (scaled(F, 1e-3), mapped(OVER_TIME, units=Units(force="mN")), C.FORCE_UNIT),
+    "grams": (scaled(F, 1 / 9.80665e-3), OVER_TIME, C.FORCE_UNIT),
+    "probes-grams": (scaled(F, 1 / 9.80665e-3), PROBES, C.FORCE_UNIT),
     "two-tools": (of_two_tools, OVER_TIME, C.TWO_TOOLS),
     "probes-one-x": (lambda t: t.assign(x=0.0), PROBES, C.LINE),
-    "probes-inward": (lambda t: t.assign(**{name: -t[name] for name in N}), PROBES, C.NORMALS),
+    "probes-inward": (scaled(N, -1), PROBES, C.NORMALS),
     "probes-shuffled": (lambda t: t.sample(frac=1, random_state=0), PROBES, C.ORDER),
     "coarse-clock": (lambda t: t.assign(t=t.t.round(1)), OVER_TIME, C.COARSE),
     "two-tools-at-once": (lambda t: of_two_tools(t).assign(t=t.t // 0.02 * 0.02), OVER_TIME, C.TWO_TOOLS),
     "noise": (lambda t: t.assign(**{name: np.random.default_rng(0).normal(0, 1, len(t)) for name in F}), OVER_TIME, C.FRAME),
     "nanoseconds": (lambda t: t.assign(t=1e9 * t.t + 1.7e18), OVER_TIME, C.TIME_UNIT),
     "header-again": (header_again, OVER_TIME, C.INVALID),
-    "kilograms": (lambda t: t.assign(**{name: t[name] / 9.80665 for name in F}), OVER_TIME, C.STIFFNESS),
-    "probes-kilograms": (lambda t: t.assign(**{name: t[name] / 9.80665 for name in F}), PROBES, C.STIFFNESS),
-    "centimetres-as-millimetres": (
-        lambda t: t.assign(**{name: 100 * t[name] for name in P}),
-        mapped(OVER_TIME, units=Units(length="mm")),
-        C.STIFFNESS,
-    ),
+    "kilograms": (scaled(F, 1 / 9.80665), OVER_TIME, C.STIFFNESS),
+    "probes-kilograms": (scaled(F, 1 / 9.80665), PROBES, C.STIFFNESS),
+    "centimetres-as-millimetres": (scaled(P, 100), mapped(OVER_TIME, units=Units(length="mm")), C.STIFFNESS),
     "minutes": (lambda t: t.assign(t=t.t / 60), OVER_TIME, C.SPEED),
     "milliseconds": (lambda t: t.assign(t=1e3 * t.t), OVER_TIME, C.TIME_UNIT),
     "missing-number": (lambda t: with_number(t, -999.0), OVER_TIME, C.MISSING),
@@ -253,12 +197,12 @@ SPOILED = {
     "tool-axes-as-recording": (in_tool_axes, OVER_TIME, C.SIGN),
     "probes-listed-twice": (lambda t: pd.concat((t, t[t.press % 5 == 1])), PROBES, C.REPEATED),
     "probes-numbered-twice": (lambda t: pd.concat((t, t[t.press % 5 == 1].assign(probe=t.probe + 1000))), PROBES, C.REPEATED),
-    "probes-flipped": (flipped, PROBES, C.SIGN),
-    "probes-turned": (turned, PROBES, C.FRAME),
-    "probes-no-normal": (no_normal, PROBES, C.INVALID),
-    "probes-no-force": (no_force, PROBES, C.NO_CONTACT),
-    "probes-shifted": (shifted, PROBES, C.JUMP),
-    "probes-millimetres": (in_mm, PROBES, C.UNIT),
+    "probes-flipped": (scaled(F, -1), PROBES, C.SIGN),
+    "probes-turned": (lambda t: t.assign(fx=t.fz, fz=t.fx), PROBES, C.FRAME),
+    "probes-no-normal": (zero_at_some(N), PROBES, C.INVALID),
+    "probes-no-force": (zero_at_some(F), PROBES, C.NO_CONTACT),
+    "probes-shifted": (lambda t: t.assign(x=t.x + 0.06 * (some(t) & (np.arange(len(t)) % 10 > 5))), PROBES, C.JUMP),
+    "probes-millimetres": (scaled(P, 1e3), PROBES, C.UNIT),
 }
 
 
