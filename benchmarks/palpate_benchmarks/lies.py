@@ -33,16 +33,10 @@ from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input, load_scenario
 
 MOMENTS: Final = ("rest", "descent", "depth", "transfer")
-BEFORE_STROKES: Final = frozenset(
-    {
-        "camera/depth/image_raw",
-        "camera/depth/camera_info",
-        "perception/surface",
-        "perception/targets",
-        "planning/camera_trigger",
-        "tf_static",
-    }
-)
+BEFORE_STROKES: Final = (
+    "camera/depth/image_raw", "camera/depth/camera_info", "perception/surface", "perception/targets",
+    "planning/camera_trigger", "tf_static",
+)  # fmt: skip
 """Topics that are sent before the first stroke alone: they lie from rest on."""
 SENSED: Final = ("ft/wrench", "joint_states", "robot/status", "control/joint_torque", "planning/setpoint", "sim/contact_wrench")
 """Topics that lie at every moment; the others at one of them in turn."""

@@ -109,14 +109,8 @@ LEVEL_COLORS: Final = ((70, 190, 90), (240, 200, 60), (220, 40, 40), (120, 130, 
 _LOG_LEVELS: Final = {"warning": "WARN", "ERROR": "ERROR"}
 
 JOINT_COLORS: Final = (
-    (230, 80, 80),
-    (240, 150, 50),
-    (220, 200, 60),
-    (110, 190, 90),
-    (70, 180, 200),
-    (80, 120, 230),
-    (170, 90, 220),
-)
+    (230, 80, 80), (240, 150, 50), (220, 200, 60), (110, 190, 90), (70, 180, 200), (80, 120, 230), (170, 90, 220),
+)  # fmt: skip
 AWAITED: Final = (*(name for name, role in contract().roles.items() if not role.observer), "grant")
 """Possible causes of a wait: the services, and the conductor's grant of simulated time."""
 _TRUE, _THIN, _WIDE = (150, 110, 240), 1.0, 1.5

@@ -281,9 +281,8 @@ class DashboardService(Service):
         for row in rows:
             self._count_wait(row.values.get("waiting_for", ""))
             self._plots.health(t, row)
-        share = self._waits / max(1.0, self._waits.sum())
-        self._plots.add(t, "waits/roles", *(100.0 * share))
-        self._plots.document(t, "text/services", text.services(rows, zip(plots.AWAITED, share, strict=True)))
+        self._plots.add(t, "waits/roles", *(100.0 * self._waits / max(1.0, self._waits.sum())))
+        self._plots.document(t, "text/services", text.services(rows))
 
     def _count_wait(self, what: str) -> None:
         """Count an observed wait for a topic or for the grant; waits for observers are ignored."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Final
 
@@ -98,17 +98,14 @@ def plain(text: str) -> str:
     return re.sub(r"([\\`\[\]<>|!])", r"\\\1", printable(text).replace("\n", " "))
 
 
-def services(rows: Sequence[Health], waits: Iterable[tuple[str, float]] = ()) -> str:
-    """Return the services page: health of services, shares of waits [1], then topics, the worst first."""
+def services(rows: Sequence[Health]) -> str:
+    """Return the services page: health of services, then of topics, the worst first."""
     lines = ["| service | state | | at | silent for |", "|---|---|---|---|---|"]
     for row in rows:
         if not row.is_topic:
             tick = f"{row.values['tick_s']} s" if "tick_s" in row.values else ""
             age = f"{row.values['report_age_s']} s" if "report_age_s" in row.values else ""
             lines.append(f"| {row.name} | {row.word} | {plain(row.message)} | {tick} | {age} |")
-    waited = [f"{role} {100 * share:.0f} %" for role, share in waits if share > 0]
-    if waited:
-        lines += ["", f"**Waited for**: {', '.join(waited)}"]
     topics = sorted((row for row in rows if row.is_topic), key=lambda row: -SEVERITY[row.word])
     if topics:
         lines += ["", "| topic | state | | Hz, simulated | missing |", "|---|---|---|---|---|"]

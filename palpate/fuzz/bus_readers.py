@@ -171,23 +171,32 @@ def _written(options: BusOptions) -> bytes:
     return _bytes("\n".join(environment.get(name, "") for name in _VARIABLES))
 
 
-def _chunk(data: bytes) -> bool:
-    try:
-        _, messages = unpack_chunk(data)
-        list(messages)
-    except codec.CodecError:
-        return False
-    return True
+def accepts(read: Callable[[bytes], object], refused: type[Exception]) -> Callable[[bytes], bool]:
+    """Return the check of a reader that refuses with `refused`."""
+
+    def check(data: bytes) -> bool:
+        try:
+            read(data)
+        except refused:
+            return False
+        return True
+
+    return check
 
 
-def _small_chunk() -> bytes:
+def _chunk(data: bytes) -> None:
+    _, messages = unpack_chunk(data)
+    list(messages)
+
+
+def _chunks(rng: random.Random) -> list[bytes]:
     topic, stamp = np.zeros(1, np.uint16), np.zeros(1, np.int64)
     sequence, length = np.zeros(1, np.uint32), np.array([2], np.uint32)
     message = RecordChunk("robot", 0, ["clock"], topic, stamp, sequence, length, np.zeros(2, np.uint8))
-    return codec.encode(message, CHUNK_TYPE)
+    return [codec.encode(message, CHUNK_TYPE), *(random_payload(CHUNK_TYPE, rng) for _ in range(3))]
 
 
-CHUNK = FuzzTarget("chunk", _chunk, lambda rng: [_small_chunk(), *(random_payload(CHUNK_TYPE, rng) for _ in range(3))])
+CHUNK = FuzzTarget("chunk", accepts(_chunk, codec.CodecError), _chunks)
 
 
 def _texts(_: random.Random) -> list[bytes]:
@@ -209,12 +218,8 @@ def _scenario(data: bytes) -> bool:
     return True
 
 
-def _setting(data: bytes) -> bool:
-    try:
-        load_scenario("healthy", data.decode("utf-8", "replace").split("\n"))
-    except ScenarioError:
-        return False
-    return True
+def _setting(data: bytes) -> None:
+    load_scenario("healthy", data.decode("utf-8", "replace").split("\n"))
 
 
 _SETTINGS = (
@@ -225,7 +230,7 @@ _SETTINGS = (
 
 
 SCENARIO = FuzzTarget("scenario", _scenario, _texts)
-SETTING = FuzzTarget("setting", _setting, lambda _: _SETTINGS)
+SETTING = FuzzTarget("setting", accepts(_setting, ScenarioError), lambda _: _SETTINGS)
 
 
 def bus_targets() -> list[FuzzTarget]:

@@ -8,6 +8,7 @@ import zipfile
 from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
 import numpy as np
@@ -17,7 +18,7 @@ from trimesh.exchange.obj import export_obj
 from trimesh.exchange.ply import export_ply
 from trimesh.exchange.stl import export_stl, export_stl_ascii
 
-from palpate.fuzz.bus_readers import FuzzTarget, random_payload
+from palpate.fuzz.bus_readers import FuzzTarget, accepts, random_payload
 from palpate.recording.read import read_recording
 from palpate.report.archive import FILE, read_evidence, write_evidence
 from palpate.report.page import read_report
@@ -46,17 +47,13 @@ TOPIC = "joint_states"
 def _target(
     name: str, file: str, read: Callable[[Path], object], seeds: Sequence[bytes], *, refused: type[Exception] = UserError
 ) -> FuzzTarget:
-    def check(data: bytes) -> bool:
+    def write_and_read(data: bytes) -> None:
         path = Path(file)
         path.parent.mkdir(exist_ok=True)
         path.write_bytes(data)
-        try:
-            read(path)
-        except refused:
-            return False
-        return True
+        read(path)
 
-    return FuzzTarget(name, check, lambda _: seeds)
+    return FuzzTarget(name, accepts(write_and_read, refused), lambda _: seeds)
 
 
 # -- meshes
@@ -169,10 +166,9 @@ def _define(path: Path) -> None:
 
 
 def _evidence() -> bytes:
-    write_evidence(Path(FILE), Collected(), run="fuzz")
-    content = Path(FILE).read_bytes()
-    Path(FILE).unlink()
-    return content
+    with TemporaryDirectory() as folder:
+        write_evidence(Path(folder, FILE), Collected(), run="fuzz")
+        return Path(folder, FILE).read_bytes()
 
 
 # -- recordings of other robots
@@ -301,9 +297,7 @@ def file_targets() -> Iterator[FuzzTarget]:
     yield _target("foreign:bag", "input.mcap", partial(_foreign, table=False), (_bag(),))
     yield _target("foreign:mapping", "mapping.yaml", partial(_foreign, table=True), (_TABLE_MAPPING,))
     yield _target("foreign:urdf", "arm.urdf", partial(_foreign, table=False), (_ARM,))
-    yield FuzzTarget(
-        "results:evidence", _target("", FILE, lambda path: read_evidence(path.parent), ()).check, lambda _: [_evidence()]
-    )
+    yield _target("results:evidence", FILE, lambda path: read_evidence(path.parent), (_evidence(),))
     yield _target("results:report", "report.json", lambda path: read_report(path.parent), (_REPORT,))
     yield _target("results:checkpoint", "input.npz", read_checkpoint, (_checkpoint(True), _checkpoint(False)))
     yield _target("json", "input.json", lambda path: parse_json(path.read_bytes(), "input"), (_REPORT,))

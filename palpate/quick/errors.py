@@ -196,19 +196,14 @@ class Loop:
 
 def _field(exam: Exam, sd: float, length: float, rng: np.random.Generator) -> RectBivariateSpline:
     """Return a smooth random field over the examined region and a margin [m]."""
-    x, y = (_axis(centre, size) for centre, size in zip(exam.centre_m, exam.region_m, strict=True))
+    halves = [0.5 * size + _BEYOND_M for size in exam.region_m]
+    x, y = (c + np.linspace(-h, h, round(2 * h / _GRID_M) + 1) for c, h in zip(exam.centre_m, halves, strict=True))
     width = length / np.sqrt(2) / _GRID_M  # white noise under a Gaussian of this width has the wanted covariance
     noise = gaussian_filter(rng.standard_normal((len(x), len(y))), width, mode="wrap")
     peak = np.zeros((len(x), len(y)))
     peak[0, 0] = 1.0
     unit = np.sqrt(np.sum(gaussian_filter(peak, width, mode="wrap") ** 2))
     return RectBivariateSpline(x, y, sd / unit * noise)
-
-
-def _axis(centre: float, size: float) -> Array:
-    """Return the coordinates of the field's grid along one axis [m]."""
-    half = 0.5 * size + _BEYOND_M
-    return centre + np.linspace(-half, half, round(2 * half / _GRID_M) + 1)
 
 
 class _Smooth:

@@ -237,16 +237,10 @@ def read_evidence(folder: Path) -> Evidence:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
 
 
-def read_figures(folder: Path) -> dict[str, Any]:
-    """Return report.json of the run in `folder`, unchecked. Raises OSError or ValueError."""
-    report: dict[str, Any] = read_json(folder / "report.json")
-    return report
-
-
 def completed(folder: Path) -> dict[str, Any] | None:
     """Return report.json of a completed run with its evidence; None if there is none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
-        report = read_figures(folder)
+        report: dict[str, Any] = read_json(folder / "report.json")
         with (folder / FILE).open("rb") as file:
             file.seek(-len(_MAGIC), io.SEEK_END)
             return report if report["failure"] is None and file.read() == _MAGIC else None

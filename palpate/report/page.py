@@ -108,7 +108,6 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         viewer=Markup((Path(__file__).parent / "templates" / "surface.js").read_text(encoding="utf-8")),
         maps=_image(page_figures.maps(evidence, samples_xy, places, report.abdomen)),
         record=_image(page_figures.record(evidence, None if report.recorded else scenario.limits.force_working_n)),
-        force_depth=_image(page_figures.force_depth(evidence)),
         truth=_image(page_figures.truth(evidence, known_truth(scenario, evidence))),
         of_clean_world=clean_world_note(report),
         version=version("palpate"),

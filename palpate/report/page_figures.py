@@ -22,7 +22,6 @@ from palpate_models.numerics.maps import half_width, level_lines
 from palpate_models.patient.mesh import vertex_normals
 
 MEASURED: Final = "#c2410c"
-TRUE: Final = "#7c3aed"
 LIMIT: Final = "#b91c1c"
 GRID: Final = "#e5e9ec"
 _PHASE_TINTS: Final = {
@@ -140,53 +139,23 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
     return _png(figure)
 
 
-def force_depth(evidence: Evidence) -> bytes | None:
-    """Return force against depth in contact, coloured by time; None without contact."""
-    states = evidence.states
-    held = states.in_contact & (states.depth * 1e3 > SHOWN.least_mm)  # a sensor that is not tared yet reports contact in the air
-    if not held.any():
-        return None
-    figure = _figure(5.6, 4.4)
-    axes = figure.subplots()
-    image = axes.scatter(states.depth[held] * 1e3, states.force[held], c=states.time[held], s=2, cmap="viridis", rasterized=True)
-    plain(axes, "measured normal force [N]", "measured depth [mm]")
-    figures.colour_bar(image, axes, "simulated time [s]")
-    return _png(figure)
-
-
 def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
-    """Return true apparent stiffness with outlines of findings, and the depth error; None if either is unknown."""
+    """Return true apparent stiffness with outlines of findings, and the error of the estimate; None if either is unknown."""
     message = evidence.collected.stiffness_map
     if known is None or message is None or not figures.drawable(message):
         return None
     drawing = figures.Drawing(message, evidence.collected.findings, known)
     if drawing.true is None:
         return None
-    figure = _figure(15.5, 5.0)
-    left, middle, right = figure.subplots(1, 3)
+    figure = _figure(10.4, 5.0)
+    left, right = figure.subplots(1, 2)
     drawing.panel(left, drawing.stiffness_layer(drawing.true), "d", "Apparent stiffness, true", figures.WHERE_FELT, truth=True)
     error = 100 * (drawing.map.apparent / drawing.true - 1)
     reach = float(np.nanquantile(np.abs(error[drawing.map.scanned]), 0.99))
     layer = figures.MapQuantity(error, "RdBu_r", Normalize(-reach, reach), "[%]")
     small = "estimated over true apparent stiffness, minus one"
-    drawing.panel(middle, layer, "e", "Error of the estimate", small, truth=True)
-    _depth_errors(right, evidence)
+    drawing.panel(right, layer, "e", "Error of the estimate", small, truth=True)
     return _png(figure)
-
-
-def _depth_errors(axes: Axes, evidence: Evidence) -> None:
-    states, contacts = evidence.states, evidence.contacts
-    true = np.interp(states.time, contacts.time, contacts.depth)
-    steady = states.steady
-    bins = np.linspace(-0.6, 0.6, 61)
-    for values, color, label in (
-        (true - states.setpoint, TRUE, "true depth minus set-point"),
-        (states.depth - true, MEASURED, "measured minus true depth"),
-    ):
-        axes.hist(np.clip(values[steady] * 1e3, -0.6, 0.6), bins=bins.tolist(), color=color, alpha=0.55, label=label)
-    plain(axes, "readings in steady contact", "depth error [mm]")
-    axes.legend(fontsize=8.5, frameon=False)
-    figures.panel_title(axes, "f", "Error of the depth", "in steady contact")
 
 
 ABOVE_SURFACE_M = np.array((0.0, 0.0, 0.001))

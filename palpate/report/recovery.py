@@ -49,9 +49,9 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
     """
     if archive.completed(folder) is not None:
         raise archive.EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
-    run = archive.interrupted_run(folder)
+    *continued, run = _runs(folder)
     note = ""
-    checkpoint, earlier = _continued(folder.resolve())
+    checkpoint = _reached(continued) if continued else None
     collected, recording = run.collected, run.recording
     if collected.findings is None or not collected.findings.final:
         try:
@@ -71,7 +71,7 @@ def recovered(folder: Path) -> tuple[Scenario, RunResult]:
         sim_time_s=recording.last / NS,
         failure=Failure(code, text + (f"; last: {why}" if why else "") + note, ("conductor",)),
         lost={"conductor": recording.last},
-        earlier=earlier,
+        earlier=tuple(one.collected for one in continued),
     )
 
 
@@ -145,14 +145,6 @@ def _holds_run(folder: Path) -> bool:
         return archive.completed(folder) is not None or archive.interrupted_run(folder) is not None
     except archive.NothingRecordedError:
         return False
-
-
-def _continued(folder: Path) -> tuple[Checkpoint | None, tuple[Collected, ...]]:
-    """Return checkpoint and messages of the runs that the one in `folder` continued; None and () if it continued none."""
-    if folder.name != FOLDER or not (folder.parent / "scenario.yaml").is_file():
-        return None, ()
-    runs = _runs(folder.parent)
-    return _reached(runs), tuple(run.collected for run in runs)
 
 
 @contextmanager

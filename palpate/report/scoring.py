@@ -72,12 +72,10 @@ def score(found: Sequence[FindingRow], found_map: Map | None, truth: Truth, cand
         lump = partner.get(i)
         known = mask & np.isfinite(excess)
         ratio = float(np.exp(np.average(excess[known], weights=felt.cells[known]))) if known.any() else None
-        on_structure, on_guarding = (lump is None and bool((mask & area).any()) for area in (structured, guarded))
-        over = (on_guarding and not on_structure, on_structure)
+        over = bool((mask & guarded).any()), bool((mask & structured).any())
         rows.append(_finding_score(finding, lump, None if lump is None else float(dice[i, lump]), ratio, over, truth))
     matched = [row for row in rows if row.lump is not None]
     palpable = sum(lump.palpable for lump in felt.lumps)
-    held = [row.ratio_held for row in matched]
     coverage, in_lumps, guarding = (None, None, None) if found_map is None else _coverage(found_map, truth)
     return Scores(
         matched=len(matched),
@@ -91,7 +89,7 @@ def score(found: Sequence[FindingRow], found_map: Map | None, truth: Truth, cand
         dice=None if found_map is None else _mean([row.dice for row in matched]),
         size_error=_mean([row.size_error for row in matched]),
         ratio_error=_mean([row.ratio_error for row in matched]),
-        ratio_coverage_90=_mean([None if h is None else float(h) for h in held]),
+        ratio_coverage_90=_mean([row.ratio_held for row in matched]),
         coverage_90=coverage,
         coverage_90_in_lumps=in_lumps,
         coverage_90_on_guarding=guarding,
@@ -146,10 +144,8 @@ def _candidate_scores(candidates: Sequence[FindingRow], taken: set[int], truth: 
         lump = next((int(j) for j in np.flatnonzero(within) if int(j) not in taken), None)
         taken = taken | {lump} if lump is not None else taken
         centroid = truth.touched.places(np.array([candidate.centroid_m[:2]]))
-        on_structure, on_guarding = (
-            lump is None and bool(felt.inside(area, centroid)[0]) for area in (felt.structured, felt.guarded)
-        )
-        rows.append(_finding_score(candidate, lump, None, None, (on_guarding and not on_structure, on_structure), truth))
+        over = bool(felt.inside(felt.guarded, centroid)[0]), bool(felt.inside(felt.structured, centroid)[0])
+        rows.append(_finding_score(candidate, lump, None, None, over, truth))
     return tuple(rows)
 
 
@@ -165,7 +161,7 @@ def _match(found: Sequence[FindingRow], dice: Array, within: Mask) -> dict[int, 
 def _finding_score(
     finding: FindingRow, index: int | None, dice: float | None, true_ratio: float | None, over: tuple[bool, bool], truth: Truth
 ) -> FindingScore:
-    """Return the score of a finding that matches the lump `index`; `over`: it is false on guarding, it is on a structure."""
+    """Return the score of a finding that matches the lump `index`; `over`: it lies on guarding, on a structure."""
     place = absolute = size = None
     if index is not None:
         lump = truth.felt.lumps[index]
@@ -184,8 +180,8 @@ def _finding_score(
         true_ratio=true_ratio,
         ratio_error=None if true_ratio is None else finding.ratio / true_ratio - 1,
         ratio_held=None if true_ratio is None else finding.ratio_90[0] <= true_ratio <= finding.ratio_90[1],
-        on_guarding=over[0],
-        on_structure=over[1],
+        on_guarding=index is None and over == (True, False),
+        on_structure=index is None and over[1],
     )
 
 

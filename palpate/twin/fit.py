@@ -51,18 +51,6 @@ class FitTuning:
     """The body extends this far beyond the presses, in radii of the indenter."""
     surface_sd_m: float = 3e-4
     """SD of a point of the surface."""
-
-
-TUNING: Final = FitTuning()
-
-
-_ROUNDING_M = 1e-6
-
-
-@dataclass(frozen=True)
-class PressLimits:
-    """Bounds on the presses of a recording."""
-
     readings: int = 8
     """Readings of a press at most."""
     slide_steps: int = 4
@@ -74,7 +62,8 @@ class PressLimits:
     """Presses that are fitted at most."""
 
 
-LIMITS: Final = PressLimits()
+TUNING: Final = FitTuning()
+_ROUNDING_M = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,18 +100,18 @@ def presses_of(recording: PalpationRecording) -> list[FittedPress]:
         radius = recording.indenter_radius_m
         presses += [_slid(sample, radius) for sample in recording.samples() if sample.stroke in slides and sample.depth > 0]
     presses = [press for press in presses if press.felt > 0]
-    if len(presses) < LIMITS.least:
-        raise UserError(f"{recording.name}: {len(presses)} presses with a force, at least {LIMITS.least} are needed for a twin")
-    chosen = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), LIMITS.most)).round().astype(int))
+    if len(presses) < TUNING.least:
+        raise UserError(f"{recording.name}: {len(presses)} presses with a force, at least {TUNING.least} are needed for a twin")
+    chosen = np.unique(np.linspace(0, len(presses) - 1, min(len(presses), TUNING.most)).round().astype(int))
     return [presses[k] for k in chosen]
 
 
 def _pressed(touch: Contact) -> FittedPress:
     until = int(np.flatnonzero(touch.depth >= 0.95 * touch.depth.max())[-1]) + 1  # without the retreat
-    chosen = np.unique(np.linspace(0, until - 1, LIMITS.readings).round().astype(int))
+    chosen = np.unique(np.linspace(0, until - 1, TUNING.readings).round().astype(int))
     chosen = chosen[touch.depth[chosen] > 0]
     if touch.time is None:
-        time = np.asarray(LIMITS.probe_step_s * np.arange(1, len(chosen) + 1), dtype=np.float64)
+        time = np.asarray(TUNING.probe_step_s * np.arange(1, len(chosen) + 1), dtype=np.float64)
     else:
         time = touch.time[chosen] - touch.time[0]
         chosen, time = chosen[time > 0], time[time > 0]
@@ -131,7 +120,7 @@ def _pressed(touch: Contact) -> FittedPress:
 
 def _slid(sample: ForceSample, radius: float) -> FittedPress:
     footprint = sqrt(2 * radius * sample.depth)
-    share = np.arange(1, LIMITS.slide_steps + 1) / LIMITS.slide_steps
+    share = np.arange(1, TUNING.slide_steps + 1) / TUNING.slide_steps
     force = np.where(share == 1, sample.force, np.nan)
     speed = max(float(np.linalg.norm(sample.velocity)), footprint)  # a sample at rest lasts a second
     return FittedPress(sample.position, share * footprint / speed, sample.depth * (1 - (1 - share) ** 2), force, True)
