@@ -45,7 +45,7 @@ from palpate_bus.messages.stamps import header, time_message
 from palpate_bus.testing import HandInbox
 from palpate_models.numerics.frames import Array
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import TOOL
+from palpate_models.robot.kinematics import link_transforms
 from palpate_models.scenario.schema import Robot
 
 MS = 1_000_000
@@ -71,21 +71,10 @@ class FakeInbox(HandInbox):
 
 def forward(joints: Array, robot: Robot) -> dict[str, tuple[Array, Rotation]]:
     """Link positions and rotations in world."""
-    position = np.array((*robot.base_xy_m, robot.base_height_m))
-    rotation = Rotation.from_euler("z", robot.base_yaw_rad)
-    poses = {"lbr_link_0": (position, rotation)}
-    for i in range(7):
-        position = position + rotation.apply(lbr.JOINT_ORIGIN[i])
-        rotation = rotation * Rotation.from_rotvec(np.array(lbr.JOINT_AXIS[i]) * joints[i])
-        poses[f"lbr_link_{i + 1}"] = (position, rotation)
-    for link, step in (
-        ("lbr_link_ee", lbr.LINK_7_TO_FLANGE_M),
-        ("ft_sensor", TOOL.flange_to_ft_m),
-        ("indenter", TOOL.ft_to_indenter_m),
-    ):
-        position = position + rotation.apply((0.0, 0.0, step))
-        poses[link] = (position, rotation)
-    return poses
+    X = {"world": np.eye(4)}
+    for parent, link, X_PL in link_transforms(joints, robot):
+        X[link] = X[parent] @ X_PL
+    return {link: (pose[:3, 3], Rotation.from_matrix(pose[:3, :3])) for link, pose in X.items() if link != "world"}
 
 
 def dome(n: int = 55) -> tuple[NDArray[np.float32], NDArray[np.uint32]]:
@@ -123,8 +112,7 @@ def ratio_field(vertices: NDArray[np.float32]) -> Array:
     return np.asarray(1.0 + 3.0 / (1.0 + np.exp(np.minimum((d - 0.03) / 0.003, 50.0))))
 
 
-def latched(scenario_robot: Robot) -> Messages:
-    del scenario_robot
+def latched() -> Messages:
     vertices, triangles = dome()
     ratio = ratio_field(vertices)
     lesion = np.where(ratio > 2.5, 0, -1).astype(np.int32)
@@ -179,21 +167,9 @@ def stiffness_map(t: int, share: float) -> Any:
     mean = (1.7e5 * ratio_field(vertices)).astype(np.float32)
     none = np.full(len(vertices), -1, np.int32)
     return StiffnessMap(
-        header(t, "abdomen"),
-        vertices.ravel(),
-        triangles.ravel(),
-        1e-5 * mean,
-        0.8e-5 * mean,
-        1.2e-5 * mean,
-        1e-5 * mean,
-        mean,
-        scanned,
-        np.where(scanned, 0, 1).astype(np.uint8),
-        none,
-        0.01,
-        1.7,
-        100,
-    )
+        header(t, "abdomen"), vertices.ravel(), triangles.ravel(), 1e-5 * mean, 0.8e-5 * mean, 1.2e-5 * mean, 1e-5 * mean, mean,
+        scanned, np.where(scanned, 0, 1).astype(np.uint8), none, 0.01, 1.7, 100,
+    )  # fmt: skip
 
 
 def findings(t: int) -> Any:
@@ -203,16 +179,8 @@ def findings(t: int) -> Any:
 
 def robot_status(t: int, torque: Array) -> Any:
     """The rest of the message is not drawn."""
-    zero = np.zeros(7)
-    rest = {
-        "position": zero,
-        "velocity": zero,
-        "wrench": Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0)),
-        "applied_torque": torque,
-        "measured_torque": torque,
-        "commands_rejected": 0,
-    }
-    return RobotStatus(header=header(t), mode=1, cause=0, reason="", culprit="", **rest)
+    zero, wrench = np.zeros(7), Wrench(Vector3(0.0, 0.0, 0.0), Vector3(0.0, 0.0, 0.0))
+    return RobotStatus(header(t), 1, 0, "", zero, zero, wrench, torque, 0, "", torque)
 
 
 def exam(t: int, phase: int, message: str, depth: float, force: float, visited: int) -> Any:
@@ -234,7 +202,7 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
     world = rest + X_WA
     for t in range(0, int(seconds * 1000) * MS, step_ms * MS):
         s = t / (seconds * 1e9)
-        new: Messages = latched(robot) if t == 0 else {}
+        new: Messages = latched() if t == 0 else {}
         joints = lbr.HOME + np.array((0.4 * np.sin(6.28 * s), 0.5 * s, 0, 0.2 * s, 0, 0, 0))
         poses = forward(joints, robot)
         pressing = s > 0.3
@@ -263,9 +231,8 @@ def run(seconds: float, robot: Robot, step_ms: int = 50) -> Iterator[tuple[int, 
         if s > 0.95:
             new["assessment/findings"] = findings(t)
         if t % (1000 * MS) == 0:
-            rows = [
-                DiagnosticStatus(0, role, "running", "", [KeyValue("step", "0.1 ms")]) for role in ("robot", "tissue", "control")
-            ]
+            step = [KeyValue("step", "0.1 ms")]
+            rows = [DiagnosticStatus(0, role, "running", "", step) for role in ("robot", "tissue", "control")]
             new["diagnostics"] = DiagnosticArray(header(t), rows)
         yield t, new
 

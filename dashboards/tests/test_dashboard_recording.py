@@ -233,9 +233,8 @@ def test_any_topic_may_be_missing(tmp_path: Path, topic: str) -> None:
 
 
 def test_starting_late_shows_what_is_latched(tmp_path: Path) -> None:
-    robot = Scenario().robot
-    late = [(t, new) for t, new in run(4.0, robot) if t > 2_500_000_000]
-    late[0] = (late[0][0], late[0][1] | latched(robot))
+    late = [(t, new) for t, new in run(4.0, Scenario().robot) if t > 2_500_000_000]
+    late[0] = (late[0][0], late[0][1] | latched())
     draw(tmp_path / FILE, late)
     recording = Recording(tmp_path / FILE)
     assert "/world/truth/lesions" in recording.static

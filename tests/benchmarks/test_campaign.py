@@ -141,18 +141,10 @@ def test_an_end_that_names_no_role_is_bad(tmp_path: Path) -> None:
     assert not judged(watch().finished(failed), tmp_path, "nan", "planning/setpoint").good
 
 
-def found(where: str, detected_ms: float, peak_force_n: float) -> FaultFinding:
-    """Return a run in lockstep that ended because of a killed role."""
-    text = f"{where} lost"
-    return FaultFinding(
-        *("kill", where, "lockstep", 8.0, detected_ms, text, "run ended", 5.0, peak_force_n, CaseOutcome.ENDED, text), named=True
-    )
-
-
 def test_findings_are_read_back_from_their_file() -> None:
-    quoted = replace(found("robot", 33.2, 6.0), sign='robot, "gone"\nat once', peak_force_n=None)
+    killed = FaultFinding("kill", "robot", "lockstep", 8.0, 33.2, 'robot, "gone"\nat once', "run ended", 5.0, named=True)
     hung = FaultFinding("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False)
-    assert from_csv(csv_text([quoted, hung])) == [quoted, hung]
+    assert from_csv(csv_text([killed, hung])) == [killed, hung]
 
 
 def test_a_file_of_other_columns_is_refused() -> None:

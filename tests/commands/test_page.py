@@ -49,7 +49,7 @@ def test_the_page_is_self_contained(page: str) -> None:
     assert not re.search(r'(src|href)="(?!data:)', page)
     assert "@import" not in page
     images = re.findall(r'src="data:image/png;base64,([^"]+)"', page)
-    assert len(images) == 4
+    assert len(images) == 3
     assert all(base64.b64decode(image).startswith(b"\x89PNG") for image in images)
     assert len(page) < 5_000_000
 

@@ -27,18 +27,6 @@ from palpate_models.patient.motion import BodyMotion, Motion
 from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Scenario
 
-REPORT_FIELDS = [
-    *("scenario", "seed", "runtime", "platform", "sim_time_s", "wall_time_s", "real_time_factor", "run_hash", "samples"),
-    *("skipped_targets", "max_force_N", "mean_force_N", "depth_rms_error_m", "surface_rms_error_m"),
-    *("findings", "truth", "scores", "blame"),
-]
-FINDING_FIELDS = ["centroid_m", "quadrant", "area_m2", "ratio", "ratio_90", "confidence"]
-SCORE_FIELDS = [
-    *("matched", "missed", "not_palpable", "false_findings", "on_guarding", "place_error_m", "absolute_error_m", "dice"),
-    *("size_error", "ratio_error", "ratio_coverage_90", "coverage_90", "coverage_90_in_lumps"),
-    *("coverage_90_on_guarding", "findings"),
-]
-
 
 @pytest.fixture(scope="module")
 def scenario() -> Scenario:
@@ -55,12 +43,8 @@ def felt(scenario: Scenario) -> Known:
 def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
     report = write_results(tmp_path, scenario, result(collected()))
     written = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
-    assert set(REPORT_FIELDS) <= set(written)
-    assert set(FINDING_FIELDS) <= set(written["findings"][0])
-    assert set(SCORE_FIELDS) <= set(written["scores"])
     assert Report.model_validate(written) == report
-    assert written["scenario"] == "clean"
-    assert written["seed"] == 3
+    assert (written["scenario"], written["seed"]) == ("clean", 3)
     assert written["findings"][0]["quadrant"] == "RLQ"
     assert written["findings"][0]["centroid_m"][:2] == pytest.approx(FOUND)
     assert written["truth"]["felt"]
