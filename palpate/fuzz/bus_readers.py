@@ -4,7 +4,6 @@ import random
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import partial
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -44,7 +43,7 @@ def _codecs() -> Iterator[FuzzTarget]:
     rules = contract()
     names = sorted({row.type for row in rules.topics.values()} | {row.type for row in rules.internal.values()})
     for name in names:
-        yield FuzzTarget(f"codec:{name}", _codec_check(name), partial(_payloads, name))
+        yield FuzzTarget(f"codec:{name}", _codec_check(name), _payloads(name))
 
 
 def _codec_check(name: str) -> Callable[[bytes], bool]:
@@ -66,8 +65,8 @@ def _codec_check(name: str) -> Callable[[bytes], bool]:
     return check
 
 
-def _payloads(name: str, rng: random.Random) -> list[bytes]:
-    return [random_payload(name, rng) for _ in range(8)]
+def _payloads(name: str) -> Callable[[random.Random], list[bytes]]:
+    return lambda rng: [random_payload(name, rng) for _ in range(8)]
 
 
 def random_payload(name: str, rng: random.Random) -> bytes:

@@ -176,7 +176,8 @@ def assess(service: Service, gathered: Collected) -> dict[str, Any]:
     first, last = (nanoseconds(state.header.stamp) for state in (states[0], states[-1]))
     inbox = _Inbox()
     service.start()
-    for t, topic, messages in ((first, "perception/surface", [gathered.surface]), (last, "exam/state", states)):
+    surface: Any = gathered.surface
+    for t, topic, messages in ((first, "perception/surface", [surface]), (last, "exam/state", list(states))):
         inbox.messages[topic], inbox.events = messages[-1], {topic: messages}
         inbox.stamps[topic] = nanoseconds(messages[-1].header.stamp)
         outbox = service.step(t, inbox)

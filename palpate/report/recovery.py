@@ -5,12 +5,12 @@ A run that continues DIR has its results in DIR/resumed; the continuation of tha
 
 import tempfile
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any, Final
+from typing import Final
 
 import numpy as np
 
@@ -195,11 +195,7 @@ def _extended(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkp
         surface = apply(X_AW, points(c.surface))
         targets = apply(X_AW, np.array([vector(p) for p in c.targets.positions]).reshape(-1, 3))[:, :2]
         wanted = range(len(targets)) if earlier is None else earlier.wanted(targets, run.scenario.exam.spacing_m)
-        left = targets[[i for i in sorted(wanted) if i >= _latest_steady_target(c.exam_states)]]
+        latest = max((int(state.target_index) for state in c.exam_states if state.steady), default=0)  # its stroke starts there
+        left = targets[[i for i in sorted(wanted) if i >= latest]]
     strokes = max((int(state.stroke) for state in c.exam_states), default=0)
     return Checkpoint(columns(assessment.samples, run.recording.last / NS), left, surface, strokes)
-
-
-def _latest_steady_target(exam_states: Iterable[Any]) -> int:
-    """Return the index of the latest target with steady contact. The continuation palpates it again: its stroke starts there."""
-    return max((int(state.target_index) for state in exam_states if state.steady), default=0)

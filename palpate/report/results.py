@@ -112,7 +112,7 @@ def assemble(scenario: Scenario, result: RunResult, known: Known) -> Report:
         depth_rms_error_m=depth.true_against_setpoint_m,
         depth=depth,
         surface_rms_error_m=_surface(scenario, c.surface, known.body),
-        assessed=final is not None and (found is not None or (_has_no_map(c) and len(steady) > 0)),
+        assessed=final is not None and (found is not None or (not c.samples and len(steady) > 0)),  # or one without a map
         prevalence=None if final is None else scenario.exam.prevalence,
         findings=findings,
         candidates=candidates,
@@ -135,11 +135,6 @@ def _unfelt(scenario: Scenario, result: RunResult) -> dict[str, float]:
         lost = {Loss.UNFINISHED: exam.target_count - exam.target_index}
     lost = {Loss.NOT_REACHED: exam.targets_skipped} if lost is None else lost
     return {str(reason): region * count / exam.target_count for reason, count in lost.items() if count}
-
-
-def _has_no_map(c: Collected) -> bool:
-    """Return True if the assessment publishes findings only. The default one publishes samples before its map."""
-    return c.stiffness_map is None and not c.samples
 
 
 def write_results(folder: Path, scenario: Scenario, result: RunResult, recorded: RecordedRow | None = None) -> Report:

@@ -206,7 +206,9 @@ def calibration(variant: Variant, bootstrap: Bootstrap) -> FindingCalibration | 
         expected_error=estimate(error, errors, len(p), "areas"),
         expected_error_by_chance=_by_chance(p, label),
         brier=estimate(float(brier_score_loss(hit, p, labels=[False, True])), squares, len(p), "areas"),
-        bins=tuple(_bin(p[label == i], hit[label == i], patient[label == i], bootstrap) for i in np.unique(label)),
+        bins=tuple(
+            (float(p[b].mean()), bootstrap.share(hit[b], patient[b], "areas")) for b in label == np.unique(label)[:, None]
+        ),
     )
 
 
@@ -215,10 +217,6 @@ def _bins(p: Array) -> NDArray[np.intp]:
     _, first = np.unique(p, return_index=True)
     rank = first[np.searchsorted(p[first], p)]
     return (rank * BINS // len(p)).astype(np.intp)
-
-
-def _bin(p: Array, hit: NDArray[np.bool_], patient: NDArray[np.intp], bootstrap: Bootstrap) -> tuple[float, Estimate]:
-    return float(p.mean()), bootstrap.share(hit, patient, "areas")
 
 
 def _expected_error(p: Array, hit: NDArray[np.bool_], label: NDArray[np.intp], drawn: Array) -> Array:
