@@ -84,7 +84,7 @@ def weigh(case: Case) -> list[Weighed]:
     _, candidates, _ = judged
     logits: Array = calibration.logit(np.array([c.features for c in candidates])) if candidates else np.zeros(0)
     return [
-        Weighed(float(logit), c.signs.features.tolist(), c.log_contrast < 0, cause(c, known))
+        Weighed(float(logit), list(c.signs), c.log_contrast < 0, cause(c, known))
         for c, logit in zip(candidates, logits, strict=True)
     ]
 
