@@ -18,15 +18,7 @@ HEADERS = {
     "plain": ("probe", "x", "y", "z", "fx", "fy", "fz"),
     "german": ("Messpunkt", "Position X (mm)", "Position Y (mm)", "Position Z (mm)", "Kraft X [N]", "Kraft Y [N]", "Kraft Z [N]"),
     "joined": ("Punkt Nr.", "posx", "posy", "posz", "FxN", "FyN", "FzN"),
-    "messages": (
-        "id",
-        "pose.position.x",
-        "pose.position.y",
-        "pose.position.z",
-        "wrench.force.x",
-        "wrench.force.y",
-        "wrench.force.z",
-    ),
+    "messages": ("id", *(f"pose.position.{axis}" for axis in "xyz"), *(f"wrench.force.{axis}" for axis in "xyz")),
     "one force": ("point_id", "tip_x_mm", "tip_y_mm", "tip_z_mm", "torque x", "torque y", "Normalkraft (N)"),
 }
 WRITTEN = {
@@ -39,18 +31,20 @@ WRITTEN = {
 }
 
 
-def probes() -> pd.DataFrame:
-    """Return 36 probes to 3 mm of a flat body, in millimetres, with a stiff place."""
+def probes(names: str = "plain") -> pd.DataFrame:
+    """Return 36 probes to 3 mm of a flat body, in millimetres, with a stiff place; the columns have these names."""
     rng = np.random.default_rng(0)
     x, y, step = (a.ravel() for a in np.meshgrid(np.arange(6) * 5.0, np.arange(6) * 5.0, np.arange(10), indexing="ij"))
     force = (1 + (np.hypot(x - 10, y - 10) < 6)) * (step / 9) ** 1.5 + rng.normal(0, 0.01, len(x))
     side = rng.normal(0, 0.01, (2, len(x)))
-    return pd.DataFrame(np.column_stack((np.repeat(np.arange(36), 10), x, y, -step / 3, *side, force))).astype({0: int})
+    columns = np.column_stack((np.repeat(np.arange(36), 10), x, y, -step / 3, *side, force))
+    return pd.DataFrame(columns).astype({0: int}).set_axis(list(HEADERS[names]), axis=1)
 
 
-@pytest.mark.parametrize("names", HEADERS.values(), ids=HEADERS)
-def test_columns_and_units_are_recognised_by_their_names(names: tuple[str, ...], tmp_path: Path) -> None:
-    probes().set_axis(list(names), axis=1).to_csv(tmp_path / "probes.csv", index=False)
+@pytest.mark.parametrize("writer", HEADERS)
+def test_columns_and_units_are_recognised_by_their_names(writer: str, tmp_path: Path) -> None:
+    names = HEADERS[writer]
+    probes(writer).to_csv(tmp_path / "probes.csv", index=False)
     lines = propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
     mapping = read_mapping(tmp_path / "mapping.yaml")
     assert mapping.table is not None
@@ -64,7 +58,7 @@ def test_columns_and_units_are_recognised_by_their_names(names: tuple[str, ...],
 
 
 def test_probes_may_have_names_and_yaml_takes_on_for_true(tmp_path: Path) -> None:
-    table = probes().set_axis(list(HEADERS["plain"]), axis=1)
+    table = probes()
     table.assign(probe="P" + table.probe.astype(str), **{name: -table[name] for name in ("fx", "fy", "fz")}).to_csv(
         tmp_path / "probes.csv", index=False
     )
@@ -78,7 +72,7 @@ def test_probes_may_have_names_and_yaml_takes_on_for_true(tmp_path: Path) -> Non
 
 
 def test_forces_that_may_be_in_kgf_are_named(tmp_path: Path) -> None:
-    table = probes().set_axis(list(HEADERS["plain"]), axis=1)
+    table = probes()
     for scale, printed in ((1.0, False), (1 / 9.80665, True)):
         table.assign(**{name: scale * table[name] for name in ("fx", "fy", "fz")}).to_csv(tmp_path / "probes.csv", index=False)
         lines = propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
@@ -87,13 +81,13 @@ def test_forces_that_may_be_in_kgf_are_named(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("written", WRITTEN.values(), ids=WRITTEN)
 def test_tables_of_any_separator_are_read(written: dict[str, str], tmp_path: Path) -> None:
-    table = probes().set_axis(list(HEADERS["plain"]), axis=1)
+    table = probes()
     table.to_csv(tmp_path / "probes.csv", index=False, **written)
     pd.testing.assert_frame_equal(read_table(tmp_path / "probes.csv"), table, check_dtype=False)
 
 
 def test_a_separator_at_the_end_of_each_row_moves_no_column(tmp_path: Path) -> None:
-    table = probes().set_axis(list(HEADERS["plain"]), axis=1)
+    table = probes()
     table.to_csv(tmp_path / "probes.csv", index=False, lineterminator=",\n")
     text = (tmp_path / "probes.csv").read_text()
     (tmp_path / "probes.csv").write_text(text.replace("fz,\n", "fz\n"))
@@ -101,7 +95,7 @@ def test_a_separator_at_the_end_of_each_row_moves_no_column(tmp_path: Path) -> N
 
 
 def test_a_recording_without_a_map_has_a_report_and_status_2(tmp_path: Path) -> None:
-    probes().set_axis(list(HEADERS["plain"]), axis=1).iloc[:20].to_csv(tmp_path / "probes.csv", index=False)
+    probes().iloc[:20].to_csv(tmp_path / "probes.csv", index=False)
     propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
     table, mapping, out = (str(tmp_path / name) for name in ("probes.csv", "mapping.yaml", "results"))
     called = CliRunner().invoke(app_for("assess"), ["assess", table, "--mapping", mapping, "--out", out])
@@ -112,13 +106,13 @@ def test_a_recording_without_a_map_has_a_report_and_status_2(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("rows", [0, 1], ids=["header", "one row"])
 def test_too_few_rows_are_one_line(rows: int, tmp_path: Path) -> None:
-    probes().set_axis(list(HEADERS["plain"]), axis=1).iloc[:rows].to_csv(tmp_path / "probes.csv", index=False)
+    probes().iloc[:rows].to_csv(tmp_path / "probes.csv", index=False)
     with pytest.raises(UserError, match=r"no numbers|1 usable rows"):
         propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")
 
 
 def test_an_orientation_in_degrees_is_no_quaternion(tmp_path: Path) -> None:
-    table = probes().set_axis(list(HEADERS["plain"]), axis=1).assign(q0=90.0, q1=0.0, q2=10.0, q3=0.0)
+    table = probes().assign(q0=90.0, q1=0.0, q2=10.0, q3=0.0)
     table.to_csv(tmp_path / "probes.csv", index=False)
     with pytest.raises(UserError, match=r"norm is 90\.6"):
         propose(tmp_path / "probes.csv", tmp_path / "mapping.yaml")

@@ -1,5 +1,6 @@
 """The service, driven by states of a sphere that slides over the real tissue, and whole scans on a few seeds."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -14,6 +15,7 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, StiffnessMap, SurfaceMesh, SurfaceMotion, Vector3
 from palpate_bus.messages.codec import encode
 from palpate_bus.messages.stamps import header, nanoseconds
+from palpate_bus.service import Outbox
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam, Scenario
@@ -83,20 +85,23 @@ def test_the_same_states_give_the_same_bytes(small: Scan, examined: Examined) ->
         assert encode(a, types[name].type) == encode(b, types[name].type)
 
 
+def played(service: AssessmentService, states: Sequence[Any], surface: Any = None) -> list[tuple[int, Outbox]]:
+    """Times and messages of steps with a state each; `surface` comes with the first."""
+    steps = []
+    for state in states:
+        t = nanoseconds(state.header.stamp)
+        steps.append((t, service.step(t, StepInbox({"exam/state": [state], "perception/surface": [surface] if surface else []}))))
+        surface = None
+    return steps
+
+
 def test_maps_grow_and_the_findings_come_once(small: Scan) -> None:
     service = AssessmentService(exam_input(small.scenario))
-    stamps, finals = [], 0
-    surface = [small.surface]
-    for state in [*small.states, small.states[-1], small.states[-1]]:
-        t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        outbox = service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
-        surface = []
-        if "assessment/map" in outbox:
-            stamps.append(t)
-        finals += "assessment/findings" in outbox
+    steps = played(service, [*small.states, small.states[-1], small.states[-1]], small.surface)
+    stamps = [t for t, outbox in steps if "assessment/map" in outbox]
     assert len(stamps) >= 5
     assert np.diff(stamps[:-1]).min() >= MAP.growing_period_ns  # the last map is the final one
-    assert finals == 1
+    assert sum("assessment/findings" in outbox for _, outbox in steps) == 1
 
 
 def test_an_examination_without_samples_ends_with_no_findings(small: Scan) -> None:
@@ -109,12 +114,7 @@ def test_an_examination_without_samples_ends_with_no_findings(small: Scan) -> No
 
 def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> None:
     service = AssessmentService(exam_input(small.scenario))
-    half = small.states[: len(small.states) // 2]
-    surface = [small.surface]
-    for state in half:
-        t = state.header.stamp.sec * 1_000_000_000 + state.header.stamp.nanosec
-        service.step(t, StepInbox({"exam/state": [state], "perception/surface": surface}))
-        surface = []
+    played(service, small.states[: len(small.states) // 2], small.surface)
     last = small.states[-1]
     aborted = ExamState(**{**vars(last), "phase": ExamState.PHASE_ABORTED})
     outbox = service.step(60_000_000_000, StepInbox({"exam/state": [aborted]}))
@@ -124,18 +124,14 @@ def test_an_aborted_examination_is_assessed_as_far_as_it_came(small: Scan) -> No
 
 def test_what_was_felt_while_a_patient_moved_is_forgotten(small: Scan) -> None:
     service = AssessmentService(exam_input(small.scenario))
-    for state in small.states[: len(small.states) // 2]:
-        service.step(nanoseconds(state.header.stamp), StepInbox({"exam/state": [state], "perception/surface": []}))
+    half = len(small.states) // 2
+    played(service, small.states[:half])
     before = service.finish()["samples"]
-    last = small.states[len(small.states) // 2]
-    moved = ExamState(**{**vars(last), "patient_moved": True})
-    for _ in range(2):
-        service.step(nanoseconds(last.header.stamp), StepInbox({"exam/state": [moved]}))
+    moved = [ExamState(**{**vars(state), "patient_moved": True}) for state in small.states[half:]]
+    played(service, [moved[0], moved[0]])
     after = service.finish()["samples"]
     assert 0 < after < before
-    for state in small.states[len(small.states) // 2 :]:
-        still = ExamState(**{**vars(state), "patient_moved": True})
-        service.step(nanoseconds(state.header.stamp), StepInbox({"exam/state": [still]}))
+    played(service, moved)
     assert service.finish()["samples"] == after
 
 
