@@ -28,30 +28,22 @@ GRID: Final = "twin.csv"
 
 
 @dataclass(frozen=True)
-class ElasticPresses:
-    """Presses from which the elastic twin is made."""
+class TwinTuning:
+    """Presses of the elastic twin, and findings that become lumps."""
 
     presses: int = 20
     """Presses from which the scale of Young's modulus is found."""
     steps: int = 8
     """Time steps of such a press: it goes down during the first half."""
-
-
-ELASTIC: Final = ElasticPresses()
-
-
-@dataclass(frozen=True)
-class LumpLimits:
-    """Findings that become lumps of the twin."""
-
     least_radius_m: float = 0.002
+    """Least radius of a lump."""
     ring: float = 2.0
     """The surroundings of a finding reach this many of its radii."""
     least: float = 1.05
     """Least change of the modulus, up or down."""
 
 
-LUMPS: Final = LumpLimits()
+TUNING: Final = TwinTuning()
 
 
 @dataclass(frozen=True)
@@ -114,14 +106,14 @@ def _lumps(vertices: Array, finding: NDArray[np.int32], wall: FittedWall) -> lis
         if not len(inside):
             continue
         x, y = inside.mean(axis=0).tolist()
-        a, b = np.maximum(2 * inside.std(axis=0), LUMPS.least_radius_m).tolist()  # of a uniform ellipse
+        a, b = np.maximum(2 * inside.std(axis=0), TUNING.least_radius_m).tolist()  # of a uniform ellipse
         away = np.linalg.norm((nodes - (x, y)) / (a, b), axis=1)
         k_w = wall.grid.k_w_n_per_m3
-        ring = (away > 1) & (away <= LUMPS.ring)
+        ring = (away > 1) & (away <= TUNING.ring)
         if not ring.any():
             continue
         contrast = float(np.clip(np.median(k_w[away <= 1]) / np.median(k_w[ring]), 0.1, 20))
-        if max(contrast, 1 / contrast) >= LUMPS.least:
+        if max(contrast, 1 / contrast) >= TUNING.least:
             lumps.append(Lesion(centre_m=(x, y), radii_m=(a, b), contrast=contrast, edge_m=min(0.008, a, b)))
     return lumps
 
@@ -161,15 +153,15 @@ def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array
     service = elastic_service(scenario)
     assert isinstance(service, TissueService)
     fitted = np.flatnonzero(~wall.held_out)
-    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // ELASTIC.presses)]]
-    step = float(np.median([press.time[-1] for press in presses])) / ELASTIC.steps
+    presses = [wall.presses[k] for k in fitted[:: max(1, len(fitted) // TUNING.presses)]]
+    step = float(np.median([press.time[-1] for press in presses])) / TUNING.steps
     tissue = service.backend.in_steps_of(step)
     expected = []
     for press, place, normal in zip(presses, *skin_at(tissue.model, presses), strict=True):
         tissue.settle()
         depth = press.depth.max() + wall.onset_m
-        for k in range(1, ELASTIC.steps + 1):
-            centre = place + (radius - depth * min(1.0, 2 * k / ELASTIC.steps)) * normal
+        for k in range(1, TUNING.steps + 1):
+            centre = place + (radius - depth * min(1.0, 2 * k / TUNING.steps)) * normal
             force, _ = tissue.step(k * step, centre, np.zeros(3), radius)
         expected.append(float(force @ normal))
     return np.array([press.felt for press in presses]), np.array(expected)
