@@ -86,7 +86,6 @@ DISTRIBUTION = {
     "PIL": "pillow",
     "markupsafe": "jinja2",
     "pinocchio": "pin",
-    "pydantic_settings": "pydantic-settings",
     "rerun": "rerun-sdk",
     "sklearn": "scikit-learn",
     "stable_baselines3": "stable-baselines3",

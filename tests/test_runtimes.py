@@ -3,6 +3,7 @@
 A forged sender is distinguished from a lost service, and has no effect if the run has a key.
 """
 
+import os
 import signal
 import socket
 import subprocess
@@ -100,7 +101,7 @@ def test_all_roles_of_a_frozen_process_are_lost_and_reported_once() -> None:
 
     def freeze(running: Running) -> None:
         if at(running, 0.3, done):
-            running.processes["planning"].send_signal(signal.SIGSTOP)
+            os.kill(running.processes["planning"].pid, signal.SIGSTOP)
         reported.extend(text for text in running.conductor.result.trouble if text not in reported)
 
     patience = Patience(soft=0.5, hard=60.0, frozen=1.0)

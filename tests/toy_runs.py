@@ -1,18 +1,19 @@
 """Runs of the toy services in real processes over zenoh, placed on processes in any way."""
 
+import multiprocessing
 import os
-import subprocess
+import runpy
 import sys
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
+from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from unittest import mock
 
 import zenoh
 
-from palpate.run.forks import Forked, Forks
 from palpate_bus.contract import contract
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.composed import Composed
@@ -26,8 +27,9 @@ sys.path.insert(0, str(Path(__file__).parents[1] / "bus" / "tests"))
 import toy_services
 
 TOYS = toy_services.__name__
-FORKS = Forks(["palpate_bus.run"])
+FORKS = multiprocessing.get_context("forkserver")
 """Processes of the toy services, which import their libraries once."""
+FORKS.set_forkserver_preload(["palpate_bus.run"])
 ROLES = tuple(toy_services.TOYS)
 LOOP = ("robot", "tissue", "control")
 
@@ -41,11 +43,31 @@ APART = tuple((role,) for role in ROLES)
 LOOP_APART = with_own_process(("robot",), ("tissue",), ("control",))
 
 
+def become_toys(words: Sequence[str], environment: Mapping[str, str]) -> None:
+    """Be the process of the toy services with these arguments and this environment."""
+    os.setpgid(0, 0)
+    os.environ.clear()
+    os.environ.update(environment)
+    contract.cache_clear()  # the fork server may have read it for another run
+    null = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(null, sys.stdout.fileno())
+    os.dup2(null, sys.stderr.fileno())
+    sys.argv = [TOYS, *words]
+    runpy.run_module(TOYS, run_name="__main__", alter_sys=True)
+
+
+def started(words: Sequence[str], environment: Mapping[str, str]) -> ForkServerProcess:
+    """Start a process of the toy services."""
+    process = FORKS.Process(target=become_toys, args=(tuple(words), dict(environment)), daemon=True)
+    process.start()
+    return process
+
+
 @dataclass
 class Running:
     """A toy run in progress."""
 
-    processes: dict[str, Forked]
+    processes: dict[str, ForkServerProcess]
     session: zenoh.Session
     conductor: Conductor
 
@@ -84,30 +106,23 @@ def run_toys(
             "PALPATE_ABSENT": ",".join(name for name in contract().roles if contract().roles[name].optional),
             "PALPATE_RUNTIME": "wallclock" if wallclock else "lockstep",
         }
-        started = {
-            group: FORKS.start(
-                (sys.executable, "-m", TOYS, ",".join(group), *(faults or {}).get(group[0], ())),
-                {**base, **bus[group[0]].to_env()},
-                Path(os.devnull),
-            )
-            for group in groups
-        }
-        processes = {role: child for group, child in started.items() for role in group}
+        processes: dict[str, ForkServerProcess] = {}
+        for group in groups:
+            words = (",".join(group), *(faults or {}).get(group[0], ()))
+            processes |= dict.fromkeys(group, started(words, {**base, **bus[group[0]].to_env()}))
         conductor = Conductor(session, contract(), 0, ROLES, Collector(), patience, Timing(wallclock=wallclock))
         running = Running(processes, session, conductor)
 
         def exited() -> dict[str, str]:
-            return {role: f"status {code}" for role, child in processes.items() if (code := child.poll()) is not None}
+            return {role: f"status {code}" for role, child in processes.items() if (code := child.exitcode) is not None}
 
         try:
             return conductor.run(exited, lambda _: meddle(running))
         finally:
             for child in processes.values():
-                try:
-                    child.wait(timeout=3)
-                except subprocess.TimeoutExpired:
-                    child.kill()
-                    child.wait()
+                child.join(timeout=3)
+                child.kill()
+                child.join()
             close_session(session)
 
 

@@ -1,7 +1,7 @@
 """Short examinations with a fault from outside: in a process, in messages, in the conductor, in the machine.
 
 `strike` starts a conductor as a process of its own, which may be hit as well, injects the fault when it says so, and returns what
-it saw. The conductor forks the other processes, prints their process ids, and prints a line when the fault is due.
+it saw. The conductor starts the other processes, prints their process ids, and prints a line when the fault is due.
 """
 
 import os
@@ -21,14 +21,12 @@ import psutil
 from pydantic import TypeAdapter
 
 from palpate.environment import FIXED
-from palpate.run.forks import Forks
 from palpate.run.group import Groups, one_per_process
 from palpate.run.options import Record
 from palpate.run.processes import LocalProcesses, SecureBus, compose_file, read_processes
-from palpate.run.roles import WORKERS, choice, write_scenario_files
+from palpate.run.roles import WORKERS, write_scenario_files
 from palpate.run.self_test import RATES, TEST, measure
 from palpate_benchmarks.fault_cases import LIMITS, CaseOutcome
-from palpate_bus import implementations
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS
 from palpate_bus.runtime.failure import FailureCode
@@ -313,11 +311,10 @@ def serve() -> None:
 def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
     roles = tuple(role for group in run.groups for role in group)
     scenario = load_scenario("clean", SETTINGS)
-    forks = Forks(implementations.kind(role).entry_point(choice(scenario, role)).module for role in WORKERS)
     timing = Timing(run.wallclock, rate=run.rate)
     record: Record = "full" if "recorder" in roles else "none"
     files = write_scenario_files(scenario, run.folder)
-    local = LocalProcesses(run.groups, run.folder, files, timing, record=record, secure=secure, forks=forks)
+    local = LocalProcesses(run.groups, run.folder, files, timing, record=record, secure=secure)
     session = open_session(local.bus[CONDUCTOR])
     processes = read_processes(compose_file(), roles)
     if run.faulty:

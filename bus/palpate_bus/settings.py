@@ -10,13 +10,12 @@ No other module reads PALPATE_ variables. The scenario, not the settings, says w
 import os
 import types
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Any, Literal, Self
 
-from pydantic import Field, ValidationError, field_validator
-from pydantic_settings import BaseSettings, NoDecode, SettingsConfigDict
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, ValidationInfo, field_validator
 
 from palpate_errors import UserError
 from palpate_inputs import Bounds
@@ -50,116 +49,85 @@ class BusConfigError(UserError):
     """An invalid setting, or a bus that cannot be joined. Names the variable, its value and what is allowed."""
 
 
-class Settings(BaseSettings):
+class Settings(BaseModel):
     """Settings of a process. Each field is an environment variable: `listen` is PALPATE_LISTEN, `domain` is ROS_DOMAIN_ID.
 
     An empty variable counts as unset.
     """
 
-    model_config = SettingsConfigDict(
-        env_prefix=PREFIX, env_ignore_empty=True, extra="ignore", frozen=True, populate_by_name=True, validate_default=False
-    )
+    model_config = ConfigDict(frozen=True, use_attribute_docstrings=True)
 
-    listen: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="Endpoints to listen on, separated by commas, such as `tcp/127.0.0.1:7501`."
-    )
-    connect: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="Endpoints of peers, separated by commas. A peer that does not answer yet is tried again."
-    )
-    router: str | None = Field(
-        default=None,
-        description="Endpoint of a router, such as `tcp/host:7447`. Peers find each other through it, then talk directly.",
-    )
-    mode: Literal["peer", "client", "router"] = Field(
-        default="peer",
-        description="A `client` sends everything through the router: in secure mode, or behind address translation.",
-    )
-    lowlatency: bool = Field(
-        default=False, description="Offer zenoh's low-latency transport. `palpate run` sets it; no effect in wall-clock mode."
-    )
-    shared_memory: bool = Field(
-        default=True, description="Send messages over 3 KiB to processes on the same host by shared memory."
-    )
-    tls: Path | None = Field(
-        default=None,
-        description="Folder with `ca.pem`, `cert.pem` and `key.pem` (`palpate keys init`). Endpoints: `tls/host:port`.",
-    )
-    key: Path | None = Field(
-        default=None,
-        description="File with the run's key, mode 0600. Topics marked as tagged in the contract carry a tag; "
-        "messages without a valid tag are dropped.",
-    )
-    tags: bool | None = Field(
-        default=None, description="Tags on messages (default: on). Off, an operator's release and end still need one."
-    )
-    zenoh_config: Path | None = Field(
-        default=None, description="A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect."
-    )
-    domain: int = Field(default=0, ge=0, le=DOMAIN_MAX, validation_alias="ROS_DOMAIN_ID", description="ROS domain.")
-    runtime: Literal["lockstep", "wallclock"] = Field(
-        default="lockstep", description="Runtime of the services: `lockstep` or `wallclock`."
-    )
-    rate: float | None = Field(
-        default=None,
-        gt=0,
-        le=1,
-        description="Wall-clock mode: simulated seconds per second, the same for all processes. "
-        "`palpate run` measures a sustainable rate.",
-    )
-    scenario: Path | None = Field(default=None, description="Scenario file of a service, as written by `palpate prepare`.")
-    checkpoint: Path | None = Field(
-        default=None,
-        description="Checkpoint of an interrupted examination that this run resumes; written by `palpate run --resume`.",
-    )
-    out: Path | None = Field(default=None, description="Results folder of the run, for services that write files.")
-    record: Literal["none", "normal", "full"] = Field(
-        default="none",
-        description="Recorded messages. `full`: all. `normal`: topics with `record_ms` in the contract are reduced "
-        "to one message in that time, about a fifth of the bytes. `none`: no recorder.",
-    )
-    record_file_mb: int | None = Field(default=None, ge=1, description="Size [MB] at which the recorder starts a new file.")
-    viewer: str | None = Field(
-        default=None, description="Live view of the dashboard: `serve`, `serve:PORT`, `connect` or `connect:URL`."
-    )
-    periods: Annotated[dict[str, int], NoDecode] = Field(
-        default={}, description="Changed periods of roles [ms], such as `control=5`, separated by commas, for experiments."
-    )
-    absent: Annotated[tuple[str, ...], NoDecode] = Field(
-        default=(), description="Optional roles of the contract that do not take part in the run, separated by commas."
-    )
-    step_limit_s: float = Field(
-        default=10.0,
-        gt=0,
-        description="Lockstep: time [s] that a step of a foreign service may take: a file, an FMU, a plug-in of another package.",
-    )
-    start_limit_s: float = Field(
-        default=120.0, gt=0, description="Lockstep: time [s] that a foreign service may take to load and to initialise."
-    )
-    runs: Path | None = Field(
-        default=None, description="Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`."
-    )
-    compose: Annotated[tuple[Path, ...], NoDecode] = Field(
-        default=(), description="Compose file of `palpate run` and its overrides, separated by colons."
-    )
-    fmu: Path | None = Field(default=None, description="The FMU that implements this service.")
-    fmu_map: Path | None = Field(default=None, description="File that maps the FMU's variables to topics.")
+    listen: tuple[str, ...] = ()
+    """Endpoints to listen on, separated by commas, such as `tcp/127.0.0.1:7501`."""
+    connect: tuple[str, ...] = ()
+    """Endpoints of peers, separated by commas. A peer that does not answer yet is tried again."""
+    router: str | None = None
+    """Endpoint of a router, such as `tcp/host:7447`. Peers find each other through it, then talk directly."""
+    mode: Literal["peer", "client", "router"] = "peer"
+    """A `client` sends everything through the router: in secure mode, or behind address translation."""
+    lowlatency: bool = False
+    """Offer zenoh's low-latency transport. `palpate run` sets it; no effect in wall-clock mode."""
+    shared_memory: bool = True
+    """Send messages over 3 KiB to processes on the same host by shared memory."""
+    tls: Path | None = None
+    """Folder with `ca.pem`, `cert.pem` and `key.pem` (`palpate keys init`). Endpoints: `tls/host:port`."""
+    key: Path | None = None
+    """File with the run's key, mode 0600. Topics marked as tagged in the contract carry a tag; messages without a valid tag are
+    dropped."""
+    tags: bool | None = None
+    """Tags on messages (default: on). Off, an operator's release and end still need one."""
+    zenoh_config: Path | None = None
+    """A zenoh configuration file (JSON5), used unchanged. The settings above then have no effect."""
+    domain: int = Field(default=0, ge=0, le=DOMAIN_MAX)
+    """ROS domain."""
+    runtime: Literal["lockstep", "wallclock"] = "lockstep"
+    """Runtime of the services: `lockstep` or `wallclock`."""
+    rate: float | None = Field(default=None, gt=0, le=1)
+    """Wall-clock mode: simulated seconds per second, the same for all processes. `palpate run` measures a sustainable rate."""
+    scenario: Path | None = None
+    """Scenario file of a service, as written by `palpate prepare`."""
+    checkpoint: Path | None = None
+    """Checkpoint of an interrupted examination that this run resumes; written by `palpate run --resume`."""
+    out: Path | None = None
+    """Results folder of the run, for services that write files."""
+    record: Literal["none", "normal", "full"] = "none"
+    """Recorded messages. `full`: all. `normal`: topics with `record_ms` in the contract are reduced to one message in that time,
+    about a fifth of the bytes. `none`: no recorder."""
+    record_file_mb: int | None = Field(default=None, ge=1)
+    """Size [MB] at which the recorder starts a new file."""
+    viewer: str | None = None
+    """Live view of the dashboard: `serve`, `serve:PORT`, `connect` or `connect:URL`."""
+    periods: dict[str, int] = {}
+    """Changed periods of roles [ms], such as `control=5`, separated by commas, for experiments."""
+    absent: tuple[str, ...] = ()
+    """Optional roles of the contract that do not take part in the run, separated by commas."""
+    step_limit_s: float = Field(default=10.0, gt=0)
+    """Lockstep: time [s] that a step of a foreign service may take: a file, an FMU, a plug-in of another package."""
+    start_limit_s: float = Field(default=120.0, gt=0)
+    """Lockstep: time [s] that a foreign service may take to load and to initialise."""
+    runs: Path | None = None
+    """Folder of run announcements; default `$XDG_RUNTIME_DIR/palpate`, else `/tmp/palpate-<uid>`."""
+    compose: tuple[Path, ...] = ()
+    """Compose file of `palpate run` and its overrides, separated by colons."""
+    fmu: Path | None = None
+    """The FMU that implements this service."""
+    fmu_map: Path | None = None
+    """File that maps the FMU's variables to topics."""
     bounds: str = Field(
         default="",
         description="Bounds of files and texts from outside, such as `text_kb=1024,chunk_mb=128`, separated by commas: "
         + ", ".join(f"`{field.name}` ({field.default})" for field in fields(Bounds))
         + ".",
     )
-    log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = Field(default="INFO", description="Log level of a service.")
+    log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
+    """Log level of a service."""
 
-    @field_validator("listen", "connect", "absent", mode="before")
+    @field_validator("listen", "connect", "absent", "compose", mode="before")
     @classmethod
-    def _endpoints(cls, value: Any) -> Any:
-        return _split(value, ",")
-
-    @field_validator("compose", mode="before")
-    @classmethod
-    def _files(cls, value: Any) -> Any:
-        return _split(value, os.pathsep)
+    def _parts(cls, value: Any, info: ValidationInfo) -> Any:
+        if not isinstance(value, str):
+            return value
+        return [part.strip() for part in value.split(os.pathsep if info.field_name == "compose" else ",") if part.strip()]
 
     @field_validator("periods", mode="before")
     @classmethod
@@ -184,17 +152,14 @@ class Settings(BaseSettings):
 
         Raises BusConfigError that names each invalid variable, its value and what is allowed.
         """
-        if environ is None:
-            return cls._checked(cls)
-        values = {name: environ[variable(name)] for name in cls.model_fields if environ.get(variable(name))}
-        return cls._checked(lambda: cls(**(cls._defaults() | values)))
+        given = os.environ if environ is None else environ
+        return cls._checked({name: given[variable(name)] for name in cls.model_fields if given.get(variable(name))})
 
     def replaced(self, **changes: Any) -> Self:
         """Return a copy with some fields changed. Raises BusConfigError."""
         if unknown := changes.keys() - type(self).model_fields.keys():
             raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
-        values = {name: getattr(self, name) for name in type(self).model_fields}
-        return self._checked(lambda: type(self)(**(values | changes)))
+        return self._checked(dict(self) | changes)
 
     def required(self, name: str, why: str) -> Any:
         """Return the value of a setting that this process needs. Raises BusConfigError, with `why`, if it is not set."""
@@ -205,28 +170,19 @@ class Settings(BaseSettings):
 
     def to_env(self) -> dict[str, str]:
         """Return the environment variables of these settings. Unset ones are empty, to override inherited values."""
-        return {variable(name): text(getattr(self, name)) for name in type(self).model_fields}
+        return {variable(name): text(value) for name, value in self}
 
     @classmethod
-    def _defaults(cls) -> dict[str, Any]:
-        return {name: field.get_default() for name, field in cls.model_fields.items()}
-
-    @classmethod
-    def _checked(cls, make: Callable[[], Self]) -> Self:
+    def _checked(cls, values: Mapping[str, Any]) -> Self:
         try:
-            return make()
+            return cls.model_validate(values)
         except ValidationError as error:
-            raise BusConfigError("; ".join(_complaint(cls, problem) for problem in error.errors())) from None
+            raise BusConfigError("; ".join(map(_complaint, error.errors()))) from None
 
 
 def variable(name: str) -> str:
     """Return the environment variable of a field of `Settings`."""
-    alias = Settings.model_fields[name].validation_alias
-    return alias if isinstance(alias, str) else PREFIX + name.upper()
-
-
-def _split(value: Any, separator: str) -> Any:
-    return tuple(part.strip() for part in value.split(separator) if part.strip()) if isinstance(value, str) else value
+    return "ROS_DOMAIN_ID" if name == "domain" else PREFIX + name.upper()
 
 
 def text(value: Any) -> str:
@@ -244,10 +200,9 @@ def text(value: Any) -> str:
             return str(value)
 
 
-def _complaint(settings: type[Settings], error: Any) -> str:
+def _complaint(error: Any) -> str:
     """Return an error of pydantic as text: variable, value, allowed values."""
-    place = str(error["loc"][0])
-    name = next((name for name in settings.model_fields if place in (name, variable(name))), place)
+    name = str(error["loc"][0])
     problem = error["msg"].removeprefix("Value error, ") + "; " if error["type"] == "value_error" else ""
     return f"{variable(name)} is {error['input']!r}; {problem}allowed: {allowed(name)}"
 
@@ -255,18 +210,13 @@ def _complaint(settings: type[Settings], error: Any) -> str:
 def allowed(name: str) -> str:
     """Return the allowed values of a setting as text."""
     field = Settings.model_fields[name]
-    kinds = [field.annotation]
-    if isinstance(field.annotation, types.UnionType):
-        kinds = [kind for kind in typing.get_args(field.annotation) if kind is not type(None)]
-    if typing.get_origin(kinds[0]) is Literal:
-        return ", ".join(typing.get_args(kinds[0]))
-    if kinds[0] is int:
-        bounds = {bound: getattr(rule, bound) for rule in field.metadata for bound in ("ge", "le") if hasattr(rule, bound)}
-        return f"{bounds['ge']} to {bounds['le']}" if "le" in bounds else f"a whole number from {bounds['ge']}"
-    if typing.get_origin(kinds[0]) is dict:
-        return "ROLE=MILLISECONDS, ..."
-    if typing.get_origin(kinds[0]) is tuple:
-        return "roles" if name == "absent" else "files" if Path in typing.get_args(kinds[0]) else "endpoints"
-    most = "".join(f", up to {rule.le:g}" for rule in field.metadata if hasattr(rule, "le"))
-    words: dict[Any, str] = {bool: "0, 1", Path: "a path", float: f"a number above 0{most}"}
-    return "NAME=NUMBER, ..." if name == "bounds" else words.get(kinds[0], "text")
+    kind = typing.get_args(field.annotation)[0] if isinstance(field.annotation, types.UnionType) else field.annotation
+    rules = {bound: getattr(rule, bound) for rule in field.metadata for bound in ("ge", "le") if hasattr(rule, bound)}
+    if typing.get_origin(kind) is Literal:
+        return ", ".join(typing.get_args(kind))
+    if kind is int:
+        return f"{rules['ge']} to {rules['le']}" if "le" in rules else f"a whole number from {rules['ge']}"
+    most = f", up to {rules['le']:g}" if "le" in rules else ""
+    listed = {"periods": "ROLE=MILLISECONDS, ...", "bounds": "NAME=NUMBER, ...", "absent": "roles", "compose": "files"}
+    words: dict[Any, str] = {bool: "0, 1", Path: "a path", float: f"a number above 0{most}", tuple[str, ...]: "endpoints"}
+    return listed.get(name) or words.get(kind, "text")

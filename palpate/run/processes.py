@@ -17,7 +17,6 @@ from typing import IO, Any, Self
 
 from palpate.apart import ended
 from palpate.environment import FIXED, given
-from palpate.run.forks import Child, Forks
 from palpate.run.group import GroupMember, Groups, group_command
 from palpate.run.options import Record
 from palpate.service import command as service_command
@@ -194,7 +193,6 @@ class LocalProcesses:
         timing: Timing,
         record: Record = "none",
         secure: SecureBus | None = None,
-        forks: Forks | None = None,
     ) -> None:
         """Prepare the processes.
 
@@ -205,13 +203,11 @@ class LocalProcesses:
             timing: how time passes.
             record: what the run's recorder keeps.
             secure: router of which all processes are clients.
-            forks: starts the processes instead of a new interpreter each.
         """
         settings = Settings.read()
         taking_part = {role for group in groups for role in group}
         absent = tuple(name for name, role in contract().roles.items() if role.optional and name not in taking_part)
         self._given: dict[str, Any] = {"runtime": timing.runtime, "record": record, "absent": absent}
-        self._forks = forks
         self._out = out
         remove_leftovers()
         self._own = RunFolder()
@@ -247,7 +243,7 @@ class LocalProcesses:
             )
         )
         self._logs: list[IO[bytes]] = []
-        self.running: dict[str, Child] = {}
+        self.running: dict[str, subprocess.Popen[bytes]] = {}
         """By role; roles of one group share a process."""
         self._log_files: dict[str, Path] = {}
         self._ends: dict[str, str] = {}
@@ -296,9 +292,7 @@ class LocalProcesses:
             members[process.role] = GroupMember(process.shared_words(), own)
         return group_command(self.folder / f"{processes[0].role}.json", members), common
 
-    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Child:
-        if self._forks is not None:
-            return self._forks.start(command, environment, path)
+    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> subprocess.Popen[bytes]:
         log = path.open("wb")
         self._logs.append(log)
         return subprocess.Popen(
@@ -344,6 +338,6 @@ class LocalProcesses:
             self._announcement.withdraw()
             self._own.remove()
 
-    def _left(self) -> list[Child]:
+    def _left(self) -> list[subprocess.Popen[bytes]]:
         """Return the processes that have not ended."""
         return [child for child in dict.fromkeys(self.running.values()) if child.poll() is None]

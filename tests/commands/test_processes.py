@@ -175,37 +175,23 @@ def test_every_group_steps_in_the_order_of_all_roles() -> None:
 # --- local processes -----------------------------------------------------------------------------------------------------
 
 
-class Forks:
-    """Records the command and the environment of each process instead of starting it."""
-
-    def __init__(self) -> None:
-        self.started: dict[str, tuple[tuple[str, ...], dict[str, str]]] = {}
-
-    def start(self, command: tuple[str, ...], environment: dict[str, str], log: Path) -> None:
-        self.started[log.stem] = (command, environment)
-
-
 @pytest.fixture
-def forks() -> Forks:
-    return Forks()
-
-
-@pytest.fixture
-def local(tmp_path: Path, forks: Forks, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalProcesses]:
+def local(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[LocalProcesses]:
     for name in ("PALPATE_SCENARIO", "PALPATE_VIEWER"):
         monkeypatch.delenv(name, raising=False)
     groups = placement(ROLES, [",".join(LOOP)], None)
     files = write_scenario_files(load_scenario("clean"), tmp_path)
-    processes = LocalProcesses(groups, tmp_path, files, Timing(), forks=forks)  # type: ignore[arg-type]
+    processes = LocalProcesses(groups, tmp_path, files, Timing())
     yield processes
     processes.stop()
 
 
-def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProcesses, forks: Forks) -> None:
+def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProcesses, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(local, "_started", lambda command, environment, _: (command, environment))
     processes = read_processes(compose_file(), ROLES)
     local.start(*(processes[role] for role in LOOP))
+    command, environment = local.running.pop("robot")
     local.running.clear()
-    command, environment = forks.started["robot+tissue+control"]
     rows = json.loads(Path(command[-1]).read_text(encoding="utf-8"))
     assert local.bus["robot"] == local.bus["tissue"] != local.bus["planning"]
     assert local.bus["robot"].lowlatency

@@ -5,12 +5,11 @@ import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, cast
+from typing import Any
 
 import pytest
 
 from palpate.run import composed
-from palpate.run.forks import Forks
 from palpate.run.group import one_per_process
 from palpate.run.processes import LocalProcesses, compose_file, read_processes
 from palpate.run.roles import OBSERVERS, workers, write_scenario_files
@@ -42,33 +41,28 @@ Hand = Callable[[Scenario, Path], Mapping[str, Handout]]
 """The handouts of a run of a scenario, by role."""
 
 
-class Forked:
-    """Records what each process is given instead of forking it."""
+class Unstarted(LocalProcesses):
+    """Records what each process is given instead of starting it."""
 
-    def __init__(self) -> None:
-        self.handouts: dict[str, Handout] = {}
-
-    def start(self, command: Sequence[str], environment: Mapping[str, str], log: Path) -> Any:
+    def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> Any:
         file = Path(environment["PALPATE_SCENARIO"])
         files = {path.name: path.read_bytes() for path in file.parent.iterdir() if path.is_file()}
         listening = Path(environment["PALPATE_LISTEN"].partition("/")[2]).parent  # a folder of random name
         kept = {name: value.replace(str(listening), "/sockets") for name, value in environment.items()}
-        self.handouts[log.stem] = Handout(files, kept, tuple(command))
-        return None
+        return Handout(files, kept, command)
 
 
 def distributed(scenario: Scenario, out: Path) -> Any:
     """Return the handouts of processes."""
     files = write_scenario_files(scenario, out)
-    forked = Forked()
-    local = LocalProcesses(one_per_process(ROLES), out, files, Timing(), record="full", forks=cast("Forks", forked))
+    local = Unstarted(one_per_process(ROLES), out, files, Timing(), record="full")
     try:
         for process in read_processes(compose_file(), ROLES).values():
             local.start(process)
+        return dict(local.running)
     finally:
         local.running.clear()
         local.stop()
-    return forked.handouts
 
 
 def in_one_process(scenario: Scenario, out: Path) -> Any:
