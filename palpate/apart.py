@@ -62,7 +62,7 @@ def shared_numbers() -> MutableSequence[int]:
 class TimeLimit:
     """Finds when a child stays at one place for too long. Time in which this process was stopped does not count."""
 
-    def __init__(self, place: Callable[[], tuple[int, ...]], limit_s: Callable[[], float]) -> None:
+    def __init__(self, place: Callable[[], object], limit_s: Callable[[], float]) -> None:
         """`place`: where the child is; `limit_s`: how long it may be there [s]."""
         self._place, self._limit_s = place, limit_s
         self._last = place()
@@ -93,11 +93,7 @@ def run_apart(
 
 
 def guarded(
-    part: str,
-    work: Callable[[], T],
-    limit_s: float,
-    error: type[Exception] = RunError,
-    place: Callable[[], tuple[int, ...]] = tuple,
+    part: str, work: Callable[[], T], limit_s: float, error: type[Exception] = RunError, place: Callable[[], object] = tuple
 ) -> T:
     """Return what `work` returns in a child process. Raises `error` that names the part if that exits, crashes or hangs.
 

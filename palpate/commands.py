@@ -70,17 +70,9 @@ GROUPS = {
 }
 """Module and attribute of each command, by group: a function, or a Typer app of several commands."""
 EXTRAS = {
-    "assess": "library",
-    "compare": "library",
-    "fit": "library",
-    "dashboard": "dashboard",
-    "fmu": "fmu",
-    "study": "study",
-    "validate": "bench",
-    "reproduce": "bench",
-    "bench": "bench",
-    "faults": "bench",
-    "fuzz": "bench",
+    **{"dashboard": "dashboard", "fmu": "fmu", "study": "study"},
+    **dict.fromkeys(("assess", "compare", "fit"), "library"),
+    **dict.fromkeys(("validate", "reproduce", "bench", "faults", "fuzz"), "bench"),
 }
 """Extra with the libraries of a command that the extra `run` does not install."""
 HELP_OPTIONS = ["-h", "--help"]
@@ -125,15 +117,9 @@ def app_for(name: str, columns: int | None = None) -> typer.Typer:
     `columns`: width of the help, by default that of the terminal.
     """
     app = typer.Typer(
-        name="palpate",
-        cls=CommandGroup,
-        help=HELP,
-        callback=_options,
-        no_args_is_help=True,
-        rich_markup_mode="rich",
-        pretty_exceptions_show_locals=False,
-        context_settings={"help_option_names": HELP_OPTIONS},
-    )
+        name="palpate", cls=CommandGroup, help=HELP, callback=_options, no_args_is_help=True, rich_markup_mode="rich",
+        pretty_exceptions_show_locals=False, context_settings={"help_option_names": HELP_OPTIONS},
+    )  # fmt: skip
     if name in COMMANDS:
         _add(app, name, columns or shutil.get_terminal_size().columns)
         return app
@@ -185,9 +171,8 @@ def _flowing(command: object, columns: int) -> str:
 
 def _examples(examples: list[str], columns: int) -> str:
     """Return example commands with their explanations next to them, or below them if `columns` are too few."""
-    lines = [example.partition("  ")[::2] for example in examples]
-    widest = max(len(line) for line, _ in lines)
-    pairs = [(line, text.strip()) for line, text in lines]
+    pairs = [(line, text.strip()) for line, _, text in (example.partition("  ") for example in examples)]
+    widest = max(len(line) for line, _ in pairs)
     rows = [f"{INDENT}{line:<{widest}}  {text}".rstrip() for line, text in pairs]
     if max(map(len, rows)) > columns - 2 * MARGIN:
         rows = [part for line, text in pairs for part in (INDENT + line, *([3 * INDENT + text] if text else []))]

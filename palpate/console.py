@@ -9,16 +9,8 @@ from pathlib import Path
 from typing import Any, NoReturn, TextIO
 
 import typer
+from rich import progress
 from rich.console import Console, ConsoleOptions, RenderableType
-from rich.progress import (
-    BarColumn,
-    MofNCompleteColumn,
-    Progress,
-    SpinnerColumn,
-    TaskProgressColumn,
-    TextColumn,
-    TimeRemainingColumn,
-)
 from rich.segment import Segment
 from rich.table import Table
 from rich.text import Text
@@ -116,38 +108,27 @@ def output_file(text: str, *names: str) -> typer.models.OptionInfo:
 
     `text`: the help; `names`: names of the option, if not that of its parameter.
     """
-
-    def check(path: Path | None) -> Path | None:
-        if path is not None:
-            _make(path.parent)
-            if path.is_dir() or not os.access(path if path.exists() else path.parent, os.W_OK):
-                raise typer.BadParameter(f"{path}: is not a writable file")
-        return path
-
-    return _option(text, check, *names)
+    return _output(text, names, folder=False)
 
 
 def output_folder(text: str, *names: str) -> typer.models.OptionInfo:
     """Return the option for a folder that the command writes into; as `output_file`."""
+    return _output(text, names, folder=True)
 
+
+def _output(text: str, names: tuple[str, ...], folder: bool) -> typer.models.OptionInfo:
     def check(path: Path | None) -> Path | None:
-        if path is not None:
-            _make(path)
-            if not os.access(path, os.W_OK):
-                raise typer.BadParameter(f"{path}: is not a writable folder")
+        if path is None:
+            return None
+        made = path if folder else path.parent
+        try:
+            made.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise typer.BadParameter(f"{made}: cannot be made a folder: {error.strerror}") from None
+        if (path.is_dir() and not folder) or not os.access(path if path.exists() else made, os.W_OK):
+            raise typer.BadParameter(f"{path}: is not a writable {'folder' if folder else 'file'}")
         return path
 
-    return _option(text, check, *names)
-
-
-def _make(folder: Path) -> None:
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise typer.BadParameter(f"{folder}: cannot be made a folder: {error.strerror}") from None
-
-
-def _option(text: str, check: Callable[[Path | None], Path | None], *names: str) -> typer.models.OptionInfo:
     option: typer.models.OptionInfo = typer.Option(*names, help=text, callback=check)
     return option
 
@@ -203,19 +184,22 @@ def bandwidth(bytes_per_s: float) -> str:
     return f"{bytes_per_s:.0f} B/s"
 
 
-class CaseDisplay(Progress):
+class CaseDisplay(progress.Progress):
     """A bar over many cases on a terminal; one line per case otherwise; nothing when quiet."""
 
     def __init__(self, console: Console, quiet: bool, unit: str = "examinations") -> None:
         self._lines = not (quiet or console.is_terminal)
-        columns = (SpinnerColumn(), TextColumn(unit), BarColumn(bar_width=30), MofNCompleteColumn(), TimeRemainingColumn())
-        super().__init__(
-            *(*columns, TextColumn("{task.fields[last]}", markup=False)),
-            console=console,
-            transient=True,
-            disable=quiet or self._lines,
-            speed_estimate_period=3600.0,  # one case may take minutes
+        bars = (
+            progress.SpinnerColumn(),
+            unit,
+            progress.BarColumn(30),
+            progress.MofNCompleteColumn(),
+            progress.TimeRemainingColumn(),
         )
+        super().__init__(
+            *bars, "{task.fields[last]}", console=console, transient=True, disable=quiet or self._lines,
+            speed_estimate_period=3600.0,  # one case may take minutes
+        )  # fmt: skip
         self._task = self.add_task(unit, total=None, last="")
 
     def show(self, done: int, total: int, last: str) -> None:
@@ -225,7 +209,7 @@ class CaseDisplay(Progress):
             self.console.print(f"{done} of {total}  {last}", highlight=False)
 
 
-class TimeLeft(Progress):
+class TimeLeft(progress.Progress):
     """A bar from `begin` to `end`, in any unit, for a `with` block; nothing if standard error is not a terminal.
 
     `where` gives the position and `doing` the text at each refresh, ten times per second.
@@ -233,7 +217,7 @@ class TimeLeft(Progress):
 
     def __init__(self, doing: Callable[[], str], where: Callable[[], float], begin: float, end: float) -> None:
         console = SteadyConsole(stderr=True)
-        columns = (TextColumn("{task.description}"), BarColumn(bar_width=30), TaskProgressColumn(), TimeRemainingColumn())
+        columns = "{task.description}", progress.BarColumn(30), progress.TaskProgressColumn(), progress.TimeRemainingColumn()
         super().__init__(*columns, console=console, transient=True, disable=not console.is_terminal, speed_estimate_period=10.0)
         self._doing, self._where, self._begin = doing, where, begin
         self._shown = self.add_task(doing(), total=end - begin)

@@ -11,25 +11,20 @@ from contextlib import contextmanager
 
 KERNELS = {"x86_64": "Haswell"}
 """OpenBLAS kernels by machine: those of AVX2. With its own choice a surface fit differed in the last bit between processors."""
-FIXED = {
-    "OMP_NUM_THREADS": "1",
-    "OPENBLAS_NUM_THREADS": "1",
-    "PYTHONHASHSEED": "0",
-    **({"OPENBLAS_CORETYPE": KERNELS[platform.machine()]} if platform.machine() in KERNELS else {}),
-}
+FIXED = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "PYTHONHASHSEED": "0"}
 """docker-compose.yml sets the same."""
+if platform.machine() in KERNELS:
+    FIXED["OPENBLAS_CORETYPE"] = KERNELS[platform.machine()]
 
 
 @contextmanager
 def given(variables: Mapping[str, str]) -> Iterator[None]:
     """Temporarily sets environment variables."""
-    before = {name: os.environ.get(name) for name in variables}
+    before = dict(os.environ)
     os.environ.update(variables)
     try:
         yield
     finally:
-        for name, value in before.items():
-            if value is None:
-                del os.environ[name]
-            else:
-                os.environ[name] = value
+        for name in variables:
+            del os.environ[name]
+        os.environ.update(before)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -46,27 +45,12 @@ def perceive(
     own = bag / "exam.yaml"
     chosen = load_scenario(scenario or (str(own) if own.is_file() else "clean"), settings or ())
     seen = perceived(ReplayedCamera(open_recording(bag), whole=False), chosen)
-    figures = asdict(write(out, seen, chosen))
+    figures = write(out, seen, chosen)
     if as_json:
         print_json(figures)
     else:
         print(", ".join(f"{name} {value:.4g}" for name, value in figures.items()))
         print(f"written to {out}: surface.ply, surface.png")
-
-
-@dataclass(frozen=True)
-class SurfaceFigures:
-    """Figures of a perceived surface."""
-
-    frames: int
-    coverage: float
-    """Share of the region that is in view."""
-    noise_mm: float
-    """SD of the surface."""
-    vertices: int
-    area_cm2: float
-    steepest_deg: float
-    """Largest angle between a normal and z of the abdomen frame."""
 
 
 def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
@@ -89,8 +73,12 @@ def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
     return found
 
 
-def write(folder: Path, found: Perceived, scenario: Scenario) -> SurfaceFigures:
-    """Write surface.ply and surface.png, in the abdomen frame, and return the figures."""
+def write(folder: Path, found: Perceived, scenario: Scenario) -> dict[str, float]:
+    """Write surface.ply and surface.png, in the abdomen frame, and return figures of the surface.
+
+    `coverage` is the share of the region that is in view, `noise_mm` the SD of the surface, `steepest_deg` the largest angle
+    between a normal and z.
+    """
     import numpy as np
     import trimesh
 
@@ -103,14 +91,9 @@ def write(folder: Path, found: Perceived, scenario: Scenario) -> SurfaceFigures:
     mesh = trimesh.Trimesh(vertices, found.mesh.triangles.astype(np.int64), vertex_normals=normals, process=False)
     mesh.export(folder / "surface.ply", vertex_normal=True)
     _draw(folder / "surface.png", vertices, normals)
-    return SurfaceFigures(
-        frames=found.frames,
-        coverage=found.coverage,
-        noise_mm=1e3 * found.sigma,
-        vertices=len(vertices),
-        area_cm2=1e4 * float(mesh.area),
-        steepest_deg=float(np.degrees(np.arccos(np.clip(normals[:, 2].min(), -1, 1)))),
-    )
+    steepest = float(np.degrees(np.arccos(np.clip(normals[:, 2].min(), -1, 1))))
+    seen = {"frames": found.frames, "coverage": found.coverage, "noise_mm": 1e3 * found.sigma}
+    return {**seen, "vertices": len(vertices), "area_cm2": 1e4 * float(mesh.area), "steepest_deg": steepest}
 
 
 def _draw(path: Path, vertices: Array, normals: Array) -> None:

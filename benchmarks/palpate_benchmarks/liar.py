@@ -29,7 +29,7 @@ from typing import Any, Final
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.conformance import numbers
+from palpate_bus.contract.port_check import numbers
 from palpate_bus.implementations import create as create_service
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.stamps import NS, nanoseconds, time_message

@@ -13,14 +13,15 @@ from io import BytesIO
 from mmap import ACCESS_READ, mmap
 from operator import attrgetter
 from pathlib import Path, PurePath
-from typing import IO, Any, NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import zstandard
 from mcap import stream_reader
 from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
-from mcap.reader import McapReader, NonSeekingReader, make_reader
+from mcap.reader import NonSeekingReader, make_reader
 from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import MAGIC_SIZE, StreamReader, breakup_chunk
 from mcap.writer import MCAP0_MAGIC
@@ -36,17 +37,8 @@ from palpate_inputs import MB, InputFile, bounds, over, read_yaml
 
 SCENARIO = "scenario.yaml"
 """Name of the attachment with the scenario of a reference recording."""
-BROKEN = (
-    McapError,
-    EOFError,
-    RuntimeError,
-    ValueError,
-    LookupError,
-    OverflowError,
-    MemoryError,
-    zstandard.ZstdError,
-    struct.error,
-)
+_DAMAGED = (McapError, zstandard.ZstdError, struct.error)
+BROKEN = (*_DAMAGED, EOFError, RuntimeError, ValueError, LookupError, OverflowError, MemoryError)
 """Errors of a truncated or damaged file: a short record, a chunk that does not decompress, a wrong checksum or length."""
 
 
@@ -86,14 +78,8 @@ def bz2(data: bytes) -> bytes:
     return _whole(BZ2Decompressor(), data)
 
 
-class _Library:
-    """A module of a compression as mcap calls it."""
-
-    def __init__(self, decompress: Any) -> None:
-        self.decompress = decompress
-
-
-stream_reader.zstandard, stream_reader.lz4 = _Library(zstd), _Library(lz4)
+# modules of compressions as mcap calls them
+stream_reader.zstandard, stream_reader.lz4 = SimpleNamespace(decompress=zstd), SimpleNamespace(decompress=lz4)
 storage_mcap.DECOMPRESSORS.update(zstd=zstd, lz4=lz4)
 rosbag1_reader.decompressors.update(bz2=bz2, lz4=lz4)
 
@@ -171,19 +157,15 @@ class Recording:
         if not names:
             return
         with ExitStack() as stack:
-            streams = [(file, stack.enter_context(_opened(file))) for file in self.files]
-            readers = [
-                self._reader(file, stream).iter_messages(topics=names, starting_at=begin, ending_at=end)
-                for file, stream in streams
-            ]
-            each = [
-                (
-                    RecordedMessage(m.log_time, channel.topic.removeprefix("/"), m.data, m.sequence)
-                    for schema, channel, m in reader
-                    if schema is not None
-                )
-                for reader in readers
-            ]
+
+            def read(file: Path) -> Iterator[RecordedMessage]:
+                kind = NonSeekingReader if file in self.unindexed else make_reader
+                reader = kind(stack.enter_context(_opened(file)), validate_crcs=True)
+                for schema, channel, m in reader.iter_messages(topics=names, starting_at=begin, ending_at=end):
+                    if schema is not None:
+                        yield RecordedMessage(m.log_time, channel.topic.removeprefix("/"), m.data, m.sequence)
+
+            each = [read(file) for file in self.files]
             try:
                 yield from each[0] if len(each) == 1 else heapq.merge(*each, key=attrgetter("stamp"))
             except UserError as error:
@@ -191,9 +173,6 @@ class Recording:
             except BROKEN as error:
                 broken = self.path if self.path.is_file() else self.files[0].parent
                 raise RecordingError(f"{self.path}: is damaged; {_recover(broken)}") from error
-
-    def _reader(self, file: Path, stream: IO[bytes]) -> McapReader:
-        return (NonSeekingReader if file in self.unindexed else make_reader)(stream, validate_crcs=True)
 
     def origin(self, topics: Collection[str]) -> int:
         """Return the stamp [ns] at which the time of `topics` begins: 0 in simulated time, their first stamp in Unix time."""
@@ -207,15 +186,11 @@ class Recording:
         """
         for name in topics:
             if whole and name in self.thinned:
-                raise RecordingError(
-                    f"{self.path}: only one message of topic {name} per {self.thinned[name]} ms was kept, but all are needed; "
-                    "record with --record full"
-                )
+                kept = f"only one message of topic {name} per {self.thinned[name]} ms was kept, but all are needed"
+                raise RecordingError(f"{self.path}: {kept}; record with --record full")
             if name in self.types and (difference := self.types[name].difference(rules.topics[name])):
-                raise RecordingError(
-                    f"{self.path}: topic {name} was recorded {difference}; "
-                    "record again, or replay with the version that recorded it"
-                )
+                advice = "record again, or replay with the version that recorded it"
+                raise RecordingError(f"{self.path}: topic {name} was recorded {difference}; {advice}")
 
 
 def _recover(path: Path) -> str:
@@ -234,10 +209,9 @@ def _unreadable(file: Path, path: Path) -> RecordingError:
         head = stream.read(16)
     if not head:
         return RecordingError(f"{file}: is empty, so nothing was recorded")
-    if head.startswith(b"SQLite format 3"):
-        return RecordingError(f"{file}: is an SQLite bag, want MCAP; {_convert(path)}")
-    if head.startswith(b"#ROSBAG"):
-        return RecordingError(f"{file}: is a ROS 1 bag, want MCAP; {_convert(path)}")
+    for begin, kind in ((b"SQLite format 3", "an SQLite bag"), (b"#ROSBAG", "a ROS 1 bag")):
+        if head.startswith(begin):
+            return RecordingError(f"{file}: is {kind}, want MCAP; {_convert(path)}")
     if head.startswith(b"\x28\xb5\x2f\xfd"):
         remedy = _convert(path) if path != file else f"run: zstd -d {shlex.quote(str(file))}"
         return RecordingError(f"{file}: is compressed as a whole, want MCAP; {remedy}")
@@ -258,9 +232,7 @@ def recorded_files(path: Path) -> tuple[Path, tuple[Path, ...]]:
     if not found:
         raise RecordingError(f"{path}: no recording there; give a run's folder, a rosbag2 folder or an .mcap file")
     if len(found) > 1:
-        raise RecordingError(
-            f"{folder}: has {len(found)} files but no metadata.yaml, so it was not completed; {_recover(folder)}"
-        )
+        raise RecordingError(f"{folder}: has {len(found)} files but no metadata.yaml: it was not completed; {_recover(folder)}")
     return folder, tuple(found)
 
 
@@ -277,10 +249,8 @@ def _listed(metadata: Path) -> tuple[Path, ...]:
     if compression == "message":
         raise RecordingError(f"{metadata}: compression_mode = message, want none or chunks of MCAP; {_convert(metadata.parent)}")
     for name, file in zip(names, files, strict=True):
-        if name.is_absolute() or ".." in name.parts:
-            raise RecordingError(f"{metadata}: lists {name}; want files of its folder")
-        if not file.is_file():
-            raise RecordingError(f"{metadata}: lists {name}, which is not there")
+        if name.is_absolute() or ".." in name.parts or not file.is_file():
+            raise RecordingError(f"{metadata}: lists {name}; want files that are in its folder")
     if not files:
         raise RecordingError(f"{metadata}: lists no file")
     return files
@@ -312,19 +282,16 @@ def _contents(file: Path) -> _Contents:
                 stamps = (statistics.message_start_time, statistics.message_end_time) if statistics.message_count else ()
                 return _Contents(summary.schemas, summary.channels, counts, stamps, scenario, indexed=True)
         stream.seek(0)
-        schemas: dict[int, Schema] = {}
-        channels: dict[int, Channel] = {}
-        counted: Counter[int] = Counter()
-        stamps = ()
+        found = _Contents({}, {}, Counter(), (), scenario, indexed=False)
         for record in StreamReader(stream).records:
             if isinstance(record, Schema):
-                schemas[record.id] = record
+                found.schemas[record.id] = record
             elif isinstance(record, Channel):
-                channels[record.id] = record
+                found.channels[record.id] = record
             elif isinstance(record, Message):
-                counted[record.channel_id] += 1
-                stamps = (min((*stamps, record.log_time)), max((*stamps, record.log_time)))
-        return _Contents(schemas, channels, counted, stamps, scenario, indexed=False)
+                found.counts[record.channel_id] += 1
+                found.stamps = (min((*found.stamps, record.log_time)), max((*found.stamps, record.log_time)))
+        return found
 
 
 def open_recording(path: Path) -> Recording:

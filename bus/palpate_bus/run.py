@@ -11,7 +11,7 @@ import logging
 import os
 import signal
 import sys
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -83,7 +83,7 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
 
     `name` is that of the process in the log. Services that join the bus in the same way share a session.
     """
-    status = 0
+    status: int = ExitStatus.FAILED
     sessions: dict[BusOptions, zenoh.Session] = {}
     log = logging.getLogger(name)
     try:
@@ -92,40 +92,31 @@ def host(hosted: Callable[[], Sequence[Hosted]], name: str, transport: Callable[
         handler.setFormatter(PrintableFormatter(f"%(asctime)s {name} %(levelname)s %(message)s"))
         logging.basicConfig(level=settings.log, handlers=[handler])
         rules = contract()
-        members_of_process = hosted()
+        here = hosted()
         signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that open files are closed
-        services = [one.make() for one in members_of_process]
-        if all(in_background(rules.roles[one.role], settings.runtime) for one in members_of_process):
+        services = [one.make() for one in here]
+        if all(in_background(rules.roles[one.role], settings.runtime) for one in here):
             run_in_background()
-        sessions = {options: open_session(options) for options in dict.fromkeys(one.options for one in members_of_process)}
-        transports = {options: transport(session) for options, session in sessions.items()}
-        members = {
-            one.role: Member(sessions[one.options], one.role, rules, settings.domain, transports[one.options])
-            for one in members_of_process
-        }
+        sessions = {options: open_session(options) for options in dict.fromkeys(one.options for one in here)}
+        carriers = {options: transport(session) for options, session in sessions.items()}
+        bus = rules, settings.domain
+        members = {one.role: Member(sessions[one.options], one.role, *bus, carriers[one.options]) for one in here}
         node = _node(services, members, settings.runtime)
         with rare_collections():
             node.run()
         for member in members.values():
             member.leave()
+        status = 0
     except RunAborted as aborted:
         log.warning("run ended early: %s", aborted)
-        status = ExitStatus.FAILED
     except KeyboardInterrupt:
-        status = ExitStatus.FAILED
+        pass
     except UserError as error:
         log.error("%s", error)
-        status = ExitStatus.FAILED
     except (Exception, SystemExit):
         log.exception("%s failed", name)
-        status = ExitStatus.FAILED
-    leave(sessions.values(), status)
-
-
-def leave(sessions: Iterable[zenoh.Session], status: int) -> None:
-    """Close the sessions and exit without waiting for zenoh's threads."""
-    for session in sessions:
+    for session in sessions.values():
         close_session(session)
     sys.stderr.flush()
     sys.stdout.flush()
-    os._exit(status)
+    os._exit(status)  # without waiting for zenoh's threads

@@ -11,11 +11,12 @@ from palpate_bus.contract import contract
 from palpate_bus.messages import Advance, JointState, JointTorqueCommand, SurfaceMesh, codec
 from palpate_bus.messages.stamps import duration_message, header
 from palpate_bus.messages.struct_codecs import STRUCT_CODECS
+from palpate_bus.messages.typestore import palpation_definitions
 
 TYPES = sorted(
     {row.type for row in contract().topics.values()}
     | {row.type for row in contract().internal.values()}
-    | set(codec.palpation_definitions())
+    | set(palpation_definitions())
     # Shapes that our rows do not have: arrays of messages and of strings, bytes, eight-byte numbers behind one-byte ones.
     | {"visualization_msgs/msg/Marker", "std_msgs/msg/ByteMultiArray", "sensor_msgs/msg/BatteryState", "std_msgs/msg/Char"}
     | {"shape_msgs/msg/SolidPrimitive", "trajectory_msgs/msg/JointTrajectory", "geometry_msgs/msg/PolygonStamped"}

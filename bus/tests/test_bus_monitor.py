@@ -11,9 +11,8 @@ from hypothesis import strategies as st
 from message_strategies import messages
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.conformance import ViolationKind as Kind
-from palpate_bus.contract.conformance import leaves, numbers
-from palpate_bus.contract.port_check import Checker
+from palpate_bus.contract.port_check import Checker, leaves, numbers
+from palpate_bus.contract.port_check import ViolationKind as Kind
 from palpate_bus.messages import DiagnosticStatus, JointState, JointTorqueCommand, Vector3, Wrench, WrenchStamped, codec
 from palpate_bus.messages.stamps import MS, duration_message, header
 from palpate_bus.monitor.health import RECENT_S, Violation, diagnostics

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, MutableSequence
+from collections.abc import Mapping, MutableSequence
 from contextlib import nullcontext, suppress
 from dataclasses import dataclass, replace
 from enum import IntEnum
@@ -59,24 +59,10 @@ class ChildPlace:
         self.cells[0] = BETWEEN if role is None else tuple(contract().roles).index(role)
         self.cells[2] = stage
 
-    def now(self) -> tuple[int, int, int]:
-        """Return the numbers."""
-        return self.cells[0], self.cells[1], self.cells[2]
-
-    @property
-    def role(self) -> str | None:
-        """The role whose code runs; None between two steps."""
-        return None if self.cells[0] == BETWEEN else tuple(contract().roles)[self.cells[0]]
-
-    @property
-    def t(self) -> int:
-        """Simulated time [ns]."""
-        return self.cells[1]
-
-    @property
-    def stage(self) -> ChildStage:
-        """Present activity."""
-        return ChildStage(self.cells[2])
+    def now(self) -> tuple[str | None, int, ChildStage]:
+        """Return the role whose code runs, None between two steps; simulated time [ns]; present activity."""
+        number, t, stage = self.cells[:3]
+        return None if number == BETWEEN else tuple(contract().roles)[number], t, ChildStage(stage)
 
 
 @dataclass(frozen=True)
@@ -91,17 +77,17 @@ class News:
     measured: bool
 
 
-def load_services(scenario: Scenario, roles: tuple[str, ...], loading: Callable[[str], None] = lambda _: None) -> list[Service]:
+def load_services(scenario: Scenario, roles: tuple[str, ...], place: ChildPlace | None = None) -> list[Service]:
     """Return the services of `roles` as the scenario chooses them. Raises PluginError for a missing one or missing libraries.
 
-    `loading` is called with each role before.
+    `place` is kept up to date.
     """
-
-    def load(role: str) -> Service:
-        loading(role)
-        return create(role, choice(scenario, role), seen(scenario, view_of(role)))
-
-    return [load(role) for role in roles]
+    services = []
+    for role in roles:
+        if place is not None:
+            place.enter(ChildStage.LOAD, role)
+        services.append(create(role, choice(scenario, role), seen(scenario, view_of(role))))
+    return services
 
 
 def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str, ...] = OBSERVERS) -> RunResult:
@@ -134,7 +120,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         if limit.there_s > limits.patience.quiet and (text := limits.wait_text()) not in waits:
             waits.append(text)
             trouble.append(text)
-            show(place.t)
+            show(place.now()[1])
         limit.check()
 
     try:
@@ -142,16 +128,10 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     except UserError:
         raise
     except Exception as error:  # the report needs what was measured
-        now = perf_counter()
-        result = RunResult(
-            runtime="composed",
-            collected=collected,
-            sim_time_s=place.t / NS,
-            wall_time_s=now - (start or now),
-            start_time_s=start or now,
-            failure=limits.failure(error) if isinstance(error, RunError) else failure_of(error, place.t),
-            lost={} if place.role is None else {place.role: place.t},
-        )
+        now, (role, t, _) = perf_counter(), place.now()
+        failure = limits.failure(error) if isinstance(error, RunError) else failure_of(error, t)
+        times: dict[str, Any] = {"sim_time_s": t / NS, "wall_time_s": now - (start or now), "start_time_s": start or now}
+        result = RunResult("composed", collected, **times, failure=failure, lost={} if role is None else {role: t})
     all_is_measured()
     return replace(result, collected=collected, start_time_s=result.start_time_s - begin)
 
@@ -165,27 +145,26 @@ class _Limits:
 
     def limit_s(self) -> float:
         """Return the limit at the present place [s]."""
-        starts = self._place.stage is ChildStage.LOAD
-        if self._place.role in self._foreign:
-            return self._settings.start_limit_s if starts else self._settings.step_limit_s
-        return self.patience.start if starts else self.patience.hard
+        role, _, stage = self._place.now()
+        if role in self._foreign:
+            return self._settings.start_limit_s if stage is ChildStage.LOAD else self._settings.step_limit_s
+        return self.patience.start if stage is ChildStage.LOAD else self.patience.hard
 
     def wait_text(self) -> str:
         """Return a text for a child that stays at its present place."""
-        role = self._place.role or "the process of all services"
+        role, t, stage = self._place.now()
         doing = {
-            ChildStage.LOAD: f"still starting {role}; a first run compiles, which takes a minute or more",
-            ChildStage.STEP: f"waiting for {role} to finish its step at {self._place.t / NS:.3f} s",
-            ChildStage.FINISH: f"waiting for {role} to finish its files",
+            ChildStage.LOAD: "start; a first run compiles, which takes a minute or more",
+            ChildStage.FINISH: "finish its files",
         }
-        return f"{doing[self._place.stage]} ({self.limit_s():g} s at most)"
+        what = doing.get(stage, f"finish its step at {t / NS:.3f} s")
+        return f"waiting for {role or 'the process of all services'} to {what} ({self.limit_s():g} s at most)"
 
     def failure(self, error: RunError) -> Failure:
         """Return the failure of a run whose child ended with `error`."""
-        role, stage = self._place.role, self._place.stage
+        role, t, stage = self._place.now()
         hangs = isinstance(error, ChildLost) and error.late
-        step = f"at {self._place.t / NS:.3f} s"
-        when = {ChildStage.LOAD: "at start", ChildStage.STEP: step, ChildStage.FINISH: "at its end"}[stage]
+        when = {ChildStage.LOAD: "at start", ChildStage.STEP: f"at {t / NS:.3f} s", ChildStage.FINISH: "at its end"}[stage]
         where = " in its step" if role and stage is ChildStage.STEP else ""
         text = f"{role or 'the process of all services'} lost {when}: {error}{where}"
         if hangs and role in self._foreign:
@@ -202,16 +181,11 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
     """
     collector = Collector(tree=FrameTree(exam_input(scenario)))
     news = CollectedNews(collector.collected)
-    observer_settings = {"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}
-
-    def loading(role: str) -> None:
-        place.enter(ChildStage.LOAD, role)
-
-    with given(observer_settings):  # only observers: the name of the results folder may reveal the patient
-        observing = load_services(scenario, observers, loading)
+    with given({"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}):  # only observers: the name may reveal the patient
+        observing = load_services(scenario, observers, place)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
-    services = [*load_services(scenario, workers(scenario), loading), *viewers, collector]
+    services = [*load_services(scenario, workers(scenario), place), *viewers, collector]
     run = Composed(services, taps=[recorder.record for recorder in recorders], at=place.cells)
     start = perf_counter()
     failure: Failure | None = None

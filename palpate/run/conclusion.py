@@ -26,12 +26,8 @@ from palpate_errors import ExitStatus
 from palpate_models.scenario.schema import Scenario
 
 log = logging.getLogger(__name__)
-HOLD_REASONS: Final = (
-    ExamState.REASON_OPERATOR_STOP,
-    ExamState.REASON_ROBOT_HOLD,
-    ExamState.REASON_EMERGENCY_STOP,
-    ExamState.REASON_NOT_RELEASED,
-)
+_NAMES = ("OPERATOR_STOP", "ROBOT_HOLD", "EMERGENCY_STOP", "NOT_RELEASED")
+HOLD_REASONS: Final = frozenset(getattr(ExamState, f"REASON_{name}") for name in _NAMES)
 """Reasons for which planning gives up with a text that has the cause of the hold."""
 
 
@@ -89,12 +85,8 @@ def _write(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report,
         report, page, why = _write_into(other, scenario, result)
         return report, page, f"{trouble}; they are in {other}" + (f"; {why}" if why else "")
     except OSError as error:
-        report = assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier))
-        return (
-            report,
-            None,
-            f"{trouble}, nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here",
-        )
+        trouble += f", nor in {tempfile.gettempdir()} ({error.strerror}): nothing is kept but what is printed here"
+        return assemble(scenario, result, truth_of_run(scenario, result.collected, result.earlier)), None, trouble
 
 
 def _write_into(folder: Path, scenario: Scenario, result: RunResult) -> tuple[Report, Path, str]:

@@ -15,7 +15,7 @@ from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session
 from palpate_conductor.collector import FrameTree
 from palpate_conductor.conductor import conduct
 from palpate_conductor.handover import REPLACEABLE
-from palpate_conductor.outcome import Patience, RunProgress, RunResult, Tell, Timing
+from palpate_conductor.outcome import Patience, RunResult, Tell, Timing
 from palpate_errors import UserError
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
@@ -52,17 +52,12 @@ def run_distributed(
         _check_shares(processes[role], absent)
     files = write_scenario_files(scenario, out)
     local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
-    begun = False
+    at_once = True
 
     def ended() -> dict[str, str]:
         """Return how processes ended, with the user's file."""
         files = {role: file for role in roles if is_file(file := choice(scenario, role))}
         return {role: f"{how} ({files[role]})" if role in files else how for role, how in local.ended().items()}
-
-    def report_progress(progress: RunProgress) -> None:
-        nonlocal begun
-        begun = True
-        tell(progress)
 
     try:
         options = local.bus["conductor"]
@@ -71,32 +66,28 @@ def run_distributed(
             if mine := [processes[role] for role in group if role not in absent.roles]:
                 local.start(*mine)
         others = (*absent.roles, *(REPLACEABLE if timing.handover_s else ()))
-        places = {
-            role: ServicePlace(process.command, local.environment(process), role in absent.roles)
-            for role, process in processes.items()
-            if role in others
-        }
+        free = {role: process for role, process in processes.items() if role in others}
+        places = {role: ServicePlace(one.command, local.environment(one), role in absent.roles) for role, one in free.items()}
         if places:
             write_places(out, places)
-        settings = Settings.read()
-        patience = Patience(
-            foreign=foreign_roles(scenario), foreign_start=settings.start_limit_s, foreign_step=settings.step_limit_s
-        )
+        start_s, step_s = Settings.read().start_limit_s, Settings.read().step_limit_s
+        patience = Patience(foreign=foreign_roles(scenario), foreign_start=start_s, foreign_step=step_s)
         if absent.roles:
             patience = replace(patience, absent=absent.roles, join=absent.wait_s)
             absent.call(out, places)
         try:
             tree = FrameTree(exam_input(scenario))
             with local.as_conductor():
-                result = conduct(session, roles, report_progress, ended, timing, patience, begin, tree)
+                result = conduct(session, roles, tell, ended, timing, patience, begin, tree)
                 all_is_measured()
+            at_once = not result.wall_time_s  # it has not begun
             if result.failure is not None:
                 result.failure = absent.explain(result.failure)
             return result
         finally:
             close_session(session)
     finally:
-        local.stop(at_once=not begun)
+        local.stop(at_once=at_once)
 
 
 def _check(process: ServiceProcess, scenario: Scenario) -> None:

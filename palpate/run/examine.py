@@ -102,10 +102,7 @@ def _refuse_contradictions(scenario: Scenario, options: RunOptions) -> None:
     """Raise UserError for options that exclude each other."""
     o, shared = options, bool(options.group) or options.processes is not None
     for contradiction, why in (
-        (
-            o.composed and (o.realtime or o.wallclock),
-            "--composed runs as fast as it can: it takes neither --realtime nor --wallclock",
-        ),
+        (o.composed and (o.realtime or o.wallclock), "--composed runs as fast as it can: without --realtime and --wallclock"),
         (scenario.services.tissue == NONE and not o.wallclock, NEEDS_WALLCLOCK),
         (o.without and o.composed, "--without ROLE leaves out a process: it goes without --composed"),
         (shared and o.composed, "--composed is one process for all: it takes neither --group nor --processes"),

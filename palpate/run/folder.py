@@ -156,9 +156,7 @@ def check_room(folder: Path, exam: Exam, record: Record) -> None:
     """Raise UserError if the disk of a folder has no room for the results of an examination."""
     needed, free = expected_mb(exam, record), free_mb(folder)
     if free < needed:
-        shorter = (
-            f"; without recordings (--record none) {REPORT_MB} MB are enough" if record != "none" and free > REPORT_MB else ""
-        )
+        shorter = "" if record == "none" else f"; without recordings (--record none) {REPORT_MB} MB are enough"
         raise UserError(f"--out {folder}: {free:.0f} MB are free there, and this run needs about {needed:.0f} MB{shorter}")
 
 

@@ -15,15 +15,8 @@ Record = Literal["none", "normal", "full"]
 ScenarioName = Annotated[str, typer.Argument(help="Name of a scenario (see `palpate scenarios`) or a YAML file.")]
 Seed = Annotated[int | None, typer.Option(min=0, help="Overrides the scenario's seed.")]
 Settings = Annotated[list[str] | None, typer.Option("--set", metavar="a.b=c", help="Overrides a field; may be repeated.")]
-ServiceChoices = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--service",
-        metavar="ROLE=NAME_OR_FILE",
-        help="The implementation of a role: an installed one, or a Python file with create(scenario). Short for "
-        "--set services.ROLE=...; may be repeated.",
-    ),
-]
+_CHOICE = "The implementation of a role: an installed one, or a Python file with create(scenario); may be repeated."
+ServiceChoices = Annotated[list[str] | None, typer.Option("--service", metavar="ROLE=NAME_OR_FILE", help=_CHOICE)]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Print the findings only.")]
 Realtime = Annotated[bool, typer.Option("--realtime", help="Run lockstep no faster than real time.")]
 
@@ -48,12 +41,7 @@ class RunOptions:
     ] = None
     realtime: Realtime = False
     wallclock: Annotated[
-        bool,
-        typer.Option(
-            "--wallclock",
-            help="Run every service in real time, on its own timer, as with hardware; slower where the machine cannot keep it "
-            "(or by PALPATE_RATE).",
-        ),
+        bool, typer.Option("--wallclock", help="Run every service in real time, as with hardware, or slower (PALPATE_RATE).")
     ] = False
     handover: Annotated[
         float, typer.Option(min=0, help="With --wallclock: seconds that a stopped service may take to be replaced; see takeover.")

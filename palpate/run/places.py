@@ -68,10 +68,8 @@ class Absent:
         for role in self.roles:
             given = places[role].environment
             where = given.get("PALPATE_LISTEN") or given.get("PALPATE_ROUTER", "")
-            self._sentences[role] = (
-                f"{role} is awaited at {where} for {self.wait_s:.0f} s: "
-                f"palpate join {role} --run {out.name} (or any program with the environment in {out / FILE})"
-            )
+            how = f"palpate join {role} --run {out.name} (or any program with the environment in {out / FILE})"
+            self._sentences[role] = f"{role} is awaited at {where} for {self.wait_s:.0f} s: {how}"
             self.tell(self._sentences[role])
 
     def explain(self, failure: Failure) -> Failure:
@@ -136,10 +134,8 @@ def enter(find: Callable[[str, Run], ServicePlace], role: str, service: str | No
     os.execvpe(program, [program, *words], {**os.environ, **place.environment})
 
 
-NameOrFile = Annotated[
-    str | None,
-    typer.Option("--service", metavar="NAME_OR_FILE", help="An installed implementation or a Python file; else the run's own."),
-]
+_CHOICE = "An installed implementation or a Python file; else the run's own."
+NameOrFile = Annotated[str | None, typer.Option("--service", metavar="NAME_OR_FILE", help=_CHOICE)]
 RunName = Annotated[str | None, typer.Option(help="The run: its process id, or part of its name; by default the newest.")]
 
 

@@ -51,10 +51,9 @@ class SecureBus:
         options = BusOptions(mode="client", router=self.endpoint, tls=self.keys / role, shared_memory=False)
         certificate = read(self.keys / role / "cert.pem")
         if certificate.expired or certificate.name != role:
-            raise BusConfigError(
-                f"{certificate.path}: is of {certificate.name!r}, valid until {certificate.until:%Y-%m-%d}; "
-                f"want a valid one of {role!r}: palpate keys init {self.keys}"
-            )
+            found = f"is of {certificate.name!r}, valid until {certificate.until:%Y-%m-%d}"
+            wanted = f"want a valid one of {role!r}: palpate keys init {self.keys}"
+            raise BusConfigError(f"{certificate.path}: {found}; {wanted}")
         return options
 
     def __enter__(self) -> Self:
@@ -125,7 +124,7 @@ def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path]
             if service is None and role not in found:
                 raise UserError(f"{file}: no service {role!r}; it has {', '.join(services)}")
             if service is not None:
-                found[role] = _merged(file, role, service, found.get(role))
+                found[role] = _merged(file, role, service, found.get(role, ServiceProcess(role, (), {})))
     return found
 
 
@@ -134,23 +133,22 @@ def _services(path: Path) -> dict[str, Any]:
         document = read_yaml(path)
     except OSError as error:
         raise UserError(f"{path}: cannot be read: {error}") from error
-    services = document.get("services") if isinstance(document, dict) else None
-    if not isinstance(services, dict):
-        raise UserError(f"{path}: services: want a mapping")
-    return services
+    return _mapping(document.get("services") if isinstance(document, dict) else document, f"{path}: services")
 
 
-def _merged(path: Path, role: str, service: Mapping[str, Any], earlier: ServiceProcess | None) -> ServiceProcess:
-    if not isinstance(service, dict):
-        raise UserError(f"{path}: services.{role} = {service!r}: want a mapping")
-    command = service.get("command", None if earlier is None else list(earlier.command))
+def _mapping(value: Any, name: str) -> dict[str, Any]:
+    if not isinstance(value, dict):
+        raise UserError(f"{name} = {value!r}: want a mapping")
+    return value
+
+
+def _merged(path: Path, role: str, service: Any, earlier: ServiceProcess) -> ServiceProcess:
+    name = f"{path}: services.{role}"
+    command = _mapping(service, name).get("command", list(earlier.command))
     if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
-        raise UserError(f"{path}: services.{role}.command = {command!r}: want a list of words")
-    environment = service.get("environment") or {}
-    if not isinstance(environment, dict):
-        raise UserError(f"{path}: services.{role}.environment: want a mapping")
-    before = {} if earlier is None else earlier.environment
-    return ServiceProcess(role, tuple(command), {**before, **{k: str(v) for k, v in environment.items()}})
+        raise UserError(f"{name}.command = {command!r}: want a list of words")
+    environment = _mapping(service.get("environment") or {}, f"{name}.environment")
+    return ServiceProcess(role, tuple(command), {**earlier.environment, **{k: str(v) for k, v in environment.items()}})
 
 
 _LOGGED = re.compile(r"^\d{4}-\d\d-\d\d [\d:,.]+ \S+ [A-Z]+ ")
@@ -207,17 +205,16 @@ class LocalProcesses:
         settings = Settings.read()
         taking_part = {role for group in groups for role in group}
         absent = tuple(name for name, role in contract().roles.items() if role.optional and name not in taking_part)
-        self._given: dict[str, Any] = {"runtime": timing.runtime, "record": record, "absent": absent}
         self._out = out
         remove_leftovers()
         self._own = RunFolder()
         self.folder = self._own.path
         """Folder of sockets and key, removed at the end."""
-        self._given["key"] = key = settings.key or make_key(self.folder / "run.key")
-        self._given["rate"] = timing.rate if timing.wallclock else None
-        self._scenario_files = {
-            role: file if view_of(role) == "scenario" else self._copy(file) for role, file in scenario_files.items()
-        }
+        key = settings.key or make_key(self.folder / "run.key")
+        time: dict[str, Any] = {"runtime": timing.runtime, "rate": timing.wallclock_rate}
+        self._given: dict[str, Any] = {**time, "record": record, "absent": absent, "key": key}
+        own = {role for role in scenario_files if view_of(role) == "scenario"}
+        self._scenario_files = {role: file if role in own else self._copy(file) for role, file in scenario_files.items()}
         router = secure.endpoint if secure else settings.router
         processes = {group[0]: group for group in (("conductor",), *groups)}
         quick = [name for name, roles in processes.items() if BARRIER.issuperset(roles)]
@@ -229,19 +226,9 @@ class LocalProcesses:
             self.bus = {role: secure.options(role) for role in self.bus}
             endpoints = dict.fromkeys(self.bus, secure.endpoint)
         (out / "bus.json").write_text(json.dumps(endpoints, indent=2) + "\n", encoding="utf-8")
-        self._announcement = Announcement(
-            Run(
-                name=out.name,
-                endpoints=endpoints,
-                domain=settings.domain,
-                runtime=timing.runtime,
-                rate=timing.wallclock_rate,
-                router=router,
-                out=str(out),
-                keys=None if secure is None else str(secure.keys),
-                key=str(key),
-            )
-        )
+        secrets: dict[str, Any] = {"keys": None if secure is None else str(secure.keys), "key": str(key)}
+        run = Run(out.name, endpoints, settings.domain, router=router, out=str(out), **time, **secrets)
+        self._announcement = Announcement(run)
         self._logs: list[IO[bytes]] = []
         self.running: dict[str, subprocess.Popen[bytes]] = {}
         """By role; roles of one group share a process."""
@@ -256,15 +243,9 @@ class LocalProcesses:
 
     def environment(self, process: ServiceProcess) -> dict[str, str]:
         """Return the environment of a service beyond that of this process."""
-        settings = Settings.read({**os.environ, **process.environment})
-        return {
-            **process.environment,
-            **FIXED,
-            **settings.replaced(
-                scenario=self._scenario_files[process.role], out=self._out if process.role in OBSERVERS else None, **self._given
-            ).to_env(),
-            **self.bus[process.role].to_env(),
-        }
+        files = {"scenario": self._scenario_files[process.role], "out": self._out if process.role in OBSERVERS else None}
+        settings = Settings.read({**os.environ, **process.environment}).replaced(**files, **self._given)
+        return {**process.environment, **FIXED, **settings.to_env(), **self.bus[process.role].to_env()}
 
     def as_conductor(self) -> AbstractContextManager[None]:
         """Set the run's key in the environment of this process within a `with` block."""
@@ -275,9 +256,8 @@ class LocalProcesses:
         roles = [process.role for process in processes]
         for role in roles:
             self._ends.pop(role, None)
-        command, given = processes[0].command, self.environment(processes[0])
-        if len(processes) > 1:
-            command, given = self._group(processes)
+        alone = len(processes) == 1
+        command, given = (processes[0].command, self.environment(processes[0])) if alone else self._group(processes)
         path = self._out / "logs" / f"{'+'.join(roles)}.log"
         self._log_files |= dict.fromkeys(roles, path)
         self.running |= dict.fromkeys(roles, self._started(command, {**os.environ, **given}, path))
@@ -286,10 +266,8 @@ class LocalProcesses:
         """Return command and common environment of services in one process. The group's file has the rest of each environment."""
         environments = {process.role: self.environment(process) for process in processes}
         common = dict(set.intersection(*(set(environment.items()) for environment in environments.values())))
-        members = {}
-        for process in processes:
-            own = dict(environments[process.role].items() - common.items())
-            members[process.role] = GroupMember(process.shared_words(), own)
+        own = {role: dict(environment.items() - common.items()) for role, environment in environments.items()}
+        members = {process.role: GroupMember(process.shared_words(), own[process.role]) for process in processes}
         return group_command(self.folder / f"{processes[0].role}.json", members), common
 
     def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> subprocess.Popen[bytes]:

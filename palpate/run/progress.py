@@ -114,23 +114,11 @@ class RunDisplay:
         self._troubles_shown = 0
         self._stopped = ""
         self._keys = OperatorKeys()
-        self._bar = Progress(
-            SpinnerColumn(),
-            TextColumn("{task.fields[phase]:<9}", style="bold", markup=False),
-            BarColumn(bar_width=20),
-            TaskProgressColumn(),
-            TextColumn("{task.fields[facts]}", markup=False),
-            TimeElapsedColumn(),
-            console=console,
-            transient=True,
-            disable=quiet or not console.is_terminal,
-        )
-        self._task = self._bar.add_task(
-            "run",
-            total=1.0,
-            phase="starting",
-            facts="the services start: some seconds, a minute or more on a first run, which compiles",
-        )
+        phase, facts = TextColumn("{task.fields[phase]:<9}", style="bold", markup=False), "{task.fields[facts]}"
+        columns = SpinnerColumn(), phase, BarColumn(bar_width=20), TaskProgressColumn(), facts, TimeElapsedColumn()
+        self._bar = Progress(*columns, console=console, transient=True, disable=quiet or not console.is_terminal)
+        starts = "the services start: some seconds, a minute or more on a first run, which compiles"
+        self._task = self._bar.add_task("run", total=1.0, phase="starting", facts=starts)
 
     def __enter__(self) -> Self:
         self._bar.start()
@@ -151,10 +139,8 @@ class RunDisplay:
             return
         self.begun = True
         news, part, left = self._narration.news(exam), self._narration.part(exam), self._left(progress)
-        facts = (
-            f"{left}   t {progress.t / NS:.0f} s   {progress.real_time_factor:.2f} x real time   "
-            f"{exam.normal_force:5.2f} N   {max(exam.depth, -0.0999) * 1e3:5.1f} mm"
-        )
+        felt = f"{exam.normal_force:5.2f} N   {max(exam.depth, -0.0999) * 1e3:5.1f} mm"
+        facts = f"{left}   t {progress.t / NS:.0f} s   {progress.real_time_factor:.2f} x real time   {felt}"
         self._bar.update(self._task, completed=min(1.0, progress.t / NS / self._expected_s), phase=part, facts=facts)
         if self._quiet:
             return
@@ -188,6 +174,5 @@ class RunDisplay:
         stopped = supervisor.reason if supervisor is not None and supervisor.level else ""
         if stopped != self._stopped:
             self._stopped = stopped
-            self._console.print(
-                Text(f"stopped: {stopped}", "bold red") if stopped else "released", highlight=False, soft_wrap=True
-            )
+            text = Text(f"stopped: {stopped}", "bold red") if stopped else "released"
+            self._console.print(text, highlight=False, soft_wrap=True)

@@ -9,6 +9,7 @@ import yaml
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import codec
+from palpate_bus.messages.typestore import palpation_definitions
 
 HEAD = """\
 # RIHS01 hashes of every type on the bus. A test fails when one changes by accident.
@@ -19,7 +20,7 @@ HEAD = """\
 def main() -> None:
     rules = contract()
     rows = [*rules.topics.values(), *rules.internal.values()]
-    names = sorted({row.type for row in rows} | set(codec.palpation_definitions()))
+    names = sorted({row.type for row in rows} | set(palpation_definitions()))
     hashes = {name: codec.type_hash(name) for name in names}
     Path(__file__).with_name("type_hashes.yaml").write_text(HEAD + yaml.safe_dump(hashes, width=200), encoding="utf-8")
 

@@ -15,7 +15,7 @@ from rosbags.typesys import Stores, get_typestore
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.conformance import ViolationKind
+from palpate_bus.contract.port_check import ViolationKind
 
 RULES = contract()
 TYPES = {

@@ -9,8 +9,9 @@ import yaml
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Edge, Topic, Visibility, contract, parse
-from palpate_bus.contract.conformance import leaves
+from palpate_bus.contract.port_check import leaves
 from palpate_bus.messages import codec
+from palpate_bus.messages.typestore import palpation_definitions
 
 RULES = contract()
 TOPICS = pytest.mark.parametrize("topic", RULES.topics.values(), ids=lambda topic: topic.name)
@@ -21,7 +22,7 @@ FRAMES = {"world", "abdomen", "ft_sensor", "camera_depth_optical_frame"}
 
 def all_types() -> list[str]:
     rows = [*RULES.topics.values(), *RULES.internal.values()]
-    return sorted({row.type for row in rows} | set(codec.palpation_definitions()))
+    return sorted({row.type for row in rows} | set(palpation_definitions()))
 
 
 @pytest.mark.parametrize("name", all_types())
@@ -63,7 +64,7 @@ def test_every_physical_quantity_of_our_own_types_has_a_unit(topic: Topic) -> No
 
 def _comment(type_name: str, path: str) -> str:
     """Return the comment of a field in its .msg, and of the outer fields."""
-    definitions = codec.palpation_definitions()
+    definitions = palpation_definitions()
     found = ""
     description = type_name
     for name in path.split("."):
@@ -180,7 +181,7 @@ BUILD = (PACKAGE / "CMakeLists.txt").read_text(encoding="utf-8")
 def used_packages() -> set[str]:
     """Packages of the types within our messages."""
     used = set()
-    for name in codec.palpation_definitions():
+    for name in palpation_definitions():
         for _, described in codec.store.get_msgdef(name).fields:
             description = described
             while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
@@ -211,7 +212,7 @@ def test_the_build_finds_and_names_them() -> None:
 
 
 def test_names_are_those_that_rosidl_takes() -> None:
-    for name, text in codec.palpation_definitions().items():
+    for name, text in palpation_definitions().items():
         assert re.fullmatch(r"palpation_msgs/msg/[A-Z][A-Za-z0-9]*", name)
         for line in text.splitlines():
             words = line.partition("#")[0].split()

@@ -44,6 +44,12 @@ class Visibility(StrEnum):
 class _Row(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
+    def _ns(self, field: str) -> int:
+        """Return a time of the row [ns]."""
+        if (value := getattr(self, field)) is None:
+            raise ValueError(f"contract.yaml: {getattr(self, 'name', '')} has no {field}")
+        return int(value * MS)
+
 
 class Role(_Row):
     """A role, implemented by a service. Its period is in whole milliseconds of simulated time."""
@@ -117,12 +123,12 @@ class Topic(_Row):
     @property
     def max_age(self) -> int:
         """Age [ns] from which the newest message is stale. Raises ValueError if the contract gives none."""
-        return _given(self, "max_age_ms") * MS
+        return self._ns("max_age_ms")
 
     @property
     def expiry(self) -> int:
         """Time [ns] after its stamp at which a message expires. Raises ValueError if the contract gives none."""
-        return _given(self, "expiry_ms") * MS
+        return self._ns("expiry_ms")
 
     @property
     def periodic(self) -> bool:
@@ -156,13 +162,6 @@ class Topic(_Row):
         return facts
 
 
-def _given(row: Topic | Internal, field: str) -> int:
-    value: int | None = getattr(row, field)
-    if value is None:
-        raise ValueError(f"contract.yaml: {row.name} has no {field}")
-    return value
-
-
 class Internal(_Row):
     """A message of the runtime."""
 
@@ -180,17 +179,17 @@ class Internal(_Row):
     @property
     def period(self) -> int:
         """Time between messages [ns]. Raises ValueError if the contract gives none."""
-        return _given(self, "period_ms") * MS
+        return self._ns("period_ms")
 
     @property
     def deadline(self) -> int:
         """Time [ns] without a message after which its sender is lost. Raises ValueError if the contract gives none."""
-        return _given(self, "deadline_ms") * MS
+        return self._ns("deadline_ms")
 
 
-_MAY_KNOW: dict[Visibility, frozenset[str]] = {
-    Visibility.SIM: frozenset({"robot", "tissue", "camera", "dashboard", "recorder"}),
-    Visibility.TRUTH: frozenset({"conductor", "dashboard", "recorder"}),
+_MAY_KNOW = {
+    Visibility.SIM: {"robot", "tissue", "camera", "dashboard", "recorder"},
+    Visibility.TRUTH: {"conductor", "dashboard", "recorder"},
 }
 
 
@@ -211,16 +210,11 @@ class Contract(_Row):
                     raise ValueError(f"topic {topic.name}: no role {role!r}; roles are {sorted(self.roles)}")
             if topic.qos not in self.qos:
                 raise ValueError(f"topic {topic.name}: no QoS class {topic.qos!r}; classes are {sorted(self.qos)}")
-            if not topic.latched and topic.period_ms % self.roles[topic.producer].period_ms:
-                raise ValueError(
-                    f"topic {topic.name}: period {topic.period_ms} ms is not a multiple of the period of "
-                    f"{topic.producer}, {self.roles[topic.producer].period_ms} ms"
-                )
-            allowed = _MAY_KNOW.get(topic.visibility)
-            if allowed is not None and not set(topic.readers) <= allowed:
-                raise ValueError(
-                    f"topic {topic.name} is {topic.visibility} and must not be read by {sorted(set(topic.readers) - allowed)}"
-                )
+            if not topic.latched and topic.period_ms % (own_ms := self.roles[topic.producer].period_ms):
+                why = f"not a multiple of the period of {topic.producer}, {own_ms} ms"
+                raise ValueError(f"topic {topic.name}: period {topic.period_ms} ms is {why}")
+            if wrong := topic.readers.keys() - _MAY_KNOW.get(topic.visibility, topic.readers.keys()):
+                raise ValueError(f"topic {topic.name} is {topic.visibility} and must not be read by {sorted(wrong)}")
         self.step_order(tuple(self.roles))
         return self
 
@@ -242,18 +236,13 @@ class Contract(_Row):
 
         Raises ValueError that names the members of a cycle.
         """
-        before = {
-            role: {t.producer for t, edge in self.inputs(role) if edge is Edge.SAME_TICK and t.producer in roles}
-            for role in roles
-        }
+        needs = {role: {t.producer for t, edge in self.inputs(role) if edge is Edge.SAME_TICK} for role in roles}
         order: list[str] = []
-        while before:
-            ready = [role for role, needs in before.items() if not needs & before.keys()]
+        while left := [role for role in roles if role not in order]:
+            ready = [role for role in left if needs[role].isdisjoint(left)]
             if not ready:
-                raise ValueError(f"cycle of same_tick edges among {sorted(before)}")
+                raise ValueError(f"cycle of same_tick edges among {sorted(left)}")
             order += ready
-            for role in ready:
-                del before[role]
         return tuple(order)
 
 

@@ -13,30 +13,9 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS, fitted
-from palpate_bus.messages.typestore import (
-    CodecError,
-    array_dtype,
-    definition,
-    message_type,
-    palpation_definitions,
-    store,
-    type_hash,
-)
+from palpate_bus.messages.typestore import CodecError, array_dtype, definition, message_type, store, type_hash
 
-__all__ = [
-    "CodecError",
-    "Message",
-    "decode",
-    "decoder",
-    "definition",
-    "encode",
-    "encoder",
-    "message_type",
-    "palpation_definitions",
-    "passer",
-    "store",
-    "type_hash",
-]
+__all__ = ["CodecError", "Message", "decode", "decoder", "definition", "encode", "encoder", "message_type", "store", "type_hash"]
 
 _LITTLE_ENDIAN = ENCAPSULATION[:2]
 Message = Any

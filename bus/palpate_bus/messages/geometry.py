@@ -75,13 +75,11 @@ def rotation(orientation: Quaternion) -> Array:
     if not abs(norm - 1.0) < 0.01:  # also true for NaN
         raise ValueError(f"orientation = ({x}, {y}, {z}, {w}) has norm {norm}: must be 1")
     x, y, z, w = x / norm, y / norm, z / norm, w / norm
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
 
 
 def pose_matrix(message: Pose) -> Array:
@@ -176,13 +174,11 @@ def mesh_message(
     header: Header, vertices: ArrayLike, normals: ArrayLike = (), triangles: ArrayLike = (), breathing: ArrayLike = ()
 ) -> SurfaceMesh:
     """Return the `SurfaceMesh` of arrays, shaped as in `MeshArrays`; arrays that are left out are empty in the message."""
-    return SurfaceMesh(
-        header,
-        np.ascontiguousarray(vertices, dtype=np.float32).reshape(-1),
-        np.ascontiguousarray(normals, dtype=np.float32).reshape(-1),
-        np.ascontiguousarray(triangles, dtype=np.uint32).reshape(-1),
-        np.ascontiguousarray(breathing, dtype=np.float32),
-    )
+
+    def flat(array: ArrayLike, kind: Any = np.float32) -> Any:
+        return np.ascontiguousarray(array, dtype=kind).reshape(-1)
+
+    return SurfaceMesh(header, flat(vertices), flat(normals), flat(triangles, np.uint32), flat(breathing))
 
 
 def cloud_message(header: Header, points: Array) -> PointCloud2:

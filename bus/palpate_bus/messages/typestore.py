@@ -36,19 +36,11 @@ class CodecError(ValueError):
     """Bytes that do not hold the expected type, a message that does not fit its type, or an unknown type."""
 
 
-def _interface_package() -> Path:
-    """Return the folder of the ROS 2 package `palpation_msgs`, in a wheel or a checkout."""
-    package = Path(__file__).resolve().parents[1]
-    packaged = package / "palpation_msgs"
-    return packaged if packaged.is_dir() else package.parent / "palpation_msgs"
-
-
 def palpation_definitions() -> dict[str, str]:
-    """Return the .msg text of every message of `palpation_msgs`, by type name."""
-    return {
-        f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8")
-        for path in sorted((_interface_package() / "msg").glob("*.msg"))
-    }
+    """Return the .msg text of every message of the ROS 2 package `palpation_msgs`, in a wheel or a checkout, by type name."""
+    package = Path(__file__).resolve().parents[1]
+    paths = sorted(path for place in (package, package.parent) for path in place.glob("palpation_msgs/msg/*.msg"))
+    return {f"palpation_msgs/msg/{path.stem}": path.read_text(encoding="utf-8") for path in paths}
 
 
 def _load_store() -> Any:

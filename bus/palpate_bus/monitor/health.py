@@ -12,8 +12,8 @@ from statistics import median
 from typing import NamedTuple
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.contract.conformance import MessageViolation
-from palpate_bus.contract.conformance import ViolationKind as Kind
+from palpate_bus.contract.port_check import MessageViolation
+from palpate_bus.contract.port_check import ViolationKind as Kind
 from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import MS, header
 

@@ -24,12 +24,7 @@ from palpate_errors import RunError
 
 CONFIRM_S = 2.0
 """Timeout of a confirmation, wall time."""
-WORDS = {
-    "stop": OperatorRequest.STOP,
-    "soft-stop": OperatorRequest.SOFT_STOP,
-    "release": OperatorRequest.RELEASE,
-    "end": OperatorRequest.END,
-}
+WORDS = {word: getattr(OperatorRequest, word.replace("-", "_").upper()) for word in ("stop", "soft-stop", "release", "end")}
 """Requests to the examination and the message constant of each."""
 TIME_REQUESTS = ("pause", "resume", "step")
 """Requests to the conductor of a lockstep run: stop, continue, or briefly continue granting time."""
@@ -72,9 +67,9 @@ def order(session: zenoh.Session, domain: int, word: str, reason: str, key: byte
     """Send a request as `ask` does; return text for the operator, also without an answer."""
     try:
         answer, after_ms = ask(session, domain, word, reason, key=key)
+        return f"{word}: {answer} (confirmed after {after_ms:.0f} ms)"
     except NotAnswered as error:
         return f"{word}: {error}"
-    return f"{word}: {answer} (confirmed after {after_ms:.0f} ms)"
 
 
 KEYS = {"s": "soft-stop", "e": "stop", "r": "release"}

@@ -22,7 +22,7 @@ from palpate_bus.runtime.member import Member
 from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
-from palpate_bus.wire.transport import ReceivedSample, Sender, Subscription
+from palpate_bus.wire.transport import ReceivedSample, Sender, Subscription, dropped_by
 
 log = logging.getLogger(__name__)
 
@@ -54,12 +54,8 @@ class LockstepNode(Node):
                     seat.output.hello()
                     if seat in self._advances:
                         self._advances[seat].hello()
-                    detail = {
-                        "missing": self._inputs[seat].missing_inputs(),
-                        "process": [one.role for one in self._seats],
-                        **process_identity(),
-                    }
-                    seat.reports.send(ServiceReport.READY, NEVER, detail=detail)
+                    detail = {"missing": self._inputs[seat].missing_inputs(), "process": [one.role for one in self._seats]}
+                    seat.reports.send(ServiceReport.READY, NEVER, detail={**detail, **process_identity()})
             elif message is not None:
                 self._obey(message)
 
@@ -121,7 +117,7 @@ class LockstepNode(Node):
         return True
 
     def _counts(self, seat: Seat) -> dict[str, Any]:
-        counts = self._inputs[seat].counts()
+        counts = dropped_by(self._inputs[seat].subscriptions)
         if seat is self._seats[0]:
             counts["garbage"] += self._link.garbage
         return {"digests": seat.stepper.digests(), **counts}
@@ -153,6 +149,7 @@ class RemoteInputs:
         self._observed = tuple(buffer for buffer in remote if buffer.edge is Edge.OBSERVE)
         producers = sorted({b.topic.producer for b in self._awaited if b.edge.blocking and not b.topic.periodic})
         self._advances = {role: member.internal_subscription(f"palpate/advance/{role}", ADVANCE_TYPE) for role in producers}
+        self.subscriptions = (*self._data.values(), *self._advances.values())
         self._last: dict[str, tuple[int, int]] = {}
         """By topic, sequence number and sending time of the newest message."""
         self._event_topics = {role: event_topics(self._rules, role) for role in producers}
@@ -217,11 +214,9 @@ class RemoteInputs:
             while not doubled and (later := self._data[buffer.topic.name].get(max(end - monotonic(), 0.0))) is not None:
                 doubled = later.sequence <= sample.sequence and later.sent != sample.sent
             if doubled:
-                raise ForgedSenderError(
-                    f"{error}; two senders share an identity: a forged or doubled sender of "
-                    f"{buffer.topic.name}, not a loss of {buffer.topic.producer}",
-                    buffer.topic.name,
-                ) from None
+                name, why = buffer.topic.name, f"{error}; two senders share an identity"
+                text = f"{why}: a forged or doubled sender of {name}, not a loss of {buffer.topic.producer}"
+                raise ForgedSenderError(text, name) from None
             raise
         self._last[buffer.topic.name] = (sample.sequence, sample.sent)
 
@@ -235,11 +230,6 @@ class RemoteInputs:
             buffer = self._stepper.buffers.get(name)
             if buffer is not None:
                 buffer.advance(advance.tick, int(sequence))
-
-    def counts(self) -> dict[str, int]:
-        """Return the numbers of dropped messages: `garbage`, `foreign` ones of another sender, `forged` ones with a wrong tag."""
-        subscriptions = (*self._data.values(), *self._advances.values())
-        return {kind: sum(getattr(s, kind) for s in subscriptions) for kind in ("garbage", "foreign", "forged")}
 
 
 class Advances:

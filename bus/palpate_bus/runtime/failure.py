@@ -101,12 +101,9 @@ class Failure:
     def from_report(cls, role: str, detail: Mapping[str, Any]) -> Failure:
         """Return the failure that the service `role` reported."""
         code = detail.get("code")
-        return cls(
-            FailureCode(str(code)) if code in {*FailureCode} else FailureCode.ROLE_FAILED,
-            str(detail.get("error", "unknown error")),
-            tuple(map(str, detail.get("roles", (role,)))),
-            tuple(map(str, detail.get("topics", ()))),
-        )
+        known = FailureCode(str(code)) if code in {*FailureCode} else FailureCode.ROLE_FAILED
+        roles, topics = tuple(map(str, detail.get("roles", (role,)))), tuple(map(str, detail.get("topics", ())))
+        return cls(known, str(detail.get("error", "unknown error")), roles, topics)
 
 
 def _own_line(error: BaseException) -> str:

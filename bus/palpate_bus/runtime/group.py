@@ -57,7 +57,4 @@ class Group:
 
     def digests(self) -> dict[str, str]:
         """Return the digest of each hashed topic of the group."""
-        digests: dict[str, str] = {}
-        for stepper in self.steppers.values():
-            digests.update(stepper.digests())
-        return digests
+        return {name: digest for stepper in self.steppers.values() for name, digest in stepper.digests().items()}

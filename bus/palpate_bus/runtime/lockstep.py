@@ -49,16 +49,10 @@ class Blame:
     def per_step_us(self) -> dict[str, object]:
         """Return means in microseconds per step, for the report."""
         steps = max(self.steps, 1)
-        figures: dict[str, object] = {
-            name: round(getattr(self, name) / steps / 1e3, 2)
-            for name in ("compute", "decode", "encode", "send", "transport", "wait")
-        }
-        figures["steps"] = self.steps
-        figures["waited_for"] = {
-            role: round(duration / steps / 1e3, 2)
-            for role, duration in sorted(self.waited_for.items(), key=lambda item: -item[1])
-        }
-        return figures
+        spent = {name: getattr(self, name) for name in ("compute", "decode", "encode", "send", "transport", "wait")}
+        waits = sorted(self.waited_for.items(), key=lambda item: -item[1])
+        means, waited = ({name: round(ns / steps / 1e3, 2) for name, ns in rows} for rows in (spent.items(), waits))
+        return {**means, "steps": self.steps, "waited_for": waited}
 
 
 _CHAIN = struct.Struct("<qqq")
@@ -138,14 +132,10 @@ class InputBuffer:
     def accept(self, sequence: int, payload: bytes) -> None:
         """Take a received message. Raises LockstepError if one before it is missing."""
         if sequence != self._last_sequence + 1:
-            if sequence <= self._last_sequence:
-                raise LockstepError(
-                    f"{self.topic.name}: sequence {sequence} is a duplicate after {self._last_sequence}", self.topic.name
-                )
-            raise LockstepError(
-                f"{self.topic.name}: messages {self._last_sequence + 1}..{sequence - 1} of {self.topic.producer} are missing",
-                self.topic.name,
-            )
+            name, last = self.topic.name, self._last_sequence
+            missing = f"messages {last + 1}..{sequence - 1} of {self.topic.producer} are missing"
+            why = missing if sequence > last else f"sequence {sequence} is a duplicate after {last}"
+            raise LockstepError(f"{name}: {why}", name)
         self._last_sequence = sequence
         if self._periodic:
             stamp = (sequence - 1) * self.period
@@ -302,10 +292,8 @@ class Stepper:
         self.service = service
         self._refuse = refuse
         self.role = contract.roles[service.role]
-        self.buffers = {
-            topic.name: InputBuffer(topic, edge, contract.roles[topic.producer].period)
-            for topic, edge in contract.inputs(service.role)
-        }
+        inputs = contract.inputs(service.role)
+        self.buffers = {row.name: InputBuffer(row, edge, contract.roles[row.producer].period) for row, edge in inputs}
         self.ports = {topic.name: OutputPort(topic) for topic in contract.outputs(service.role)}
         self.blame = Blame()
         self.inbox = TickInbox(self.buffers, self.blame)
@@ -413,12 +401,10 @@ class Stepper:
         return sent
 
     def _port(self, name: str) -> OutputPort:
-        try:
-            return self.ports[name]
-        except KeyError:
-            raise LockstepError(
-                f"{self.role.name} sent {name}, which is not its topic; by the contract it sends {', '.join(self.ports)}"
-            ) from None
+        if name not in self.ports:
+            allowed = f"by the contract it sends {', '.join(self.ports)}"
+            raise LockstepError(f"{self.role.name} sent {name}, which is not its topic; {allowed}")
+        return self.ports[name]
 
     def digests(self) -> dict[str, str]:
         """Return the digest of each hashed topic."""

@@ -6,7 +6,7 @@ nothing is lost, but the run may be slower.
 """
 
 import logging
-from abc import ABC, abstractmethod
+from collections import Counter
 from contextlib import suppress
 from dataclasses import dataclass
 from time import monotonic, sleep
@@ -25,7 +25,7 @@ from palpate_bus.runtime.output import CHUNK_TYPE, unpack_chunk
 from palpate_bus.runtime.process import process_identity
 from palpate_bus.service import Service
 from palpate_bus.wire.rmw import WireError, unpack
-from palpate_bus.wire.transport import decoded, subscribe
+from palpate_bus.wire.transport import subscribe
 
 log = logging.getLogger(__name__)
 
@@ -61,9 +61,7 @@ class _Feed:
         self._refuse = member.note_refused
         self.sequence = 0
         self.missed = 0
-        self.garbage = 0
-        self.forged = 0
-        self.refused = 0
+        self.dropped = Counter(garbage=0, forged=0, refused=0)
         self._tags = member.transport.tag_check(key)
 
     def drain(self) -> list[tuple[int, bytes, codec.Message]]:
@@ -71,23 +69,22 @@ class _Feed:
         received = []
         while (sample := self._try()) is not None:
             try:
-                attachment = sample.attachment.to_bytes()
+                attachment, payload = sample.attachment.to_bytes(), sample.payload.to_bytes()
                 sequence, sent, _ = unpack(attachment)
-            except (WireError, AttributeError):
-                self.garbage += 1
-                continue
-            payload = sample.payload.to_bytes()
-            if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
-                self.forged += 1
-                continue
-            message = decoded(self._decode, payload)
-            if message is None:  # an observer accepts every sender, and invalid bytes must not end it
-                self.garbage += 1
-                continue
-            try:
+                if self._tags is not None and not self._tags.accepts(attachment, sent, payload):
+                    self.dropped["forged"] += 1
+                    continue
+                message = self._decode(payload)
                 self._check(message, (sequence - 1) * self.topic.period)
+            except (
+                WireError,
+                AttributeError,
+                codec.CodecError,
+            ):  # every sender is accepted: invalid bytes must not end an observer
+                self.dropped["garbage"] += 1
+                continue
             except RefusedMessage as refused:
-                self.refused += 1
+                self.dropped["refused"] += 1
                 self._refuse(refused)
                 continue
             if sequence > self.sequence + 1 and not self.topic.open:
@@ -143,16 +140,12 @@ class ObservedService:
 
     def counters(self) -> dict[str, object]:
         """Return the numbers of dropped and missed messages, for the report."""
-        return {
-            "garbage": sum(feed.garbage for feed in self.feeds),
-            "forged": sum(feed.forged for feed in self.feeds),
-            "refused": sum(feed.refused for feed in self.feeds),
-            "missed": {feed.topic.name: feed.missed for feed in self.feeds if feed.missed},
-        }
+        counters = {kind: sum(feed.dropped[kind] for feed in self.feeds) for kind in ("garbage", "forged", "refused")}
+        return {**counters, "missed": {feed.topic.name: feed.missed for feed in self.feeds if feed.missed}}
 
 
-class ObservingNode(ABC):
-    """A process outside the barrier: it receives messages until the conductor ends the run."""
+class ObserverNode:
+    """One observing service in a process of its own: it receives messages until the conductor ends the run."""
 
     def __init__(self, service: Service, member: Member) -> None:
         self._service = service
@@ -160,29 +153,38 @@ class ObservingNode(ABC):
         self._link = ConductorLink(member, LIMITS.stay_s)
         self._reports = Reports(member)
         self._observed = frozenset(role.name for role in member.rules.roles.values() if not role.observer)
+        self._open()
 
-    @abstractmethod
+    def _open(self) -> None:
+        """Open the inputs and outputs."""
+        self._feeds = ObservedService(self._service, self._member)
+
     def _drain(self) -> bool:
         """Process received messages; return True if there were any."""
+        return self._feeds.drain_and_step()
 
-    @abstractmethod
     def _reached(self) -> int:
         """Return the tick [ns] up to which everything was received."""
+        return self._feeds.now
 
-    @abstractmethod
-    def _missing(self) -> list[str]:
-        """Return the inputs without a sender before the run begins."""
+    def _hello(self) -> list[str]:
+        """Answer a hello on all edges; return the inputs without a sender before the run begins."""
+        for publisher in self._feeds.publishers.values():
+            publisher.hello()
+        return []
 
-    @abstractmethod
     def _details(self) -> dict[str, Any]:
         """Return counts for the last report."""
+        return {"blame": self._feeds.stepper.blame.per_step_us(), **self._feeds.counters()}
 
     def _report(self) -> None:
+        """Report progress."""
         self._reports.progress(self._reached())
 
-    @abstractmethod
     def _obey(self, message: Any) -> None:
         """Process a control message other than HELLO and END."""
+        if message.command == RunControl.LOST:
+            self._feeds.stepper.inbox.lost_roles.add(message.role)
 
     def run(self) -> None:
         """Observe until the conductor ends the run, and finish the service in any case.
@@ -200,7 +202,8 @@ class ObservingNode(ABC):
                         sleep(LIMITS.idle_s)
                     self._report()
                 elif message.command == RunControl.HELLO:
-                    self._hello()
+                    self._drain()
+                    self._reports.send(ServiceReport.READY, NEVER, detail={"missing": self._hello(), **process_identity()})
                 elif message.command == RunControl.END:
                     break
                 else:
@@ -208,14 +211,10 @@ class ObservingNode(ABC):
                         self._observed -= {message.role}
                     self._obey(message)
             self._drain_rest()
-        except RunAborted as ended:
-            log.warning("run aborted: %s", ended)
-            self._drain_rest()
-            self._service.finish()
-            raise
-        except KeyboardInterrupt:
-            log.warning("run aborted by a signal")
-            self._drain()
+        except (RunAborted, KeyboardInterrupt) as ended:
+            aborted = isinstance(ended, RunAborted)
+            log.warning("run aborted: %s", ended if aborted else "by a signal")
+            (self._drain_rest if aborted else self._drain)()
             self._service.finish()
             raise
         except Exception:
@@ -235,39 +234,6 @@ class ObservingNode(ABC):
         while self._drain():
             pass
 
-    def _hello(self) -> None:
-        self._drain()
-        self._reports.send(ServiceReport.READY, NEVER, detail={"missing": self._missing(), **process_identity()})
-
-
-class ObserverNode(ObservingNode):
-    """One observing service in a process of its own."""
-
-    def __init__(self, service: Service, member: Member) -> None:
-        super().__init__(service, member)
-        self._feeds = ObservedService(service, member)
-
-    def _drain(self) -> bool:
-        return self._feeds.drain_and_step()
-
-    def _reached(self) -> int:
-        return self._feeds.now
-
-    def _missing(self) -> list[str]:
-        return []
-
-    def _details(self) -> dict[str, Any]:
-        return {"blame": self._feeds.stepper.blame.per_step_us(), **self._feeds.counters()}
-
-    def _obey(self, message: Any) -> None:
-        if message.command == RunControl.LOST:
-            self._feeds.stepper.inbox.lost_roles.add(message.role)
-
-    def _hello(self) -> None:
-        for publisher in self._feeds.publishers.values():
-            publisher.hello()
-        super()._hello()
-
 
 CLOCK = "clock"
 
@@ -285,13 +251,13 @@ class RawRecorder(Protocol):
         """Take a message: its row, CDR bytes, simulated stamp [ns] and sequence number."""
 
 
-class RecorderNode(ObservingNode):
+class RecorderNode(ObserverNode):
     """A recorder in a process of its own."""
 
-    def __init__(self, service: Service, member: Member) -> None:
+    def _open(self) -> None:
+        service, member = self._service, self._member
         if not isinstance(service, RawRecorder):
             raise TypeError(f"the {service.role} service has no record(topic, payload, stamp, sequence)")
-        super().__init__(service, member)
         self._recorder: RawRecorder = service
         self._topics = member.rules.topics
         producers = [role.name for role in member.rules.roles.values() if not role.observer]
@@ -300,20 +266,19 @@ class RecorderNode(ObservingNode):
         self._numbers = dict.fromkeys(producers, 0)
         """By role, the sequence number of the newest chunk."""
         # messages of observers (clock, diagnostics, operator's requests) are rare and come directly; the clock dates the others
-        direct = [topic for topic, _ in member.rules.inputs(service.role) if member.rules.roles[topic.producer].observer]
+        inputs = member.rules.inputs(self._service.role)
+        direct = [topic for topic, _ in inputs if member.rules.roles[topic.producer].observer]
         direct.sort(key=lambda topic: topic.name != CLOCK)
         self._direct = [(topic, member.subscription(topic)) for topic in direct]
-        self._clock = 0
+        self._clock = self._messages = self._garbage = 0
         self._lost: set[str] = set()
-        self._messages = 0
-        self._garbage = 0
         self._reported_trouble = ""
 
     def _reached(self) -> int:
         """Return the tick [ns] up to which the messages of every producer that is not lost are written."""
         return min((tick for role, tick in self._covered.items() if role not in self._lost), default=NEVER)
 
-    def _missing(self) -> list[str]:
+    def _hello(self) -> list[str]:
         return [f"palpate/record/{role}" for role, chunk in self._chunks.items() if not chunk.hello_received]
 
     def _details(self) -> dict[str, Any]:

@@ -5,6 +5,7 @@ producer another send per message and the recorder a wake-up each. A chunk every
 """
 
 from collections.abc import Iterator, Sequence
+from itertools import accumulate, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -56,42 +57,30 @@ class ChunkWriter:
         """Return a chunk of the messages since the last one, up to tick `t` [ns], in CDR."""
         self._next = t + CHUNK_PERIOD
         topics, payloads, stamps, sequences = zip(*self._sent, strict=True) if self._sent else ((), (), (), ())
-        message = RecordChunk(
-            self._role,
-            t,
-            list(self._topics),
-            np.fromiter(map(self._index.__getitem__, topics), np.uint16),
-            np.array(stamps, np.int64),
-            np.array(sequences, np.uint32),
-            np.fromiter(map(len, payloads), np.uint32),
-            np.frombuffer(b"".join(payloads), np.uint8),
-        )
+        index, length = np.fromiter(map(self._index.__getitem__, topics), np.uint16), np.fromiter(map(len, payloads), np.uint32)
+        rows = index, np.array(stamps, np.int64), np.array(sequences, np.uint32), length
         self._sent.clear()
         self._bytes = 0
-        return _encode(message)
+        return _encode(RecordChunk(self._role, t, list(self._topics), *rows, np.frombuffer(b"".join(payloads), np.uint8)))
 
 
 def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
     """Return the tick [ns] that a chunk covers, and its messages. Raises CodecError if it is invalid."""
     chunk = _decode(payload)
     data = chunk.data.tobytes()
-    columns = (chunk.topic.tolist(), chunk.stamp.tolist(), chunk.sequence.tolist(), chunk.length.tolist())
-    if len({len(column) for column in columns}) != 1:
+    columns = topics, stamps, sequences, lengths = [
+        column.tolist() for column in (chunk.topic, chunk.stamp, chunk.sequence, chunk.length)
+    ]
+    if len(set(map(len, columns))) != 1:
         raise codec.CodecError(f"{CHUNK_TYPE}: columns of {', '.join(str(len(column)) for column in columns)} messages")
-    if sum(columns[3]) != len(data):
-        raise codec.CodecError(f"{CHUNK_TYPE}: messages of {sum(columns[3])} bytes in {len(data)} bytes")
-    if columns[1] and min(columns[1]) < 0:
-        raise codec.CodecError(f"{CHUNK_TYPE}: a message of {min(columns[1])} ns, before the start")
-    if columns[0] and max(columns[0]) >= len(chunk.topics):
-        raise codec.CodecError(f"{CHUNK_TYPE}: a message of topic {max(columns[0])} of {len(chunk.topics)}")
-
-    def messages() -> Iterator[ChunkMessage]:
-        begin = 0
-        for topic, stamp, sequence, length in zip(*columns, strict=True):
-            yield ChunkMessage(chunk.topics[topic], data[begin : begin + length], stamp, sequence)
-            begin += length
-
-    return int(chunk.tick), messages()
+    if sum(lengths) != len(data):
+        raise codec.CodecError(f"{CHUNK_TYPE}: messages of {sum(lengths)} bytes in {len(data)} bytes")
+    if min(stamps, default=0) < 0 or max(topics, default=-1) >= len(chunk.topics):
+        raise codec.CodecError(f"{CHUNK_TYPE}: a message of {min(stamps)} ns, or of topic {max(topics)} of {len(chunk.topics)}")
+    ends = list(accumulate(lengths, initial=0))
+    payloads = (data[begin:end] for begin, end in pairwise(ends))
+    names = (chunk.topics[topic] for topic in topics)
+    return int(chunk.tick), map(ChunkMessage, names, payloads, stamps, sequences)
 
 
 class ServiceOutput:

@@ -136,5 +136,4 @@ class Activity:
 
     def _wants_core(self) -> bool:
         """Return True if one of its threads could run."""
-        tasks = (psutil.Process(thread.id) for thread in self._process.threads())
-        return any(task.status() == psutil.STATUS_RUNNING for task in tasks)
+        return any(psutil.Process(thread.id).status() == psutil.STATUS_RUNNING for thread in self._process.threads())

@@ -10,10 +10,13 @@ On a slow machine the common clock may run slower than the wall clock (PALPATE_R
 """
 
 import logging
+from collections import Counter
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from time import monotonic_ns, perf_counter_ns, sleep
 from typing import Any
+
+import numpy as np
 
 from palpate_bus.contract import Edge, Topic, Visibility
 from palpate_bus.contract.port_check import RefusedMessage
@@ -27,6 +30,7 @@ from palpate_bus.runtime.node import Node, Seat
 from palpate_bus.runtime.process import lower_priority, niceness_of_period, process_identity
 from palpate_bus.service import Service
 from palpate_bus.settings import Settings
+from palpate_bus.wire.transport import dropped_by
 
 BIN_NS = 20_000
 BINS = 5_000
@@ -36,38 +40,32 @@ BINS = 5_000
 class LatencyHistogram:
     """Histogram of the latencies of one topic [ns], from sending to reception; its memory is constant."""
 
-    __slots__ = ("_bins", "count", "total", "worst")
+    __slots__ = ("_bins", "total", "worst")
 
     def __init__(self) -> None:
         self._bins = [0] * BINS
-        self.count = 0
-        self.total = 0
-        self.worst = 0
+        self.total = self.worst = 0
+
+    @property
+    def count(self) -> int:
+        """Number of latencies."""
+        return sum(self._bins)
 
     def add(self, latency: int) -> None:
         """Count a latency [ns]. A negative one, from clocks of two machines, counts as zero."""
         self._bins[min(max(latency, 0) // BIN_NS, BINS - 1)] += 1
-        self.count += 1
         self.total += latency
         self.worst = max(self.worst, latency)
 
     def quantile(self, fraction: float) -> int:
         """Return the latency [ns] that this fraction of the messages does not exceed, to within a bin; 0 without messages."""
-        left = fraction * self.count
-        for index, number in enumerate(self._bins):
-            left -= number
-            if left <= 0 and number:
-                return min((index + 1) * BIN_NS, max(self.worst, 0))
-        return 0
+        index = int(np.searchsorted(np.cumsum(self._bins), max(fraction * self.count, 1e-9)))
+        return min((index + 1) * BIN_NS, max(self.worst, 0))
 
     def as_ms(self) -> dict[str, float]:
         """Return mean, median, 99th percentile and largest latency [ms]."""
-        figures = {
-            "mean": self.total / self.count if self.count else 0.0,
-            "p50": self.quantile(0.5),
-            "p99": self.quantile(0.99),
-            "max": self.worst,
-        }
+        mean = self.total / max(self.count, 1)
+        figures = {"mean": mean, "p50": self.quantile(0.5), "p99": self.quantile(0.99), "max": self.worst}
         return {name: round(value / 1e6, 3) for name, value in figures.items()}
 
 
@@ -123,11 +121,7 @@ class WallClockNode(Node):
             for name, buffer in self._stepper.buffers.items()
         }
         self._sequences = dict.fromkeys(self._data, 0)
-        self.gaps = 0
-        self.undecodable = 0
-        self.refused = 0
-        self.overruns = 0
-        self.skips = 0
+        self._number = Counter(gaps=0, undecodable=0, refused=0, overruns=0, skips=0)
         self._ages = {name: LatencyHistogram() for name in self._data}
         self._end: int | None = None
         self._rate = Settings.read().rate or 1.0
@@ -150,11 +144,8 @@ class WallClockNode(Node):
                 continue
             if message.command == RunControl.HELLO:
                 self._seat.output.hello()
-                missing = [
-                    name
-                    for name, buffer in self._stepper.buffers.items()
-                    if buffer.edge.blocking and not self._data[name].hello_received
-                ]
+                silent = (name for name, data in self._data.items() if not data.hello_received)
+                missing = [name for name in silent if self._stepper.buffers[name].edge.blocking]
                 self._seat.reports.send(ServiceReport.READY, NEVER, detail={"missing": missing, **process_identity()})
             elif message.command == RunControl.GRANT and message.last:
                 raise RunAborted("the run is already ending")
@@ -183,10 +174,10 @@ class WallClockNode(Node):
             if late < 0:
                 sleep(-late / self._rate / 1e9)
             elif late > period:
-                self.overruns += 1
+                self._number["overruns"] += 1
                 if late > catch_up:
                     t += late // period * period
-                    self.skips += 1
+                    self._number["skips"] += 1
             self._receive(t)
             everything: list[Sent] = []
             for sent in self._stepper.parts(t):
@@ -219,18 +210,16 @@ class WallClockNode(Node):
 
         Events are not awaited, nor topics that only a simulation sends, since there may be none.
         """
+        self._receive(0)
         needed = [b for b in self._stepper.buffers.values() if _awaited(b.edge, b.topic)]
-        while True:
-            self._receive(0)
-            missing = next((b.topic.name for b in needed if not b.holds_any), "")
-            if not missing:
-                break
-            self._seat.progress(missing)
+        while missing := [b.topic.name for b in needed if not b.holds_any]:
+            self._seat.progress(missing[0])
             if self._end is not None:  # the missing input will not be sent
                 return self._end + 1
-            message = self._link.poll(TIMES.handshake_poll_s if needed else None)
+            message = self._link.poll(TIMES.handshake_poll_s)
             if message is not None:
                 self._obey(message)
+            self._receive(0)
         period = self._stepper.role.period
         return max(0, self._passed() // period * period)
 
@@ -247,7 +236,7 @@ class WallClockNode(Node):
                 if sample.sequence <= last and not buffer.topic.open:
                     continue
                 if sample.sequence > last + 1 and not buffer.topic.open:
-                    self.gaps += sample.sequence - last - 1
+                    self._number["gaps"] += sample.sequence - last - 1
                 self._sequences[name] = sample.sequence
                 self._ages[name].add(now - sample.sent)
                 try:
@@ -258,29 +247,21 @@ class WallClockNode(Node):
                     self._refuse(refused)
                     continue
                 except CodecError as error:
-                    self.undecodable += 1
-                    if self.undecodable == 1:
+                    if not self._number["undecodable"]:
                         log.error("%s: %s; such messages are dropped and counted", name, error)
+                    self._number["undecodable"] += 1
                     continue
                 buffer.deliver(Packet(sample.payload, t - buffer.delay, sample.sequence, message))
 
     def _refuse(self, refused: RefusedMessage) -> None:
-        self.refused += 1
+        self._number["refused"] += 1
         self._member.note_refused(refused)
 
     def _send(self, seat: Seat, sent: Sequence[Sent]) -> None:
         seat.output.send(sent)
 
     def _counts(self, seat: Seat) -> dict[str, Any]:
-        return {
-            "digests": {},
-            "garbage": sum(s.garbage for s in self._data.values()) + self._link.garbage,
-            "foreign": sum(s.foreign for s in self._data.values()),
-            "forged": sum(s.forged for s in self._data.values()),
-            "gaps": self.gaps,
-            "undecodable": self.undecodable,
-            "refused": self.refused,
-            "overruns": self.overruns,
-            "skips": self.skips,
-            "age_ms": {name: ages.as_ms() for name, ages in self._ages.items() if ages.count},
-        }
+        ages = {name: ages.as_ms() for name, ages in self._ages.items() if ages.count}
+        dropped = dropped_by(self._data.values())
+        dropped["garbage"] += self._link.garbage
+        return {"digests": {}, **dropped, **self._number, "age_ms": ages}

@@ -90,20 +90,16 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     access.allow(OPERATOR, "orders", [OPERATOR_REQUESTS], False, data)
     for member in (*rules.roles, VIEWER, OPERATOR):
         access.allow(member, "sees", [f"{ADMIN_SPACE}/**"], False, presence)
-    return {
-        "enabled": True,
-        "default_permission": "deny",
-        "rules": access.rules,
-        "subjects": [{"id": member, by: [member]} for member in access.policies],
-        "policies": [{"rules": names, "subjects": [member]} for member, names in access.policies.items()],
-    }
+    subjects = [{"id": member, by: [member]} for member in access.policies]
+    policies = [{"rules": names, "subjects": [member]} for member, names in access.policies.items()]
+    members = {"rules": access.rules, "subjects": subjects, "policies": policies}
+    return {"enabled": True, "default_permission": "deny", **members}
 
 
 def watched(rules: Contract) -> list[str]:
     """Return the topics that the monitor of a run may receive, in the contract's order."""
-    own = {topic.name for topic, _ in rules.inputs(WATCHER)}
-    shown = set(public(rules))
-    return [name for name in rules.topics if name in own or name in shown]
+    shown = {*public(rules), *(topic.name for topic, _ in rules.inputs(WATCHER))}
+    return [name for name in rules.topics if name in shown]
 
 
 def public(rules: Contract) -> list[str]:

@@ -14,7 +14,7 @@ and `qos.cpp`; the numbers of the policies are those of ros2/rmw, `rmw/types.h`.
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from enum import StrEnum
-from itertools import count
+from itertools import count, product
 from queue import Empty, SimpleQueue
 from typing import Any
 
@@ -68,24 +68,16 @@ class Entity:
     def token(self) -> str:
         """Key of the token."""
         parts = [str(self.domain), self.zid, str(self.node_id), str(self.entity_id), self.kind.value]
-        parts += [_mangle(self.enclave), _mangle(self.namespace), _mangle(self.node)]
+        parts += [self.enclave, self.namespace, self.node]
         if self.endpoint is not None:
             topic = "/" + self.endpoint.topic.strip("/")
-            parts += [_mangle(topic), dds_type(self.endpoint.type), self.endpoint.type_hash, self.endpoint.qos]
-        return "/".join([ADMIN_SPACE, *parts])
+            parts += [topic, dds_type(self.endpoint.type), self.endpoint.type_hash, self.endpoint.qos]
+        return "/".join([ADMIN_SPACE, *(part.replace("/", "%") for part in parts)])
 
     @property
     def gid(self) -> bytes:
         """GID, 16 bytes."""
         return gid(self.token)
-
-
-def _mangle(name: str) -> str:
-    return name.replace("/", "%")
-
-
-def _demangle(name: str) -> str:
-    return name.replace("%", "/")
 
 
 def gid(token: str) -> bytes:
@@ -120,10 +112,9 @@ def parse_token(key: str) -> Entity:
         if len(parts) < _PARTS_OF_ENDPOINT:
             raise WireError(f"liveliness token {key!r} lacks topic, type, hash or QoS")
         topic, dds, type_hash, qos = endpoint[:4]
-        described = Endpoint(_demangle(topic).strip("/"), ros_type(dds), type_hash, qos)
-    return Entity(
-        numbers[0], zid, numbers[1], numbers[2], entity_kind, node, _demangle(namespace), _demangle(enclave), described
-    )  # fmt: skip
+        described = Endpoint(topic.replace("%", "/").strip("/"), ros_type(dds), type_hash, qos)
+    names = namespace.replace("%", "/"), enclave.replace("%", "/")
+    return Entity(numbers[0], zid, numbers[1], numbers[2], entity_kind, node, *names, described)
 
 
 class NodeTokens:
@@ -222,15 +213,12 @@ class GraphWatch:
 
 def mismatches(entities: Iterable[Entity]) -> list[str]:
     """Return a text for each publisher and subscription of a topic that do not connect because type or hash differ."""
-    endpoints = [(entity, entity.endpoint) for entity in entities if entity.endpoint is not None]
-    found = set()
-    for publisher, sent in endpoints:
-        for subscription, wanted in endpoints:
-            if publisher.kind is not EntityKind.PUBLISHER or subscription.kind is not EntityKind.SUBSCRIPTION:
-                continue
-            if sent.topic == wanted.topic and (sent.type, sent.type_hash) != (wanted.type, wanted.type_hash):
-                found.add(
-                    f"topic {sent.topic}: {publisher.node} publishes {sent.type} {sent.type_hash}, but {subscription.node} "
-                    f"wants {wanted.type} {wanted.type_hash}; both need the same message definitions"
-                )
-    return sorted(found)
+    endpoints = [(entity.kind, entity.node, entity.endpoint) for entity in entities if entity.endpoint is not None]
+    publishers = [(node, end) for kind, node, end in endpoints if kind is EntityKind.PUBLISHER]
+    subscriptions = [(node, end) for kind, node, end in endpoints if kind is EntityKind.SUBSCRIPTION]
+    return sorted({
+        f"topic {sent.topic}: {sender} publishes {sent.type} {sent.type_hash}, but {reader} wants {wanted.type} "
+        f"{wanted.type_hash}; both need the same message definitions"
+        for (sender, sent), (reader, wanted) in product(publishers, subscriptions)
+        if sent.topic == wanted.topic and (sent.type, sent.type_hash) != (wanted.type, wanted.type_hash)
+    })  # fmt: skip

@@ -3,7 +3,7 @@
 Callbacks only put samples into the subscription's queue, which the service's thread empties.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from itertools import count
 from queue import Empty, SimpleQueue
 from time import monotonic, time_ns
@@ -67,12 +67,9 @@ class Publisher:
         self.key = key
         self._session = session
         self._now = now
-        options: dict[str, Any] = {
-            "priority": getattr(zenoh.Priority, qos.priority),
-            "congestion_control": getattr(zenoh.CongestionControl, qos.congestion),
-            "express": qos.express,
-            "reliability": getattr(zenoh.Reliability, qos.reliability),
-        }
+        options: dict[str, Any] = {"priority": getattr(zenoh.Priority, qos.priority), "express": qos.express}
+        options["congestion_control"] = getattr(zenoh.CongestionControl, qos.congestion)
+        options["reliability"] = getattr(zenoh.Reliability, qos.reliability)
         if qos.transient_local:
             self._publisher: Any = zenoh.ext.declare_advanced_publisher(
                 session, key, cache=zenoh.ext.CacheConfig(qos.depth), publisher_detection=True, **options
@@ -224,6 +221,11 @@ class Subscription:
         """Undeclare the subscribers."""
         self._hellos.undeclare()
         self._subscriber.undeclare()
+
+
+def dropped_by(subscriptions: Collection[Subscription]) -> dict[str, int]:
+    """Return the numbers of messages that subscriptions dropped: `garbage`, `foreign` ones of another sender, `forged` ones."""
+    return {kind: sum(getattr(one, kind) for one in subscriptions) for kind in ("garbage", "foreign", "forged")}
 
 
 class Transport:

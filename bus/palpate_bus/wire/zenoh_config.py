@@ -103,9 +103,7 @@ class BusOptions:
         for endpoint in (*self.listen, *self.connect, *([self.router] if self.router else [])):
             _check_endpoint(endpoint)
             if self.tls is not None and not endpoint.startswith("tls/"):
-                raise BusConfigError(
-                    f"PALPATE_TLS is {self.tls}, but endpoint {endpoint!r} is not encrypted; want tls/<host>:<port>"
-                )
+                raise BusConfigError(f"PALPATE_TLS is {self.tls}, but {endpoint!r} is not encrypted; want tls/<host>:<port>")
         for name in TLS_FILES if self.tls is not None else ():
             if self.tls is not None and not (self.tls / name).is_file():
                 raise BusConfigError(f"PALPATE_TLS is {self.tls}: no {name} in it; `palpate keys init` makes such folders")
@@ -134,9 +132,8 @@ def _check_endpoint(endpoint: str) -> None:
     if not (protocol and slash and address):
         raise BusConfigError(f"endpoint {endpoint!r} is not <protocol>/<address>, like tcp/127.0.0.1:7447")
     if protocol == "unixsock-stream" and len(os.fsencode(address)) > UNIX_PATH_MAX_BYTES:
-        raise BusConfigError(
-            f"endpoint {endpoint!r}: the path of a unix socket has at most {UNIX_PATH_MAX_BYTES} bytes; choose a shorter folder"
-        )
+        why = f"the path of a unix socket has at most {UNIX_PATH_MAX_BYTES} bytes; choose a shorter folder"
+        raise BusConfigError(f"endpoint {endpoint!r}: {why}")
 
 
 def zenoh_config(options: BusOptions) -> zenoh.Config:
@@ -206,12 +203,8 @@ def mesh(roles: Sequence[str], folder: Path, *, lowlatency: Sequence[str] = ()) 
     `lowlatency` names the roles that offer the low-latency transport.
     """
     endpoints = {role: f"unixsock-stream/{folder.resolve()}/{role}.sock" for role in roles}
-    return {
-        role: BusOptions(
-            listen=(endpoints[role],), connect=tuple(endpoints[other] for other in roles[:index]), lowlatency=role in lowlatency
-        )
-        for index, role in enumerate(roles)
-    }
+    before = {role: tuple(endpoints[other] for other in roles[:index]) for index, role in enumerate(roles)}
+    return {role: BusOptions((endpoints[role],), before[role], lowlatency=role in lowlatency) for role in roles}
 
 
 def open_session(options: BusOptions | None = None, access: Mapping[str, Any] | None = None) -> zenoh.Session:

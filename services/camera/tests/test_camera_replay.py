@@ -110,8 +110,8 @@ def test_perception_alone_sees_the_recorded_surface(recording: Path, tmp_path: P
     height = SCENARIO.camera.look_at_m[2] - SCENARIO.exam.pose.xyz_m[2]
     np.testing.assert_allclose(mesh.vertices[:, 2], height, atol=0.008)  # of a camera with an error of calibration
     assert mesh.vertex_normals[:, 2].min() > 0.99
-    assert figures.frames == FRAMES
-    assert figures.coverage > 0.95
+    assert figures["frames"] == FRAMES
+    assert figures["coverage"] > 0.95
     assert (tmp_path / "surface.png").stat().st_size > 10_000
 
 

@@ -35,12 +35,8 @@ class FrameTree:
         transforms = self._transforms.copy()
         for i, rotation in enumerate(rotations.tolist(), _FIRST_JOINT):
             transforms[i] = Transform(transforms[i].translation, Quaternion(*rotation))
-        return TFMessage(
-            [
-                TransformStamped(header(t, parent), child, transform)
-                for (parent, child), transform in zip(self._names, transforms, strict=True)
-            ]
-        )
+        named = zip(self._names, transforms, strict=True)
+        return TFMessage([TransformStamped(header(t, parent), child, transform) for (parent, child), transform in named])
 
 
 DIAGNOSTICS_PERIOD_NS = NS
@@ -58,9 +54,8 @@ class KeptMessages(Sequence[Any]):
 
     def extend(self, messages: Iterable[Any]) -> None:
         """Append messages."""
-        for message in messages:
-            self._kept.append(self._encode(message))
-            self._newest = message
+        for self._newest in messages:
+            self._kept.append(self._encode(self._newest))
 
     def kept_from(self, first: int) -> list[bytes]:
         """Return the messages from the one with index `first` on, as bytes."""
@@ -69,8 +64,7 @@ class KeptMessages(Sequence[Any]):
     def keep(self, messages: Sequence[bytes]) -> None:
         """Append messages that are bytes already."""
         self._kept += messages
-        if messages:
-            self._newest = self._decode(messages[-1])
+        self._newest = self._decode(messages[-1]) if messages else self._newest
 
     def __len__(self) -> int:
         return len(self._kept)
@@ -185,14 +179,11 @@ class Collector(Service):
             last = c.status_changes[-1] if c.status_changes else None
             if last is None or (last.mode, last.cause) != (status.mode, status.cause):
                 c.status_changes.append(status)
-        c.supervisor = inbox.latest("supervisor/state")
-        c.phantom = inbox.latest("truth/phantom")
+        c.supervisor, c.phantom = inbox.latest("supervisor/state"), inbox.latest("truth/phantom")
         if not self._sampled:  # the frame of the samples is the first scan; later scans are of a patient who has moved
-            c.surface = inbox.latest("perception/surface")
-            c.targets = inbox.latest("perception/targets")
+            c.surface, c.targets = inbox.latest("perception/surface"), inbox.latest("perception/targets")
         c.correction = inbox.latest("exam/correction")
-        c.stiffness_map = inbox.latest("assessment/map")
-        c.findings = inbox.latest("assessment/findings")
+        c.stiffness_map, c.findings = inbox.latest("assessment/map"), inbox.latest("assessment/findings")
         out: dict[str, Any] = {"clock": Clock(time_message(t))}
         if self.diagnose is not None and t - self._diagnostics_at >= DIAGNOSTICS_PERIOD_NS:
             self._diagnostics_at = t

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Container, Iterable, Mapping, Set
+from collections.abc import Callable, Container, Mapping, Set
 from dataclasses import dataclass
-from time import monotonic, perf_counter, sleep
+from time import perf_counter, sleep
 from typing import Any
 
 import zenoh
@@ -89,14 +89,14 @@ class Conductor:
         collector.diagnose = self.diagnose
         self.grants = Grants(lambda tick, last: self._send(RunControl.GRANT, tick, last), timing)
         self._operator_requests = OperatorRequestServer(session, domain, self.request, self.grants.pace, member.transport.key)
-        self._started_at = 0.0
+        self.started_at = 0.0
+        """When the first grant was sent, by `perf_counter` [s]; 0 before."""
         self._warned = False
-        self.started_at_perf = 0.0
 
     @property
     def elapsed_s(self) -> float:
         """Wall time [s] since the first grant."""
-        return monotonic() - self._started_at if self._started_at else 0.0
+        return perf_counter() - self.started_at if self.started_at else 0.0
 
     # -- messages to and from the services
 
@@ -126,20 +126,18 @@ class Conductor:
                     if not isinstance(detail, dict):
                         raise InputError(f"palpate/report/{role}: not an object")
                 except (codec.CodecError, InputError) as error:
-                    self._notify_once([f"a report is dropped: {error}"])
+                    self._notify(f"a report is dropped: {error}")
                     continue
                 self.watchdog.report(role, int(message.tick), message.waiting_for)
-                self._notify_once(detail.get("suspicions", ()))
+                self._notify(*detail.get("suspicions", ()))
+                if message.waiting_for == CONDUCTOR:
+                    self._on_heartbeat_timeout(role, message.tick, detail.get("conductor_lost", ""))
                 reports.append((role, message, detail))
         return reports
 
-    def _notify(self, text: str) -> None:
-        self.result.trouble.append(text)
-
-    def _notify_once(self, texts: Iterable[str]) -> None:
-        for text in texts:
-            if text not in self.result.trouble:
-                self._notify(text)
+    def _notify(self, *texts: str) -> None:
+        """Add messages for the user, each once."""
+        self.result.trouble += [text for text in texts if text not in self.result.trouble]
 
     def diagnose(self) -> list[Any]:
         """Return the statuses of services, then topics, for `diagnostics`."""
@@ -168,13 +166,12 @@ class Conductor:
             self.result.interrupted = True
             self.abort("interrupted")
             raise RunFailed(FailureCode.INTERRUPTED, "interrupted before the first tick") from None
-        self._started_at = monotonic()
-        self.started_at_perf = perf_counter()
+        self.started_at = perf_counter()
         self.watchdog.restart()
         self.grants.begin()
         try:
             self._conduct(exited, tell)
-            self.result.wall_time_s = monotonic() - self._started_at
+            self.result.wall_time_s = self.elapsed_s
             self._end(exited, tell)
             tell(self)
         except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report needs what was measured, whatever ended the run
@@ -183,15 +180,14 @@ class Conductor:
             self._collect_heartbeat_timeouts()
             known = self.result.failure is not None and failure.roles and set(failure.roles) <= self.result.lost.keys()
             self.result.failure = self.result.failure or failure
-            self.result.wall_time_s = monotonic() - self._started_at
+            self.result.wall_time_s = self.elapsed_s
             self.abort(failure.text)
             if isinstance(error, RunFailed):  # before the services end and the report is written, which takes seconds
-                if not known:
-                    self._notify_once([failure.text])
+                self._notify(*([] if known else [failure.text]))
                 tell(self)
         self._operator_requests.close()
         self._contract.close()
-        self.result.sim_time_s = max(0, *(p.tick for p in self.watchdog.progress.values())) / NS
+        self.result.sim_time_s = self.watchdog.reached / NS
         self._observed.drain_and_step(last=True)
         if not (self.result.failure or self._wallclock):
             self.result.run_hash = run_hash(self.result.digests)
@@ -200,7 +196,7 @@ class Conductor:
     def _handshake(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Send hellos until every service has answered and has a sender on every input."""
         missing_inputs: dict[str, list[str]] = {}
-        begin = own_answered = monotonic()
+        begin = own_answered = perf_counter()
         own_roles = set(self._roles) - set(self._patience.absent)
         warned = False
         while len(missing_inputs) < len(self._roles) or any(missing_inputs.values()):
@@ -222,31 +218,23 @@ class Conductor:
                 self.abort(f"{', '.join(roles)} exited at start")
                 raise RunFailed(FailureCode.START_FAILED, f"{', '.join(roles)} exited at start: {how}", *roles)
             if not own_roles <= missing_inputs.keys():
-                own_answered = monotonic()
+                own_answered = perf_counter()
             joining = bool(self._patience.absent) and own_roles <= missing_inputs.keys()
             since, limit_s = (own_answered, self._patience.join) if joining else (begin, self._patience.start)
             if not joining and own_roles - missing_inputs.keys() <= self._patience.foreign:
                 limit_s = min(limit_s, self._patience.foreign_start)
-            if not warned and monotonic() - begin > self._patience.quiet:
-                self._notify(
-                    f"still starting, {limit_s:.0f} s at most: {self._unready(missing_inputs)}; "
-                    "a first run compiles, which takes a minute or more"
-                )
+            silent = [role for role in self._roles if role not in missing_inputs]
+            waits = [f"no answer from {', '.join(silent)}"] if silent else []
+            waits += [f"{role} receives nothing on {', '.join(keys)}" for role, keys in missing_inputs.items() if keys]
+            if not warned and perf_counter() - begin > self._patience.quiet:
+                hint = "a first run compiles, which takes a minute or more"
+                self._notify(f"still starting, {limit_s:.0f} s at most: {'; '.join(waits)}; {hint}")
                 tell(self)
                 warned = True
-            if monotonic() - since > limit_s:
+            if perf_counter() - since > limit_s:
                 self.abort("start timed out")
-                silent = [role for role in self._roles if role not in missing_inputs]
-                text = f"not ready after {limit_s:.0f} s: {self._unready(missing_inputs)}"
-                raise RunFailed(FailureCode.NO_ANSWER, text, *silent)
+                raise RunFailed(FailureCode.NO_ANSWER, f"not ready after {limit_s:.0f} s: {'; '.join(waits)}", *silent)
         self._contract.poll(force=True)  # so that the first diagnostics include the service that joined last
-
-    def _unready(self, missing_inputs: Mapping[str, list[str]]) -> str:
-        """Return a text for the services that have not answered or have an input without a sender."""
-        silent = [role for role in self._roles if role not in missing_inputs]
-        texts = [f"no answer from {', '.join(silent)}"] if silent else []
-        texts += [f"{role} receives nothing on {', '.join(keys)}" for role, keys in missing_inputs.items() if keys]
-        return "; ".join(texts)
 
     def _not_in_run(self, name: str) -> bool:
         """Return True if `name` is a topic whose producer has no part in this run."""
@@ -268,7 +256,7 @@ class Conductor:
             for role, how in self._slots.expired().items():
                 why = f"{how}; no replacement joined within {self._slots.patience_s:.0f} s"
                 self._mark_lost(role, Failure(FailureCode.ROLE_LOST, why))
-            self._notify_once([*self._member.complaints(), *self._member.suspicions()])
+            self._notify(*self._member.complaints(), *self._member.suspicions())
             self._operator_requests.poll(self._collector.collected.supervisor)
             self._contract.poll()
             self._extend_grant()
@@ -277,20 +265,14 @@ class Conductor:
             sleep(TUNING.poll_s)
 
     def _handle_report(self, role: str, message: Any, detail: dict[str, Any], finished: set[str]) -> None:
-        if message.waiting_for == CONDUCTOR:
-            self._on_heartbeat_timeout(role, message.tick, detail.get("conductor_lost", ""))
+        when = f"{max(message.tick, 0) / NS:.3f} s"
         if "ended_by" in detail:
-            when = max(message.tick, 0) / NS
-            raise RunFailed(
-                FailureCode.FORGED,
-                f"{role} ended at {when:.3f} s on a message that this conductor did not send ({detail['ended_by']}): "
-                "a forged or doubled sender of palpate/control",
-                role,
-                topics=("palpate/control",),
-            )
+            text = f"{role} ended at {when} on a message that this conductor did not send ({detail['ended_by']})"
+            forged = f"{text}: a forged or doubled sender of palpate/control"
+            raise RunFailed(FailureCode.FORGED, forged, role, topics=("palpate/control",))
         if self._slots.fill(role):
-            self.watchdog.progress[role].moved = monotonic()  # the time before does not count as a stall
-            self._notify(f"another process replaces {role} from {max(message.tick, 0) / NS:.3f} s on")
+            self.watchdog.restart(role)  # the time before does not count as a stall
+            self._notify(f"another process replaces {role} from {when} on")
         if message.state == ServiceReport.FINISHED:
             finished.add(role)
             self._store_report(role, detail)
@@ -300,11 +282,11 @@ class Conductor:
     def _extend_grant(self) -> None:
         if self.grants.paused:
             self.watchdog.restart()
-            self._notify_once([f"paused by an operator: waiting for palpate resume, {self._patience.pause:g} s at most"])
+            self._notify(f"paused by an operator: waiting for palpate resume, {self._patience.pause:g} s at most")
             if self.grants.paused_s > self._patience.pause:
                 raise RunFailed(FailureCode.STOPPED, f"paused for {self._patience.pause:g} s without palpate resume")
         if self.grants.exam_silent_s > self._patience.quiet:
-            self._notify_once([f"waiting for exam/state of planning, {GRANTS.exam_silent_s:g} s at most"])
+            self._notify(f"waiting for exam/state of planning, {GRANTS.exam_silent_s:g} s at most")
         collected = self._collector.collected
         records = "recorder" in self._observers and "recorder" not in self.result.lost
         recorded = self.watchdog.progress["recorder"].tick if records else None
@@ -327,8 +309,8 @@ class Conductor:
             role, text = self.watchdog.culprit(roles)
             raise RunFailed(FailureCode.BLOCKED, f"{role} blocks the run for {stalled:.0f} s: {text}", role)
         if stalled > self._patience.soft and not self._warned:
-            limit = f"{self._patience.hard:.0f} s at most"
-            self._notify(f"no tick for {stalled:.0f} s, waiting {limit}: {self.watchdog.culprit(roles)[1]}")
+            why = self.watchdog.culprit(roles)[1]
+            self._notify(f"no tick for {stalled:.0f} s, waiting {self._patience.hard:.0f} s at most: {why}")
         self._warned = stalled > self._patience.soft
 
     # -- lost services
@@ -349,8 +331,7 @@ class Conductor:
         gone = self._member.gone()
         texts = {role: self._freezes.connection_lost(role) for role in gone - self.result.lost.keys() - ended.keys()}
         if gone and self._member.transport_lost():  # checked last: services disappear before their router does
-            reached = max(progress.tick for progress in self.watchdog.progress.values())
-            text = f"transport lost at {max(reached, 0) / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault"
+            text = f"transport lost at {self.watchdog.reached / NS:.3f} s: {TRANSPORT_LOST}; no service is at fault"
             raise RunFailed(FailureCode.TRANSPORT_LOST, text)
         return {**texts, **ended}
 
@@ -385,15 +366,12 @@ class Conductor:
             raise RunFailed(failure.code, failure.text, *failure.roles, topics=failure.topics)
         for one in lost:
             self._send(RunControl.LOST, self.result.lost[one], role=one, reason=cause.text)
-        reached = max(progress.tick for progress in self.watchdog.progress.values())
-        end = reached - reached % MS + TUNING.after_loss_ns
+        end = self.watchdog.reached // MS * MS + TUNING.after_loss_ns
         self.grants.grant(min(end, self.grants.horizon) if self.grants.last else end, last=True)
 
     def _collect_heartbeat_timeouts(self) -> None:
         """Record that services left while this conductor stood still, so that they are not blamed."""
-        for role, message, detail in self._receive_reports():
-            if message.waiting_for == CONDUCTOR:
-                self._on_heartbeat_timeout(role, message.tick, detail.get("conductor_lost", ""))
+        self._receive_reports()
         if self._heartbeat.stood_still_s and CONDUCTOR not in self.result.lost:
             tick = self.watchdog.progress[self._workers[0]].tick
             self._on_heartbeat_timeout("", tick, "the services left without it")
@@ -419,9 +397,9 @@ class Conductor:
     def _end(self, exited: Callable[[], Mapping[str, str]], tell: Callable[[Conductor], None]) -> None:
         """Let the observers take in what is left and close their files."""
         waiting = set(self._observers) - self.result.lost.keys()
-        begin, warned = monotonic(), False
+        begin, warned = perf_counter(), False
         self._send(RunControl.END)
-        while waiting and monotonic() - begin < TUNING.observers_finish_s:
+        while waiting and perf_counter() - begin < TUNING.observers_finish_s:
             self._heartbeat.loop_turned()
             self._observed.drain_and_step()
             ended = exited()
@@ -430,13 +408,13 @@ class Conductor:
                 if message.state == ServiceReport.FINISHED:
                     waiting.discard(role)
                     self._store_report(role, detail)
-                    self._notify_once(filter(None, [detail.get("facts", {}).get("trouble")]))
+                    self._notify(*filter(None, [detail.get("facts", {}).get("trouble")]))
             for role in waiting & ended.keys():
                 self._notify(f"{role} exited while closing: {ended[role]}")
             waiting -= ended.keys()
-            if waiting and not warned and monotonic() - begin > self._patience.quiet:
-                limit = f"{TUNING.observers_finish_s:.0f} s at most"
-                self._notify(f"waiting for {', '.join(sorted(waiting))} to close the files, {limit}")
+            if waiting and not warned and perf_counter() - begin > self._patience.quiet:
+                roles = ", ".join(sorted(waiting))
+                self._notify(f"waiting for {roles} to close the files, {TUNING.observers_finish_s:.0f} s at most")
                 tell(self)
                 warned = True
         for role in waiting:
@@ -474,5 +452,5 @@ def conduct(
         result.failure = result.failure or gave_up(collector.collected)
     except RunFailed as error:
         result.failure = error.failure
-    result.start_time_s = (conductor.started_at_perf or perf_counter()) - begin
+    result.start_time_s = (conductor.started_at or perf_counter()) - begin
     return result

@@ -94,14 +94,10 @@ def service_statuses(
     for role, at in progress.items():
         found = violations(role)
         level, message = _judge(at, role in lost, now - at.reported, silent_s, found, now)
-        values = {
-            "tick_s": f"{at.tick / NS:.3f}",
-            "waiting_for": at.waiting_for,
-            "report_age_s": f"{now - at.reported:.2f}",
-            "violations": str(sum(seen.count for seen in found)),
-        }
-        pairs = [KeyValue(key, value) for key, value in values.items()]
-        statuses.append(DiagnosticStatus(level, f"palpate/{role}", message, role, pairs))
+        values = [KeyValue("tick_s", f"{at.tick / NS:.3f}"), KeyValue("waiting_for", at.waiting_for)]
+        values.append(KeyValue("report_age_s", f"{now - at.reported:.2f}"))
+        values.append(KeyValue("violations", str(sum(seen.count for seen in found))))
+        statuses.append(DiagnosticStatus(level, f"palpate/{role}", message, role, values))
     return statuses
 
 

@@ -6,7 +6,7 @@ It answers once the supervisor confirms or refuses the request.
 import json
 from collections.abc import Callable
 from dataclasses import dataclass
-from queue import Empty, SimpleQueue
+from queue import SimpleQueue
 from time import monotonic, time_ns
 from typing import Any
 
@@ -58,12 +58,8 @@ class OperatorRequestServer:
 
     def poll(self, supervisor: Any | None) -> None:
         """Forward new requests, and answer those that the newest supervisor state confirms or refuses."""
-        while True:
-            try:
-                query = self._asked.get_nowait()
-            except Empty:
-                break
-            self._take(query, supervisor)
+        while not self._asked.empty():  # this is the only reader
+            self._take(self._asked.get(), supervisor)
         for pending in list(self._pending):
             answer = _answer(pending, supervisor)
             if answer is not None:
@@ -85,9 +81,10 @@ class OperatorRequestServer:
             return
         if request is None:
             try:
-                self._reply(query, True, self._pace(word, ms), 0.0)
+                done, text = True, self._pace(word, ms)
             except UserError as error:
-                self._reply(query, False, str(error), 0.0)
+                done, text = False, str(error)
+            self._reply(query, done, text, 0.0)
             return
         self._send(request, reason)
         before = (0, 0) if supervisor is None else (int(supervisor.releases), int(supervisor.refusals))

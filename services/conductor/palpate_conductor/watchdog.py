@@ -116,12 +116,12 @@ class FreezeWatch:
     def connection_lost(self, role: str) -> str:
         """Return a text for the closed connection of `role`, with the state of its process if that still runs."""
         activity = self._activity.get(role)
-        if activity is None or not is_running(activity.pid):
-            return "its connection closed"
-        sleep(TUNING.exit_s)
-        if not is_running(activity.pid):
-            return "its connection closed"
-        return f"its connection closed, but its process {activity.pid} runs: the connection broke, or the machine is overloaded"
+        if activity is not None and is_running(activity.pid):
+            sleep(TUNING.exit_s)
+            if is_running(activity.pid):
+                why = "the connection broke, or the machine is overloaded"
+                return f"its connection closed, but its process {activity.pid} runs: {why}"
+        return "its connection closed"
 
     def frozen(self) -> dict[str, str]:
         """Return the roles of frozen processes with a text each: stopped ones, or if there is none, ones that sleep for long.
@@ -135,11 +135,8 @@ class FreezeWatch:
         states = {role: activity.check() for role, activity in self._activity.items()}
         stopped = {role: state for role, state in states.items() if state.stopped}
         limit = self._patience.frozen if stopped else self._patience.asleep
-        return {
-            role: f"frozen: its process {state.pid} is {state.status} and has used no processor time for {state.seconds:.1f} s"
-            for role, state in (stopped or states).items()
-            if state.seconds >= limit
-        }
+        text = "frozen: its process {0.pid} is {0.status} and has used no processor time for {0.seconds:.1f} s"
+        return {role: text.format(state) for role, state in (stopped or states).items() if state.seconds >= limit}
 
 
 @dataclass
@@ -164,16 +161,16 @@ class RunWatchdog:
         self._producers = producers
 
     def report(self, role: str, tick: int, waiting_for: str) -> None:
-        """Take a report. A role that the run does not have is ignored."""
-        progress = self.progress.get(role)
-        if progress is None:
-            return
-        now = monotonic()
-        progress.reported = now
-        progress.waiting_for = waiting_for
+        """Take a report."""
+        progress, now = self.progress[role], monotonic()
+        progress.reported, progress.waiting_for = now, waiting_for
         if tick > progress.tick:
-            progress.tick = tick
-            progress.moved = now
+            progress.tick, progress.moved = tick, now
+
+    @property
+    def reached(self) -> int:
+        """The latest tick [ns] that any service has finished, 0 at least."""
+        return max(0, *(progress.tick for progress in self.progress.values()))
 
     def silent_for(self) -> float:
         """Return the time [s] since the last report of any service; services that wait report, too."""
@@ -191,11 +188,10 @@ class RunWatchdog:
         """Return the longest time [s] since one of `roles` finished a tick (wall-clock runs)."""
         return monotonic() - min((self.progress[role].moved for role in roles), default=monotonic())
 
-    def restart(self) -> None:
-        """Start to measure stalls from now, at the first grant and while the run is paused."""
-        now = monotonic()
-        for progress in self.progress.values():
-            progress.moved = now
+    def restart(self, *roles: str) -> None:
+        """Start to measure stalls of `roles`, by default of all, from now: at the first grant and while the run is paused."""
+        for role in roles or self.progress:
+            self.progress[role].moved = monotonic()
 
     def culprit(self, roles: Collection[str]) -> tuple[str, str]:
         """Return the one of `roles` that blocks the others, and a text.
@@ -203,11 +199,8 @@ class RunWatchdog:
         Follows who-waits-for-whom from the slowest waiting service to one that does not wait, or around a cycle.
         """
         computing = self.silent(roles, TUNING.interrupted_s)  # what they waited for before their step is past
-        waiting = {
-            role: self._producers[p.waiting_for]
-            for role, p in self.progress.items()
-            if role in roles and self._producers.get(p.waiting_for) in roles and role not in computing
-        }
+        awaited = {role: self._producers.get(self.progress[role].waiting_for, "") for role in roles if role not in computing}
+        waiting = {role: producer for role, producer in awaited.items() if producer in roles}
         if all(self.progress[role].waiting_for == "grant" for role in roles):
             return "conductor", "all services wait for a grant of the conductor: planning or the recorder is behind"
         if not waiting:

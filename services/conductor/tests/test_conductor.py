@@ -255,7 +255,6 @@ def test_only_a_finished_tick_counts_as_movement() -> None:
     before = w.progress["robot"].moved
     w.report("robot", 1_000_000, "control/joint_torque")
     assert w.progress["robot"].moved == before
-    w.report("unknown", 5, "")
 
 
 def test_only_the_given_roles_can_be_the_culprit() -> None:

@@ -100,19 +100,12 @@ class _File:
         self.first = stamp if self.first is None else min(self.first, stamp)
         self.last = max(self.last, stamp)
 
-    @property
-    def extent(self) -> dict[str, Any]:
-        """rosbag2's description of a span of messages."""
-        return _extent(self.first, self.last, self.messages)
 
-
-def _extent(first: int | None, last: int, messages: int) -> dict[str, Any]:
-    start = first or 0
-    return {
-        "starting_time": {"nanoseconds_since_epoch": start},
-        "duration": {"nanoseconds": last - start},
-        "message_count": messages,
-    }
+def _extent(*files: _File) -> dict[str, Any]:
+    """Return rosbag2's description of the span of the messages in some files."""
+    start, end = min((file.first for file in files if file.first is not None), default=0), max(file.last for file in files)
+    span = {"starting_time": {"nanoseconds_since_epoch": start}, "duration": {"nanoseconds": end - start}}
+    return {**span, "message_count": sum(file.messages for file in files)}
 
 
 class BagWriter:
@@ -174,11 +167,9 @@ class BagWriter:
         for channel in self.channels.values():
             if channel.type not in schemas:
                 schemas[channel.type] = self._writer.register_schema(channel.type, "ros2msg", channel.schema.encode())
-            metadata = {
-                "offered_qos_profiles": yaml.safe_dump(channel.qos, sort_keys=False),
-                "topic_type_hash": channel.type_hash,
-                **({KEPT_EVERY: str(channel.kept_every_ms)} if channel.kept_every_ms else {}),
-            }
+            profiles = yaml.safe_dump(channel.qos, sort_keys=False)
+            metadata = {"offered_qos_profiles": profiles, "topic_type_hash": channel.type_hash}
+            metadata |= {KEPT_EVERY: str(channel.kept_every_ms)} if channel.kept_every_ms else {}
             ids[channel.topic] = self._writer.register_channel(channel.topic, "cdr", schemas[channel.type], metadata)
         return ids
 
@@ -199,15 +190,11 @@ class BagWriter:
         if self._flush_at is None:
             self._flush_at = stamp + SIZES.flush_ns
         elif stamp >= self._flush_at:
-            self.flush()
+            self._writer.flush()  # to the operating system, so that it survives a crash of this process
             self._flush_at = stamp + SIZES.flush_ns
             if self._stream.tell() >= self._file_bytes:
                 self._end_file()
                 self._begin_file()
-
-    def flush(self) -> None:
-        """Pass all written data to the operating system, so that it survives a crash of this process."""
-        self._writer.flush()
 
     def _end_file(self) -> None:
         self._writer.finish()
@@ -229,14 +216,11 @@ class BagWriter:
 
     def metadata(self) -> dict[str, Any]:
         """Return rosbag2's description of the recording."""
-        stamps = [file.first for file in self._files if file.first is not None]
-        total = sum(file.messages for file in self._files)
-        extent = _extent(min(stamps, default=None), max(file.last for file in self._files), total)
         return {
             "version": 9,
             "storage_identifier": "mcap",
             "relative_file_paths": [file.path.name for file in self._files],
-            **extent,
+            **_extent(*self._files),
             "topics_with_message_count": [
                 {
                     "topic_metadata": {
@@ -252,7 +236,7 @@ class BagWriter:
             ],
             "compression_format": "",
             "compression_mode": "",
-            "files": [{"path": file.path.name, **file.extent} for file in self._files],
+            "files": [{"path": file.path.name, **_extent(file)} for file in self._files],
             "custom_data": {"run": self._run},
             "ros_distro": "jazzy",
         }

@@ -58,27 +58,17 @@ def salvage(folder: Path, topics: Collection[str]) -> Salvaged:
     Raises FileNotFoundError if there is no recording, ValueError if none of the topics is in a complete chunk.
     """
     broken, wanted = _Broken(folder), frozenset(f"/{topic}" for topic in topics)
-    held = [
-        RecordedMessage(record.log_time, channel.topic[1:], record.data, record.sequence)
-        for channel, record in broken.messages()
-        if channel.topic in wanted
-    ]
+    found = [(channel.topic, record) for channel, record in broken.messages() if channel.topic in wanted]
+    held = [RecordedMessage(record.log_time, topic[1:], record.data, record.sequence) for topic, record in found]
     channels = {name[1:]: channel for name, channel in broken.found().items()}
     if not held:
         raise ValueError(f"{folder}: holds none of {', '.join(topics)}")
     held.sort(key=attrgetter("stamp"))
-    return Salvaged(
-        path=folder,
-        files=tuple(broken.files),
-        types={name: RecordedType(channel.type, channel.type_hash, channel.schema) for name, channel in channels.items()},
-        counts=dict(Counter(message.topic for message in held)),
-        thinned={name: channel.kept_every_ms for name, channel in channels.items() if channel.kept_every_ms},
-        first=held[0].stamp,
-        last=held[-1].stamp,
-        scenario=None,
-        held=tuple(held),
-        damage=broken.damage,
-    )
+    types = {name: RecordedType(channel.type, channel.type_hash, channel.schema) for name, channel in channels.items()}
+    thinned = {name: channel.kept_every_ms for name, channel in channels.items() if channel.kept_every_ms}
+    counts = dict(Counter(message.topic for message in held))
+    span, files = (held[0].stamp, held[-1].stamp), tuple(broken.files)
+    return Salvaged(folder, files, types, counts, thinned, *span, scenario=None, held=tuple(held), damage=broken.damage)
 
 
 class _Broken:
@@ -143,9 +133,8 @@ def _channel(record: ChannelRecord, schema: Schema) -> Channel:
 
 def _offered(record: ChannelRecord) -> dict[str, Any]:
     """Return the first quality of service that a channel was offered with; empty if that is not known."""
-    with suppress(InputError, LookupError, TypeError):
-        profile = parse_yaml(record.metadata.get("offered_qos_profiles", ""), record.topic)[0]
-        return profile if isinstance(profile, dict) else {}
+    with suppress(InputError, LookupError, TypeError, ValueError):
+        return dict(parse_yaml(record.metadata.get("offered_qos_profiles", ""), record.topic)[0])
     return {}
 
 

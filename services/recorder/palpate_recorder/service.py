@@ -84,12 +84,10 @@ class RecorderService(Service):
 
     def _check_room(self, stamp: int) -> None:
         try:
-            left = shutil.disk_usage(self._bag.folder).free
+            if (left := shutil.disk_usage(self._bag.folder).free) < SPARE_BYTES:
+                self._stop(stamp, f"{left / 1e6:.0f} MB are left on its disk, which the report needs")
         except OSError as error:
             self._stop(stamp, f"its folder is lost: {error.strerror}")
-            return
-        if left < SPARE_BYTES:
-            self._stop(stamp, f"{left / 1e6:.0f} MB are left on its disk, which the report needs")
 
     def _stop(self, stamp: int, why: str) -> None:
         """Complete the recording."""
