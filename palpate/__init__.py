@@ -19,32 +19,20 @@ from typing import TYPE_CHECKING, Any
 from palpate_plugins import needs
 
 if TYPE_CHECKING:
-    from palpate.interface.assessment import Assessment, StiffnessMap, assess
-    from palpate.interface.examination import Examination, run
-    from palpate.interface.scenarios import scenario
-    from palpate.interface.studies import StudyResult, study
-    from palpate.quick.patient import Patient, Touch
-    from palpate.recording.read import read_recording
-    from palpate.recording.recording import PalpationRecording
-    from palpate_models.scenario.load import ScenarioError
-    from palpate_models.scenario.schema import Scenario
-
-__all__ = [
-    "Assessment",
-    "Examination",
-    "PalpationRecording",
-    "Patient",
-    "Scenario",
-    "ScenarioError",
-    "StiffnessMap",
-    "StudyResult",
-    "Touch",
-    "assess",
-    "read_recording",
-    "run",
-    "scenario",
-    "study",
-]
+    from palpate.interface.assessment import Assessment as Assessment
+    from palpate.interface.assessment import StiffnessMap as StiffnessMap
+    from palpate.interface.assessment import assess as assess
+    from palpate.interface.examination import Examination as Examination
+    from palpate.interface.examination import run as run
+    from palpate.interface.scenarios import scenario as scenario
+    from palpate.interface.studies import StudyResult as StudyResult
+    from palpate.interface.studies import study as study
+    from palpate.quick.patient import Patient as Patient
+    from palpate.quick.patient import Touch as Touch
+    from palpate.recording.read import read_recording as read_recording
+    from palpate.recording.recording import PalpationRecording as PalpationRecording
+    from palpate_models.scenario.load import ScenarioError as ScenarioError
+    from palpate_models.scenario.schema import Scenario as Scenario
 
 _HOMES = {
     "Assessment": "palpate.interface.assessment",
@@ -63,6 +51,7 @@ _HOMES = {
     "study": "palpate.interface.studies",
 }
 """The module of each name of the interface."""
+__all__ = [*_HOMES]  # noqa: PLE0604
 
 
 def __getattr__(name: str) -> Any:

@@ -189,13 +189,7 @@ class CaseDisplay(progress.Progress):
 
     def __init__(self, console: Console, quiet: bool, unit: str = "examinations") -> None:
         self._lines = not (quiet or console.is_terminal)
-        bars = (
-            progress.SpinnerColumn(),
-            unit,
-            progress.BarColumn(30),
-            progress.MofNCompleteColumn(),
-            progress.TimeRemainingColumn(),
-        )
+        bars = unit, progress.BarColumn(30), progress.MofNCompleteColumn(), progress.TimeRemainingColumn()
         super().__init__(
             *bars, "{task.fields[last]}", console=console, transient=True, disable=quiet or self._lines,
             speed_estimate_period=3600.0,  # one case may take minutes

@@ -129,17 +129,12 @@ def summary(exam: Exam, planned: Prospect) -> str:
     from palpate_models.scenario.schema import Mode
 
     targets, touches = len(planned.scan.targets), _counted(len(planned.touches), "touch", "touches")
+    time = f"{planned.duration_s:.0f} s of simulated time"
     if exam.searched:
-        return (
-            f"{targets} places to choose from, at most {exam.budget.presses} presses; {touches} before the search; "
-            f"at most {planned.duration_s:.0f} s of simulated time"
-        )
+        return f"{targets} places, at most {exam.budget.presses} presses; {touches} before the search; at most {time}"
     lines, strokes = _counted(len(planned.scan.lines), "line"), _counted(len(planned.strokes), "stroke")
     slides = f"{planned.length_m:.2f} m of sliding" if exam.mode is Mode.CONTINUOUS else "pressed one by one"
-    return (
-        f"{targets} targets in {lines}, palpated in {strokes}; {slides}, {touches} before; "
-        f"about {planned.duration_s:.0f} s of simulated time"
-    )
+    return f"{targets} targets in {lines}, palpated in {strokes}; {slides}, {touches} before; about {time}"
 
 
 def _counted(number: int, one: str, many: str = "") -> str:
@@ -172,22 +167,15 @@ def draw(path: Path, scenario: Scenario, phantom: PhantomModel, planned: Prospec
     if not used.all():
         axes.scatter(targets[~used, 0], targets[~used, 1], marker="x", s=50, color="#c00000", label="left out", zorder=5)
     if len(planned.strokes):
-        axes.plot(
-            *(planned.strokes[0][0] * mm), marker="*", markersize=15, color="#c000a0", linestyle="", label="begins here", zorder=6
-        )
+        axes.plot(*(planned.strokes[0][0] * mm), "*", markersize=15, color="#c000a0", label="begins here", zorder=6)
     (cx, cy), (width, height) = scenario.exam.centre_m, scenario.exam.region_m
     margin = 0.03
     axes.set_xlim((cx - width / 2 - margin) * mm, (cx + width / 2 + margin) * mm)
     axes.set_ylim((cy - height / 2 - margin) * mm, (cy + height / 2 + margin) * mm)
-    axes.set_aspect("equal")
-    axes.set_xlabel("x, to the patient's left [mm]")
-    axes.set_ylabel("y, to the head [mm]")
+    axes.set(aspect="equal", xlabel="x, to the patient's left [mm]", ylabel="y, to the head [mm]")
     figure.legend(loc="outside lower center", ncols=2, fontsize=9)
     exam = scenario.exam
-    if exam.searched:
-        how = f"search, at most {exam.budget.presses} presses, at most"
-    else:
-        strokes = "1 stroke" if len(planned.strokes) == 1 else f"{len(planned.strokes)} strokes"
-        how = f"{Path(exam.pattern).stem}, {exam.mode}, {strokes}, about"
+    how = f"{Path(exam.pattern).stem}, {exam.mode}, {_counted(len(planned.strokes), 'stroke')}, about"
+    how = f"search, at most {exam.budget.presses} presses, at most" if exam.searched else how
     axes.set_title(f"{scenario.name}: {how} {planned.duration_s:.0f} s", parse_math=False)
     figure.savefig(path)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from functools import cache
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import Duration, ImpedanceSetpoint
+from palpate_bus.messages import ImpedanceSetpoint
 from palpate_bus.messages.geometry import Array, pose_message, rotation, twist, twist_message, vector, wrench, wrench_message
 from palpate_bus.messages.stamps import duration_message, header, nanoseconds
 
@@ -63,7 +62,7 @@ class Setpoint:
             joint_position=self.q,
             joint_velocity=self.qd,
             joint_stiffness=self.joint_stiffness,
-            valid_for=_validity(),
+            valid_for=duration_message(contract().topics[TOPIC].expiry),
         )
 
     @classmethod
@@ -82,8 +81,3 @@ class Setpoint:
             qd=message.joint_velocity,
             joint_stiffness=message.joint_stiffness,
         )
-
-
-@cache
-def _validity() -> Duration:
-    return duration_message(contract().topics[TOPIC].expiry)

@@ -44,10 +44,8 @@ def check(arm: Name) -> None:
     console.print(table)
     elbow, _ = found.elbow
     shapes = sum(map(len, found.capsules))
-    console.print(
-        f"{found.joints} joints, flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes",
-        highlight=False,
-    )
+    parts = f"flange {found.link_names[-1]}, elbow {found.joint_names[elbow]}, {shapes} shapes"
+    console.print(f"{found.joints} joints, {parts}", highlight=False)
 
 
 @app.command()
@@ -79,10 +77,8 @@ def place(
     console.print(f"pressed: {describe(robot, deep)}", highlight=False, soft_wrap=True)
     console.print(f"raised:  {describe(robot, raised)}", highlight=False, soft_wrap=True)
     x, y = robot.base_xy_m
-    console.print(
-        f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}\nbase_yaw_rad: {robot.base_yaw_rad:g}",
-        highlight=False,
-    )
+    console.print(f"base_xy_m: [{x:g}, {y:g}]\nbase_height_m: {robot.base_height_m:g}", highlight=False)
+    console.print(f"base_yaw_rad: {robot.base_yaw_rad:g}", highlight=False)
     _draw(out, chosen, targets[0][0], np.asarray(deep.reachable & raised.reachable), (x, y))
     at = chosen.model_copy(update={"robot": robot})
     if not look_postures(exam_input(at)):
@@ -120,9 +116,7 @@ def _draw(path: Path, scenario: Scenario, positions: Array, reached: Array, base
     for chosen, colour, label in ((reached, "#2a9d8f", "reached"), (np.logical_not(reached), "#d07000", "out of reach")):
         if chosen.any():
             axes.plot(*positions[chosen, :2].T, "o", ms=4, color=colour, label=label)
-    axes.set(
-        xlabel="x [m]", ylabel="y [m]", title=f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets", aspect="equal"
-    )
-    axes.set_ylim(-0.6, 0.6)
+    title = f"{scenario.robot.arm}: {reached.sum()} of {len(reached)} targets"
+    axes.set(xlabel="x [m]", ylabel="y [m]", title=title, aspect="equal", ylim=(-0.6, 0.6))
     axes.legend()
     figure.savefig(path)

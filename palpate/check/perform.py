@@ -91,9 +91,8 @@ class LiveRig(Rig):
         end = monotonic() + seconds
         while self.role.name not in self._others():
             if monotonic() > end:
-                raise NoBus(
-                    f"no node {self.role.name!r} appeared within {seconds:.0f} s; it needs a liveliness token of that name"
-                )
+                why = f"no node {self.role.name!r} appeared within {seconds:.0f} s"
+                raise NoBus(f"{why}; it needs a liveliness token of that name")
             self._say(RunControl.HELLO)
             sleep(TIMING.hello_s)
         self.expect("joins as a node of its role", True, self.role.name, self.role.name)
@@ -121,9 +120,8 @@ class LiveRig(Rig):
                 if message.state == ServiceReport.READY:
                     missing = list(parse_json(message.detail or "{}", "the detail of palpate/report").get("missing", []))
         self.ready = missing == []
-        got = (
-            "READY" if self.ready else "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
-        )
+        got = "nothing" if missing is None else f"READY, but it receives nothing on {', '.join(missing)}"
+        got = "READY" if self.ready else got
         self.expect("answers the conductor's hello", self.ready, "a ServiceReport READY with nothing missing", got)
 
     def _check_graph(self) -> None:
@@ -273,9 +271,8 @@ def started(command: str | None, role: str, settings: RigSettings, endpoint: str
             raise NoBus(f"--start {command}: {error}") from error
         try:
             yield
-            child.wait(timeout=5)
-        except subprocess.TimeoutExpired:
-            pass
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(timeout=5)
         finally:
             for end in (child.terminate, child.kill):
                 if child.poll() is None:
@@ -346,8 +343,6 @@ def print_report(report: ConformanceReport, failures: bool) -> None:
     verdict = ("conforms", "green") if report.passed else ("does not conform", "bold red")
     load = os.getloadavg()[0] / (os.cpu_count() or 1)
     if not report.passed and load > 1:
-        out.print(
-            f"\nthis machine is overloaded (load {load:.1f} per processor): rates and reaction times are unreliable",
-            style="yellow",
-        )
+        why = f"this machine is overloaded (load {load:.1f} per processor)"
+        out.print(f"\n{why}: rates and reaction times are unreliable", style="yellow")
     out.print(Text.assemble(f"\n{report.role}: ", verdict, f", {summary}"))

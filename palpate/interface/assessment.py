@@ -175,12 +175,9 @@ def assess(touches: Touch | Iterable[Touch] | PalpationRecording) -> Assessment:
 
 
 def _assessment(gathered: Collected, facts: dict[str, Any]) -> Assessment:
-    return Assessment(
-        samples=samples_frame(gathered.samples),
-        map=None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map),
-        findings=findings_frame([] if gathered.findings is None else finding_rows(gathered.findings.findings)),
-        facts=facts,
-    )
+    found = findings_frame([] if gathered.findings is None else finding_rows(gathered.findings.findings))
+    stiffness = None if gathered.stiffness_map is None else StiffnessMap.of(gathered.stiffness_map)
+    return Assessment(pd.DataFrame(sample_columns(gathered.samples)), stiffness, found, facts)
 
 
 def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
@@ -197,11 +194,9 @@ def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
 def _states(touch: Touch, X_WA: Array, stroke: int) -> list[Any]:
     """Return `exam/state` at each time of a touch, with its stroke number, and one state after it, out of contact."""
     places, normals = apply(X_WA, touch.position), touch.normal @ X_WA[:3, :3].T
-    rows = zip(touch.time, places, normals, touch.depth, touch.force, touch.steady, strict=True)
-    states = [
-        _state(round(t * NS), ExamState.PHASE_SCAN, p, n, stroke, (float(depth), float(force)), bool(steady))
-        for t, p, n, depth, force, steady in rows
-    ]
+    felt = zip(touch.depth.tolist(), touch.force.tolist(), strict=True)
+    rows, scan = zip(touch.time, places, normals, felt, touch.steady.tolist(), strict=True), ExamState.PHASE_SCAN
+    states = [_state(round(t * NS), scan, p, n, stroke, pair, steady) for t, p, n, pair, steady in rows]
     return [*states, _state(round((touch.time[-1] + PERIOD_S) * NS), ExamState.PHASE_RETRACT, places[-1], normals[-1], stroke)]
 
 
@@ -211,24 +206,8 @@ def _state(
     """Return `exam/state` at time `t` [ns]; `felt` is the measured depth [m] and force [N]."""
     depth, force = felt
     touching = force > THRESHOLDS.on_n
-    return exam_state(
-        t,
-        phase,
-        p_W,
-        n_W,
-        in_contact=touching,
-        steady=steady and touching,
-        depth_setpoint=depth,
-        depth=depth,
-        normal_force=force,
-        depth_uncertainty=DEPTH_SD_M,
-        stroke=stroke,
-    )
-
-
-def samples_frame(messages: list[Any]) -> pd.DataFrame:
-    """Return a row per `palpation_msgs/PalpationSample`, with the columns of samples.csv."""
-    return pd.DataFrame(sample_columns(messages))
+    measured = {"depth_setpoint": depth, "depth": depth, "normal_force": force, "depth_uncertainty": DEPTH_SD_M}
+    return exam_state(t, phase, p_W, n_W, in_contact=touching, steady=steady and touching, stroke=stroke, **measured)
 
 
 def findings_frame(rows: Iterable[FindingRow]) -> pd.DataFrame:

@@ -15,10 +15,8 @@ from palpate_bus.runs.announcement import BusTarget, NoBus, find
 from palpate_bus.security.access import public
 from palpate_bus.wire.zenoh_config import BusOptions, session
 
-Connect = Annotated[
-    list[str] | None,
-    typer.Option("--connect", "-c", metavar="ENDPOINT", help="Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."),
-]
+_ENDPOINT = "Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."
+Connect = Annotated[list[str] | None, typer.Option("--connect", "-c", metavar="ENDPOINT", help=_ENDPOINT)]
 ChosenRun = Annotated[str | None, typer.Option("--run", metavar="NAME", help="The run: its process id, or part of its name.")]
 Domain = Annotated[int | None, typer.Option(help="ROS domain; by default the run's, else ROS_DOMAIN_ID.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]

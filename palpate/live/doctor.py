@@ -87,15 +87,8 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
             live.poll()
             sleep(LIMITS.poll_s)
         live.poll()
-        parts = (
-            _versions(bus),
-            _endpoints(bus, live),
-            _shared_memory(bus),
-            _clock(live),
-            _who(bus, live),
-            _progress(live),
-            _types(live),
-        )
+        of_bus = _versions(bus), _endpoints(bus, live), _shared_memory(bus)
+        parts = *of_bus, _clock(live), _who(bus, live), _progress(live), _types(live)
         seen = [(s.violation, s.count) for s in live.monitor.active.values()]
         return Diagnosis([remark for part in parts for remark in part], live.monitor.health(), seen)
     finally:
@@ -103,10 +96,8 @@ def examine(bus: Joined, seconds: float) -> Diagnosis:
 
 
 def _types(live: LiveMonitor) -> Iterator[Remark]:
-    differing = mismatches(live.graph.alive.values())
-    yield from (Remark("types", Severity.BAD, sentence) for sentence in differing)
-    if not differing:
-        yield Remark("types", Severity.OK, "all nodes have the same message definitions")
+    bad = [Remark("types", Severity.BAD, sentence) for sentence in mismatches(live.graph.alive.values())]
+    yield from bad or [Remark("types", Severity.OK, "all nodes have the same message definitions")]
 
 
 def _versions(bus: Joined) -> Iterator[Remark]:
@@ -177,9 +168,6 @@ def _who(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
         yield Remark("roles", Severity.OK, f"also there: {', '.join(strangers)}")
     if live.graph.garbage:
         yield Remark("roles", Severity.WARN, f"{live.graph.garbage} liveliness tokens are not rmw_zenoh's")
-    shared = [f"{', '.join(names)} share one" for names in graph.processes(alive) if len(names) > 1]
-    text = "; ".join([*shared, "every other role has its own"]) if shared else "one per role"
-    yield Remark("processes", Severity.OK, text)
 
 
 def _progress(live: LiveMonitor) -> Iterator[Remark]:
@@ -256,11 +244,8 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
 def _print(diagnosis: Diagnosis) -> None:
     out = wide_console()
     listed = table("", "", "")
-    said = ""
     for finding in diagnosis.findings:
-        about = "" if finding.about == said else finding.about
-        said = finding.about
-        listed.add_row(Text(about, "bold"), Text(finding.level, _COLOURS[finding.level]), finding.text)
+        listed.add_row(Text(finding.about, "bold"), Text(finding.level, _COLOURS[finding.level]), finding.text)
     listed.show_header = False
     out.print(listed)
     out.print()

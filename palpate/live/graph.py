@@ -41,26 +41,15 @@ def ends(found: Iterable[Entity], *kinds: EntityKind) -> list[tuple[str, Endpoin
     return [(entity.node, entity.endpoint) for entity in found if entity.kind in kinds and entity.endpoint is not None]
 
 
-def processes(found: Iterable[Entity]) -> list[tuple[str, ...]]:
-    """Return the nodes of each process, sorted: those that share a session. On a secure bus each node has its own session."""
-    by_session: dict[str, set[str]] = {}
-    for entity in found:
-        by_session.setdefault(entity.zid, set()).add(entity.node)
-    return sorted(tuple(sorted(names)) for names in by_session.values())
-
-
 def missing(rules: Contract, found: Iterable[Entity], run: Run | None) -> list[str]:
     """Return the roles that are not on the bus, critical ones first.
 
     Expected are all observers and the roles of `run`, or, if the run is unknown, the roles of every run.
     """
-    there = {entity.node for entity in found}
-    absent = [
-        role
-        for role in rules.roles.values()
-        if role.name not in there and (role.observer or (role.name in run.endpoints if run is not None else not role.optional))
-    ]
-    return [role.name for role in sorted(absent, key=lambda role: (role.observer, not role.critical))]
+    there, roles = {entity.node for entity in found}, rules.roles.values()
+    expected = [role for role in roles if role.observer or (role.name in run.endpoints if run else not role.optional)]
+    expected.sort(key=lambda role: (role.observer, not role.critical))
+    return [role.name for role in expected if role.name not in there]
 
 
 app = typer.Typer(help="Nodes on a live bus.", no_args_is_help=True)
@@ -81,9 +70,8 @@ def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = 
     listed: list[dict[str, Any]] = []
     for name, own in groupby(sorted(found, key=attrgetter("node")), key=attrgetter("node")):
         mine = list(own)
-        kinds = {"publishes": [EntityKind.PUBLISHER], "subscribes": [EntityKind.SUBSCRIPTION]}
-        kinds["services"] = [kind for kind in EntityKind if [kind] not in kinds.values()]
-        topics = {what: sorted(end.topic for _, end in ends(mine, *chosen)) for what, chosen in kinds.items()}
+        kinds = {"publishes": EntityKind.PUBLISHER, "subscribes": EntityKind.SUBSCRIPTION}
+        topics = {what: sorted(end.topic for _, end in ends(mine, kind)) for what, kind in kinds.items()}
         listed.append({"node": name, "role": name in rules.roles, "sessions": sorted({one.zid for one in mine}), **topics})
     if as_json:
         print_json({"nodes": listed, "missing": absent})

@@ -15,7 +15,7 @@ import yaml
 import zenoh
 from rich.text import Text
 
-from palpate.console import SteadyConsole, bandwidth, print_json, print_line, say, table, wide_console
+from palpate.console import bandwidth, print_json, print_line, say, table, wide_console
 from palpate.live import graph
 from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, joined
 from palpate_bus.contract import Topic, contract
@@ -96,10 +96,9 @@ def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Dom
         raise _unknown(name)
     ends = [(entity, entity.endpoint) for entity in found if entity.endpoint is not None]
     if as_json:
-        endpoints = [
-            {"node": e.node, "kind": e.kind.name.lower(), "type": end.type, "hash": end.type_hash, "qos": end.qos}
-            for e, end in ends
-        ]
+        nodes = [{"node": entity.node, "kind": entity.kind.name.lower()} for entity, _ in ends]
+        kinds = [{"type": end.type, "hash": end.type_hash, "qos": end.qos} for _, end in ends]
+        endpoints = [node | kind for node, kind in zip(nodes, kinds, strict=True)]
         print_json({"topic": name, "contract": None if row is None else row.model_dump(mode="json"), "endpoints": endpoints})
         return
     out = table("", "")
@@ -180,10 +179,8 @@ def bw(
             rate, mean = sum(sizes) / (len(window) * TOPIC.report_period_s), sum(sizes) / max(len(sizes), 1)
             if as_json:
                 print_line({"topic": topic.name, "bytes_per_s": rate, "messages": len(sizes), "mean_bytes": mean})
-            elif not sizes:
-                _print_none()
             else:
-                size = f"{mean:.0f} B per message, {min(sizes)} to {max(sizes)}"
+                size = f"{mean:.0f} B per message, {min(sizes, default=0)} to {max(sizes, default=0)}"
                 print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
 
 
@@ -231,14 +228,10 @@ def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
     if steps_ms.size == 0 or not sent[-1] > sent[0]:
         return {"wall_hz": None, "simulated_hz": None}
     passed_ns = stamps[-1] - stamps[0] if len(stamps) > 1 else 0
-    return {
-        "wall_hz": 1e3 * steps_ms.size / steps_ms.sum(),
-        "simulated_hz": 1e9 * (len(stamps) - 1) / passed_ns if passed_ns > 0 else None,
-        "mean_ms": float(steps_ms.mean()),
-        "least_ms": float(steps_ms.min()),
-        "most_ms": float(steps_ms.max()),
-        "std_ms": float(steps_ms.std()),
-    }
+    simulated_hz = 1e9 * (len(stamps) - 1) / passed_ns if passed_ns > 0 else None
+    figures = {"mean": steps_ms.mean(), "least": steps_ms.min(), "most": steps_ms.max(), "std": steps_ms.std()}
+    rates = {"wall_hz": 1e3 * steps_ms.size / steps_ms.sum(), "simulated_hz": simulated_hz}
+    return {**rates, **{f"{name}_ms": float(value) for name, value in figures.items()}}
 
 
 @contextmanager
@@ -248,11 +241,8 @@ def _subscribed(name: str, connect: list[str] | None, run: str | None, domain: i
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:
-            live = [
-                end.type
-                for _, end in graph.ends(graph.present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
-                if end.topic == name
-            ]
+            found = graph.ends(graph.present(bus), EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
+            live = [end.type for _, end in found if end.topic == name]
             if not live:
                 raise _unknown(name)
             kind = min(live)
@@ -330,10 +320,6 @@ def _plain(value: Any, full: bool) -> Any:
     return value.item() if isinstance(value, np.generic) else value
 
 
-def _print_none() -> None:
-    SteadyConsole(highlight=False).print("no messages", style="dim")
-
-
 def _print_rate(rows: Sequence[tuple[int, int | None]], topic: Topic, as_json: bool, whole: bool = False) -> None:
     """Print the rate of the new messages, which follow the first of `rows`, or of the `whole` stream."""
     facts = {"messages": max(len(rows) - (not whole), 0), **spacing(rows)}
@@ -342,7 +328,7 @@ def _print_rate(rows: Sequence[tuple[int, int | None]], topic: Topic, as_json: b
         print_line({"topic": topic.name, "contract_hz": contract_hz, **facts})
         return
     if facts["messages"] < 2:
-        _print_none()
+        print("no messages", flush=True)
         return
     text = "in all: " if whole else ""
     text += f"{facts['wall_hz']:.4g} Hz"

@@ -51,21 +51,14 @@ def replay(  # noqa: PLR0913 - the options of a command
     from palpate.replay.play import play
     from palpate_bus.messages.stamps import NS
 
-    on_the_bus: dict[str, object] = {
-        "--rate": rate != 1.0,
-        "--topic": topics,
-        "--listen": listen,
-        "--hold": hold,
-        "--drive": drive,
-    }
-    of_the_part: dict[str, object] = {"--from": begin, "--for": length}
+    played: dict[str, object] = {"--topic": topics, "--listen": listen, "--hold": hold, "--drive": drive, "--rate": rate != 1.0}
     compared: dict[str, object] = {"--tolerance": tolerance, "--json": as_json}
-    again = {"--update-refs": update_refs, "--scenario": scenario, **compared}
-    unused, why = on_the_bus | of_the_part, "is for a recording that is played on the bus; --service compares all of it"
-    if service is None:
-        unused, why = again, "needs --service ROLE"
-    elif update_refs is not None:
-        unused, why = on_the_bus | compared, "cannot be combined with --update-refs, which only writes"
+    unused, why = {"--update-refs": update_refs, "--scenario": scenario, **compared}, "needs --service ROLE"
+    if update_refs is not None and service is not None:
+        unused, why = played | compared, "cannot be combined with --update-refs, which only writes"
+    elif service is not None:
+        unused = {**played, "--from": begin, "--for": length}
+        why = "is for a recording that is played on the bus; --service compares all of it"
     for option in (name for name, value in unused.items() if value):
         refuse(f"{option} {why}")
     start = round(begin * NS)

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import asdict, dataclass, field, fields, is_dataclass
+from itertools import chain
 from typing import Any
 
 import numpy as np
@@ -46,11 +47,9 @@ def flat(message: Any, prefix: str = "") -> Iterator[tuple[str, Value]]:
 def _floats(message: Any) -> NDArray[np.float32] | None:
     """Return the floats in the bytes of a depth image or point cloud; None for any other message."""
     kind = getattr(message, "__msgtype__", "")
-    if kind == "sensor_msgs/msg/Image" and message.encoding == "32FC1":
-        return np.asarray(message.data, np.uint8).view(np.float32)
-    if kind == "sensor_msgs/msg/PointCloud2" and message.fields and all(f.datatype == f.FLOAT32 for f in message.fields):
-        return np.asarray(message.data, np.uint8).view(np.float32)
-    return None
+    image = kind == "sensor_msgs/msg/Image" and message.encoding == "32FC1"
+    cloud = kind == "sensor_msgs/msg/PointCloud2" and message.fields and all(f.datatype == f.FLOAT32 for f in message.fields)
+    return np.asarray(message.data, np.uint8).view(np.float32) if image or cloud else None
 
 
 RELATIVE = 1e-6
@@ -163,35 +162,29 @@ def compare(
             result.identical += 1
         else:
             _differ(result, rules.topics[now.topic], then, now, tolerance)
-    for left in waiting.values():
+    for left in chain(waiting.values(), [] if following is None else [following], recorded):
         results[left.topic].missing += 1
-    while following is not None:
-        results[following.topic].missing += 1
-        following = next(recorded, None)
     return results
 
 
 def _differ(result: TopicResult, topic: Topic, then: RecordedMessage, now: RecordedMessage, tolerance: Tolerance) -> None:
     decode = codec.decoder(topic.type)
     was, is_now = list(flat(decode(then.payload))), list(flat(decode(now.payload)))
-    if [name for name, _ in was] != [name for name, _ in is_now]:
-        _note(result, FieldDifference("", now.stamp, f"{len(was)} fields", f"{len(is_now)} fields", float("inf"), 0.0))
-        return
-    for (name, a), (_, b) in zip(was, is_now, strict=True):
-        difference = _difference(topic, name, a, b, now.stamp, tolerance)
-        if difference is not None:
-            _note(result, difference)
-
-
-def _note(result: TopicResult, difference: FieldDifference) -> None:
-    before = result.worst.get(difference.name)
-    if before is None or difference.ratio > before.ratio:
-        result.worst[difference.name] = difference
+    found: list[FieldDifference | None]
+    if [name for name, _ in was] == [name for name, _ in is_now]:
+        found = [_difference(topic, name, a, b, now.stamp, tolerance) for (name, a), (_, b) in zip(was, is_now, strict=True)]
+    else:
+        found = [FieldDifference("", now.stamp, f"{len(was)} fields", f"{len(is_now)} fields", float("inf"), 0.0)]
+    for difference in filter(None, found):
+        before = result.worst.get(difference.name)
+        if before is None or difference.ratio > before.ratio:
+            result.worst[difference.name] = difference
 
 
 def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, tolerance: Tolerance) -> FieldDifference | None:
     if isinstance(a, tuple) or isinstance(b, tuple):
-        return None if a == b else FieldDifference(name, stamp, _text(a), _text(b), float("inf"), 0.0)
+        was, got = (", ".join(map(repr, value)) for value in (a, b))
+        return None if a == b else FieldDifference(name, stamp, was, got, float("inf"), 0.0)
     if a.shape != b.shape:
         return FieldDifference(name, stamp, f"{a.size} items", f"{b.size} items", float("inf"), 0.0)
     x, y = a.astype(np.float64), b.astype(np.float64)
@@ -206,10 +199,6 @@ def _difference(topic: Topic, name: str, a: Value, b: Value, stamp: int, toleran
         ratio = np.where(off == 0, 0.0, off / allowed)
     i = int(np.argmax(ratio))
     return FieldDifference(name, stamp, f"{x[i]:.9g}", f"{y[i]:.9g}", float(off[i]), float(allowed[i]))
-
-
-def _text(value: Value) -> str:
-    return ", ".join(repr(item) for item in value) if isinstance(value, tuple) else f"{value.size} items"
 
 
 def parse_tolerance(options: list[str]) -> Tolerance:
@@ -249,12 +238,9 @@ def result_table(results: Mapping[str, TopicResult]) -> Table:
     for result in results.values():
         worst = max(result.worst.values(), key=lambda d: d.ratio, default=None)
         counts = [str(n) for n in (result.messages, result.identical, result.missing, result.extra)]
-        cells = ["", "", "", ""] if worst is None else [
-            worst.name,
-            f"{worst.deviation:.3g}" if worst.deviation != float("inf") else f"{worst.recorded} -> {worst.got}",
-            f"{worst.tolerance:.3g}",
-            f"{worst.stamp / NS:.3f}",
-        ]  # fmt: skip
-        style = None if result.agrees else "red"
-        table.add_row(result.topic, *counts, *cells, style=style)
+        cells = []
+        if worst is not None:
+            off = f"{worst.deviation:.3g}" if worst.deviation != float("inf") else f"{worst.recorded} -> {worst.got}"
+            cells = [worst.name, off, f"{worst.tolerance:.3g}", f"{worst.stamp / NS:.3f}"]
+        table.add_row(result.topic, *counts, *cells, style=None if result.agrees else "red")
     return table

@@ -47,6 +47,10 @@ def rerun(
     contract.
     """
     stepper = Stepper(service, rules)
+
+    def deliver(message: RecordedMessage) -> None:
+        stepper.buffers[message.topic].deliver(Packet(message.payload, message.stamp, message.sequence))
+
     late = {name for name, buffer in stepper.buffers.items() if buffer.edge is Edge.OBSERVE}
     for port, packet in stepper.start():
         yield RecordedMessage(0, port.topic.name, packet.payload, packet.sequence)
@@ -55,14 +59,10 @@ def rerun(
     held: list[RecordedMessage] = []
     for t in range(begin, end + 1, stepper.role.period):
         for message in held:
-            stepper.buffers[message.topic].deliver(Packet(message.payload, message.stamp, message.sequence))
+            deliver(message)
         held.clear()
         while following is not None and following.stamp <= t:
-            if following.topic in late and following.stamp == t:
-                held.append(following)
-            else:
-                packet = Packet(following.payload, following.stamp, following.sequence)
-                stepper.buffers[following.topic].deliver(packet)
+            (held.append if following.topic in late and following.stamp == t else deliver)(following)
             following = next(source, None)
         for port, packet in stepper.step(t):
             yield RecordedMessage(t, port.topic.name, packet.payload, packet.sequence)
@@ -193,9 +193,7 @@ def prepare(path: Path, choice: str, scenario: Path | None = None) -> GoldenCase
     topics = [topic.name for topic, _ in rules.inputs(role)] + [topic.name for topic in rules.outputs(role)]
     recording.check(rules, topics)
     if recording.origin([name for name in topics if recording.counts.get(name)]):
-        raise RecordingError(
-            f"{path}: has Unix time, not the simulated time of a run: it can be played, but no service re-run on it"
-        )
+        raise RecordingError(f"{path}: has Unix time, not that of a run: it can be played, but no service re-run on it")
     if not any(recording.counts.get(topic.name) for topic in rules.outputs(role)):
         raise RecordingError(f"{path}: has no message of {role} to compare with")
     loaded = load_text(text)
@@ -241,15 +239,10 @@ def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
     begin -= begin % max(period, 100 * MS)  # a tick of every role
     end = min(end, case.end)
     given = list(cut(case.recording, case.rules, case.inputs, begin, end))
-    last = (end - begin) // period * period
-    answered = rerun(case.service, case.rules, iter(given), last)
-    messages = chain(given, _rounded(answered, case.rules))
-    write_recording(path, case.rules, messages, {SCENARIO: ("application/yaml", case.scenario.encode())})
-
-
-def _rounded(messages: Iterator[RecordedMessage], rules: Contract) -> Iterator[RecordedMessage]:
-    for message in messages:
-        yield message._replace(payload=rounded(rules.topics[message.topic], message.payload))
+    sent = rerun(case.service, case.rules, iter(given), (end - begin) // period * period)
+    answers = (message._replace(payload=rounded(case.rules.topics[message.topic], message.payload)) for message in sent)
+    attached = {SCENARIO: ("application/yaml", case.scenario.encode())}
+    write_recording(path, case.rules, chain(given, answers), attached)
 
 
 def write_reference(file: Path, service: str, scenario: Path | None, start: int, end: int | None, target: Path) -> None:

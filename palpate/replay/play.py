@@ -1,7 +1,7 @@
 """Plays a recording on the bus: the same keys, bytes and sequence numbers, in scaled real time."""
 
 import logging
-from collections.abc import Callable, Collection
+from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns, sleep
@@ -32,8 +32,6 @@ class PlayTimes:
 
     longest_ns: int = 7 * 86400 * NS
     """Longest recording that is played [ns]; a longer one has stamps of two clocks."""
-    gap_ns: int = 5 * NS
-    """A longer time without a message is announced [ns]."""
     clock_period_ns: int = 10 * MS
 
 
@@ -108,19 +106,16 @@ class Player:
         for name in self.topics if alive else ():
             row = rules.topics[name]
             if row.producer in alive:
-                raise UserError(
-                    f"{row.producer} runs on this bus and sends {name} itself; play on another bus (--listen) or other topics"
-                )
+                advice = "play on another bus (--listen) or other topics"
+                raise UserError(f"{row.producer} runs on this bus and sends {name} itself; {advice}")
             acting = sorted(role for role in row.readers if role in alive and not rules.roles[role].observer)
             if acting and not self._drive:
                 raise UserError(f"{', '.join(acting)} would act on {name}; --drive allows it")
 
-    def play(self, start: int = 0, until: int | None = None, gap: Callable[[float], None] = lambda _: None) -> None:
+    def play(self, start: int = 0, until: int | None = None) -> None:
         """Play from `start` to `until` [ns after the origin].
 
         It begins with the last earlier message of each topic that is not periodic.
-
-        Calls `gap` with the time [s] until the next message if that is long.
 
         Raises UserError if a service appears that sends a topic that is played, or would act on it.
         """
@@ -133,8 +128,6 @@ class Player:
         epoch = 0
         for message in self._recording.messages(self.topics, start, until):
             epoch = epoch or monotonic_ns()  # after the first chunk is unpacked
-            if (silent := (message.stamp - self.origin - self.now) / self._rate) > PLAY.gap_ns:
-                gap(silent / NS)
             while self._own_clock and self._next_clock <= message.stamp:
                 self._wait(epoch + round((self._next_clock - start) / self._rate))
                 self._tick()
@@ -169,11 +162,6 @@ class Player:
                 return
             sleep(min(due - now, LOOK_NS) / NS)
 
-    def hold(self) -> None:
-        """Stay on the bus, for late joiners of latched topics, until interrupted."""
-        while True:
-            sleep(1.0)
-
     def __enter__(self) -> Self:
         return self
 
@@ -191,12 +179,8 @@ def _chosen(recording: Recording, rules: Contract, topics: Collection[str] | Non
         raise UserError(f"--topic {', '.join(unknown)}: not in the contract")
     chosen = tuple(name for name in wanted if name in rules.topics and recording.counts.get(name))
     if not chosen:
-        known = ", ".join(
-            f"{name} ({recording.types[name].name}, {recording.counts[name]} messages)" for name in sorted(wanted)[:12]
-        )
-        raise UserError(
-            f"{recording.path}: has no message on a topic of the contract; it has {known or 'no topic with a schema'}"
-        )
+        known = ", ".join(f"{name} ({recording.types[name].name})" for name in sorted(wanted)[:12]) or "no topic with a schema"
+        raise UserError(f"{recording.path}: has no message on a topic of the contract; it has {known}")
     return chosen
 
 
@@ -230,12 +214,13 @@ def play(
             raise UserError(f"--from {start / NS:g}: {file} ends at {last / NS:.3f} s")
         try:
             with TimeLeft(lambda: "playing", lambda: player.now, start, last if end is None else min(end, last)):
-                player.play(start, end, lambda s: console.print(f"no message for the next {s:.0f} s", highlight=False))
+                player.play(start, end)
             if not player.sent:
                 raise RunError(f"{file}: played no message: it has none in the part that was chosen")
             console.print(f"played {player.sent} messages up to {player.now / NS:.3f} s, at most {player.lag_ms:.1f} ms late")
             if hold:
                 console.print("holding; Ctrl-C ends")
-                player.hold()
+            while hold:
+                sleep(1.0)
         except KeyboardInterrupt:
             console.print(f"ended at {player.now / NS:.3f} s after {player.sent} messages")

@@ -121,15 +121,6 @@ def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
     return scan
 
 
-def with_whole_path(scenario: Scenario) -> Scenario:
-    """Return the scenario with an absolute path of its pattern file: services have other working directories."""
-    pattern = scenario.exam.pattern
-    if not is_file(pattern):
-        return scenario
-    exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
-    return scenario.model_copy(update={"exam": exam})
-
-
 def usable(
     name: str,
     settings: Sequence[str] | None = None,
@@ -153,7 +144,9 @@ def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
 
     Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service.
     """
-    scenario = with_whole_path(scenario)
+    if is_file(pattern := scenario.exam.pattern):  # services have other working directories
+        exam = scenario.exam.model_copy(update={"pattern": str(Path(pattern).resolve())})
+        scenario = scenario.model_copy(update={"exam": exam})
     if scenario.services.tissue != NONE:
         scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
     return scenario if elsewhere else checked(scenario)

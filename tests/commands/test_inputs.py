@@ -123,5 +123,5 @@ def test_the_plan_of_a_user_defined_pattern_is_drawn(tmp_path: Path) -> None:
 
 def test_the_plan_of_a_search_states_its_budget_and_no_strokes(tmp_path: Path) -> None:
     output = plan(tmp_path, "exam.pattern=search", "exam.budget.presses=10")
-    assert re.search(r"\d+ places to choose from, at most 10 presses; .*; at most \d+ s", output)
+    assert re.search(r"\d+ places, at most 10 presses; .*; at most \d+ s", output)
     assert "stroke" not in output

@@ -208,11 +208,7 @@ def encode_joint_state(message: JointState) -> bytes:
         joints = _joints(n, padding(len(data) + LENGTH.size, 8))
         return data + joints.pack(n, position.tobytes(), n, velocity.tobytes(), n, effort.tobytes())
     for values in (position, velocity, effort):
-        count = len(values)
-        length = LENGTH.pack(count)
-        if count:  # an empty array has no padding
-            length += bytes(padding(len(data) + LENGTH.size, 8))
-        data += length + values.tobytes()
+        data += _numbers(values.size, len(data)).pack(values.size, values.tobytes())
     return data
 
 

@@ -80,7 +80,8 @@ class Node(ABC):
             for seat in self._seats:
                 self._acting = seat
                 seat.finish(self._counts(seat))
-            self._await_end()
+            while (message := self._link.poll(TIMES.poll_s)) is None or message.command != RunControl.END:
+                pass
         except (RunAborted, KeyboardInterrupt):
             for seat in self._seats:
                 with suppress(Exception):
@@ -116,10 +117,3 @@ class Node(ABC):
     @abstractmethod
     def _counts(self, seat: Seat) -> dict[str, Any]:
         """Return counts and digests of a service's messages, for the conductor."""
-
-    def _await_end(self) -> None:
-        """Wait for the conductor's END message."""
-        while True:
-            message = self._link.poll(TIMES.poll_s)
-            if message is not None and message.command == RunControl.END:
-                return

@@ -46,10 +46,8 @@ class PlayedScan:
     def __init__(self, X_WA: Array, depth: float, half: float, start: int) -> None:
         self._X_WA, self._depth, self._start = X_WA, depth, start
         line = np.arange(-half, half, SCAN.speed_mps * 0.01)
-        rows = []
-        for i, y in enumerate(np.arange(-half, half + 1e-9, SCAN.spacing_m)):
-            rows.append(np.column_stack((line if i % 2 == 0 else line[::-1], np.full(len(line), y))))
-        self.path = np.vstack(rows)
+        rows = enumerate(np.arange(-half, half + 1e-9, SCAN.spacing_m))
+        self.path = np.vstack([np.column_stack((line[::-1] if i % 2 else line, np.full(len(line), y))) for i, y in rows])
         self.duration = len(self.path) * 0.01 + 1.0
 
     def state(self, t: int) -> Any:
@@ -63,20 +61,8 @@ class PlayedScan:
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
         depth = float(sensed(self._depth, t)) if scanning else -0.01
         force = BELLY.force_n * self.stiffness(x, y) if scanning else 0.0
-        return exam_state(
-            t,
-            phase,
-            p_W,
-            n_W,
-            target_count=1,
-            in_contact=scanning,
-            steady=scanning,
-            depth_setpoint=self._depth,
-            depth=depth,
-            normal_force=force,
-            depth_uncertainty=0.0005,
-            stroke=1,
-        )
+        felt = {"depth_setpoint": self._depth, "depth": depth, "normal_force": force, "depth_uncertainty": 0.0005}
+        return exam_state(t, phase, p_W, n_W, target_count=1, in_contact=scanning, steady=scanning, stroke=1, **felt)
 
     @staticmethod
     def stiffness(x: float, y: float) -> float:

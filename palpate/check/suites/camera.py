@@ -8,7 +8,7 @@ import numpy as np
 from palpate.check.rig import ReceivedMessage, Rig, Source
 from palpate.check.shapes import level
 from palpate_bus.messages import CameraTrigger
-from palpate_bus.messages.geometry import pose_of_frame
+from palpate_bus.messages.geometry import depth_in_metres, pose_of_frame
 from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_models.numerics.frames import Array
 
@@ -29,12 +29,6 @@ class ViewedPlane:
 
 
 PLANE: Final = ViewedPlane()
-
-
-def depths(message: Any) -> Array:
-    """Return depth [m], shape (height, width); NaN where invalid."""
-    rows = np.frombuffer(np.asarray(message.data, np.uint8).tobytes(), np.uint8).reshape(message.height, message.step)
-    return rows[:, : 4 * message.width].copy().view("<f4").astype(float)
 
 
 def plane(centre: Array) -> Source:
@@ -99,7 +93,7 @@ def _format(rig: Rig, image: ReceivedMessage, info: ReceivedMessage) -> Array | 
     rig.expect("intrinsics are plausible", bool(good), "focal lengths > 0, principal point in the image", k.round(1).tolist())
     if m.encoding != "32FC1" or not fits:
         return None
-    depth = depths(m)
+    depth = depth_in_metres(IMAGE, m).astype(float)
     rig.within("depth is in metres, NaN where invalid", depth[np.isfinite(depth)], 1e-3, 20.0, "m")
     return depth
 
@@ -114,11 +108,7 @@ def _geometry(rig: Rig, depth: Array, info: Any, X_WC: Array, centre: Array) -> 
     rays = np.stack(((u - k[0, 2]) / k[0, 0], (v - k[1, 2]) / k[1, 1], np.ones(depth.shape)), axis=-1) @ X_WC[:3, :3].T
     expected = (centre[2] - X_WC[2, 3]) / rays[..., 2]
     hit = X_WC[:3, 3] + rays * expected[..., None]
-    on = (
-        (np.abs(hit[..., 0] - centre[0]) < 0.8 * PLANE.half_m)
-        & (np.abs(hit[..., 1] - centre[1]) < 0.8 * PLANE.half_m)
-        & (expected > 0)
-    )
+    on = (np.abs(hit - centre)[..., :2] < 0.8 * PLANE.half_m).all(axis=-1) & (expected > 0)
     error = (depth - expected)[on & np.isfinite(depth)]
     most = error.size > 0.5 * max(int(on.sum()), 1)
     rig.below("a level plane is where it is", abs(np.median(error)) if most else np.inf, 0.01, "mm off", 1e3)

@@ -48,9 +48,8 @@ def suite(rig: Rig) -> None:
     untriggered = rig.run(0.5, feed)
     rig.equal("sends nothing without a trigger", len(untriggered[TARGETS]), 0)
     rig.send("planning/camera_trigger", CameraTrigger(header(rig.t), VIEW.frames))
-    if not rig.arrives(
-        "answers a burst", rig.await_message(TARGETS, VIEW.answer_s, feed), f"{TARGETS} within {VIEW.answer_s:.0f} s"
-    ):
+    answer = rig.await_message(TARGETS, VIEW.answer_s, feed)
+    if not rig.arrives("answers a burst", answer, f"{TARGETS} within {VIEW.answer_s:.0f} s"):
         return
     rig.section("surface")
     _surface(rig, X_WA)

@@ -88,7 +88,6 @@ def suite(rig: Rig) -> None:
     _expiry(rig)
     _invalid(rig)
     _stop(rig)
-    _emergency(rig)
     rig.section("sensor")
     _force(rig)
     _twist(rig)
@@ -141,16 +140,15 @@ def _gravity(rig: Rig) -> None:
 def _signs(rig: Rig) -> None:
     """Check that a positive command moves its joint positively and that its torque is reported with that sign."""
     wrong, unreported = [], []
-    settle(rig)
+    rig.run(0.4, quiet(rig))
     arm, robot = _arm(rig), rig.settings.scenario.robot
     for joint, name in enumerate(arm.joint_names):
         release(rig)
         push = _still(rig)
-        push[joint] = (
-            TOUCH.push_rad if _positions(rig) else TOUCH.push_fraction * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
-        )
+        torque = TOUCH.push_fraction * arm.torque_nm[joint] + 2 * robot.joint_friction_nm
+        push[joint] = TOUCH.push_rad if _positions(rig) else torque
         received = rig.run(TOUCH.push_s, commanding(rig, push))["joint_states"]
-        settle(rig)
+        rig.run(0.4, quiet(rig))
         q = np.array([item.message.position[joint] for item in received])
         if len(q) < 10 or q[-5:].mean() - q[:5].mean() < TOUCH.moved_rad:
             wrong.append(name)
@@ -162,11 +160,6 @@ def _signs(rig: Rig) -> None:
         return
     got = f"not {', '.join(unreported)}" if unreported else "all of them"
     rig.expect("effort reports the applied torque", not unreported, "within 20 % of the command", got)
-
-
-def settle(rig: Rig) -> None:
-    """Wait in the driver's hold until the arm rests."""
-    rig.run(0.4, quiet(rig))
 
 
 def release(rig: Rig) -> None:
@@ -233,17 +226,9 @@ def _stop(rig: Rig) -> None:
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "conformance check"))
     received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig)))["robot/status"]
     _expect_hold(rig, "an operator's stop makes it hold", received, RobotStatus.CAUSE_STOP_REQUESTED)
-
-
-def _emergency(rig: Rig) -> None:
     _activate(rig)
     received = rig.run(0.1 + rig.slack_s, commanding(rig, _still(rig), SupervisorState.LEVEL_EMERGENCY))["robot/status"]
     _expect_hold(rig, "the supervisor's emergency stop makes it hold", received)
-
-
-def _pressing(rig: Rig, force_W: Any) -> Feed:
-    wrench = Wrench(Vector3(*map(float, force_W)), Vector3(0.0, 0.0, 0.0))
-    return {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), wrench)}
 
 
 def _force(rig: Rig) -> None:
@@ -254,10 +239,11 @@ def _force(rig: Rig) -> None:
     _activate(rig)
     rig.run(0.4, quiet(rig))
     before = _mean_force(rig.run(0.1, quiet(rig))["ft/wrench"])
-    force_W = np.array([0.0, 0.0, TOUCH.press_n])
-    pressed = _mean_force(rig.run(0.1, _pressing(rig, force_W))["ft/wrench"])
+    push = Wrench(Vector3(0.0, 0.0, TOUCH.press_n), Vector3(0.0, 0.0, 0.0))
+    pressing = {**quiet(rig), "sim/contact_wrench": lambda t: WrenchStamped(header(t, "world"), push)}
+    pressed = _mean_force(rig.run(0.1, pressing)["ft/wrench"])
     R_WI = rotation(rig.last("sim/tool_state").pose.orientation)
-    off = np.linalg.norm(pressed - before - R_WI.T @ force_W)
+    off = np.linalg.norm(pressed - before - TOUCH.press_n * R_WI[2])
     rig.run(0.3, quiet(rig))
     rig.below("ft/wrench shows a push of 10 N with its sign", off, 0.3 * TOUCH.press_n, "N off in the sensor's axes")
 

@@ -38,10 +38,8 @@ class Play:
 
     def state(self, t: int) -> Any:
         """Return the state at `t` [ns]."""
-        over = self.over
-        return exam_state(
-            t, self.phase, target_index=over, stroke=over, depth_setpoint=-0.01, depth=-0.01, depth_uncertainty=0.0005
-        )
+        depth: dict[str, Any] = {"depth_setpoint": -0.01, "depth": -0.01, "depth_uncertainty": 0.0005}
+        return exam_state(t, self.phase, target_index=self.over, stroke=self.over, **depth)
 
 
 def suite(rig: Rig) -> None:

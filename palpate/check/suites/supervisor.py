@@ -111,8 +111,7 @@ def suite(rig: Rig) -> None:
     _expect_level(rig, "a release is refused while its cause is present", rig.run(0.3, arm.feed())[STATE], STOPPED)
     _released(rig, arm, "and is released")
     arm.push_N = limits.force_emergency_n + 10.0
-    _stops(rig, arm, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE)
-    _released(rig, arm, "and is released after it")
+    _stops(rig, arm, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, released="after it")
     _expect_level(rig, "a steady force below the limits is not stopped", _press(rig, arm, limits.force_working_n))
     rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.035))
     _stops(rig, arm, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH)
@@ -120,17 +119,14 @@ def suite(rig: Rig) -> None:
     _released(rig, arm, "and is released above the surface")
     arm.qd = _turning(arm, 2.0 * limits.speed_mps)
     jump = (SupervisorState.CAUSE_SPEED, SupervisorState.CAUSE_SENSOR)  # the played arm jumps to that speed without torques
-    _stops(rig, arm, "a tool too fast", EMERGENCY, *jump)
-    _released(rig, arm, "and is released at rest")
+    _stops(rig, arm, "a tool too fast", EMERGENCY, *jump, released="at rest")
     _workspace(rig, arm)
 
     rig.section("others")
     arm.q = np.full_like(arm.home, np.nan)
-    _stops(rig, arm, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID)
-    _released(rig, arm, "and is released with numbers")
+    _stops(rig, arm, "positions that are not numbers", EMERGENCY, SupervisorState.CAUSE_INVALID, released="with numbers")
     arm.mode, arm.reason = RobotStatus.MODE_SAFE_HOLD, "conformance check"
-    _stops(rig, arm, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER)
-    _released(rig, arm, "and is released with the driver")
+    _stops(rig, arm, "a driver that holds by itself", EMERGENCY, SupervisorState.CAUSE_DRIVER, released="with the driver")
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.STOP, "enough"))
     _stops(rig, arm, "an operator's stop", EMERGENCY, SupervisorState.CAUSE_OPERATOR)
     received = rig.run(0.5, arm.feed())[STATE]
@@ -191,25 +187,25 @@ def _workspace(rig: Rig, arm: PlayedArm) -> None:
         p_A = apply(X_AW, tool_pose(q, arm.robot)[:3, 3])
         if bool(np.any(p_A < low - 0.02) or np.any(p_A > high + 0.02)):
             arm.q = q
-            _stops(rig, arm, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE)
-            _released(rig, arm, "and is released inside")
+            _stops(rig, arm, "a tool outside the workspace", EMERGENCY, SupervisorState.CAUSE_WORKSPACE, released="inside")
             return
     rig.skip("stops for a tool outside the workspace", "all postures of this check lie in the workspace")
 
 
-def _stops(rig: Rig, arm: PlayedArm, what: str, levels: tuple[int, ...], *causes: int) -> None:
-    """Expect a stop with the right cause, or one of several, and a reason."""
+def _stops(rig: Rig, arm: PlayedArm, what: str, levels: tuple[int, ...], *causes: int, released: str = "") -> None:
+    """Expect a stop with the right cause, or one of several, and a reason; with `released`, then a release."""
     start = rig.t
     received = rig.run(0.5, arm.feed())[STATE]
     first = next((item for item in received if item.message.level in levels), None)
     wanted = f"level {' or '.join(map(str, levels))}, cause {' or '.join(map(str, causes))}, a reason"
-    if not rig.expect(f"stops for {what}", first is not None, wanted, _text(received)):
-        return
-    assert first is not None
-    state = first.message
-    rig.expect(f"and states the cause: {what}", state.cause in causes and bool(state.reason), wanted, _text([first]))
-    within_ms = EXPECTED.react_ms if levels == EMERGENCY else EXPECTED.soft_ms
-    rig.below(f"in time: {what}", (first.t - start - rig.slack) / MS, within_ms + 1, "ms")
+    rig.expect(f"stops for {what}", first is not None, wanted, _text(received))
+    if first is not None:
+        state = first.message
+        rig.expect(f"and states the cause: {what}", state.cause in causes and bool(state.reason), wanted, _text([first]))
+        within_ms = EXPECTED.react_ms if levels == EMERGENCY else EXPECTED.soft_ms
+        rig.below(f"in time: {what}", (first.t - start - rig.slack) / MS, within_ms + 1, "ms")
+    if released:
+        _released(rig, arm, f"and is released {released}")
 
 
 def _released(rig: Rig, arm: PlayedArm, name: str) -> None:
