@@ -42,7 +42,7 @@ ROOT = Path(__file__).parents[2]
     [
         ("services: {}", "no service 'robot'"),
         ("services: {robot: {command: python -m x}}", "services.robot.command = 'python -m x': want a list of words"),
-        ("services: {robot: {command: [a], environment: [B=1]}}", "services.robot.environment: want a mapping"),
+        ("services: {robot: {command: [a], environment: [B=1]}}", "services.robot.environment = ['B=1']: want a mapping"),
     ],
 )
 def test_errors_name_file_service_and_field(tmp_path: Path, text: str, error: str) -> None:
