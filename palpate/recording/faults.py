@@ -59,7 +59,7 @@ class Remedy(StrEnum):
     CORRECTED = "corrected"
     NOT_TARED = "the force is taken as it is, without a tare"
     ONE_DEPTH = "all slides are taken to keep one depth"
-    REFUSED = "not assessed until it is mended"
+    REFUSED = "not assessed until it is fixed"
 
 
 @dataclass(frozen=True)

@@ -296,4 +296,4 @@ def of_whom(report: Report) -> str:
     """Return the prevalence that confidence refers to as text; empty without findings, and for a body without a prior."""
     if report.prevalence is None or not report.findings or not report.abdomen:
         return ""
-    return f"Confidence holds if one in {1 / report.prevalence:.3g} such persons has a lump. "
+    return f"Confidence assumes that one in {1 / report.prevalence:.3g} persons has a lump. "
