@@ -285,7 +285,7 @@ class Services(Section):
     model_config = ConfigDict(extra="allow")
 
     robot: str = "dart"
-    """`dart`, `mujoco`, or `lbr` for the real arm (wall-clock mode only)."""
+    """`dart`, `mujoco`; for a real arm `lbr` or `ros2_control` (wall-clock mode only, except for an emulated arm)."""
     tissue: str = "winkler"
     """`winkler`, `elastic` or `fmu`; `none` for a real object: then there is no truth and no score (wall-clock mode only)."""
     camera: str = "kinect"
