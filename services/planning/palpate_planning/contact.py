@@ -31,14 +31,7 @@ class ForceCompensation:
         """Reading of the sensor without force [N], in its axes, shape (3,)."""
         self.tared = False
         """True once the bias has been measured."""
-        self._sum = np.zeros(3)
-        self._count = 0
-
-    @staticmethod
-    def of(robot: Robot) -> ForceCompensation:
-        """Return the tool of a robot: stand-off and sphere."""
-        inertia = inertias(robot)
-        return ForceCompensation(inertia["ft_sensor"].mass + inertia["indenter"].mass)
+        self._sum, self._count = np.zeros(3), 0
 
     def weight_S(self, R_WS: Array) -> Array:
         """Return the weight in the sensor's axes [N], shape (3,)."""
@@ -118,13 +111,11 @@ class ContactMeasurement(NamedTuple):
 class ContactSensing:
     """Computes the contact with the estimated wall from sensor readings."""
 
-    def __init__(
-        self, kinematics: ArmKinematics, compensation: ForceCompensation, wall: Wall, radius: float, period_s: float
-    ) -> None:
-        """`radius` of the sphere [m]; a reading comes every `period_s`."""
+    def __init__(self, kinematics: ArmKinematics, robot: Robot, wall: Wall, period_s: float) -> None:
+        """A reading comes every `period_s`."""
         self.wall = wall
-        self.compensation = compensation
-        self._kinematics, self._radius, self._period_s = kinematics, radius, period_s
+        self.compensation = ForceCompensation(sum(inertias(robot)[link].mass for link in ("ft_sensor", "indenter")))
+        self._kinematics, self._radius, self._period_s = kinematics, robot.indenter_radius_m, period_s
         self._touching = False
         self._velocity: Array | None = None
         """Previous velocity of the sphere's centre [m/s], world axes, shape (3,)."""
@@ -141,16 +132,8 @@ class ContactSensing:
         force = float(force_W @ foot.n_W)
         self._touching = self.compensation.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         load, by_joints = float(np.linalg.norm(force_W)), joint_force - THRESHOLDS.joints_n
+        depth = self._radius - foot.distance + place.correction + place.displacement
+        skin, joints_only = wall.skin(foot, place.correction), by_joints > 0.0 and not self._touching
         return ContactMeasurement(
-            reading.q,
-            X_WI,
-            R_WS,
-            foot,
-            place,
-            self._radius - foot.distance + place.correction + place.displacement,
-            force,
-            max(load, by_joints),
-            wall.skin(foot, place.correction),
-            self._touching,
-            by_joints > 0.0 and not self._touching,
+            reading.q, X_WI, R_WS, foot, place, depth, force, max(load, by_joints), skin, self._touching, joints_only
         )

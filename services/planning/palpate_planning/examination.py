@@ -10,17 +10,17 @@ from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning.contact import ContactSensing, ForceCompensation
-from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion, TrajectoryFollower
+from palpate_planning.contact import ContactSensing
+from palpate_planning.free_motion import WORKER, BackgroundTask, FreeMotion
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
-from palpate_planning.periods import MS, SECOND, Periods
+from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
 from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, counted
 from palpate_planning.setpoints import joint_setpoint
-from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
@@ -57,25 +57,26 @@ EXAM = ExamTuning()
 class ExaminationSequence:
     """Runs one examination. `step` each planning period; `status` is what exam/state reports."""
 
-    def __init__(self, known: ExamInput, periods: Periods, before: Checkpoint | None = None, *, lockstep: bool = True) -> None:
+    def __init__(
+        self, known: ExamInput, step_s: float, frame_ns: int, before: Checkpoint | None = None, *, lockstep: bool = True
+    ) -> None:
         """Start at home.
 
         Args:
             known: the exam input.
-            periods: periods of the contract.
+            step_s: period of planning [s].
+            frame_ns: period of the camera [ns].
             before: state of the interrupted examination that this one resumes.
             lockstep: True if heavy planning takes exactly its simulated time; else it takes at least that.
         """
-        self._known, self._periods, self._lockstep = known, periods, lockstep
+        self._known, self._step_s, self._frame_ns, self._lockstep = known, step_s, frame_ns, lockstep
         self._before = before
         self._kinematics = ArmKinematics(known.robot, known.limits)
         compile_ahead()
-        wall, radius = plane(np.array(known.X_WA)), known.robot.indenter_radius_m
-        self._sense = ContactSensing(self._kinematics, ForceCompensation.of(known.robot), wall, radius, periods.step_s)
-        self._planner = ExamPlanner(known, periods.step_s)
+        self._sense = ContactSensing(self._kinematics, known.robot, plane(np.array(known.X_WA)), step_s)
+        self._planner = ExamPlanner(known, step_s)
         WORKER.submit(self._planner.prepare)
-        follower = TrajectoryFollower(self._kinematics, self._kinematics.arm.home_rad)
-        arm = FreeMotion(follower, self._planner, lockstep=lockstep)
+        arm = FreeMotion(self._kinematics, self._planner, lockstep=lockstep)
         self._course = ExamCourse(arm, 0 if before is None else before.strokes)
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart = RestartRamp()
@@ -174,14 +175,17 @@ class ExaminationSequence:
     # --- before contact -----------------------------------------------------------------------------------------------
 
     def _home(self, now: Observation, out: ExamStep) -> None:
+        if self._at_home(now) and now.t - self._course.since >= EXAM.rest_ns:
+            self._course.enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
+
+    def _at_home(self, now: Observation) -> bool:
+        """Move home; return True once there. Abort if there is no path."""
         course = self._course
         try:
-            at_home = course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived)
+            return course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived)
         except NoPathError as error:
             course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))
-            return
-        if at_home and now.t - course.since >= EXAM.rest_ns:
-            course.enter(Phase.LOOK, now.t, "moving the arm out of the camera's view")
+            return False
 
     def _look(self, now: Observation, out: ExamStep) -> None:
         course, views, frames = self._course, self._views, self._known.camera.frames
@@ -194,17 +198,15 @@ class ExaminationSequence:
                     course.since = now.t
                 elif now.t - course.since >= EXAM.rest_ns:
                     out.trigger, views.asked = True, now.t
-                    self.status.cause, self.status.message = (
-                        FOR_PERCEPTION,
-                        f"looking: {frames} frames, which perception evaluates",
-                    )
+                    self.status.cause = FOR_PERCEPTION
+                    self.status.message = f"looking: {frames} frames, which perception evaluates"
             except NoPathError as error:
                 self._look_again(now, out, Cause(Reason.VIEW_UNREACHABLE, f"look posture cannot be reached: {error}"))
         elif isinstance(now.perceived, PerceivedAbdomen):
             self._accept_view(now, now.perceived)
-        elif isinstance(now.perceived, PerceptionFailure):
-            self._look_again(now, out, now.perceived.cause)
-        elif now.t - views.asked > frames * self._periods.frame + EXAM.perception_timeout_ns:
+        elif now.perceived is not None:
+            self._look_again(now, out, now.perceived)
+        elif now.t - views.asked > frames * self._frame_ns + EXAM.perception_timeout_ns:
             text = f"no answer from perception {EXAM.perception_timeout_ns / SECOND:.0f} s after the burst"
             self._look_again(now, out, Cause(Reason.VIEW_TIMEOUT, text, "perception"))
 
@@ -283,17 +285,8 @@ class ExaminationSequence:
             course.since = now.t
         elif now.t - course.since >= EXAM.rest_ns:
             assert course.plan is not None
-            course.palpation = Palpation(
-                course.plan.segments,
-                known.exam,
-                known.limits,
-                known.robot,
-                self._periods.step_s,
-                self._sense.wall,
-                strokes=self.status.stroke,
-                more=course.plan.presses is not None,
-            )
-            course.palpation.looked_again = self._rest.looked_again
+            course.palpation = Palpation(course.plan.segments, known, self._step_s, self._sense.wall, self.status.stroke)
+            course.palpation.more, course.palpation.looked_again = course.plan.presses is not None, self._rest.looked_again
             return self._palpate(now, out)
         return None
 
@@ -311,28 +304,28 @@ class ExaminationSequence:
         sense.compensation.update(course.contact.R_WS, now.reading.wrench_S, taring=step.taring)
         if step.stage is StrokeStage.DONE:
             self._end_strokes(now, out, palpation)
-            if palpation.failed:
+            if palpation.recovery.failed:
                 return None  # it rests where it is, which may be off the planned path
         return step.setpoint
 
     def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
         status = self.status
-        self._skipped |= palpation.skipped
-        status.stroke, status.patient_moved = palpation.stroke, self._sense.wall.breath.moved
+        self._skipped |= palpation.recovery.skipped
+        status.stroke, status.patient_moved = palpation.descent.stroke, self._sense.wall.breath.moved
         status.steady, status.force_limited, status.depth_setpoint = step.steady, step.limited, step.depth_setpoint
         status.target_index = self._requested.done if self._known.exam.searched else step.target
         status.targets_skipped = len(self._skipped)
-        cause = palpation.failed or palpation.early_end or palpation.waits
+        cause = palpation.recovery.failed or palpation.recovery.early_end or palpation.waits.reported
         self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause)
 
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
         """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
         assert now.reading is not None
-        course, rest, cause = self._course, self._rest, palpation.early_end
+        course, rest, cause = self._course, self._rest, palpation.recovery.early_end
         course.arm.hold(now.reading.q)
         self._requested.drop_plan()
-        more = not palpation.failed and (palpation.open_ended or bool(palpation.ahead))
-        wanted = None if palpation.open_ended else palpation.ahead
+        more = not palpation.recovery.failed and (palpation.more or bool(palpation.ahead))
+        wanted = None if palpation.more else palpation.ahead
         if more and (palpation.moved or cause.reason is Reason.NO_TISSUE) and rest.rescans < EXAM.rescans_max:
             rest.rescans, rest.wanted, rest.bend = rest.rescans + 1, wanted, None
             rest.looked_again = rest.looked_again or not palpation.moved
@@ -344,10 +337,10 @@ class ExaminationSequence:
             rest.bend = max(rest.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
             course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause)
         else:
-            rest.unplanned = cause.text if palpation.open_ended else rest.unplanned  # a search that did not end by itself
+            rest.unplanned = cause.text if palpation.more else rest.unplanned  # a search that did not end by itself
             self._correct(out)
-            course.go_home(now, palpation.failed)
-            if cause and not palpation.failed:
+            course.go_home(now, palpation.recovery.failed)
+            if cause and not palpation.recovery.failed:
                 self.status.cause, self.status.message = cause, f"returning home: {cause.text}"
 
     def _correct(self, out: ExamStep) -> None:
@@ -364,17 +357,12 @@ class ExaminationSequence:
     # --- after contact ------------------------------------------------------------------------------------------------
 
     def _return(self, now: Observation, out: ExamStep) -> None:
-        course = self._course
-        try:
-            if not course.arm.move_to(now.t, self._kinematics.arm.home_rad, course.perceived):
-                return
-        except NoPathError as error:
-            course.abort(now, Cause(Reason.NO_PATH, f"no path home: {error}"))
+        if not self._at_home(now):
             return
-        if course.failure:
-            course.abort(now, course.failure)
+        if self._course.failure:
+            self._course.abort(now, self._course.failure)
         else:
-            course.enter(Phase.ASSESS, now.t, FOR_FINDINGS.text, FOR_FINDINGS)
+            self._course.enter(Phase.ASSESS, now.t, FOR_FINDINGS.text, FOR_FINDINGS)
 
     def _assess(self, now: Observation, out: ExamStep) -> None:
         if now.findings_final:

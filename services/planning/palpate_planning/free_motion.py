@@ -70,18 +70,18 @@ AT_POSTURE_RAD = 0.01
 """The arm is at a posture if all joints are closer than this."""
 
 
-class TrajectoryFollower:
-    """Holds a posture, or follows a trajectory to its end and holds there."""
+class FreeMotion:
+    """Moves the arm between postures without contact: holds a posture, or follows a trajectory and holds its end."""
 
-    def __init__(self, kinematics: ArmKinematics, q: Array) -> None:
-        """Start at rest at q [rad], shape (n,)."""
-        self._kinematics = kinematics
-        self.hold(q)
+    def __init__(self, kinematics: ArmKinematics, planner: ExamPlanner, *, lockstep: bool) -> None:
+        """Start at rest at home; `lockstep` as in `BackgroundTask`."""
+        self._kinematics, self._planner, self._lockstep = kinematics, planner, lockstep
+        self.hold(kinematics.arm.home_rad)
 
     def hold(self, q: Array) -> None:
-        """Stay at q [rad], shape (n,)."""
-        self._trajectory = JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, len(q))))
-        self._sample = 0.0
+        """Stay at q [rad], shape (n,); drop a motion that is being planned."""
+        self._task: BackgroundTask[JointTrajectory] | None = None
+        self.start(JointTrajectory(np.array(q, dtype=float)[None], np.zeros((1, len(q)))))
 
     def start(self, trajectory: JointTrajectory) -> None:
         """Follow a trajectory from the next step on."""
@@ -97,46 +97,12 @@ class TrajectoryFollower:
         """Posture of the last set-point [rad], shape (n,)."""
         return self._trajectory.at(self._sample)[0]
 
-    def step(self, t: int, rate: float = 1.0) -> Setpoint:
-        """Return the set-point at `t` [ns], `rate` samples further; see `RestartRamp`."""
-        self._sample = min(self._sample + rate, len(self._trajectory) - 1.0)
-        q, qd = self._trajectory.at(self._sample)
-        return joint_setpoint(t, self._kinematics.pose(q), q, rate * qd, self._kinematics.arm.stiffness_nmprad)
-
-
-class FreeMotion:
-    """Moves the arm between postures without contact."""
-
-    def __init__(self, follower: TrajectoryFollower, planner: ExamPlanner, *, lockstep: bool) -> None:
-        """`lockstep` as in `BackgroundTask`."""
-        self._follower, self._planner, self._lockstep = follower, planner, lockstep
-        self._task: BackgroundTask[JointTrajectory] | None = None
-
-    @property
-    def arrived(self) -> bool:
-        """True if the last set-point was the goal."""
-        return self._follower.arrived
-
-    @property
-    def q(self) -> Array:
-        """Posture of the last set-point [rad], shape (n,)."""
-        return self._follower.q
-
-    def hold(self, q: Array) -> None:
-        """Stay at q [rad], shape (n,); drop a motion that is being planned."""
-        self._task = None
-        self._follower.hold(q)
-
-    def start(self, trajectory: JointTrajectory) -> None:
-        """Follow a planned trajectory."""
-        self._follower.start(trajectory)
-
     def move_to(self, t: int, goal: Array, perceived: PerceivedAbdomen | None) -> bool:
         """Plan a motion to a posture [rad], shape (n,), then follow it; return True once there. Raises NoPathError."""
-        if not self._follower.arrived:
+        if not self.arrived:
             return False
         if self._task is None:
-            start = self._follower.q.copy()
+            start = self.q.copy()
             if float(np.abs(start - goal).max()) < AT_POSTURE_RAD:
                 return True
             self._task = BackgroundTask(
@@ -144,7 +110,7 @@ class FreeMotion:
             )
         elif self._task.due(t):
             task, self._task = self._task, None
-            self._follower.start(task.result())
+            self.start(task.result())
         elif self._task.late(t):
             raise NoPathError(FOR_PLAN.end.text)
         return False
@@ -154,6 +120,8 @@ class FreeMotion:
         """Since when a motion is being planned [ns], if one is."""
         return None if self._task is None else self._task.begun
 
-    def step(self, t: int, rate: float) -> Setpoint:
-        """Return the set-point at `t` [ns]; see `TrajectoryFollower.step`."""
-        return self._follower.step(t, rate)
+    def step(self, t: int, rate: float = 1.0) -> Setpoint:
+        """Return the set-point at `t` [ns], `rate` samples further; see `RestartRamp`."""
+        self._sample = min(self._sample + rate, len(self._trajectory) - 1.0)
+        q, qd = self._trajectory.at(self._sample)
+        return joint_setpoint(t, self._kinematics.pose(q), q, rate * qd, self._kinematics.arm.stiffness_nmprad)

@@ -2,7 +2,7 @@
 
 | what happens | arm | targets ahead |
 |---|---|---|
-| the last segment ends, or `close` | stays above the skin | none |
+| the last segment ends, and no `more` may follow | stays above the skin | none |
 | no request in time (`early_end`) | stays above the skin | none |
 | `leave`: patient moved, wall hidden, elbow too straight, first place without tissue, long wait | lifts and ends | `ahead` |
 | `abandon`, last allowed soft stop or place without tissue (`failed`) | lifts and ends; at once in free motion | `remaining` |
@@ -18,7 +18,7 @@ import numpy as np
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.numerics.frames import Array
-from palpate_models.scenario.schema import Exam, Limits, Robot
+from palpate_models.scenario.schema import ExamInput
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.interruptions import RECOVERY, ForceWatch, Recovery, WallWatch
 from palpate_planning.reasons import Cause, Reason
@@ -88,43 +88,31 @@ class Palpation:
     An interruption replaces what the arm does by a lift, after which the segment is taken up again.
     """
 
-    def __init__(
-        self,
-        segments: tuple[Segment, ...],
-        exam: Exam,
-        limits: Limits,
-        robot: Robot,
-        period_s: float,
-        wall: Wall,
-        *,
-        strokes: int = 0,
-        more: bool = False,
-    ) -> None:
+    def __init__(self, segments: tuple[Segment, ...], known: ExamInput, period_s: float, wall: Wall, strokes: int = 0) -> None:
         """Start with the first segment.
 
         Args:
-            segments: strokes and the paths between them.
-            exam: what is examined, and how.
-            limits: of force and speed.
-            robot: arm and tool.
+            segments: strokes and the paths between them, at least one.
+            known: examination, limits, arm and tool.
             period_s: planning period [s].
             wall: what is pressed; every touch corrects it.
             strokes: descents made before.
-            more: True if further segments may follow (`extend`, `close`).
         """
+        exam, limits = known.exam, known.limits
         self._segments, self._limits = segments, limits
-        self._more = more
+        self.more = False
+        """True if further segments may follow (`extend`)."""
         self._number = -1
         self.stage = StrokeStage.WAIT
-        self._motion = StrokeMotion(exam, limits, robot, period_s, wall)
-        self._descent = Descent(self._motion, exam.depth_m, strokes)
+        self._motion = StrokeMotion(exam, limits, known.robot, period_s, wall)
+        self.descent = Descent(self._motion, exam.depth_m, strokes)
         self.looked_again = False
         """True if the surface was scanned again because no tissue was felt."""
         self._blind_places = 0
         self._watch = WallWatch(wall.breath, exam.breathing, period_s)
         self._forces = ForceWatch(period_s)
-        self._recovery = Recovery(exam, limits, period_s)
-        self._waits, self._strokes_before = StrokeWaits(period_s), strokes
+        self.recovery = Recovery(exam, limits, period_s)
+        self.waits, self._strokes_before = StrokeWaits(period_s), strokes
         self.ahead: frozenset[int] = frozenset()
         """The targets that are left when the strokes end early."""
         self.bend_needed = 0.0
@@ -134,40 +122,15 @@ class Palpation:
     # --- state --------------------------------------------------------------------------------------------------------
 
     @property
-    def stroke(self) -> int:
-        """Number of the latest descent, 0 before the first."""
-        return self._descent.stroke
-
-    @property
-    def skipped(self) -> dict[int, Cause]:
-        """Skipped targets with the cause."""
-        return self._recovery.skipped
-
-    @property
-    def failed(self) -> Cause:
-        """Cause of abandoned strokes."""
-        return self._recovery.failed
-
-    @property
-    def early_end(self) -> Cause:
-        """Cause of an early end without failure."""
-        return self._recovery.early_end
-
-    @property
-    def waits(self) -> Cause:
-        """The present wait as a cause, once it has lasted for some seconds."""
-        return self._waits.reported
-
-    @property
     def moved(self) -> bool:
         """True if the strokes ended because the patient has moved: the targets `ahead` can be examined after a new view."""
-        return self._watch.moved and not self.failed
+        return self._watch.moved and not self.recovery.failed
 
     @property
     def free_goal(self) -> Array | None:
         """Goal of the present free motion [rad], shape (n,); None on a path."""
         free = self._motion.segment.free
-        return None if free is None or self.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
+        return None if free is None or self.recovery.failed or self.stage is StrokeStage.DONE else np.asarray(free.q[-1])
 
     @property
     def waiting(self) -> bool:
@@ -181,7 +144,7 @@ class Palpation:
         if not presses(segment):
             return later
         slid = self.stage in (StrokeStage.SLIDE, StrokeStage.LIFT)
-        reached = self._recovery.reached(self._motion.along.position, slid=slid)
+        reached = self.recovery.reached(self._motion.along.position, slid=slid)
         behind = TUNING.unnoticed_m if self._watch.moved else 0.0
         return later.union(segment.path.targets[segment.path.visits > reached - behind].tolist())
 
@@ -190,24 +153,15 @@ class Palpation:
         strokes = [segment for segment in self._segments[self._number + 1 :] if presses(segment)]
         return frozenset(int(i) for stroke in strokes for i in stroke.path.targets)
 
-    @property
-    def open_ended(self) -> bool:
-        """True if further segments may follow."""
-        return self._more
-
     # --- commands -----------------------------------------------------------------------------------------------------
 
     def extend(self, segments: tuple[Segment, ...]) -> None:
         """Append segments, which begin where the last one ends."""
         self._segments += segments
 
-    def close(self) -> None:
-        """No further segments follow."""
-        self._more = False
-
     def abandon(self, cause: Cause) -> None:
         """Lift off and end. A free motion ends at once: it has no skin to lift off from, and the arm may be off its path."""
-        self._recovery.give_up(cause)
+        self.recovery.give_up(cause)
         if self._motion.segment.free is not None:
             self._continue_with(_done())
         elif self.stage not in (StrokeStage.LIFT, StrokeStage.DONE):
@@ -215,7 +169,7 @@ class Palpation:
 
     def leave(self, cause: Cause) -> None:
         """Lift off and end without failure: the rest of the plan counts as skipped."""
-        if self.early_end or self.stage is StrokeStage.DONE:
+        if self.recovery.early_end or self.stage is StrokeStage.DONE:
             return
         self._skip_rest(cause)
         if self.stage is not StrokeStage.LIFT:
@@ -223,10 +177,10 @@ class Palpation:
 
     def pause(self) -> None:
         """Lift off along the normal and wait there for `resume`."""
-        self._recovery.paused = True
+        self.recovery.paused = True
         if self.stage in PRESSING:
             stop = self._motion.along.position + self._motion.stopping_distance
-            self._recovery.resume_at = min(stop, self._motion.segment.path.length)
+            self.recovery.resume_at = min(stop, self._motion.segment.path.length)
             self._interrupt()
         else:
             self._rise()
@@ -236,25 +190,25 @@ class Palpation:
 
         It lifts first and returns laterally above the skin, since the arm must not be drawn through tissue.
         """
-        self._recovery.paused = False
+        self.recovery.paused = False
         if self._motion.segment.free is not None:
             return
         centre_height = self._motion.centre_height(t)
-        lateral = self._recovery.measure_displacement(contact, self._motion.point, centre_height)
+        lateral = self.recovery.measure_displacement(contact, self._motion.point, centre_height)
         if lateral > RECOVERY.displaced_max_m:
             self.abandon(Cause(Reason.ARM_DISPLACED, f"the arm was moved {lateral * 1e3:.0f} mm aside while it was held"))
         self._motion.restart(contact)
 
     def skip_free_motion(self) -> None:
         """Continue with the next segment: another motion took the arm to the goal of the present free motion."""
-        self._recovery.paused = False
+        self.recovery.paused = False
         self._continue_with(self._remaining())
 
     def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:
         """Advance one planning period, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`."""
-        motion, descent = self._motion, self._descent
+        motion, descent = self._motion, self.descent
         descent.taring, descent.touched = False, None
-        self._recovery.return_to_path(contact)
+        self.recovery.return_to_path(contact)
         if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
             descent.revise()
         self._check_force(contact)
@@ -267,16 +221,16 @@ class Palpation:
                 contact,
                 open=self._watch.open,
                 calm=self._watch.calm,
-                aligned=self._recovery.displacement is None,
-                paused=self._recovery.paused,
-                ending=self._recovery.ending,
+                aligned=self.recovery.displacement is None,
+                paused=self.recovery.paused,
+                ending=self.recovery.ending,
                 rate=rate,
             )
         )
         if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and motion.segment.touch):
-            self._waits.reach(self._number, motion.along.position, at_depth=not motion.segment.touch)
+            self.waits.reach(self._number, motion.along.position, at_depth=not motion.segment.touch)
         in_contact = contact.touching and self.stage is not StrokeStage.LIFT
-        pushing = self.stage in PUSHING and not (self._recovery.paused or self._recovery.ending)
+        pushing = self.stage in PUSHING and not (self.recovery.paused or self.recovery.ending)
         motion.regulate(contact, in_contact=in_contact, pushing=pushing)
         return self._report(t, contact, rate)
 
@@ -284,7 +238,7 @@ class Palpation:
 
     def _remaining(self) -> Stages[None]:
         """Return the segments from the next one on."""
-        while self._number + 1 < len(self._segments) or (self._more and (yield from self._wait())):
+        while self._number + 1 < len(self._segments) or (self.more and (yield from self._wait())):
             self._number += 1
             segment = self._segments[self._number]
             self._motion.start(segment)
@@ -307,33 +261,33 @@ class Palpation:
         while True:
             now = yield StrokeStage.WAIT
             self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
-            if self._recovery.ending:
+            if self.recovery.ending:
                 return False
-            if not now.paused and (len(self._segments) > self._number + 1 or not self._more):
+            if not now.paused and (len(self._segments) > self._number + 1 or not self.more):
                 return len(self._segments) > self._number + 1
 
     def _press(self) -> Stages[None]:
         """Press along the present segment, from where the arm is."""
-        cause = yield from press(self._motion, self._descent)
+        cause = yield from press(self._motion, self.descent)
         self._blind_places = self._blind_places + 1 if cause.reason is Reason.NO_TISSUE else 0
         if cause.reason is Reason.NO_TISSUE:
             self._miss(cause)
         elif cause:
-            self._recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, cause)
+            self.recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, cause)
 
     def _miss(self, cause: Cause) -> None:
         """Scan the surface again where no tissue was felt; then give up the place; after several in a row, all of them."""
         if not self.looked_again:
             self._skip_rest(cause)
         elif self._blind_places < RECOVERY.blind_places_max:
-            self._recovery.give_up_place(self._motion.segment, self._motion.along.position, cause)
+            self.recovery.give_up_place(self._motion.segment, self._motion.along.position, cause)
         else:
             text = f"{cause.text}, at {self._blind_places} places: the surface or the force sensor is wrong"
-            self._recovery.give_up(cause._replace(text=text))
+            self.recovery.give_up(cause._replace(text=text))
 
     def _lift(self) -> Stages[None]:
         """Lift off; take the stroke up again where it was interrupted, else move above the skin to the end of its path."""
-        motion, recovery = self._motion, self._recovery
+        motion, recovery = self._motion, self.recovery
         while True:
             yield from lift(motion, self._height)
             if recovery.ending:
@@ -349,22 +303,22 @@ class Palpation:
     def _height(self, t: int) -> float:
         """Return the height to lift to at `t` [ns]; in metres."""
         wall, following = self._motion.wall, self._segments[self._number + 1 : self._number + 2]
-        certain = self._watch.calm and not self._recovery.paused
-        if self._recovery.ending or not certain or not following:
+        certain = self._watch.calm and not self.recovery.paused
+        if self.recovery.ending or not certain or not following:
             return self._motion.free_height(t)
-        if self._recovery.resume_at is not None:
+        if self.recovery.resume_at is not None:
             return STROKE.hop_height_m
         if following[0].free is not None:
             return self._motion.free_height(t)
         return clearance(wall.sigma(wall.perceived.xy(following[0].path.p[-1]), t))
 
     def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
-        motion, descent = self._motion, self._descent
+        motion, descent = self._motion, self.descent
         setpoint = motion.setpoint(t, contact, rate)
         if motion.segment.free is not None:
             return PalpationStep(setpoint, self.stage, -SEGMENTS.hover_m, False, False, int(motion.segment.path.targets[-1]))
-        if self._recovery.displacement is not None:
-            setpoint = self._recovery.displacement.move(setpoint)
+        if self.recovery.displacement is not None:
+            setpoint = self.recovery.displacement.move(setpoint)
         limited = is_limited(self.stage, motion)
         steady = contact.touching and self._watch.open and is_steady(self.stage, motion, limited=limited)
         depth = motion.regulation.reference
@@ -384,10 +338,10 @@ class Palpation:
         """Lift off at the soft-stop force and skip the targets there; before a sudden force, and press there again."""
         foreseen = self._forces.step(contact.load)
         if contact.load > self._limits.force_soft_stop_n and self.stage in PRESSING:
-            self._recovery.soft_stop(contact.load, self._motion.segment, self._motion.along.position)
+            self.recovery.soft_stop(contact.load, self._motion.segment, self._motion.along.position)
             self._interrupt()
         elif foreseen > self._limits.force_working_n and self.stage in PRESSING:
-            self._recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, SURGED)
+            self.recovery.repeat(self._motion.segment, self._motion.along.position, 0.0, SURGED)
             self._interrupt()
 
     def _check_elbow(self, contact: ContactMeasurement) -> None:
@@ -409,21 +363,21 @@ class Palpation:
         elif self._watch.spoiled and self.stage in PRESSING:
             back = TUNING.repeat_m if sliding else 0.0
             if self._watch.leaps:  # a cough or deep breath: only the time of waiting bounds the repeats
-                self._recovery.take_up(self._motion.along.position, back)
+                self.recovery.take_up(self._motion.along.position, back)
             else:
-                self._recovery.repeat(self._motion.segment, self._motion.along.position, back, NOT_TRACKED)
+                self.recovery.repeat(self._motion.segment, self._motion.along.position, back, NOT_TRACKED)
             self._interrupt()
         elif self._watch.leaps:
             self._rise()
 
     def _check_waits(self) -> None:
         """End strokes that wait for too long: without failure if tissue has been measured."""
-        end = self._waits.step(self._awaited())
+        end = self.waits.step(self._awaited())
         if not end:
             return
         if end.reason is Reason.NO_REQUEST:
-            self._recovery.early_end = end
-        elif end.reason is Reason.ARM_DISPLACED or not (self._waits.pressed or self._strokes_before):
+            self.recovery.early_end = end
+        elif end.reason is Reason.ARM_DISPLACED or not (self.waits.pressed or self._strokes_before):
             self.abandon(end)
         else:
             self.leave(end)
@@ -431,21 +385,21 @@ class Palpation:
     def _awaited(self) -> Wait | None:
         """Return what the arm waits for. A pause is not counted here: its stop has a bound."""
         stage, open_gate = self.stage, self._watch.open
-        if self._recovery.paused or self._recovery.ending:
+        if self.recovery.paused or self.recovery.ending:
             return None
         if stage is StrokeStage.WAIT:
             return FOR_REQUEST
         if stage in (StrokeStage.REST, StrokeStage.LIFT) and not self._watch.calm:
             return FOR_WALL if open_gate else FOR_BREATH
         returns = stage in (StrokeStage.REST, StrokeStage.LIFT, StrokeStage.TRANSFER)
-        if self._motion.behind or (returns and self._recovery.displacement is not None):
+        if self._motion.behind or (returns and self.recovery.displacement is not None):
             return FOR_ARM
         return FOR_BREATH if stage in (StrokeStage.SLIDE, StrokeStage.HOLD) and not open_gate else None
 
     def _rise(self) -> None:
         """Lift from low above the skin to where a sudden motion of the wall does not reach."""
         if self.stage is StrokeStage.REST and self._motion.joined:
-            self._recovery.resume_at = self._motion.along.position
+            self.recovery.resume_at = self._motion.along.position
             self._interrupt()
         elif self.stage is StrokeStage.TRANSFER and self._motion.segment.free is None:
             self._interrupt()
@@ -456,7 +410,7 @@ class Palpation:
         A stroke in which the arm hides the wall is not `ahead`: the wall would be hidden there again.
         """
         remaining = self.remaining
-        self._recovery.leave(cause, remaining)
+        self.recovery.leave(cause, remaining)
         self.ahead = self._later if cause.reason is Reason.WALL_HIDDEN else remaining
 
 

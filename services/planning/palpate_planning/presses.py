@@ -31,7 +31,7 @@ class RequestedPresses:
         if self._request is not None:
             request, self._request = self._request.moved(shift_A), None
             if request.xy is None:
-                palpation.close()
+                palpation.more = False
             else:
                 self._planning = BackgroundTask(t, PLANNING_TIME, lambda: presses.press(request), lockstep=self._lockstep)
                 self._number = request.number

@@ -31,9 +31,9 @@ from palpate_planning.contact import SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import WORKER
 from palpate_planning.messages import abdomen_of, correction_message, motion_of, path_message, state_message, touch_message
-from palpate_planning.periods import Periods
+from palpate_planning.periods import SECOND
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
-from palpate_planning.status import NO_STOP, ArmStop, Observation, PerceptionFailure, Phase
+from palpate_planning.status import NO_STOP, ArmStop, Observation, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.strokes.requests import PressRequest
 from palpate_planning.wall.breath import BreathObservation
@@ -66,9 +66,8 @@ class PlanningService(Service):
         self._X_WA = np.array(known.X_WA)
         if not lockstep:
             _lower_worker_priority()
-        self._exam = ExaminationSequence(
-            known, Periods(roles["planning"].period, roles["camera"].period), before, lockstep=lockstep
-        )
+        step_s, frame_ns = roles["planning"].period / SECOND, roles["camera"].period
+        self._exam = ExaminationSequence(known, step_s, frame_ns, before, lockstep=lockstep)
         self._max_silence = contract().topics["planning/setpoint"].expiry
         self._reading: SensorReading | None = None
         self._mesh: Message | None = None
@@ -127,25 +126,23 @@ class PlanningService(Service):
             "peak_force_N": self._peak_force,
         }
 
-    def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | PerceptionFailure | None:
+    def _perceived(self, inbox: Inbox) -> PerceivedAbdomen | Cause | None:
         """Return perception's newest answer, if one arrived."""
         for mesh in inbox.new("perception/surface"):
             self._mesh = mesh
-        answer: PerceivedAbdomen | PerceptionFailure | None = None
-        for targets in inbox.new("perception/targets"):
-            answer = self._answer(targets)
-        return answer
+        answers = [self._answer(targets) for targets in inbox.new("perception/targets")]
+        return answers[-1] if answers else None
 
-    def _answer(self, targets: Message) -> PerceivedAbdomen | PerceptionFailure:
+    def _answer(self, targets: Message) -> PerceivedAbdomen | Cause:
         if not len(targets.positions) or self._mesh is None:
             text = targets.message or "perception found no targets, or no usable surface"
             blocked = targets.reason == PalpationTargets.VIEW_BLOCKED
             reason = Reason.VIEW_BLOCKED if blocked else Reason.VIEW_FAILED
-            return PerceptionFailure(Cause(reason, text, CULPRITS.get(targets.reason, "camera/depth/image_raw")))
+            return Cause(reason, text, CULPRITS.get(targets.reason, "camera/depth/image_raw"))
         try:
             return abdomen_of(self._mesh, targets, self._X_WA)
         except ValueError as error:
-            return PerceptionFailure(Cause(Reason.VIEW_FAILED, str(error), "perception"))
+            return Cause(Reason.VIEW_FAILED, str(error), "perception")
 
     def _motion(self, inbox: Inbox) -> BreathObservation | None:
         """Return the newest motion of the wall, if one arrived and the scenario follows it."""
@@ -211,10 +208,8 @@ def _stop(status: Message | None, state: Message | None, requests: tuple[Message
 
 def _end(requests: tuple[Message, ...]) -> Cause:
     """Return the cause if an operator has just ended the examination."""
-    for request in requests:
-        if request.request == OperatorRequest.END:
-            return Cause(Reason.OPERATOR_END, f"ended by the operator: {request.reason}")
-    return NO_CAUSE
+    ends = [request for request in requests if request.request == OperatorRequest.END]
+    return Cause(Reason.OPERATOR_END, f"ended by the operator: {ends[0].reason}") if ends else NO_CAUSE
 
 
 @cache

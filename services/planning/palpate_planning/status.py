@@ -34,27 +34,15 @@ class Phase(IntEnum):
 
 
 PHASE_OF: Final = {
-    StrokeStage.REST: Phase.INDENT,
-    StrokeStage.DESCEND: Phase.INDENT,
-    StrokeStage.SETTLE: Phase.INDENT,
-    StrokeStage.SLIDE: Phase.SCAN,
-    StrokeStage.HOLD: Phase.SCAN,
-    StrokeStage.LIFT: Phase.RETRACT,
-    StrokeStage.TRANSFER: Phase.RETRACT,
-    StrokeStage.WAIT: Phase.RETRACT,
-    StrokeStage.DONE: Phase.RETRACT,
+    **dict.fromkeys(StrokeStage, Phase.RETRACT),
+    **dict.fromkeys((StrokeStage.REST, StrokeStage.DESCEND, StrokeStage.SETTLE), Phase.INDENT),
+    **dict.fromkeys((StrokeStage.SLIDE, StrokeStage.HOLD), Phase.SCAN),
 }
 """The phase to which each stage of a stroke belongs."""
 PALPATING: Final = frozenset(PHASE_OF.values())
 """Phases in which the strokes of the plan are carried out."""
 OVER: Final = frozenset({Phase.DONE, Phase.ABORTED})
 """Phases that end the examination."""
-
-
-class PerceptionFailure(NamedTuple):
-    """Answer of a perception that has no targets."""
-
-    cause: Cause
 
 
 class ArmStop(NamedTuple):
@@ -80,7 +68,7 @@ class Observation(NamedTuple):
     """[ns]"""
     reading: SensorReading | None
     """None before the first `robot/status`."""
-    perceived: PerceivedAbdomen | PerceptionFailure | None = None
+    perceived: PerceivedAbdomen | Cause | None = None
     """Perception's answer, if it arrived."""
     motion: BreathObservation | None = None
     """The newest motion of the wall, if it arrived."""

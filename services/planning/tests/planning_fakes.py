@@ -13,19 +13,19 @@ from palpate_models.robot.arm import TOOL
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import ExamInput, Robot, Scenario
-from palpate_planning.contact import ForceCompensation, SensorReading
+from palpate_planning.contact import SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ArmKinematics
-from palpate_planning.periods import MS, SECOND, Periods
-from palpate_planning.reasons import NO_CAUSE
+from palpate_planning.periods import MS, SECOND
+from palpate_planning.reasons import NO_CAUSE, Cause
 from palpate_planning.setpoints import CARTESIAN_STIFFNESS
-from palpate_planning.status import ArmStop, ExamStep, Observation, PerceptionFailure, Phase
+from palpate_planning.status import ArmStop, ExamStep, Observation, Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, BreathObservation
 from palpate_planning.wall.surface import PerceivedSurface
 
-PERIODS = Periods(contract().roles["planning"].period, contract().roles["camera"].period)
-PERIOD_S = PERIODS.step_s
+PERIOD, FRAME = contract().roles["planning"].period, contract().roles["camera"].period
+PERIOD_S = PERIOD / SECOND
 
 BASE = Robot(base_xy_m=(-0.08, 0.0), base_height_m=0.70)
 """Placement from which the regions of the tests are in reach."""
@@ -96,9 +96,9 @@ class World:
         self.misled = 0.0
         """Error of the forecasts [m], alternating outward and inward."""
         self.settings, self.force = settings, force or hertz(2.4)
-        self.exam = ExaminationSequence(settings, PERIODS)
+        self.exam = ExaminationSequence(settings, PERIOD_S, FRAME)
         self.kinematics = ArmKinematics(settings.robot, settings.limits)
-        self.weight = ForceCompensation.of(settings.robot)
+        self.weight = self.exam._sense.compensation
         self.bias = np.array([0.7, -0.4, 1.1])
         self.q = np.array(lbr.HOME)
         self.dome = seen_dome(settings)
@@ -106,7 +106,7 @@ class World:
         self.offset = offset
         self.t = 0
         self.depth = self.pressed = 0.0
-        self.answers: list[PerceivedAbdomen | PerceptionFailure] = [self.dome]
+        self.answers: list[PerceivedAbdomen | Cause] = [self.dome]
         self.stop, self.soft, self.end, self.lost = NO_CAUSE, False, NO_CAUSE, NO_CAUSE
         self.final = False
         self.rows: list[tuple[Phase, bool, bool, float, float, float]] = []
@@ -167,7 +167,7 @@ class World:
         self.setpoints.append(outcome.setpoint)
         if not self.stop or self.soft:  # otherwise the driver holds
             self._obey(outcome.setpoint)
-        self.t += PERIODS.step
+        self.t += PERIOD
         return outcome
 
     def _motion(self) -> BreathObservation:

@@ -12,7 +12,7 @@ from palpate_models.scenario.schema import Following
 from palpate_planning.interruptions import RECOVERY, WALL, WallWatch
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.reasons import Cause, Reason
-from palpate_planning.status import PerceptionFailure, Phase
+from palpate_planning.status import Phase
 from palpate_planning.strokes.plan import PerceivedAbdomen
 from palpate_planning.wall.breath import FORECAST_STEP, TUNING, Breath, BreathObservation
 
@@ -161,7 +161,7 @@ def test_the_rest_of_an_abandoned_stroke_is_passed_above_the_skin() -> None:
     assert max(float(np.linalg.norm(b.p_WD - a.p_WD)) for a, b in there) < 0.005
 
 
-def moved_in_the_second_stroke(*answers: PerceivedAbdomen | PerceptionFailure) -> World:
+def moved_in_the_second_stroke(*answers: PerceivedAbdomen | Cause) -> World:
     """Return an examination within a second of detected patient motion; later scans have these answers."""
     world = World(known(region_m=(0.025, 0.025)), excursion=breathing)
     world.answers += answers
@@ -195,7 +195,7 @@ def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
 
 
 def test_a_patient_who_moved_out_of_view_is_assessed_from_the_samples_before() -> None:
-    world = moved_in_the_second_stroke(PerceptionFailure(Cause(Reason.VIEW_FAILED, "a curtain")))
+    world = moved_in_the_second_stroke(Cause(Reason.VIEW_FAILED, "a curtain"))
     world.run()
     status = world.exam.status
     assert status.phase is Phase.DONE

@@ -5,7 +5,7 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
-from planning_fakes import PERIOD_S, PERIODS, World, hertz, known
+from planning_fakes import FRAME, PERIOD_S, World, hertz, known
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.schema import Mode, Robot
@@ -14,7 +14,7 @@ from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS
 from palpate_planning.palpation import HIDDEN
 from palpate_planning.reasons import NO_CAUSE, Cause, Loss, Reason
-from palpate_planning.status import PerceptionFailure, Phase
+from palpate_planning.status import Phase
 from palpate_planning.strokes.segments import STRETCHED
 
 
@@ -172,7 +172,7 @@ def test_soft_stop_skips_targets_then_gives_up() -> None:
     ],
 )
 def test_only_what_is_complete_is_called_so(cause: Cause, count: int, phase: Phase, text: str) -> None:
-    exam = ExaminationSequence(known(), PERIODS)
+    exam = ExaminationSequence(known(), PERIOD_S, FRAME)
     exam.status.target_count, exam._skipped = 20, dict.fromkeys(range(count), cause)
     exam._conclude(0)
     assert exam.status.phase is phase
@@ -225,7 +225,7 @@ def test_no_target_in_reach_aborts() -> None:
 
 def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
     world = World(known())
-    world.answers = [PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "view blocked by the arm")), world.dome]
+    world.answers = [Cause(Reason.VIEW_BLOCKED, "view blocked by the arm"), world.dome]
     states = []
     while world.exam.status.phase is not Phase.PLAN:
         world.step()
@@ -238,7 +238,7 @@ def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
 
 def test_three_blocked_views_abort() -> None:
     world = World(known())
-    world.answers = [PerceptionFailure(Cause(Reason.VIEW_BLOCKED, "view blocked by the arm"))]
+    world.answers = [Cause(Reason.VIEW_BLOCKED, "view blocked by the arm")]
     world.run()
     assert world.exam.status.phase is Phase.ABORTED
     assert world.exam.status.cause.reason is Reason.VIEW_BLOCKED

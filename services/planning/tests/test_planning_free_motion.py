@@ -6,14 +6,14 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, PERIOD_S
+from planning_fakes import BASE, PERIOD_S, known
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.robot.lbr import ARM, HOME
 from palpate_models.scenario.schema import Exam as ExamSettings
 from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.contact import ContactMeasurement
-from palpate_planning.free_motion import BackgroundTask, TrajectoryFollower
+from palpate_planning.free_motion import BackgroundTask, FreeMotion
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.timing import TIMING, RestartRamp, joint_trajectory
 from palpate_planning.palpation import Palpation
@@ -23,6 +23,7 @@ from palpate_planning.stroke import StrokeStage
 from palpate_planning.stroke_motion import MOTION as STROKE_MOTION
 from palpate_planning.stroke_motion import StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath
+from palpate_planning.strokes.plan import ExamPlanner
 from palpate_planning.strokes.segments import Segment
 from palpate_planning.waits import WAIT
 from palpate_planning.wall.surface import Foot
@@ -77,7 +78,7 @@ def ticks(late_at: int, late: int, count: int) -> list[int]:
 
 def followed(times: list[int]) -> list[Setpoint]:
     """Set-points of a follower on `MOTION`."""
-    follower, ramp = TrajectoryFollower(KINEMATICS, START), RestartRamp()
+    follower, ramp = FreeMotion(KINEMATICS, ExamPlanner(known(), PERIOD_S), lockstep=True), RestartRamp()
     follower.start(MOTION)
     return [follower.step(t, ramp.step(t)) for t in times]
 
@@ -92,7 +93,7 @@ def free_palpation() -> Palpation:
     """Return a palpation of two segments that both are `MOTION`."""
     segment = Segment(PLACE, contact=False, free=MOTION)
     wall = plane(np.eye(4))
-    return Palpation((segment, segment), ExamSettings(), Limits(), BASE, PERIOD_S, wall)
+    return Palpation((segment, segment), known(), PERIOD_S, wall)
 
 
 def test_a_free_motion_begins_where_the_arm_is_and_ends_where_it_was_planned() -> None:
@@ -161,7 +162,7 @@ def test_an_arm_that_does_not_arrive_ends_the_strokes() -> None:
     times = ticks(0, 10 * MS, len(MOTION) + round((WAIT.limit_s + 1) / 0.01))
     steps = [palpation.step(t, ABOVE) for t in times]
     assert steps[len(MOTION)].stage is StrokeStage.TRANSFER
-    assert palpation.failed.reason is Reason.ARM_DISPLACED
+    assert palpation.recovery.failed.reason is Reason.ARM_DISPLACED
     assert steps[-1].stage is StrokeStage.DONE
 
 

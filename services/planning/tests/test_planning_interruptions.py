@@ -134,7 +134,7 @@ def push(world: World, aside: float, down: float) -> None:
     """Move the arm along y and down [m]."""
     X = world.kinematics.pose(world.q)
     X[:3, 3] += (0.0, aside, -down)
-    solution = world.kinematics.solve(X, world.q, world.q)
+    solution = world.kinematics.solve(X, world.q)
     assert solution.ok
     world.q = solution.q
 

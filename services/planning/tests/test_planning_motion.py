@@ -30,7 +30,7 @@ def above(x: float, y: float, gap: float) -> np.ndarray:
     p, n = (a[0] for a in SEEN.surface.at(np.array([[x, y]])))
     R = least_twist(-n, KINEMATICS.pose(lbr.HOME)[:3, :3])
     goal = rigid(R, centre(p, n, BASE.indenter_radius_m, -gap))
-    solution = KINEMATICS.solve(goal, np.array(lbr.HOME), spin_free=True)
+    solution = KINEMATICS.solve(goal, np.array(lbr.HOME))
     assert solution.ok
     return solution.q
 
@@ -53,22 +53,10 @@ def test_inverse_kinematics_meets_position_and_axis() -> None:
         assert np.all(np.abs(solution.q) <= KINEMATICS.upper)
 
 
-def test_free_spin_meets_the_axis_only() -> None:
-    X = KINEMATICS.pose(np.array(lbr.HOME))
-    turned = X.copy()
-    turned[:3, :3] = X[:3, :3] @ np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
-    free = KINEMATICS.solve(turned, np.array(lbr.HOME), np.array(lbr.HOME), spin_free=True)
-    assert free.ok
-    assert free.q == pytest.approx(lbr.HOME, abs=1e-3), "nothing to do: the axis is right already"
-    assert KINEMATICS.pose(KINEMATICS.solve(turned, np.array(lbr.HOME)).q)[:3, 0] == pytest.approx(turned[:3, 0], abs=1e-3)
-
-
 def test_an_unreachable_pose_is_reported() -> None:
     X = KINEMATICS.pose(np.array(lbr.HOME))
     X[:3, 3] = (3.0, 0.0, 1.0)
-    solution = KINEMATICS.solve(X, np.array(lbr.HOME))
-    assert not solution.ok
-    assert solution.error_m > 1.0
+    assert not KINEMATICS.solve(X, np.array(lbr.HOME)).ok
 
 
 def test_home_is_free_and_the_table_is_not() -> None:

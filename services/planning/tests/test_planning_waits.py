@@ -5,7 +5,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from planning_fakes import BASE, PERIODS, World, known
+from planning_fakes import BASE, FRAME, PERIOD_S, World, known
 
 from palpate_models.scenario.schema import ExamInput
 from palpate_planning import waits
@@ -119,7 +119,7 @@ def test_a_silent_perception_is_named_at_once() -> None:
 
 
 def test_a_robot_without_a_status_is_named_and_awaited_for_a_time() -> None:
-    exam = ExaminationSequence(known(BASE, **SMALL), PERIODS)
+    exam = ExaminationSequence(known(BASE, **SMALL), PERIOD_S, FRAME)
     reasons = {}
     for k in range(round(2 * WAIT.limit_s)):
         exam.step(Observation(7 * SECOND + k * SECOND, None))

@@ -1,6 +1,7 @@
 """Forward and inverse kinematics of robot and tool, on pinocchio."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,7 +20,8 @@ class KinematicLimits:
     tolerance_m: float = 1e-4
     """Position error at which inverse kinematics is solved."""
     tolerance_rad: float = 1e-3
-    """Error of the tool axis at which inverse kinematics is solved."""
+    """Error of the orientation at which inverse kinematics is solved."""
+    iterations: int = 60
     straight_rad: float = 0.2
     """Elbow angle below which the arm is near its singularity: it reaches at most 4 mm further, less than the depth error of the
     perceived surface, and the elbow turns at 25 rad/s or more per m/s of wall motion."""
@@ -30,18 +32,13 @@ class KinematicLimits:
 KINEMATIC_LIMITS = KinematicLimits()
 
 
-@dataclass(frozen=True, slots=True)
-class IkSolution:
+class IkSolution(NamedTuple):
     """Result of inverse kinematics."""
 
     q: Array
     """Joint positions [rad], shape (n,)."""
     ok: bool
     """True if the pose is met to `KINEMATIC_LIMITS.tolerance_m` and `KINEMATIC_LIMITS.tolerance_rad` within the limits."""
-    error_m: float
-    """Position error of the sphere's centre [m]."""
-    error_rad: float
-    """Orientation error, or error of the tool axis if spin is free [rad]."""
 
 
 class ArmKinematics:
@@ -82,45 +79,27 @@ class ArmKinematics:
         J: Array = pin.computeFrameJacobian(self.model, self.data, q, self._indenter, _WORLD_AXES)
         return J
 
-    def solve(
-        self, X_WI: Array, q_seed: Array, q_rest: Array | None = None, *, spin_free: bool = False, iterations: int = 60
-    ) -> IkSolution:
-        """Return joint positions that put the indenter at X_WI; with `spin_free` the rotation about the tool axis is free.
+    def solve(self, X_WI: Array, q_near: Array) -> IkSolution:
+        """Return joint positions near `q_near` [rad], shape (n,), that put the indenter at X_WI.
 
-        Damped least squares (Nakamura & Hanafusa 1986) on six or five task coordinates; the null space tends to `q_rest`
-        (mid-range if None), and joints are clipped to the limits with margin. Deterministic; at most `iterations` steps.
+        Damped least squares (Nakamura & Hanafusa 1986); the null space tends to `q_near`, and joints are clipped to the limits
+        with margin. Deterministic.
         """
-        rest = self.arm.middle_rad if q_rest is None else q_rest
-        q = np.clip(np.asarray(q_seed, dtype=float), self.lower, self.upper)
-        best = (np.inf, q, np.inf, np.inf)
-        rows = 5 if spin_free else 6
-        damping = 1e-6 * np.eye(rows)
-        for _ in range(iterations):
-            X = self.pose(q)
-            J = self.jacobian(q)
+        q = np.clip(q_near, self.lower, self.upper)
+        least, best = np.inf, IkSolution(q, False)
+        for _ in range(KINEMATIC_LIMITS.iterations):
+            X, J = self.pose(q), self.jacobian(q)
             R_IW = X[:3, :3].T
-            gap = X_WI[:3, 3] - X[:3, 3]
-            turn = _turn_of_axis(R_IW @ X_WI[:3, 2]) if spin_free else pin.log3(R_IW @ X_WI[:3, :3])
+            gap, turn = X_WI[:3, 3] - X[:3, 3], pin.log3(R_IW @ X_WI[:3, :3])
             error_m, error_rad = float(np.linalg.norm(gap)), float(np.linalg.norm(turn))
-            cost = error_m + 0.1 * error_rad
-            if cost < best[0]:
-                best = (cost, q, error_m, error_rad)
+            if (cost := error_m + 0.1 * error_rad) < least:
+                ok = error_m < KINEMATIC_LIMITS.tolerance_m and error_rad < KINEMATIC_LIMITS.tolerance_rad
+                least, best = cost, IkSolution(q, ok)
             if error_m < KINEMATIC_LIMITS.tolerance_m / 10 and error_rad < KINEMATIC_LIMITS.tolerance_rad / 10:
                 break
-            A = np.vstack((J[:3], R_IW @ J[3:]))[:rows]
-            b = np.concatenate((gap, turn))[:rows]
+            A, b = np.vstack((J[:3], R_IW @ J[3:])), np.concatenate((gap, turn))
             scale = min(1.0, 0.3 / max(float(np.linalg.norm(b)), 1e-9))
-            pull = 0.1 * (rest - q)
-            q = q + A.T @ np.linalg.solve(A @ A.T + damping, scale * b - A @ pull) + pull
+            pull = 0.1 * (q_near - q)
+            q = q + A.T @ np.linalg.solve(A @ A.T + 1e-6 * np.eye(6), scale * b - A @ pull) + pull
             q = np.clip(q, self.lower, self.upper)
-        _, q, error_m, error_rad = best
-        return IkSolution(
-            q, error_m < KINEMATIC_LIMITS.tolerance_m and error_rad < KINEMATIC_LIMITS.tolerance_rad, error_m, error_rad
-        )
-
-
-def _turn_of_axis(z_I: Array) -> Array:
-    """Return the rotation vector, in axes of I, from I's z axis to unit z_I; its z component is zero, shape (3,)."""
-    across = np.array((-z_I[1], z_I[0], 0.0))
-    size = float(np.linalg.norm(across))
-    return across * (float(np.arctan2(size, z_I[2])) / max(size, 1e-12))
+        return best

@@ -20,7 +20,6 @@ from scipy.spatial import cKDTree
 
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of
-from palpate_models.robot.chain import Arm
 from palpate_models.scenario.schema import Robot
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
@@ -151,8 +150,6 @@ class PostureSequence:
     """Largest joint torque over its limit, from gravity and pressing force [1], shape (n,)."""
     dexterity: Array
     """Distance from singularity, sqrt(det(J J^T)) of the length-scaled Jacobian [1], shape (n,)."""
-    residual: Array
-    """Norm of the error of position [m] and axis [rad], shape (n,)."""
     refined: bool
     """True if the optimisation converged; else the result of inverse kinematics with a null-space gradient."""
 
@@ -177,33 +174,16 @@ def plan_redundancy(
         force_n: normal force of the postures.
 
     Unreachable targets are flagged, not dropped. The result depends only on the arguments.
-    Raises ValueError for arrays of other shapes or values that are not finite.
     """
-    positions, normals = np.asarray(positions_W, dtype=float), np.asarray(normals_W, dtype=float)
-    seed = np.asarray(q_seed, dtype=float)
     model = arm_of(robot)
-    if positions.ndim != 2 or positions.shape[1] != 3 or normals.shape != positions.shape or seed.shape != (model.joints,):
-        raise ValueError(
-            f"want positions_W (n, 3), normals_W (n, 3), q_seed ({model.joints},), "
-            f"not {positions.shape}, {normals.shape}, {seed.shape}"
-        )
-    for name, value in (("positions_W", positions), ("normals_W", normals), ("q_seed", seed)):
-        if not np.isfinite(value).all():
-            raise ValueError(f"{name}: must be finite")
-    if len(positions) == 0:
-        empty = np.zeros(0)
-        return PostureSequence(np.zeros((0, model.joints)), np.zeros(0, dtype=bool), empty, empty, empty, empty, True)
-
     limits = (model.lower_rad + joint_margin_rad, model.upper_rad - joint_margin_rad)
-    batch = Batch(robot, positions, normals, limits, force_n)
-    q = _inverse_kinematics(batch, seed)
-    refined = False
-    reachable = batch.reached(q)[1]
-    if reachable.sum() >= 2:
-        better, refined = _refine(robot, batch, q, reachable)
-        if refined:
-            q = _keep_best(batch, q, better)
-    return _judge(batch, q, refined)
+    batch = Batch(robot, positions_W, normals_W, limits, force_n)
+    q = _inverse_kinematics(batch, q_seed)
+    better = _refine(robot, batch, q, batch.reached(q)[1])
+    if better is not None:  # the refined postures, except for targets that only inverse kinematics reached
+        lost = batch.reached(q)[1] & ~batch.reached(better)[1]
+        q = np.where(lost[:, None], q, better)
+    return _judge(batch, q, better is not None)
 
 
 def prepare(robot: Robot, force_n: float = POSTURES.pressing_force_n) -> None:
@@ -218,19 +198,14 @@ def _at_origin(robot: Robot) -> Robot:
 
 
 def _seeds(batch: Batch, seed: Array) -> list[Array]:
-    """Return initial postures: the caller's, and those of the arm, facing the centre of the targets."""
+    """Return initial postures: the caller's, and the arm's, home if it has none, turned about its first joint to the targets."""
     x, y = batch.positions.mean(axis=0)[:2] - batch.base[:2]
     azimuth = np.arctan2(y, x) - batch.base[3]
     azimuth = np.arctan2(np.sin(azimuth), np.cos(azimuth))
-    return [seed, *_turned(batch.arm, azimuth)]
-
-
-def _turned(model: Arm, azimuth: float) -> list[Array]:
-    """Return the arm's seeds, home if it has none, turned about its first joint so that the tool is at `azimuth` [rad]."""
-    seeds = []
-    for q in np.array(model.seeds_rad or (model.home_rad,)):
+    seeds = [seed]
+    for q in np.array(batch.arm.seeds_rad or (batch.arm.home_rad,)):
         q[0] = 0.0
-        x, y, _ = model.posture(q)[0][-1]
+        x, y, _ = batch.arm.posture(q)[0][-1]
         q[0] = azimuth - np.arctan2(y, x)
         seeds.append(q)
     return seeds
@@ -287,11 +262,10 @@ def _program(robot: Robot, count: int, force: float) -> Any:
     return ca.nlpsol("redundancy", "ipopt", problem, options)
 
 
-def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Array, bool]:
-    """Return optimal postures interpolated from the knots and projected onto the targets; True if Ipopt converged."""
-    knots = _knots(batch, reachable)
-    if len(knots) < 2:
-        return q, False
+def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> Array | None:
+    """Return optimal postures interpolated from the knots and projected onto the targets; None if Ipopt did not converge."""
+    if reachable.sum() < 2 or len(knots := _knots(batch, reachable)) < 2:
+        return None
     solver = _program(_at_origin(robot), len(knots), batch.force)
     s = _path_length(batch.positions)
     spacing = np.diff(s[knots])
@@ -302,29 +276,21 @@ def _refine(robot: Robot, batch: Batch, q: Array, reachable: Mask) -> tuple[Arra
     lower, upper = (np.tile(limit, len(knots)) for limit in batch.limits)
     result = solver(x0=q[knots].ravel(), p=parameters, lbx=lower, ubx=upper, lbg=0, ubg=0)
     if not solver.stats()["success"]:
-        return q, False
+        return None
     optimal = np.array(result["x"]).reshape(len(knots), -1)
     within = np.clip(s, s[knots[0]], s[knots[-1]])
     between = PchipInterpolator(s[knots], optimal)(within)
-    return batch.solve(between, RESOLUTION.projection_steps, 0.0), True
-
-
-def _keep_best(batch: Batch, before: Array, after: Array) -> Array:
-    """Return the refined postures, except for targets that only inverse kinematics reached."""
-    lost = batch.reached(before)[1] & ~batch.reached(after)[1]
-    return np.where(lost[:, None], before, after)
+    return batch.solve(between, RESOLUTION.projection_steps, 0.0)
 
 
 def _judge(batch: Batch, q: Array, refined: bool) -> PostureSequence:
-    residual, reachable = batch.reached(q)
     bases = np.tile(batch.base[:, None], (1, batch.count))
     torque = np.array(batch.functions.torque.map(batch.count)(q.T, bases, batch.force)).T
     return PostureSequence(
         q=q,
-        reachable=reachable,
+        reachable=batch.reached(q)[1],
         margin=np.minimum(batch.arm.upper_rad - q, q - batch.arm.lower_rad).min(axis=1),
         torque_fraction=(np.abs(torque) / batch.arm.torque_nm).max(axis=1),
         dexterity=np.array(batch.functions.dexterity.map(batch.count)(q.T, bases))[0],
-        residual=residual,
         refined=refined,
     )

@@ -65,8 +65,6 @@ class ArmFunctions(NamedTuple):
     """(q, base) -> sqrt(det(J J^T)) of the length-scaled Jacobian [1]: zero where singular."""
     pose: Any
     """(q, base) -> rotation (3, 3) and origin (3,) [m] of the indenter frame in world."""
-    elbow: Any
-    """(q, base) -> position of the elbow in world [m], shape (3,)."""
 
 
 def _axis_rotation(ca: Any, axis: Array | tuple[float, float, float], angle: Any) -> Any:
@@ -134,19 +132,12 @@ def arm(robot: Robot) -> ArmFunctions:
         ca.Function("torque", [q, base, force], [torque]),
         ca.Function("dexterity", [q, base], [ca.sqrt(ca.fmax(gram, 0))]),
         ca.Function("pose", [q, base], [R, p]),
-        ca.Function("elbow", [q, base], [elbow]),
     )
 
 
 def surface_frames(normals: Array) -> Array:
-    """Return frames with columns t1, t2 (tangents) and n for outward unit normals of shape (n, 3); shape (n, 3, 3).
-
-    Raises ValueError if a normal is not of unit length.
-    """
-    length = np.linalg.norm(normals, axis=1)
-    if normals.ndim != 2 or normals.shape[1] != 3 or not (np.abs(length - 1) < 1e-3).all():
-        raise ValueError(f"normals: want unit vectors of shape (n, 3), not {normals.shape} with lengths {length}")
-    n = normals / length[:, None]
+    """Return frames with columns t1, t2 (tangents) and n for outward unit normals of shape (n, 3); shape (n, 3, 3)."""
+    n = normals / np.linalg.norm(normals, axis=1)[:, None]
     helper = np.zeros_like(n)
     helper[np.arange(len(n)), np.abs(n).argmin(axis=1)] = 1.0
     t1 = np.cross(helper, n)

@@ -144,7 +144,7 @@ class SegmentPlanner:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
             goal = rigid(least_twist(-n, self._R_ref), centre(p, n, self._radius, -SEGMENTS.hover_m))
             near = self._postures[piece.targets[end]]
-            solution = self._kinematics.solve(goal, near, near)
+            solution = self._kinematics.solve(goal, near)
             good = solution.ok and self._scene.free(solution.q)
             self._hovers[place] = solution.q if good else None
         return self._hovers[place]
@@ -183,7 +183,7 @@ class SegmentPlanner:
         q = np.empty((len(solved), known.shape[1]))
         infeasible: Infeasible = []
         for row, i in enumerate(solved):
-            solution = self._kinematics.solve(rigid(R[i], centres[i]), near[i], near[i])
+            solution = self._kinematics.solve(rigid(R[i], centres[i]), near[i])
             q[row] = solution.q
             if not solution.ok:
                 infeasible.append((int(i), REACH))
