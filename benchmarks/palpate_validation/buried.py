@@ -79,7 +79,7 @@ def on_elastic_tier(lump: Buried) -> float:
         )
         for lesions in ((lump.lesion,), ())
     ]
-    return forces[0].force_n / forces[1].force_n
+    return forces[0] / forces[1]
 
 
 def on_surface_tier(lump: Buried) -> float:

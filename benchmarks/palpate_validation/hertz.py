@@ -141,8 +141,8 @@ def elastic_section() -> PageSection:
         """Return forces [N] by radius and depth."""
         return np.array([[of(radius, depth) for depth in ELASTIC_DEPTHS_M.tolist()] for radius in HERTZ.radii_m])
 
-    paraboloid = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "paraboloid").force_n)
-    sphere = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "sphere").force_n)
+    paraboloid = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "paraboloid"))
+    sphere = forces(lambda radius, depth: slab.press(radius, depth, (0.0004, 0.00025), "sphere"))
     hertz = np.array([hertz_force(ELASTIC_DEPTHS_M, r, HERTZ.young_pa, slab.poisson) for r in HERTZ.radii_m])
     sneddon = forces(lambda radius, depth: sneddon_force(depth, radius, HERTZ.young_pa, slab.poisson))
     by_hertz, by_sneddon = 100 * (paraboloid / hertz - 1), 100 * (sphere / sneddon - 1)

@@ -1,8 +1,5 @@
 """Cross-compiling a folder of C into the shared libraries of an FMU, by zig's C compiler from PyPI."""
 
-import contextlib
-import hashlib
-import os
 import platform
 import subprocess
 import sys
@@ -12,7 +9,11 @@ from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
 
+import numpy as np
+from numpy.typing import NDArray
+
 from palpate_errors import UserError
+from palpate_models.numerics.cache import content_key, remembered
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wno-strict-prototypes")
 """The one exception is for the standard's own headers."""
@@ -75,36 +76,21 @@ def fmi_headers() -> Path:
     return Path(fmpy.__file__).parent / "c-code"
 
 
-def compile_library(folder: Path, sources: Sequence[str], target: Platform, includes: Sequence[Path] = ()) -> bytes:
-    """Return the shared library of `sources` in `folder` for a platform; remembered in a cache by their content.
+def compile_library(folder: Path, sources: Sequence[str], target: Platform) -> bytes:
+    """Return the shared library of `sources` in `folder` for a platform; remembered in a cache by their content."""
+    code = sorted(folder.glob("*.[ch]"))
+    inputs = (metadata.version("ziglang"), target, WARNINGS, OPTIMISE, list(sources), [path.name for path in code])
 
-    Raises CompileError.
-    """
-    flags = [*WARNINGS, *OPTIMISE, *(f"-I{path}" for path in includes)]
-    key = hashlib.sha256(f"{metadata.version('ziglang')} {target} {WARNINGS} {OPTIMISE} {list(sources)}".encode())
-    for path in sorted([*folder.glob("*.[ch]"), *(header for include in includes for header in include.glob("*.h"))]):
-        key.update(path.name.encode() + b"\0" + path.read_bytes())
-    cached = _cache() / f"{key.hexdigest()}{target.suffix}"
-    if cached.is_file() and cached.stat().st_size:
-        return cached.read_bytes()
-    with tempfile.TemporaryDirectory() as work:
-        out = Path(work) / f"library{target.suffix}"
-        link = ["-shared", "-fvisibility=hidden", "-s", "-o", str(out), *sources]
-        if "windows" not in target.triple:
-            link += ["-fPIC", "-lm"]
-        command = [sys.executable, "-m", "ziglang", "cc", "-target", target.triple, *flags, *link]
-        done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
-        if done.returncode or not out.is_file():
-            raise CompileError(f"cannot compile for {target.tuple_3}:\n{done.stderr}")
-        library = out.read_bytes()
-    with contextlib.suppress(OSError):  # a home that cannot be written has no cache
-        cached.parent.mkdir(parents=True, exist_ok=True)
-        partial = cached.with_suffix(f".{os.getpid()}")
-        partial.write_bytes(library)
-        partial.replace(cached)
-    return library
+    def compiled() -> NDArray[np.uint8]:
+        with tempfile.TemporaryDirectory() as work:
+            out = Path(work) / f"library{target.suffix}"
+            link = ["-shared", "-fvisibility=hidden", "-s", "-o", str(out), *sources]
+            if "windows" not in target.triple:
+                link += ["-fPIC", "-lm"]
+            command = [sys.executable, "-m", "ziglang", "cc", "-target", target.triple, *WARNINGS, *OPTIMISE, *link]
+            done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+            if done.returncode or not out.is_file():
+                raise CompileError(f"cannot compile for {target.tuple_3}:\n{done.stderr}")
+            return np.frombuffer(out.read_bytes(), np.uint8)
 
-
-def _cache() -> Path:
-    root = os.environ.get("XDG_CACHE_HOME") or (Path.home() / ".cache")
-    return Path(root) / "palpate" / "fmu"
+    return remembered(content_key("fmu", code, *inputs), compiled).tobytes()

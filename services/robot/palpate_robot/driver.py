@@ -175,12 +175,13 @@ class Driver:
         arm = self._arm
         if _within(q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps):
             return
-        limits = zip(arm.joint_names, arm.lower_rad.tolist(), arm.upper_rad.tolist(), arm.velocity_radps.tolist(), strict=True)
-        for (joint, q_min, q_max, v_max), q_i, v_i in zip(limits, q.tolist(), v.tolist(), strict=True):
-            if not q_min <= q_i <= q_max:
-                self.hold(t, HoldCause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limits {q_min:.4f} and {q_max:.4f} rad")
-            elif not -v_max <= v_i <= v_max:
-                self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{v_max:.3f} rad/s")
+        for joint, q_i, v_i, low, high, fastest in zip(
+            arm.joint_names, q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps, strict=True
+        ):
+            if not low <= q_i <= high:
+                self.hold(t, HoldCause.POSITION_LIMIT, f"{joint} at {q_i:.4f} rad, limits {low:.4f} and {high:.4f} rad")
+            elif not -fastest <= v_i <= fastest:
+                self.hold(t, HoldCause.VELOCITY_LIMIT, f"{joint} at {v_i:.3f} rad/s, limit +-{fastest:.3f} rad/s")
 
     def _take(self, t: int, command: Command, q: Array, gravity: Array) -> None:
         """Accept a command, ignores it (already expired while IDLE), or holds."""
@@ -207,58 +208,53 @@ class Driver:
             return
         if command.stamp > t + TUNING.ahead_ns:
             ahead, limit = (command.stamp - t) / 1e6, TUNING.ahead_ns / 1e6
-            reason = f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f} ms"
-            self._reject(t, HoldCause.INVALID_COMMAND, reason)
+            self._reject(
+                t, HoldCause.INVALID_COMMAND, f"control/joint_torque: stamped {ahead:.0f} ms ahead, limit {limit:.0f} ms"
+            )
             return
         interval_ms = 1.0
         if self._checked is not None:
             interval_ms = min(max((command.stamp - self._checked.stamp) / 1e6, 1.0), TUNING.validity_ns / 1e6)
-        if self._positions:
-            self._check_positions(t, command.values, q, interval_ms * 1e-3)
-            return
-        first = self._before is None
+        fault = (self._position_fault if self._positions else self._torque_fault)(command.values, q, gravity, interval_ms)
+        if fault is None:
+            self._before = command.values
+        else:
+            self._reject(t, fault[0], f"control/joint_torque: {fault[1]}")
+
+    def _torque_fault(self, wanted: Array, q: Array, gravity: Array, interval_ms: float) -> tuple[HoldCause, str] | None:
+        """Check torques [N m] against their limits and those before."""
+        first, limit = self._before is None, self._arm.torque_nm
         before = self._still if self._before is None else self._before
         change = TUNING.first_torque_nm if first else TUNING.torque_rate_nm_per_ms * interval_ms
-        if not _acceptable(command.values, gravity, before, self._arm.torque_nm, change):
-            numbers = (command.values.tolist(), before.tolist(), gravity.tolist())
-            joints = zip(self._arm.joint_names, self._arm.torque_nm.tolist(), *numbers, strict=True)
-            for joint, limit, torque, last, weight in joints:
-                if torque - torque != 0.0:  # NaN or infinite
-                    self._reject(t, HoldCause.INVALID_COMMAND, f"control/joint_torque: {joint} = {torque} N m, must be finite")
-                    return
-                if not -limit <= torque + weight <= limit:
-                    total = f"{torque:.1f} N m plus {weight:.1f} N m of gravity"
-                    reason = f"control/joint_torque: {joint} = {total}, limit +-{limit:.0f} N m"
-                    self._reject(t, HoldCause.TORQUE_LIMIT, reason)
-                    return
-                if not -change <= torque - last <= change:
-                    jump = f"{joint} = {torque:.1f} N m, {interval_ms:.0f} ms after {last:.1f} N m"
-                    rate = f"control/joint_torque: {jump}, limit {TUNING.torque_rate_nm_per_ms:g} N m/ms"
-                    start = (
-                        f"control/joint_torque: first command {joint} = {torque:.1f} N m, limit {TUNING.first_torque_nm:g} N m"
-                    )
-                    self._reject(t, HoldCause.INVALID_COMMAND, start if first else rate)
-                    return
-        self._before = command.values
+        if _acceptable(wanted, gravity, before, limit, change):
+            return None
+        over, far = ~(np.abs(wanted + gravity) <= limit), ~(np.abs(wanted - before) <= change)  # also for NaN
+        k = int(np.argmax(over | far))
+        joint = f"{self._arm.joint_names[k]} = {wanted[k]:.1f} N m"
+        if not np.isfinite(wanted[k]):
+            return HoldCause.INVALID_COMMAND, f"{joint}, must be finite"
+        if over[k]:
+            return HoldCause.TORQUE_LIMIT, f"{joint} plus {gravity[k]:.1f} N m of gravity, limit +-{limit[k]:.0f} N m"
+        if first:
+            return HoldCause.INVALID_COMMAND, f"first command {joint}, limit {TUNING.first_torque_nm:g} N m"
+        after = f"{interval_ms:.0f} ms after {before[k]:.1f} N m"
+        return HoldCause.INVALID_COMMAND, f"{joint}, {after}, limit {TUNING.torque_rate_nm_per_ms:g} N m/ms"
 
-    def _check_positions(self, t: int, wanted: Array, q: Array, interval_s: float) -> None:
+    def _position_fault(self, wanted: Array, q: Array, gravity: Array, interval_ms: float) -> tuple[HoldCause, str] | None:
         """Check positions [rad] against joint limits and against those before, or the measured `q` [rad]."""
         arm, before = self._arm, q if self._before is None else self._before
-        change = TUNING.position_jump_rad + (0.0 if self._before is None else interval_s) * arm.velocity_radps
+        change = TUNING.position_jump_rad + (0.0 if self._before is None else interval_ms * 1e-3) * arm.velocity_radps
         far = ~(np.abs(wanted - before) <= change)  # also for NaN
         outside = ~((wanted >= arm.lower_rad) & (wanted <= arm.upper_rad))
         for k in np.flatnonzero(far | outside)[:1]:
-            joint = f"control/joint_torque: {arm.joint_names[k]} = {wanted[k]:.4f} rad"
+            joint = f"{arm.joint_names[k]} = {wanted[k]:.4f} rad"
             if not np.isfinite(wanted[k]):
-                self._reject(t, HoldCause.INVALID_COMMAND, f"{joint}, must be finite")
-            elif outside[k]:
-                limits = f"{arm.lower_rad[k]:.4f} and {arm.upper_rad[k]:.4f} rad"
-                self._reject(t, HoldCause.POSITION_LIMIT, f"{joint}, limits {limits}")
-            else:
-                jump = f"{1e3 * interval_s:.0f} ms after {before[k]:.4f} rad, limit {change[k]:.4f} rad"
-                self._reject(t, HoldCause.INVALID_COMMAND, f"{joint}, {jump}")
-            return
-        self._before = wanted
+                return HoldCause.INVALID_COMMAND, f"{joint}, must be finite"
+            if outside[k]:
+                return HoldCause.POSITION_LIMIT, f"{joint}, limits {arm.lower_rad[k]:.4f} and {arm.upper_rad[k]:.4f} rad"
+            after = f"{interval_ms:.0f} ms after {before[k]:.4f} rad"
+            return HoldCause.INVALID_COMMAND, f"{joint}, {after}, limit {change[k]:.4f} rad"
+        return None
 
     def _reject(self, t: int, cause: HoldCause, reason: str) -> None:
         self.rejected += 1

@@ -1,6 +1,5 @@
 """Interface of a simulated arm: physics engines behind the same driver and sensors."""
 
-from collections.abc import Sequence
 from typing import Final, Protocol
 
 import numpy as np
@@ -37,40 +36,27 @@ class Plant(Protocol):
     """Torque of friction and of the driver's damping in the last step [N m], a fresh array: the drives' torque less this is on
     the links."""
 
-    def reset(self, q: Sequence[float] | Array, v: Sequence[float] | Array | None = None) -> None:
-        """Put the arm at joint positions `q` [rad] and velocities `v` [rad/s], by default at rest."""
-        ...
-
     def step(self, torque: Array, force_W: Array | None, moment_W: Array, damping: Array) -> None:
         """Advance 1 ms under joint torques (gravity not compensated), the driver's damping, and a wrench on the indenter.
 
         `damping` [N m s/rad], shape (n,), comes on top of the friction. The wrench, shapes (3,), acts at the sphere's
         centre, in world axes, and is held over the step; None for the force where nothing touches.
         """
-        ...
 
     def gravity_torque(self) -> Array:
         """Return the joint torques that compensate gravity [N m], shape (n,), with the nominal tool mass."""
-        ...
 
     def sensor_wrench(self) -> Wrench:
         """Return the wrench on the F/T sensor from the tool below it: force [N], then moment [N m], in sensor axes."""
-        ...
 
     def tool_motion(self) -> Array:
         """Return the indenter's motion in world: position p_WI [m], orientation x, y, z, w, velocities [m/s, rad/s], shape (13,).
 
         The linear velocity is that of the sphere's centre.
         """
-        ...
 
     def link_poses(self) -> Array:
         """Return the poses of all links in world: position [m], orientation x, y, z, w, shape (n + 4, 7)."""
-        ...
-
-    def contacts(self) -> int:
-        """Return the number of contact points with table or base in the last step."""
-        ...
 
 
 class PlantFactory(Protocol):
@@ -78,4 +64,3 @@ class PlantFactory(Protocol):
 
     def __call__(self, robot: Robot, *, drawn: DrawnArm) -> Plant:
         """Return a plant at rest at home: the nominal robot with the arm errors `drawn`."""
-        ...

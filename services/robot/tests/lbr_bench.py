@@ -13,8 +13,8 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, load_scenario, plant_input
 from palpate_models.scenario.schema import Scenario
 from palpate_robot.backends.arm_port import ArmPort
-from palpate_robot.backends.hardware import HardwareService, InnerLoop, load_control
-from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.hardware import HardwareService, InnerLoop
+from palpate_robot.backends.lbr.emulator import Emulator
 from palpate_robot.backends.lbr.service import lbr_service
 
 MS = 1_000_000
@@ -73,16 +73,13 @@ class DirectPort(ArmPort):
         moved, self._moved = self._moved, False
         return (self.emulator.tool(UNIX + self.t), self.emulator.links(UNIX + self.t)) if moved else (None, None)
 
-    def close(self) -> None:
-        pass
-
 
 def driver_on_emulator(scenario: Scenario, level: str = "torque", **options: Any) -> tuple[HardwareService, DirectPort]:
     """Driver and port; options are the emulator's."""
     exam = exam_input(scenario)
-    chosen = Options(**options)
-    port = DirectPort(Emulator(plant_input(scenario), chosen), chosen.period_ms)
-    inner = InnerLoop(load_control(scenario)) if level == "setpoint" else None
+    emulator = Emulator(plant_input(scenario), **options)
+    port = DirectPort(emulator, emulator.period_ms)
+    inner = InnerLoop(scenario) if level == "setpoint" else None
     connection = exam.robot.driver.model_copy(update={"emulated": True})
     robot = exam.robot.model_copy(update={"driver": connection, "level": CommandLevel(level)})
     return lbr_service(exam.model_copy(update={"robot": robot}), port, inner), port

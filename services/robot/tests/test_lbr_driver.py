@@ -14,7 +14,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.load import ScenarioError, load_scenario, plant_input
 from palpate_robot.backends.hardware import GravityModel
 from palpate_robot.backends.lbr.arm import CLOCK_SET_NS, MeasuredLbr
-from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.lbr.emulator import Emulator
 
 
 @pytest.fixture
@@ -178,7 +178,7 @@ class Stream:
     """States of an arm of which joint 1 turns at 0.5 rad/s, one every 2 ms."""
 
     def __init__(self) -> None:
-        self._state = Emulator(plant_input(load_scenario("clean")), Options()).state(0)
+        self._state = Emulator(plant_input(load_scenario("clean"))).state(0)
         self._q = np.array(self._state.measured_joint_position)
 
     def at(self, t: int, stamp: int) -> Any:

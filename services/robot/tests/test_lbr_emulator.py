@@ -58,8 +58,8 @@ ZERO = np.zeros(7)
 HOME = np.array(lbr.HOME)
 
 
-def active(**options: int) -> FriSession:
-    session = FriSession(2, HOME, **options)  # type: ignore[arg-type]
+def active() -> FriSession:
+    session = FriSession(2, HOME)
     while session.state is not SessionState.COMMANDING_ACTIVE:
         session.cycle(HOME, ZERO)
     return session
@@ -90,14 +90,6 @@ def test_commands_before_commanding_are_passed_over_and_later_ones_kept_for_ever
     for _ in range(2000):
         drive = session.cycle(HOME, ZERO)
     assert np.array_equal(drive.torque, np.ones(7)), "the stack has no time-out: that is why there is a watchdog"
-
-
-def test_a_site_that_adds_a_time_out_gets_one() -> None:
-    session = active(command_timeout_ms=50)
-    session.take(HOME, np.ones(7))
-    for _ in range(30):
-        session.cycle(HOME, ZERO)
-    assert "no command for" in session.ended
 
 
 @pytest.mark.parametrize(

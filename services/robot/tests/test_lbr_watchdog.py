@@ -22,7 +22,7 @@ from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input, seen
 from palpate_models.scenario.schema import RobotDriver
 from palpate_robot.backends.hardware import TAKE_OVER_NS
-from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.lbr.emulator import Emulator
 from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
 from palpate_robot.backends.lbr.watchdog import lbr_watchdog
 from palpate_robot.backends.watchdog import TIMEOUT_NS, Watchdog
@@ -32,7 +32,7 @@ PUSH = np.array([0.0, 12.0, 0.0, 0.0, 0.0, 0.0, 0.0])
 
 def dead_driver(watched: bool) -> Emulator:
     """Return the arm 0.6 s after a driver that pushed has died."""
-    emulator = Emulator(plant_input(load_scenario("clean")), Options())
+    emulator = Emulator(plant_input(load_scenario("clean")))
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog = lbr_watchdog()
@@ -59,7 +59,7 @@ def test_without_it_the_arm_goes_on_and_with_it_it_stands() -> None:
 
 def started() -> Watchdog:
     watchdog = lbr_watchdog()
-    emulator = Emulator(plant_input(load_scenario("clean")), Options())
+    emulator = Emulator(plant_input(load_scenario("clean")))
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     watchdog.state(0, emulator.state(1))
@@ -83,7 +83,7 @@ def test_the_old_driver_does_not_get_the_arm_back_a_new_one_does() -> None:
 
 
 def test_a_driver_that_died_before_the_watchdog_began_leaves_no_push() -> None:
-    watchdog, emulator = lbr_watchdog(), Emulator(plant_input(load_scenario("clean")), Options())
+    watchdog, emulator = lbr_watchdog(), Emulator(plant_input(load_scenario("clean")))
     while emulator.session.state is not SessionState.COMMANDING_ACTIVE:
         emulator.cycle()
     for t in range(0, TIMEOUT_NS + 3 * MS, 2 * MS):

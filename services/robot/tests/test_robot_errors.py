@@ -17,7 +17,7 @@ from palpate_models.scenario.load import load_scenario, plant_input
 from palpate_models.scenario.schema import Robot, Scenario
 from palpate_robot.backends.dart.plant import DartPlant
 from palpate_robot.backends.dart.service import create
-from palpate_robot.backends.lbr.emulator import Emulator, Options
+from palpate_robot.backends.lbr.emulator import Emulator
 from palpate_robot.backends.mujoco.plant import MujocoPlant
 from palpate_robot.plant import DT, Plant
 from palpate_robot.sensors import SENSORS, FtSensor, JointSensor
@@ -214,7 +214,7 @@ def test_the_service_measures_another_tool_pose_than_the_true_one_and_reports_th
 def test_the_emulated_arm_has_the_errors_and_the_driver_does_not_know_them() -> None:
     scenario = load_scenario("poor_errors", seed=2)
     drawn = draw_errors(scenario.errors, 2)
-    emulator = Emulator(plant_input(scenario), Options())
+    emulator = Emulator(plant_input(scenario))
     state, tool = emulator.state(0), emulator.tool(0)
     reported = tool_pose(np.array(state.measured_joint_position), scenario.robot)[:3, 3]
     p = tool.pose.position

@@ -7,8 +7,8 @@ another timer between a joint state and its torque.
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Final
+from dataclasses import replace
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -65,8 +65,7 @@ class MeasuredArm(ABC):
         """Return None if the arm accepts commands at `t` [ns], else a message that says why not."""
 
 
-@dataclass(frozen=True, slots=True)
-class CarriedLoad:
+class CarriedLoad(NamedTuple):
     """Gravity and sensor orientation at a posture."""
 
     gravity: Array
@@ -95,11 +94,6 @@ class GravityModel:
         J_W = pin.computeFrameJacobian(self._model, self._data, q, self._indenter, pin.ReferenceFrame.LOCAL_WORLD_ALIGNED)
         return np.asarray(J_W.T @ wrench_W)
 
-    def tool_pose(self, q: Array) -> Array:
-        """Return X_WI of the indenter, shape (4, 4)."""
-        pin.forwardKinematics(self._model, self._data, q)
-        return np.array(pin.updateFramePlacement(self._model, self._data, self._indenter).homogeneous)
-
 
 class _Inbox:
     """Inbox of control: joint states of `t` [ns] and the set-points since the previous state; all else from the bus."""
@@ -124,8 +118,9 @@ class _Inbox:
 class InnerLoop:
     """Steps a service of role control inside the driver."""
 
-    def __init__(self, control: Service) -> None:
-        self._control = control
+    def __init__(self, scenario: Scenario) -> None:
+        """Take the control service of the scenario. Raises PluginError if it does not exist."""
+        self._control: Service = implementations.create("control", scenario.services.control, scenario)
         self._setpoints: list[Message] = []
 
     def collect(self, inbox: Inbox) -> None:
@@ -136,11 +131,6 @@ class InnerLoop:
         """Return the torque command at `t` [ns] for these joint states."""
         setpoints, self._setpoints = self._setpoints, []
         return self._control.step(t, _Inbox(t, joints, setpoints, inbox))["control/joint_torque"]
-
-
-def load_control(scenario: Scenario) -> Service:
-    """Return the control service of the scenario. Raises PluginError if it does not exist."""
-    return implementations.create("control", scenario.services.control, scenario)
 
 
 class HardwareService(Service):

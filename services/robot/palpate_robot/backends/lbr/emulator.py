@@ -38,6 +38,8 @@ from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import WRENCH
 from palpate_robot.backends.emulated import BRAKE_NMS, EmulatedArm, serve
 from palpate_robot.backends.lbr.port import (
+    FT_TOPIC,
+    NAMESPACE,
     STATE,
     TORQUE_COMMAND,
     ClientCommandMode,
@@ -61,6 +63,8 @@ class SessionTuning:
     """Time in COMMANDING_WAIT (assumed)."""
     quality_window: int = 100
     """Answers over which connection quality is computed."""
+    pid_p: float = 0.1
+    """Gain of the stack's filter of joint positions."""
 
 
 SESSION: Final = SessionTuning()
@@ -82,16 +86,11 @@ class Drive:
 class FriSession:
     """One FRI session behind the stack."""
 
-    def __init__(self, period_ms: int, q: Array, *, pid_p: float = 0.1, command_timeout_ms: int = 0) -> None:
-        """`command_timeout_ms`: optional time-out on commands; 0 for none, as in the stack.
-
-        Raises UserError for a period outside FRI's range.
-        """
+    def __init__(self, period_ms: int, q: Array) -> None:
+        """Raise UserError for a period outside FRI's range."""
         if period_ms not in PERIODS_MS:
             raise UserError(f"send period {period_ms} ms: want whole milliseconds from {PERIODS_MS[0]} to {PERIODS_MS[-1]}")
         self._dt = period_ms * 1e-3
-        self._pid_p = pid_p
-        self._timeout = command_timeout_ms * 1e-3
         self.state = SessionState.IDLE
         self.quality = ConnectionQuality.POOR
         self.ended = ""
@@ -100,7 +99,6 @@ class FriSession:
         self._answers: deque[bool] = deque(maxlen=SESSION.quality_window)
         self._target = Drive(q.copy(), np.zeros(7))
         self._position = q.copy()
-        self._since_command: float | None = None
         self._q_before: Array | None = None
 
     def _enter(self, state: SessionState) -> None:
@@ -116,7 +114,6 @@ class FriSession:
         """Take a command: joint positions [rad], overlay [N m], shapes (7,). Ignored unless COMMANDING_ACTIVE."""
         if self.state is SessionState.COMMANDING_ACTIVE:
             self._target = Drive(position, torque)
-            self._since_command = 0.0
 
     def cycle(self, q: Array, gravity: Array, *, answered: bool = True) -> Drive:
         """Run one send period at measured positions q [rad] and gravity torques [N m]; returns the applied drive."""
@@ -131,32 +128,23 @@ class FriSession:
         return self._apply(q, gravity)
 
     def _advance(self, q: Array) -> None:
-        state = self.state
+        state, monitored = self.state, self._in_state > SESSION.monitoring_s
         if state is SessionState.IDLE:
             self._enter(SessionState.MONITORING_WAIT)
-        elif (
-            state is SessionState.MONITORING_WAIT
-            and self._in_state > SESSION.monitoring_s
-            and self.quality >= ConnectionQuality.GOOD
-        ):
+        elif state is SessionState.MONITORING_WAIT and monitored and self.quality >= ConnectionQuality.GOOD:
             self._enter(SessionState.MONITORING_READY)
-        elif state is SessionState.MONITORING_READY and self._in_state > SESSION.monitoring_s:
+        elif state is SessionState.MONITORING_READY and monitored:
             self._enter(SessionState.COMMANDING_WAIT)
         elif state is SessionState.COMMANDING_WAIT and self._in_state > SESSION.sync_s:
             self._enter(SessionState.COMMANDING_ACTIVE)
             self._target, self._position = Drive(q.copy(), np.zeros(7)), q.copy()
-            self._since_command = None
         elif state >= SessionState.COMMANDING_WAIT and self.quality is ConnectionQuality.POOR:
             self.end("connection quality is POOR: the client does not answer in time")
 
     def _apply(self, q: Array, gravity: Array) -> Drive:
-        if self._since_command is not None:
-            self._since_command += self._dt
-            if 0.0 < self._timeout < self._since_command:
-                self.end(f"no command for {self._since_command * 1e3:.0f} ms, time-out {self._timeout * 1e3:.0f} ms")
         if not (np.isfinite(self._target.position).all() and np.isfinite(self._target.torque).all()):
             self._target, self._position = Drive(q.copy(), np.zeros(7)), q.copy()
-        self._position = self._position + self._pid_p * (self._target.position - q)
+        self._position = self._position + SESSION.pid_p * (self._target.position - q)
         self._guard(q, gravity)
         return Drive(q, np.zeros(7)) if self.ended else Drive(self._position, self._target.torque)
 
@@ -169,42 +157,28 @@ class FriSession:
             elif speed[i] > lbr.VELOCITY_LIMIT[i]:
                 self.end(f"command guard: {joint} at {speed[i]:.2f} rad/s, limit {lbr.VELOCITY_LIMIT[i]:.2f} rad/s")
             elif abs(self._target.torque[i] + gravity[i]) > lbr.TORQUE_LIMIT[i]:
-                self.end(
-                    f"controller: {joint} at {self._target.torque[i] + gravity[i]:.0f} N m, limit {lbr.TORQUE_LIMIT[i]:.0f} N m"
-                )
+                total = self._target.torque[i] + gravity[i]
+                self.end(f"controller: {joint} at {total:.0f} N m, limit {lbr.TORQUE_LIMIT[i]:.0f} N m")
 
 
 log = logging.getLogger("emulator")
 
 
-@dataclass(frozen=True)
-class Options:
-    """Options of the emulated arm; see `main`."""
-
-    period_ms: int = 2
-    stiffness_nm: float = 0.0
-    gravity_error_nm: float = 0.0
-    command_timeout_ms: int = 0
-    namespace: str = "lbr"
-    ft_topic: str = "ft_sensor/wrench"
-
-
 class Emulator(EmulatedArm):
     """Physics and session; call `cycle` once per send period. Time comes from the caller."""
 
-    def __init__(self, known: PlantInput, options: Options) -> None:
-        """Create the arm of a scenario, with its errors."""
-        super().__init__(known, options.period_ms)
-        self._options = options
-        self.session = FriSession(options.period_ms, self.measured, command_timeout_ms=options.command_timeout_ms)
-        self._load_error = self._load_rng.uniform(-1.0, 1.0, 7) * options.gravity_error_nm
+    def __init__(self, known: PlantInput, period_ms: int = 2, stiffness_nm: float = 0.0, gravity_error_nm: float = 0.0) -> None:
+        """Create the arm of a scenario, with its errors; arguments as the options of `main`."""
+        super().__init__(known, period_ms)
+        self.session, self._stiffness = FriSession(period_ms, self.measured), stiffness_nm
+        self._load_error = self._load_rng.uniform(-1.0, 1.0, 7) * gravity_error_nm
         """Constant error of the arm's load data [N m]."""
         self._applied = Drive(self.measured, np.zeros(7))
 
     def cycle(self, *, answered: bool = True) -> None:
         """Advance the arm by one send period under the newest command."""
         self.measure()
-        plant, stiffness = self._plant, self._options.stiffness_nm
+        plant, stiffness = self._plant, self._stiffness
         self._applied = drive = self.session.cycle(self.measured, plant.gravity_torque(), answered=answered)
         active = self.session.state is SessionState.COMMANDING_ACTIVE
         damping = 2 * 0.7 * np.sqrt(np.full(7, stiffness)) if active else np.full(7, BRAKE_NMS)
@@ -221,7 +195,7 @@ class Emulator(EmulatedArm):
         session, drive = self.session, self._applied
         ipo = self.measured if session.state >= SessionState.COMMANDING_WAIT else np.full(7, np.nan)
         return LBRState(
-            sample_time=self._options.period_ms * 1e-3,
+            sample_time=self.period_ms * 1e-3,
             session_state=int(session.state),
             connection_quality=int(session.quality),
             safety_state=int(SafetyState.NORMAL_OPERATION),
@@ -242,11 +216,11 @@ class Emulator(EmulatedArm):
         )
 
 
-def serve_graph(emulator: Emulator, node: RosNode, options: Options) -> None:
+def serve_graph(emulator: Emulator, node: RosNode) -> None:
     """Run in wall-clock time until a signal; after the session ends the arm stands and no state is published."""
-    states = node.publisher(f"{options.namespace}/state", STATE)
-    wrenches = node.publisher(options.ft_topic, WRENCH)
-    commands = node.subscription(f"{options.namespace}/command/torque", TORQUE_COMMAND)
+    states = node.publisher(f"{NAMESPACE}/state", STATE)
+    wrenches = node.publisher(FT_TOPIC, WRENCH)
+    commands = node.subscription(f"{NAMESPACE}/command/torque", TORQUE_COMMAND)
     reported = ""
 
     def cycle(stamp: int) -> None:
@@ -274,20 +248,17 @@ def main(arguments: list[str] | None = None) -> int:
     parser.add_argument("--period-ms", type=int, default=2, help="FRI send period")
     parser.add_argument("--stiffness", type=float, default=0.0, help="stiffness of the joint impedance controller [N m/rad]")
     parser.add_argument("--gravity-error", type=float, default=0.0, help="largest error of the load data per joint [N m]")
-    parser.add_argument(
-        "--command-timeout-ms", type=int, default=0, help="end the session without commands; 0: never, as the stack"
-    )
     given = parser.parse_args(arguments)
     logging.basicConfig(level="INFO", format="%(asctime)s emulator %(levelname)s %(message)s", stream=sys.stderr)
-    options = Options(given.period_ms, given.stiffness, given.gravity_error, given.command_timeout_ms)
     try:
-        emulator = Emulator(plant_input(load_scenario(given.scenario)), options)
+        known = plant_input(load_scenario(given.scenario))
+        emulator = Emulator(known, given.period_ms, given.stiffness, given.gravity_error)
         node = RosNode("lbr_emulator", given.domain, BusOptions(listen=(given.listen,)))
     except UserError as error:
         print(f"emulator: {error}", file=sys.stderr)
         return 2
-    log.info("an LBR at %s, FRI every %d ms", given.listen, options.period_ms)
-    serve_graph(emulator, node, options)
+    log.info("an LBR at %s, FRI every %d ms", given.listen, given.period_ms)
+    serve_graph(emulator, node)
     return 0
 
 

@@ -36,22 +36,12 @@ float64 tracking_performance
 """
 STATE = "lbr_fri_idl/msg/LBRState"
 TORQUE_COMMAND = "lbr_fri_idl/msg/LBRTorqueCommand"
-NAMESPACE = "lbr"
+NAMESPACE, FT_TOPIC = "lbr", "ft_sensor/wrench"
 """Default of the stack's `robot_name`, which is also its namespace."""
 DEFINITIONS = {STATE: _STATE, TORQUE_COMMAND: "float64[7] joint_position\nfloat64[7] torque\n"}
 
-
-def register() -> None:
-    """Register the messages with the codec; further calls do nothing."""
-    if STATE in codec.store.types:
-        return
-    types: dict[str, Any] = {}
-    for name, text in DEFINITIONS.items():
-        types.update(get_types_from_msg(text, name))
-    codec.store.register(types)
-
-
-register()
+for _name, _text in DEFINITIONS.items():
+    codec.store.register(get_types_from_msg(_text, _name))
 LBRState: Any = codec.message_type(STATE)
 LBRTorqueCommand: Any = codec.message_type(TORQUE_COMMAND)
 
@@ -109,8 +99,7 @@ class ZenohPort(ZenohArmPort):
         """Connect. Raises BusConfigError."""
         name = (given.namespace or NAMESPACE).strip("/")
         command = f"{name}/command/torque", TORQUE_COMMAND
-        ft_topic = given.ft_topic or "ft_sensor/wrench"
-        super().__init__("palpate_robot.backends.lbr", given, (f"{name}/state", STATE), command, ft_topic)
+        super().__init__("palpate_robot.backends.lbr", given, (f"{name}/state", STATE), command, given.ft_topic or FT_TOPIC)
 
     def command(self, q: Array, values: Array) -> None:
         """Send both; the stack's torque controller also needs a joint position, see docs/real-lbr.md on its stiffness."""

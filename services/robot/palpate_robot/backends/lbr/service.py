@@ -10,7 +10,7 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import ExamInput, Scenario
 from palpate_robot.backends.arm_port import ArmPort
-from palpate_robot.backends.hardware import HardwareService, InnerLoop, load_control
+from palpate_robot.backends.hardware import HardwareService, InnerLoop
 from palpate_robot.backends.lbr.arm import MeasuredLbr
 from palpate_robot.backends.lbr.port import ZenohPort
 
@@ -29,5 +29,5 @@ def create(scenario: Scenario) -> HardwareService:
     if Settings.read().runtime != "wallclock":
         raise BusConfigError("services.robot = lbr drives hardware and cannot run in simulated time: use --wallclock")
     exam = exam_input(scenario)
-    inner = InnerLoop(load_control(scenario)) if exam.robot.level is CommandLevel.SETPOINT else None
+    inner = InnerLoop(scenario) if exam.robot.level is CommandLevel.SETPOINT else None
     return lbr_service(exam, ZenohPort(exam.robot.driver), inner)

@@ -122,10 +122,6 @@ class EmulatedPort(Ros2Port):
         """See `ArmPort.command`."""
         self.emulator.command = values
 
-    def rivals(self) -> list[bytes]:
-        """Return none."""
-        return []
-
     def contact(self, wrench: Any) -> None:
         """See `ArmPort.contact`."""
         self.emulator.touch(wrench)
@@ -137,9 +133,6 @@ class EmulatedPort(Ros2Port):
     def status(self) -> StackStatus:
         """See `Ros2Port.status`."""
         return self.emulator.status()
-
-    def close(self) -> None:
-        """Do nothing."""
 
 
 def _timed(text: str) -> tuple[float, str]:

@@ -15,6 +15,7 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import BusConfigError
 from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.arm import TOOL, arm_of, base_pose
+from palpate_models.robot.kinematics import tool_pose
 from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.load import exam_input, plant_input
 from palpate_models.scenario.schema import ExamInput, Scenario
@@ -76,7 +77,7 @@ class Ros2ControlService(HardwareService):
             self._driver.hold(t, HoldCause.DEVICE, fault)
             return  # the next state is answered by the hold
         if self._level is CommandLevel.SETPOINT:
-            X_WI = self._model.tool_pose(self._arm.q)
+            X_WI = tool_pose(self._arm.q, self._robot)
             if active and self._setpoint is not None:
                 X_WI = pose_matrix(self._setpoint.pose)
             X_IF = rigid(np.eye(3), (0.0, 0.0, -TOOL.flange_to_ft_m - TOOL.ft_to_indenter_m))
@@ -94,12 +95,8 @@ class Ros2ControlService(HardwareService):
         if self._level is CommandLevel.SETPOINT:
             if self._setpoint is None:
                 return ""
-            command, measured, names = (
-                pose_matrix(self._setpoint.pose)[:3, 3],
-                self._model.tool_pose(arm.q)[:3, 3],
-                ["x", "y", "z"],
-            )
-            unit = "m"
+            command, measured = pose_matrix(self._setpoint.pose)[:3, 3], tool_pose(arm.q, self._robot)[:3, 3]
+            names, unit = ["x", "y", "z"], "m"
         elif self._level is CommandLevel.POSITION:
             command, measured, names, unit = values, arm.q, self._names, "rad"
         elif not self._profile.effort_is_torque:

@@ -1,37 +1,22 @@
 """A flat slab pressed by a sphere, for comparison of the elastic tissue with theory.
 
 slab = FlatSlab(young_pa=1e4)
-slab.press(radius_m=0.02, depth_m=0.005).force_n
+slab.press(radius_m=0.02, depth_m=0.005)
 """
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import Literal
 
 import numpy as np
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
-from palpate_models.patient.schema import Lesion, Stiffness
+from palpate_models.patient.schema import Lesion
 from palpate_tissue.backends.elastic.compliance import COMPLIANCE, YOUNG_OVER_K_W, Compliance, compliance
 from palpate_tissue.backends.elastic.patch import ContactSolver
-from palpate_tissue.backends.elastic.tissue import ElasticTissue
 
 Profile = Literal["sphere", "paraboloid"]
-
-
-@dataclass(frozen=True)
-class PressedSlab:
-    """A slab at rest under an indenter."""
-
-    force_n: float
-    """Force on the indenter along the slab's outward normal."""
-    displacement_m: Array
-    """Inward displacement of every vertex, shape (n,)."""
-    contact_radius_m: float
-    """Radius of the circle with the area of the vertices in contact."""
 
 
 class FlatSlab:
@@ -64,8 +49,8 @@ class FlatSlab:
 
     def press(
         self, radius_m: float, depth_m: float, xy_m: tuple[float, float] = (0.0, 0.0), profile: Profile = "sphere"
-    ) -> PressedSlab:
-        """Return the slab at rest under a sphere at `xy_m` whose lowest point is `depth_m` below z = 0.
+    ) -> float:
+        """Return the force [N] on a sphere at `xy_m` whose lowest point is `depth_m` below z = 0, along the outward normal.
 
         `paraboloid` is Hertz's indenter, a sphere to second order.
         """
@@ -77,17 +62,6 @@ class FlatSlab:
             held = depth_m - radius_m + np.sqrt(np.maximum(radius_m**2 - square, 0.0))
             held[square >= radius_m**2] = -1.0
         near = np.flatnonzero(held > 0)
-        force = np.zeros(len(self.vertices))
-        displacement = np.zeros(len(self.vertices))
-        free = self.compliance.free
-        if len(near):
-            solver = ContactSolver(np.ascontiguousarray(self._matrix[np.ix_(near, near)]))
-            solver.begin_with(held[near] > 0.5 * held[near].max())
-            force[free[near]] = solver.solve(held[near])[0]
-            displacement[free] = self._matrix[:, near] @ force[free[near]]
-        area = float(self.model.areas[force > 0].sum())
-        return PressedSlab(float(force.sum()), displacement, math.sqrt(area / math.pi))
-
-    def tissue(self, stiffness: Stiffness | None = None, breathing: BreathingCurve = STILL, dt: float = 1e-3) -> ElasticTissue:
-        """Return the slab as a tissue that steps in time: `tissue.step(t_s, p_A, v_A, radius)` gives force and torque."""
-        return ElasticTissue(self.model, self.compliance, stiffness, breathing, dt)
+        solver = ContactSolver(np.ascontiguousarray(self._matrix[np.ix_(near, near)]))
+        solver.begin_with(held[near] > 0.5 * held[near].max(initial=0.0))
+        return float(solver.solve(held[near])[0].sum())

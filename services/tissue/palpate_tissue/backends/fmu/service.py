@@ -167,12 +167,6 @@ def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuServi
     known: dict[str, Any] = {"X_WA.position": X_WA[:3, 3], "X_WA.orientation": Rotation.from_matrix(X_WA[:3, :3]).as_quat()}
     if table.role == "tissue":
         model = build_phantom(scenario.phantom, scenario.seed)
-        known |= {
-            "phantom.vertices": model.vertices,
-            "phantom.normals": model.normals,
-            "phantom.triangles": model.triangles,
-            "phantom.stiffness": model.stiffness,
-            "phantom.background": model.background,
-            "phantom.lesion": model.lesion,
-        }
+        names = ("vertices", "normals", "triangles", "stiffness", "background", "lesion")
+        known |= {f"phantom.{name}": getattr(model, name) for name in names}
     return host(table.role, fmu_file, table, frames, known)

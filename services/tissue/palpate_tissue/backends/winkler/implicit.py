@@ -127,7 +127,7 @@ def press(
         patch.f[k] = 0.0
         if u[near[at]] > room[at, 1]:
             continue
-        f = -unbalanced(wall, near[at], room[at, 0], activation, 1.0)
+        f = -pull(wall, near[at], room[at, 0], activation, 1.0, 1.0)[0]
         if f <= 0.0:
             continue
         n, d = row(table, k, 0), subtract(sphere.p, row(table, k, 3))
@@ -147,41 +147,36 @@ def press(
 
 
 @compiled
+def pull(wall: ImplicitWall, i: int, before: float, activation: float, length: float, kept: float) -> tuple[float, float]:
+    """Return the residual force [N], inward, at a vertex, and how fast it falls as the vertex moves on [N/m].
+
+    The vertex was at `before` [m] a step of `length` ago; `length` and `kept` as in `Stride`.
+    """
+    table, at, drag = wall.table, wall.u[i], wall.table[i, DRAG] / length
+    force, slope = drag * (before - at), drag + kept * table[i, DIAGONAL]
+    for j in range(wall.indptr[i], wall.indptr[i + 1]):
+        force -= wall.K[j] * wall.s[wall.indices[j]]
+    if at > 0.0:
+        bent = min(at, table[i, STRAIGHT_FROM])
+        stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
+        force -= table[i, FOUNDATION] * (stiffer * (at - 2.0 / 3.0 * bent) + held * at)
+        slope += table[i, FOUNDATION] * (stiffer + held)
+    return force, slope
+
+
+@compiled
 def sweep(wall: ImplicitWall, near: NDArray[np.intp], room: Array, activation: float, stride: Stride) -> float:
     """Sweep once over vertices with over-relaxation, bounded below by the sphere; return the largest motion [m]."""
-    u, s, table, indptr, indices, K = wall.u, wall.s, wall.table, wall.indptr, wall.indices, wall.K
-    longest = 0.0
+    u, s, longest = wall.u, wall.s, 0.0
     for k in range(len(near)):
         i = near[k]
-        at, drag = u[i], table[i, DRAG] / stride.length
-        force = drag * (room[k, 0] - at)
-        slope = drag + stride.kept * table[i, DIAGONAL]
-        for j in range(indptr[i], indptr[i + 1]):
-            force -= K[j] * s[indices[j]]
-        if at > 0.0:
-            bent = min(at, table[i, STRAIGHT_FROM])
-            stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
-            force -= table[i, FOUNDATION] * (stiffer * (at - 2.0 / 3.0 * bent) + held * at)
-            slope += table[i, FOUNDATION] * (stiffer + held)
+        at = u[i]
+        force, slope = pull(wall, i, room[k, 0], activation, stride.length, stride.kept)
         moved = max(at + stride.over * force / slope, room[k, 1])
         s[i] += stride.kept * (moved - at)
         u[i] = moved
         longest = max(longest, abs(moved - at))
     return longest
-
-
-@compiled
-def unbalanced(wall: ImplicitWall, i: int, before: float, activation: float, length: float) -> float:
-    """Return the residual force [N], inward, at a vertex that was at `before` [m] a step of `length` ago."""
-    at = wall.u[i]
-    force: float = wall.table[i, DRAG] / length * (before - at)
-    for j in range(wall.indptr[i], wall.indptr[i + 1]):
-        force -= wall.K[j] * wall.s[wall.indices[j]]
-    if at > 0.0:
-        bent = min(at, wall.table[i, STRAIGHT_FROM])
-        stress = wall.table[i, BETA2] * bent * bent * (at - 2.0 / 3.0 * bent) + wall.table[i, TENSION] * activation * at
-        force -= wall.table[i, FOUNDATION] * stress
-    return force
 
 
 @compiled
@@ -203,8 +198,7 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
     First each vertex relaxes with its branches as if in equilibrium; then up to `sweeps` sweeps restore equilibrium, which is far
     away where the sphere has just left.
     """
-    u, s, y, clock, decay, table = wall.u, wall.s, wall.y, wall.clock, wall.decay, wall.table
-    indptr, indices, K = wall.indptr, wall.indices, wall.K
+    u, s, y, clock, decay = wall.u, wall.s, wall.y, wall.clock, wall.decay
     begin, length = np.zeros(len(vertices)), np.zeros(len(vertices), dtype=np.int64)
     for k in range(len(vertices)):
         i = vertices[k]
@@ -224,15 +218,7 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
             if length[k] == 0:
                 continue
             i = vertices[k]
-            drag = table[i, DRAG] / length[k]
-            force, slope = drag * (begin[k] - u[i]), drag + table[i, DIAGONAL]
-            for j in range(indptr[i], indptr[i + 1]):
-                force -= K[j] * s[indices[j]]
-            if u[i] > 0.0:
-                bent = min(u[i], table[i, STRAIGHT_FROM])
-                stiffer, held = table[i, BETA2] * bent * bent, table[i, TENSION] * activation
-                force -= table[i, FOUNDATION] * (stiffer * (u[i] - 2.0 / 3.0 * bent) + held * u[i])
-                slope += table[i, FOUNDATION] * (stiffer + held)
+            force, slope = pull(wall, i, begin[k], activation, float(length[k]), 1.0)
             u[i] += force / slope
             s[i] += force / slope
             longest = max(longest, abs(force / slope))

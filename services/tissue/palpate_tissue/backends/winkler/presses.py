@@ -19,12 +19,12 @@ from scipy.spatial import cKDTree
 
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
-from palpate_models.numerics.vectors import add, dot, row, scale, subtract
+from palpate_models.numerics.vectors import Vector, add, dot, row, scale, subtract
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
 from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
-from palpate_tissue.backends.winkler.implicit import TUNING, ImplicitWall, Stride, implicit_wall, sweep, unbalanced
+from palpate_tissue.backends.winkler.implicit import TUNING, ImplicitWall, Stride, implicit_wall, pull, sweep
 from palpate_tissue.contact import RIM
 
 ENDS_S: Final = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.75, press.DURATION_S - 0.5 * press.READ_S)
@@ -163,13 +163,7 @@ def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array
 
 
 @compiled
-def floor(
-    X: tuple[float, float, float],
-    n: tuple[float, float, float],
-    p: tuple[float, float, float],
-    radius: float,
-    normal: tuple[float, float, float],
-) -> float:
+def floor(X: Vector, n: Vector, p: Vector, radius: float, normal: Vector) -> float:
     """Return the least displacement [m] that a sphere at p allows a vertex X with outward normal n: w in `tissue.hold`."""
     d = subtract(p, X)
     along = -dot(n, d)
@@ -181,14 +175,7 @@ def floor(
 
 @compiled
 def held(
-    wall: ImplicitWall,
-    skin: Skin,
-    part: NDArray[np.intp],
-    room: Array,
-    activation: float,
-    h: float,
-    p: tuple[float, float, float],
-    normal: tuple[float, float, float],
+    wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], room: Array, activation: float, h: float, p: Vector, normal: Vector
 ) -> float:
     """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, as in `tissue.hold`."""
     total = 0.0
@@ -196,7 +183,7 @@ def held(
         i = part[k]
         if wall.u[i] > room[k, 1]:
             continue
-        f = -unbalanced(wall, i, room[k, 0], activation, h)
+        f = -pull(wall, i, room[k, 0], activation, h, 1.0)[0]
         if f <= 0.0:
             continue
         n, d = row(skin.normals, i), subtract(p, row(skin.vertices, i))

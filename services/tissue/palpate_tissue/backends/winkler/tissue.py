@@ -307,18 +307,8 @@ class WinklerTissue(TissueBackend):
         decay: Array = np.exp(-h / np.array(stiffness.prony_tau_s))
         feed: Array = np.array(stiffness.prony_g) * (1 - decay)
         prony, share = np.column_stack((decay, feed)), h / stiffness.dashpot_s
-        return Membrane(
-            self.displacement,
-            self.branches,
-            indptr,
-            columns,
-            A.data,
-            prony,
-            h,
-            self._springs(),
-            share,
-            np.array([self.activation]),
-        )
+        springs, activation = self._springs(), np.array([self.activation])
+        return Membrane(self.displacement, self.branches, indptr, columns, A.data, prony, h, springs, share, activation)
 
     def _springs(self) -> Array:
         """Return the rows of `Membrane.spring`; no columns if no vertex stiffens or has a muscle."""
