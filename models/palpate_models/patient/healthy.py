@@ -70,24 +70,13 @@ def _waves(rng: np.random.Generator, lengths: Array, heavy: bool) -> _Waves:
     return _Waves(turn @ (frequency / lengths[:, None]), phase, weight * np.sqrt(2 / (weight**2).sum()))
 
 
-def _ridges(g: Array) -> Array:
-    return np.asarray(-np.sqrt(g**2 + 0.01))
-
-
-def _patches(g: Array) -> Array:
-    return np.tanh(3 * g)
-
-
-def _hills(g: Array) -> Array:
-    return np.exp(0.8 * g)
-
-
-def _unchanged(g: Array) -> Array:
-    return g
-
-
-_FAMILIES: tuple[Family, ...] = (_ridges, _patches, _hills, _unchanged)
-"""Transformations of waves; the last one keeps heavy-tailed waves."""
+_FAMILIES: tuple[Family, ...] = (
+    lambda g: -np.sqrt(g**2 + 0.01),
+    lambda g: np.tanh(3 * g),
+    lambda g: np.exp(0.8 * g),
+    lambda g: g,
+)
+"""Transformations of waves to ridges, patches and hills; the last one keeps heavy-tailed waves."""
 
 
 class _Component(NamedTuple):
@@ -109,7 +98,7 @@ def _component(rng: np.random.Generator, length_m: tuple[float, float], share: f
     length = np.exp(rng.uniform(*np.log(length_m)))
     longer = np.exp(rng.uniform(0, np.log(VARIATION.most_anisotropic)))
     lengths = np.array((min(length * longer, length_m[1]), length, length))
-    part = _Component(_waves(rng, lengths, heavy=family is _unchanged), family, float(np.sqrt(share)))
+    part = _Component(_waves(rng, lengths, heavy=family is _FAMILIES[-1]), family, float(np.sqrt(share)))
     values = part(reference)
     return part._replace(mean=float(values.mean()), sd=float(values.std()))
 

@@ -23,7 +23,6 @@ class MeshLimits:
     region_half_m: float = 0.112
     """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
     near_umbilicus_m: float = 0.03
-    smallest_body_m: float = 0.15
     widest_m: float = 0.9
     """Width of the body across the umbilicus, and its thickness there."""
     thickest_m: float = 0.5
@@ -31,11 +30,7 @@ class MeshLimits:
 
 
 LIMITS: Final = MeshLimits()
-
-UNITS_M = {
-    **{"micrometres": 1e-6, "millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "kilometres": 1e3},
-    **{"inches": 0.0254, "feet": 0.3048, "yards": 0.9144},
-}
+SCALING: Final = "scale it, by 0.001 from millimetres, 0.01 from centimetres, 0.0254 from inches or 0.3048 from feet"
 
 
 @dataclass(frozen=True)
@@ -85,10 +80,11 @@ def weld(vertices: Array, triangles: IntArray) -> tuple[Array, IntArray]:
 
 def check(vertices: Array, triangles: IntArray) -> None:
     """Raise MeshError unless the mesh is a manifold of sound triangles, in metres."""
+    import trimesh  # noqa: PLC0415 - as in read_mesh
+
     size = float(np.ptp(vertices, axis=0).max())
     if not LIMITS.smallest_m <= size <= LIMITS.largest_m:
-        fitting = _fitting_units(vertices, triangles)
-        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; {fitting}")
+        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres: {SCALING}")
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -101,32 +97,13 @@ def check(vertices: Array, triangles: IntArray) -> None:
     if len(crowded):
         where = _place(vertices[unique[crowded[0]]])
         raise MeshError(f"non-manifold: {len(crowded)} edges with more than two triangles, the first at {where}")
-    joined = sparse.coo_array((np.ones(len(unique)), (unique[:, 0], unique[:, 1])), shape=(len(vertices),) * 2)
-    pieces, _ = connected_components(joined, directed=False)
     border = unique[count == 1]
-    rim = sparse.coo_array((np.ones(len(border)), border.T), shape=(len(vertices),) * 2)
-    rims, _ = connected_components(rim, directed=False)
-    rims -= len(vertices) - len(np.unique(border))
-    if rims > 1:
-        raise MeshError(
-            f"it has {rims} borders, the first at {_place(vertices[border[0]])}: fill its holes; one border is allowed"
-        )
-    if pieces > 1:
+    if (rims := len(trimesh.graph.connected_components(border))) > 1:
+        where = _place(vertices[border[0]])
+        raise MeshError(f"it has {rims} borders, the first at {where}: fill its holes; one border is allowed")
+    if (pieces := len(trimesh.graph.connected_components(unique))) > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
     _check_fans(vertices, triangles)
-
-
-def _fitting_units(vertices: Array, triangles: IntArray) -> str:
-    """Return the units in which a surface can be a body, each with its size."""
-    size, (width, thickness) = float(np.ptp(vertices, axis=0).max()), _across(vertices, triangles)
-    fitting = [
-        f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
-        for unit, factor in UNITS_M.items()
-        if LIMITS.smallest_body_m <= size * factor <= LIMITS.largest_m
-        and width * factor <= LIMITS.widest_m
-        and thickness * factor <= LIMITS.thickest_m
-    ]
-    return ", ".join(fitting) or "no unit fits"
 
 
 def _across(vertices: Array, triangles: IntArray) -> tuple[float, float]:
@@ -154,7 +131,7 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     if width > LIMITS.widest_m or thickness > LIMITS.thickest_m:
         raise MeshError(
             f"at the umbilicus it is {width:.3g} m wide and {thickness:.3g} m thick, want up to {LIMITS.widest_m} and "
-            f"{LIMITS.thickest_m}; {_fitting_units(vertices, triangles)}"
+            f"{LIMITS.thickest_m} metres: {SCALING}"
         )
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
@@ -273,17 +250,13 @@ def vertex_normals(vertices: Array, triangles: IntArray) -> Array:
 
 def _check_fans(vertices: Array, triangles: IntArray) -> None:
     """Raise MeshError where surfaces touch in a single vertex: a vertex's triangles must form one fan."""
-    m = len(triangles)
-    half = np.sort(_half_edges(triangles), axis=1)
-    face = np.tile(np.arange(m), 3)
-    order = np.lexsort((half[:, 1], half[:, 0]))
-    same = np.flatnonzero((half[order][1:] == half[order][:-1]).all(axis=1))
-    f, g, edge = face[order[same]], face[order[same + 1]], half[order[same]]
-    rows, columns = [], []
-    for vertex in edge.T:  # corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge
-        rows.append(3 * f + np.argmax(triangles[f] == vertex[:, None], axis=1))
-        columns.append(3 * g + np.argmax(triangles[g] == vertex[:, None], axis=1))
-    graph = sparse.coo_array((np.ones(2 * len(f)), (np.concatenate(rows), np.concatenate(columns))), shape=(3 * m, 3 * m))
+    import trimesh  # noqa: PLC0415 - as in read_mesh
+
+    pairs, edge = trimesh.graph.face_adjacency(triangles, return_edges=True)
+    # Corner k of face f is node 3 f + k; corners at the same vertex are joined across the edge.
+    joined = [[3 * f + np.argmax(triangles[f] == end[:, None], axis=1) for end in edge.T] for f in pairs.T]
+    nodes = (np.concatenate(joined[0]), np.concatenate(joined[1]))
+    graph = sparse.coo_array((np.ones(len(nodes[0])), nodes), shape=(triangles.size,) * 2)
     _, fan = connected_components(graph, directed=False)
     fans = np.unique(np.column_stack((triangles.ravel(), fan)), axis=0)
     touched, count = np.unique(fans[:, 0], return_counts=True)

@@ -39,15 +39,7 @@ JOINT_ORIGIN: Final[tuple[Point, ...]] = (
     (0.0, 0.0707, 0.091),
 )
 """Origin of joint i + 1 in its parent link i [m]."""
-JOINT_AXIS: Final[tuple[Point, ...]] = (
-    (0.0, 0.0, 1.0),
-    (0.0, 1.0, 0.0),
-    (0.0, 0.0, 1.0),
-    (0.0, -1.0, 0.0),
-    (0.0, 0.0, 1.0),
-    (0.0, 1.0, 0.0),
-    (0.0, 0.0, 1.0),
-)
+JOINT_AXIS: Final[tuple[Point, ...]] = ((0, 0, 1), (0, 1, 0), (0, 0, 1), (0, -1, 0), (0, 0, 1), (0, 1, 0), (0, 0, 1))
 LINK_7_TO_FLANGE_M: Final = 0.035
 ARM_INERTIA: Final[tuple[Inertia, ...]] = (
     Inertia(4.855658, (-0.012857, 0.0, 0.069964), (0.017839, 0.022294, 0.021334), (0.0, 0.000781, 0.0)),
@@ -80,7 +72,7 @@ ARM: Final = Arm(
     joint_names=JOINT_NAMES,
     link_names=LINK_NAMES,
     origin_m=_fixed(np.array(JOINT_ORIGIN)),
-    axis=_fixed(np.array(JOINT_AXIS)),
+    axis=_fixed(np.array(JOINT_AXIS, dtype=float)),
     flange_m=_fixed(np.array((0.0, 0.0, LINK_7_TO_FLANGE_M))),
     lower_rad=_fixed(-POSITION_LIMIT),
     upper_rad=POSITION_LIMIT,

@@ -82,6 +82,18 @@ def _coal() -> Any:
         raise UserError("the meshes of an arm need coal: pip install 'palpate[run]'") from error
 
 
+Group = list[tuple[str, Array]]
+"""Links fixed to each other, with their pose in the root at zero."""
+_MOMENTS: Final = ("xx", "yy", "zz", "xy", "xz", "yz")
+_LIMITS: Final[tuple[tuple[str, str, float | None], ...]] = (
+    ("lower", "lower_rad", -TUNING.continuous_rad),
+    ("upper", "upper_rad", TUNING.continuous_rad),
+    ("velocity", "velocity_radps", None),
+    ("effort", "torque_nm", None),
+)
+"""Limits of a joint: attribute in a URDF, field of `ArmFile`, value for a continuous joint."""
+
+
 class _Reader:
     """Reads the chain from base to flange of one URDF and collects faults."""
 
@@ -106,19 +118,17 @@ class _Reader:
             near = get_close_matches(self._given.flange, self._links, 6, 0.4) or list(self._links)[-6:]
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
         chain = self._tree.chain(self._given.flange)
+        self._base = chain[0]
         poses, moving = self._placed(chain)
         n = len(moving)
         if n not in (6, 7):
             return None, [f"{n} joints from {chain[0]} to {self._given.flange}, want 6 or 7 that turn"]
-        limits = self._limits(moving)
+        lower, upper, velocity, torque = self._limits(moving)
         R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
         frames = [np.eye(4), *(poses[chain.index(linked(joint, "child"))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
-        inertias = tuple(
-            self._inertia(group, R_BF, origin, name=links[0], fixed=k == 0)
-            for k, (group, origin, links) in enumerate(zip(groups, origins, [[g[0][0]] for g in groups], strict=True))
-        )
+        inertias = tuple(self._inertia(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
         capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
         if not any(capsules):
             self.faults.append(f"links {chain[0]} to {self._given.flange}: none has a shape, so collisions cannot be seen")
@@ -127,18 +137,16 @@ class _Reader:
             self.faults.append(f"home_rad: {len(home)} values, want {n}")
         if self.faults:
             return None, self.faults
-        given_axes = [self._axis(joint) for joint in moving]
-        axes = np.array([X[:3, :3] @ axis for X, axis in zip(frames[1:], given_axes, strict=True)])
-        lower, upper, velocity, torque = limits
-        given = self._given
-        outside = np.flatnonzero((home < lower) | (home > upper)) if given.home_rad else ()
-        for k in outside:
+        axes = np.array([X[:3, :3] @ self._axis(joint) for X, joint in zip(frames[1:], moving, strict=True)])
+        given, last = self._given, linked(moving[-1], "child")
+        for k in np.flatnonzero((home < lower) | (home > upper)) if given.home_rad else ():
             joint = moving[k].get("name")
             self.faults.append(f"home_rad: {home[k]:.3f} of {joint} is outside {lower[k]:.3f} to {upper[k]:.3f} rad")
+        flange = given.flange if given.flange != last else f"{last}_flange"
         arm = Arm(
             name=name,
             joint_names=tuple(joint.get("name", "") for joint in moving),
-            link_names=(chain[0], *(linked(joint, "child") for joint in moving), self._flange_name(moving)),
+            link_names=(chain[0], *(linked(joint, "child") for joint in moving), flange),
             origin_m=np.diff(origins, axis=0) @ R_BF,
             axis=axes @ R_BF,
             flange_m=R_BF.T @ (poses[-1][:3, 3] - origins[-1]),
@@ -172,10 +180,6 @@ class _Reader:
             raise ValueError(f"{self._tree.part}: its axis is zero")
         return axis / np.linalg.norm(axis)
 
-    def _flange_name(self, moving: list[ElementTree.Element]) -> str:
-        last = linked(moving[-1], "child")
-        return self._given.flange if self._given.flange != last else f"{last}_flange"
-
     def _placed(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
         """Return the pose of each link in the root at zero, and the joints that turn."""
         X, poses, moving = np.eye(4), [np.eye(4)], []
@@ -195,22 +199,18 @@ class _Reader:
                 raise ValueError(f"{self._tree.part}: is {kind}; want joints that turn")
         return poses, moving
 
-    def _limits(self, moving: list[ElementTree.Element]) -> tuple[Array, Array, Array, Array]:
-        """Return lower and upper position, speed and torque limits, shapes (n,)."""
+    def _limits(self, moving: list[ElementTree.Element]) -> Array:
+        """Return lower and upper position, speed and torque limits, shape (4, n)."""
         table = np.zeros((4, len(moving)))
         for k, joint in enumerate(moving):
             limit, name = joint.find("limit"), joint.get("name")
             self._tree.part = f"joint {name}"
-            endless = joint.get("type") == "continuous"
-            for row, (attribute, field, usual) in enumerate(
-                (("lower", "lower_rad", -TUNING.continuous_rad), ("upper", "upper_rad", TUNING.continuous_rad),
-                 ("velocity", "velocity_radps", None), ("effort", "torque_nm", None))
-            ):  # fmt: skip
+            for row, (attribute, field, endless) in enumerate(_LIMITS):
                 given = getattr(self._given, field)
                 if given is not None and k < len(given):
                     table[row, k] = given[k]
-                elif endless and usual is not None:
-                    table[row, k] = usual
+                elif endless is not None and joint.get("type") == "continuous":
+                    table[row, k] = endless
                 elif limit is None or attribute not in limit.attrib:
                     self.faults.append(f"joint {name}: no limit {attribute!r}; give {field} in the YAML file")
                 else:
@@ -221,18 +221,16 @@ class _Reader:
             for value, field in ((velocity, "velocity_radps"), (torque, "torque_nm")):
                 if not value > 0:
                     self.faults.append(f"joint {name}: {field} is {value:g}, want more than 0")
-        return table[0], table[1], table[2], table[3]
+        return table
 
-    def _rigid(
-        self, chain: list[str], poses: dict[str, Array], moving: list[ElementTree.Element]
-    ) -> list[list[tuple[str, Array]]]:
+    def _rigid(self, chain: list[str], poses: dict[str, Array], moving: list[ElementTree.Element]) -> list[Group]:
         """Return for the base and each moving link the links fixed to it, with their pose in the root at zero.
 
         A flange that is fixed to the last link is left out, and so is what is behind it; other fixed branches belong to the arm.
         """
         carrier: dict[str, int] = {}
         movers = {linked(joint, "child"): k + 1 for k, joint in enumerate(moving)}
-        groups: list[list[tuple[str, Array]]] = [[] for _ in range(len(moving) + 1)]
+        groups: list[Group] = [[] for _ in range(len(moving) + 1)]
         current = 0
         for link in chain:
             current = movers.get(link, current)
@@ -250,19 +248,17 @@ class _Reader:
                     todo.append(child)
         return groups
 
-    def _inertia(self, group: list[tuple[str, Array]], R_BF: Array, origin: Array, *, name: str, fixed: bool) -> Inertia:
+    def _inertia(self, group: Group, R_BF: Array, origin: Array) -> Inertia:
         """Return the inertia of links fixed to each other, about their common centre, in the axes of the flange at zero."""
         parts = []
         for link, X in group:
-            inertial = self._links[link].find("inertial") if link in self._links else None
+            inertial = self._links[link].find("inertial")
             if inertial is None:
                 continue
             self._tree.part = f"link {link}"
             mass = float(self._numbers(inertial.find("mass"), "value", "0")[0])
             entries = inertial.find("inertia")
-            xx, yy, zz, xy, xz, yz = (
-                float(self._numbers(entries, key, "0")[0]) for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-            )
+            xx, yy, zz, xy, xz, yz = (float(self._numbers(entries, f"i{axes}", "0")[0]) for axes in _MOMENTS)
             tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
             if mass == 0 and not tensor.any():
                 continue
@@ -272,16 +268,14 @@ class _Reader:
                 self.faults.append(f"link {link}: its centre of mass is farther than {TUNING.largest_link_m:g} m: want metres")
             X_C = X @ offset
             parts.append((mass, X_C[:3, 3], X_C[:3, :3] @ tensor @ X_C[:3, :3].T))
-        total = sum(mass for mass, _, _ in parts)
+        name, total = group[0][0], sum(mass for mass, _, _ in parts)
+        fixed = name == self._base
         if total <= 0:
             if not fixed:
                 self.faults.append(f"link {name}: no mass")
             return Inertia(1.0, (0.0, 0.0, 0.0), (0.01, 0.01, 0.01))  # the base does not move
         centre = sum(mass * p for mass, p, _ in parts) / total
-        about = sum(
-            tensor + mass * ((r := p - centre) @ r * np.eye(3) - np.outer(r, r))
-            for mass, p, tensor in parts  # Steiner
-        )
+        about = sum(tensor + mass * ((r := p - centre) @ r * np.eye(3) - np.outer(r, r)) for mass, p, tensor in parts)  # Steiner
         if np.linalg.eigvalsh(about)[0] <= 0 and not fixed:
             self.faults.append(f"link {name}: inertia is not positive: a principal moment is 0 kg m^2")
         local = R_BF.T @ about @ R_BF
@@ -305,14 +299,11 @@ class _Reader:
         elif c > mass * TUNING.largest_link_m**2 > 0:
             self.faults.append(f"link {link}: inertia of {c:.3g} kg m^2 with {mass:g} kg: its unit is not kg m^2")
 
-    def _shape(self, group: list[tuple[str, Array]], R_BF: Array, origin: Array) -> tuple[Capsule, ...]:
+    def _shape(self, group: Group, R_BF: Array, origin: Array) -> tuple[Capsule, ...]:
         """Return a capsule about the collision geometry of each link of a group (visual where there is none)."""
         found = []
         for link, X in group:
-            element = self._links.get(link)
-            if element is None:
-                continue
-            shapes = element.findall("collision") or element.findall("visual")
+            shapes = self._links[link].findall("collision") or self._links[link].findall("visual")
             self._tree.part = f"link {link}"
             clouds = [points for shape in shapes if len(points := self._points(link, X, shape))]
             if clouds:

@@ -41,13 +41,6 @@ class Pinhole:
         """K [px], shape (3, 3)."""
         return np.array([[self.fx, 0.0, self.cx], [0.0, self.fy, self.cy], [0.0, 0.0, 1.0]])
 
-    def directions(self) -> Array:
-        """Return viewing directions in C with unit z, shape (height, width, 3): depth times direction is the point in C."""
-        directions = np.ones((self.height, self.width, 3))
-        directions[..., 0] = (np.arange(self.width) - self.cx) / self.fx
-        directions[..., 1] = ((np.arange(self.height) - self.cy) / self.fy)[:, np.newaxis]
-        return directions
-
     def every(self, k: int) -> Pinhole:
         """Return the camera of every `k`-th pixel: its pixel (i, j) is (k // 2 + k i, k // 2 + k j) of this one."""
         first = k // 2

@@ -166,7 +166,9 @@ def ball(centre: tuple[float, float, float], radius: float) -> Mesh:
 
 def rays() -> np.ndarray:
     """Viewing directions in world, unit depth."""
-    return PINHOLE.directions() @ X_WC[:3, :3].T
+    v, u = np.indices((PINHOLE.height, PINHOLE.width))
+    directions = np.stack(((u - PINHOLE.cx) / PINHOLE.fx, (v - PINHOLE.cy) / PINHOLE.fy, np.ones(u.shape)), axis=-1)
+    return directions @ X_WC[:3, :3].T
 
 
 def test_depth_and_incidence_of_a_plane_are_analytic() -> None:

@@ -8,18 +8,7 @@ from typing import Any, ClassVar, Final, NamedTuple
 import numpy as np
 
 from palpate_bus.contract import contract
-from palpate_bus.messages import (
-    ImpedanceSetpoint,
-    JointTorqueCommand,
-    Point,
-    Pose,
-    Quaternion,
-    RobotStatus,
-    Twist,
-    Vector3,
-    Wrench,
-    codec,
-)
+from palpate_bus.messages import JointTorqueCommand, RobotStatus, codec
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
 from palpate_bus.messages.stamps import MS, NS, duration_message, header, nanoseconds
@@ -95,24 +84,12 @@ class ControlService(Service):
 
     def _warm_up(self) -> None:
         """Compile the law in both modes on decoded set-points, which would take too long at 1 kHz."""
-        kind, rest, still = "palpation_msgs/msg/ImpedanceSetpoint", self._still, Vector3(0.0, 0.0, 0.0)
-        pose = Pose(Point(0.0, 0.0, 0.0), Quaternion(0.0, 0.0, 0.0, 1.0))
+        kind, rest, axes = "palpation_msgs/msg/ImpedanceSetpoint", self._still, np.ones(6)
         for mode in ControlMode:
             guide = Extrapolator(contract().topics[TOPIC].period)
             for stamp in (0, MS):
-                message = ImpedanceSetpoint(
-                    header(stamp, "world"),
-                    int(mode),
-                    pose,
-                    Twist(still, still),
-                    Wrench(still, still),
-                    np.ones(6),
-                    np.ones(6),
-                    rest,
-                    rest,
-                    np.ones_like(rest),
-                    self._full_validity,
-                )
+                pose, motion = (np.eye(3), np.zeros(3)), (np.zeros(6), np.zeros(6))
+                message = Setpoint(stamp, mode, *pose, *motion, axes, axes, rest, rest, np.ones_like(rest)).message()
                 guide.accept(Setpoint.from_message(codec.decode(codec.encode(message, kind), kind)), stamp)
                 self._controller.command(self._home, rest, guide.at(stamp))
         self._controller.reset()

@@ -129,21 +129,23 @@ class Pipeline:
 
         seen = visibility.seen(p_A, self._exam)
         coverage = float(np.mean(seen))
+
+        def failed(reason: ViewReason, message: str) -> Perceived:
+            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, reason, message)
+
         if fused.agreeing < PIPELINE.least_agreeing:
             differing = f"{100 * (1 - fused.agreeing):.0f} % of the depths"
             message = f"{differing} differ from frame to frame by more than {cloud.GATE:g} times the camera's noise"
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, ViewReason.BAD_FRAMES, message)
+            return failed(ViewReason.BAD_FRAMES, message)
 
         if coverage < PIPELINE.least_coverage:
             gaps = self._gaps(seen, p_A, depth, origin, camera)
-            message = (
-                f"{100 * coverage:.0f} % of the region of interest seen, {100 * PIPELINE.least_coverage:.0f} % needed: {gaps}"
-            )
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, gaps.reason, message)
+            part = f"{100 * coverage:.0f} % of the region of interest seen"
+            return failed(gaps.reason, f"{part}, {100 * PIPELINE.least_coverage:.0f} % needed: {gaps}")
 
         if (away := float(np.abs(shift).max())) > PIPELINE.margin_m:  # outside the cropped and fitted area
             message = f"the patient moved by {1e3 * away:.0f} mm since the first scan (limit {1e3 * PIPELINE.margin_m:.0f} mm)"
-            return Perceived(points, None, Targets.none(), 0.0, fused.frames, coverage, ViewReason.PATIENT_MOVED, message)
+            return failed(ViewReason.PATIENT_MOVED, message)
 
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))

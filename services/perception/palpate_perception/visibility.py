@@ -104,11 +104,8 @@ class Gaps:
     @property
     def reason(self) -> ViewReason:
         """The reason to act on: a blocked view even if it is not the largest part, since another view can avoid it."""
-        return (
-            ViewReason.VIEW_BLOCKED
-            if ViewReason.VIEW_BLOCKED in self.shares
-            else next(iter(self.shares), ViewReason.TOO_FEW_POINTS)
-        )
+        blocked = ViewReason.VIEW_BLOCKED
+        return blocked if blocked in self.shares else next(iter(self.shares), ViewReason.TOO_FEW_POINTS)
 
     def __str__(self) -> str:
         """Text for people."""

@@ -121,11 +121,9 @@ def watched(exam: Exam) -> RegionBox:
 def basis(p_A: Array, low: Array, high: Array) -> Array:
     """Products of Legendre polynomials of total degree up to WALL_FIT.degree over a rectangle, at places, shape (n, 2 or 3)."""
     x, y = (2 * (np.clip(p_A[:, :2], low, high) - low) / (high - low) - 1).T
-    columns = legendre.legvander2d(x, y, [WALL_FIT.degree, WALL_FIT.degree]).reshape(
-        len(x), WALL_FIT.degree + 1, WALL_FIT.degree + 1
-    )
-    i, j = np.indices((WALL_FIT.degree + 1, WALL_FIT.degree + 1))
-    return np.asarray(columns[:, i + j <= WALL_FIT.degree])
+    degree = WALL_FIT.degree
+    i, j = np.indices((degree + 1, degree + 1)).reshape(2, -1)
+    return np.asarray(legendre.legvander2d(x, y, [degree, degree])[:, i + j <= degree])
 
 
 def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[WallPixels, Array]:
@@ -140,18 +138,12 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     box = watched(exam)
     keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE.top_m + CROP.table_clearance_m)
     keep[keep] &= sigma[keep] < WALL_FIT.edge_noise * np.median(sigma[keep]) if keep.any() else False
-    if np.count_nonzero(keep) < WALL_FIT.least_pixels:
-        raise WallNotVisibleError(
-            f"{np.count_nonzero(keep)} pixels of the small image show the wall, want {WALL_FIT.least_pixels}"
-        )
+    _check_count(keep, "show the wall")
     field = surface.fit(p_A[keep], sigma[keep], box.low[:2], box.high[:2], WALL_FIT.cutoff_m)
     n_A = field.normal(p_A[:, 0], p_A[:, 1])
     slope = np.einsum("ij,ij->i", n_A, r_C @ X_AC[:3, :3].T)
     keep &= -slope > WALL_FIT.least_cosine * np.linalg.norm(r_C, axis=1)
-    if np.count_nonzero(keep) < WALL_FIT.least_pixels:
-        raise WallNotVisibleError(
-            f"{np.count_nonzero(keep)} pixels of the small image show the wall at a usable angle, want {WALL_FIT.least_pixels}"
-        )
+    _check_count(keep, "show the wall at a usable angle")
     pixel, gain = pixel[keep], 1 / slope[keep]
     mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
 
@@ -162,12 +154,17 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     d = outward @ weight / (weight @ lifts)
     if not mode.coefficients[1:].any():  # still: what d shows is noise
         d = np.zeros(len(d))
-    expired = (
-        float(np.quantile(np.convolve(d, np.full(3, 1 / 3), "valid"), WALL_FIT.expired_share)) if len(d) > 2 else float(d.min())
-    )
+    smooth, share = (np.convolve(d, np.full(3, 1 / 3), "valid"), WALL_FIT.expired_share) if len(d) > 2 else (d, 0.0)
+    expired = float(np.quantile(smooth, share))
     depth = mean + gain * lifts * expired
     r_W = r_C[keep] @ camera.X_WC[:3, :3].T
     return WallPixels(pixel, depth, gain, sigma, p_A, n_A, mode, lifts, r_W, camera), d - expired
+
+
+def _check_count(keep: NDArray[np.bool_], what: str) -> None:
+    """Raise WallNotVisibleError if too few pixels are kept."""
+    if (count := np.count_nonzero(keep)) < WALL_FIT.least_pixels:
+        raise WallNotVisibleError(f"{count} pixels of the small image {what}, want {WALL_FIT.least_pixels}")
 
 
 def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
@@ -178,11 +175,7 @@ def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
     step = np.diff(without_gaps(seen), axis=0)
     between = np.isfinite(seen[1:]) & np.isfinite(seen[:-1])  # steps at the edges of gaps are not noise
     noise = np.sqrt(np.sum(np.where(between, step, 0.0) ** 2, axis=0) / np.maximum(between.sum(axis=0), 1) / 2)
-    sigma = (
-        np.where(between.any(axis=0), noise, WALL_FIT.unknown_noise_m)
-        if len(frames) > 2
-        else np.full(len(pixel), WALL_FIT.unknown_noise_m)
-    )
+    sigma = np.where(between.any(axis=0) & (len(frames) > 2), noise, WALL_FIT.unknown_noise_m)
     return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
 
 
