@@ -12,9 +12,9 @@ An episode is one patient and `presses` presses. The reward of a press is the de
 truth (no lump, or one near its true place), at least `REWARD.least`.
 """
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import lru_cache
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -30,8 +30,7 @@ from palpate_search.presses import Budget, Task, press_duration
 ID: Final = "Palpate/Search-v0"
 
 
-@dataclass(frozen=True)
-class RewardTuning:
+class RewardTuning(NamedTuple):
     """Settings of the reward."""
 
     per_s: float = 0.01

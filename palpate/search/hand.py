@@ -4,8 +4,8 @@
 (`palpate.quick.felt`): no physics, a hundredth of the time. Places are in the registered abdomen frame.
 """
 
-from dataclasses import dataclass, replace
-from typing import Final, Protocol
+from dataclasses import replace
+from typing import Final, NamedTuple, Protocol
 
 import numpy as np
 
@@ -20,8 +20,7 @@ from palpate_models.scenario.schema import Scenario
 from palpate_search.presses import Press, Task, press_duration
 
 
-@dataclass(frozen=True)
-class HandTuning:
+class HandTuning(NamedTuple):
     """Presses of the hands."""
 
     descent_mps: float = 0.030
@@ -117,16 +116,8 @@ class PatientHand(_Timed):
                 forces.append(force)
         patient.rest(PERIOD_S)
         noise = float(np.std(forces) / np.sqrt(len(forces)))
-        return Press(
-            float(xy[0]),
-            float(xy[1]),
-            float(np.mean(depths)),
-            float(np.mean(forces)),
-            patient.time,
-            noise,
-            limited,
-            self._reported_sd_m,
-        )
+        depth, force = float(np.mean(depths)), float(np.mean(forces))
+        return Press(float(xy[0]), float(xy[1]), depth, force, patient.time, noise, limited, self._reported_sd_m)
 
     @property
     def _period(self) -> int:

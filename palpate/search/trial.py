@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from time import perf_counter
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -15,8 +15,7 @@ from palpate_models.scenario.schema import Scenario
 from palpate_search.posterior import Policy, Posterior
 
 
-@dataclass(frozen=True)
-class TrialLump:
+class TrialLump(NamedTuple):
     """The lump and the budget of a trial."""
 
     contrast: float = 2.0
@@ -108,13 +107,4 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
         rows.append((*felt.xy, felt.depth, felt.force, hand.spent, near, belief.lump, *place))
         left = belief.left(hand.spent)
     table = np.array(rows).reshape(-1, 9)
-    return Trial(
-        xy=table[:, :2],
-        depth=table[:, 2],
-        force=table[:, 3],
-        seconds=table[:, 4],
-        near=table[:, 5],
-        lump=table[:, 6],
-        place=table[:, 7:],
-        computing_s=computing_s / max(len(rows), 1),
-    )
+    return Trial(table[:, :2], *table[:, 2:7].T, table[:, 7:], computing_s / max(len(rows), 1))

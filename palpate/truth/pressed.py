@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Final
+from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -74,8 +74,7 @@ class TrueSurface:
         return np.asarray(np.nan_to_num(np.linalg.norm(normal, axis=1) / normal[:, 2], nan=1.0))
 
 
-@dataclass(frozen=True)
-class PressedGrid:
+class PressedGrid(NamedTuple):
     """Pressed places and their reach."""
 
     nearest: int = 4

@@ -140,11 +140,8 @@ def _causality(variable: Variable) -> dict[str, str]:
     if variable.kind is VariableKind.INPUT:
         return {"causality": "input", "variability": "continuous"}
     if variable.parameter:
-        return {
-            "causality": "parameter",
-            "variability": "fixed" if variable.kind is VariableKind.FIXED else "tunable",
-            "initial": "exact",
-        }
+        fixed = variable.kind is VariableKind.FIXED
+        return {"causality": "parameter", "variability": "fixed" if fixed else "tunable", "initial": "exact"}
     if variable.kind is VariableKind.STATE:
         return {"causality": "local", "variability": "continuous", "initial": "exact"}
     if variable.role is VariableRole.CALCULATED:
@@ -240,16 +237,8 @@ def description_2(token: str, about: str, starts: Mapping[str, Array], sizes: Si
         causality = _causality(variable)
         for k, index in enumerate(product(*(range(1, extent + 1) for extent in variable.extents(sizes)))):
             suffix = f"[{','.join(map(str, index))}]" if index else ""
-            scalar = ET.SubElement(
-                parent,
-                "ScalarVariable",
-                {
-                    "name": variable.name + suffix,
-                    "valueReference": str(variable.vr + k),
-                    "description": variable.doc,
-                    **causality,
-                },
-            )
+            facts = {"name": variable.name + suffix, "valueReference": str(variable.vr + k), "description": variable.doc}
+            scalar = ET.SubElement(parent, "ScalarVariable", facts | causality)
             attributes = _type_attributes(variable)
             if start is not None:
                 attributes["start"] = _number(start[k], variable.integer)

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,8 +14,7 @@ from palpate_models.patient.mesh import orient, vertex_normals
 from palpate_models.patient.schema import Anatomy, Skeleton
 
 
-@dataclass(frozen=True)
-class BodyShape:
+class BodyShape(NamedTuple):
     """Relief of the parametric abdomen, and its mesh."""
 
     costal_edge_m: float = 0.04

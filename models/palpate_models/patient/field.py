@@ -17,9 +17,8 @@ of 40 mm that touches the skin is felt 15 % too little. S was chosen on one ridg
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from statistics import harmonic_mean
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,8 +29,7 @@ from palpate_models.patient.schema import Background, Lesion, Structure
 from palpate_models.patient.wall import Guarding
 
 
-@dataclass(frozen=True)
-class FeltLump:
+class FeltLump(NamedTuple):
     """Constants of the head of this file."""
 
     share: float = 0.857
@@ -65,8 +63,7 @@ def at_skin(lesion: Lesion) -> Lesion:
     )
 
 
-@dataclass(frozen=True)
-class HealthyField:
+class HealthyField(NamedTuple):
     """The healthy wall's variation."""
 
     features: int = 512

@@ -5,7 +5,7 @@ The file is CSV with a header and one row per node of a complete regular grid, i
 
 from dataclasses import dataclass, fields
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.interpolate import RegularGridInterpolator
@@ -17,8 +17,7 @@ from palpate_models.patient.mesh import boundary_vertices, orient, vertex_normal
 from palpate_models.patient.mesh_file import MeshError
 
 
-@dataclass(frozen=True)
-class GridTuning:
+class GridTuning(NamedTuple):
     """A grid that can be a body."""
 
     apron_m: float = 0.12

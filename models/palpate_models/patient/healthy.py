@@ -18,8 +18,7 @@ from palpate_models.patient.field import smoothstep
 from palpate_models.patient.schema import Anatomy, Muscles
 
 
-@dataclass(frozen=True)
-class VariationTuning:
+class VariationTuning(NamedTuple):
     """Random fields of a person, and what muscles add."""
 
     features: int = 96

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.mesh_file import IntArray, MeshError, read_mesh
 
 
-@dataclass(frozen=True)
-class MeshLimits:
+class MeshLimits(NamedTuple):
     """Surfaces that can be a body."""
 
     largest_m: float = 3.0

@@ -19,8 +19,7 @@ from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.wall import Guarding
 
 
-@dataclass(frozen=True)
-class PersonTuning:
+class PersonTuning(NamedTuple):
     """Distributions of a person, besides the body and the wall."""
 
     gap_m: tuple[float, float] = (0.002, 0.020)

@@ -5,8 +5,7 @@ the flange.
 """
 
 import warnings
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -18,8 +17,7 @@ from palpate_models.robot.urdf_arm import load_arm, read_arm
 from palpate_models.scenario.schema import Robot
 
 
-@dataclass(frozen=True)
-class ToolGeometry:
+class ToolGeometry(NamedTuple):
     """F/T sensor and standoff between flange and indenter."""
 
     flange_to_ft_m: float = 0.030

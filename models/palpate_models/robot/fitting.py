@@ -1,7 +1,6 @@
 """Fits of values that an arm's URDF and file leave open: a ready posture, and a capsule about each link."""
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.optimize import least_squares
@@ -10,8 +9,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm, Capsule, Point
 
 
-@dataclass(frozen=True)
-class HomeTuning:
+class HomeTuning(NamedTuple):
     """The posture that is sought."""
 
     starts: int = 24

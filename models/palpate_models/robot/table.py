@@ -1,7 +1,7 @@
 """The operating table and the robot's cubic base, as boxes in world."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -10,8 +10,7 @@ from palpate_models.scenario.schema import Robot
 from palpate_models.section import Pose, Vec3
 
 
-@dataclass(frozen=True)
-class OperatingTable:
+class OperatingTable(NamedTuple):
     """Measures of the operating table."""
 
     top_m: float = 0.73

@@ -4,12 +4,12 @@
 """
 
 import sys
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from xml.etree import ElementTree
 
 import numpy as np
@@ -24,8 +24,7 @@ from palpate_models.robot.urdf_tree import UrdfTree, linked
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 
 
-@dataclass(frozen=True)
-class ArmTuning:
+class ArmTuning(NamedTuple):
     """Values of an arm that says nothing of them, and bounds of plausible ones."""
 
     stiffness_per_torque: float = 5.0

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,7 @@ Surface = Callable[[Array], tuple[Array, Array]]
 """Perceived surface: maps xy in A [m], shape (n, 2), to points [m] and outward unit normals, both (n, 3), in A."""
 
 
-@dataclass(frozen=True)
-class PatternLimits:
+class PatternLimits(NamedTuple):
     """Targets that a pattern may give, and the first touches."""
 
     most_targets: int = 20_000

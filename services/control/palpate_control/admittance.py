@@ -16,8 +16,8 @@ The joints follow the planned posture, corrected by inverse kinematics on comman
 a singular wrist the tool tilts, where two joints would otherwise turn fast against each other and leave the plan.
 """
 
-from dataclasses import dataclass
 from math import exp
+from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -28,8 +28,7 @@ from palpate_control.reference import Reference
 from palpate_models.numerics.frames import GRAVITY, Array
 
 
-@dataclass(frozen=True)
-class AdmittanceTuning:
+class AdmittanceTuning(NamedTuple):
     """Constants of the law."""
 
     yield_s: float = 0.15

@@ -20,7 +20,6 @@ M_ii joint by joint, two nearly coaxial joints that turn against each other are 
 few milliseconds then makes the arm oscillate.
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -63,8 +62,7 @@ class LawTuning(NamedTuple):
 LAW = LawTuning()
 
 
-@dataclass(frozen=True)
-class ControllerTuning:
+class ControllerTuning(NamedTuple):
     """Settings of the controller outside the compiled law."""
 
     joint_clip_rad: float = 0.25
@@ -76,17 +74,6 @@ class ControllerTuning:
 
 
 TUNING = ControllerTuning()
-
-
-class CartesianGains(NamedTuple):
-    """Gains of mode CARTESIAN: K and B for the six axes of D, shape (6,); K_0 and B_0 for the null-space posture, shape (n,)."""
-
-    K: Array
-    B: Array
-    K_0: Array
-    B_0: Array
-    J_bar: Array
-    """Inverse of the Jacobian (world axes) consistent with W = (M + T D)^-1: W J^T (J W J^T)^-1, shape (n, 6)."""
 
 
 class JointGains(NamedTuple):
@@ -107,7 +94,7 @@ class ImpedanceController:
         self._friction = np.stack((model.viscous_friction, model.coulomb_friction, model.velocity_limit))
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._cartesian_gains: Arrays = ()  # the fields of `CartesianGains`
+        self._cartesian_gains: Arrays = ()  # see `cartesian_gains`
         self._joint_gains = JointGains(np.zeros(0), np.zeros(0))
 
     def reset(self) -> None:
@@ -129,7 +116,7 @@ class ImpedanceController:
             setpoint = reference.setpoint  # copied: arrays of messages are read-only, a different type for numba
             requested = (setpoint.stiffness.copy(), setpoint.damping_ratio.copy(), setpoint.joint_stiffness.copy())
             inertia, friction = model.inertia(q), model.viscous_friction
-            self._cartesian_gains = tuple(cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time))
+            self._cartesian_gains = cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time)
         arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
         R_DI = R_WD.T.dot(model.R_WI)
         gains, torque = self._cartesian_gains, np.empty_like(q)
@@ -175,7 +162,7 @@ def cartesian_torque(
         x: coordinates of the desired `ReferenceMotion`, shape (18 + 3 n,).
         phi: rotation vector of R_DI [rad], shape (3,).
         Jlog: derivative of `phi` with respect to a rotation in axes of I, shape (3, 3).
-        gains: the fields of `CartesianGains`.
+        gains: as `cartesian_gains` returns them.
         friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, n).
         torque: output [N m], shape (n,).
     """
@@ -217,7 +204,7 @@ def to_axes(R_AB: Array, x_B: Array) -> Array:
 
 
 @compiled
-def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> CartesianGains:
+def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> Arrays:
     """Return the stiffness that is stable when sampled, the matching damping, and the null-space gains at a posture.
 
     Args:
@@ -227,6 +214,9 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
         M: joint-space inertia [kg m^2], shape (n, n).
         D: viscous joint friction [N m s/rad], shape (n,).
         dead_time: delay from measurement to torque [s].
+
+    Returns K and B for the six axes of D, shapes (6,), K_0 and B_0 for the null-space posture, shapes (n,), and the inverse of J
+    that these weigh, J_bar, shape (n, 6).
     """
     stiffness, damping_ratio, K_0 = requested
     turn = np.kron(np.eye(2), R_WD.T)  # twist or wrench from world axes to axes of D
@@ -242,7 +232,7 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     B = 2 * damping_ratio * np.sqrt(K * mass)
     B_0 = 2 * LAW.joint_damping_ratio * np.sqrt(K_0 / np.diag(M_inverse))
     J_bar = W @ J.T @ slow_inertia @ turn
-    return CartesianGains(K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar)
+    return K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:

@@ -1,6 +1,5 @@
 """Reference motion between set-points: each is extrapolated by its velocity and blended with the previous one."""
 
-from dataclasses import dataclass
 from math import exp
 from typing import NamedTuple
 
@@ -11,8 +10,7 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class ReferenceTuning:
+class ReferenceTuning(NamedTuple):
     """Extrapolation and blending of set-points."""
 
     bridged_periods: int = 3

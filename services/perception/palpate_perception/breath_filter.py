@@ -10,8 +10,7 @@ The displacement is a level and two stochastic oscillators, one at the breathing
 each with a constant variance. Variances and rate are re-estimated from the last half minute, since amplitude and period change.
 """
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,7 @@ from numpy.typing import NDArray
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class BreathTuning:
+class BreathTuning(NamedTuple):
     """Tuning of the breath filter."""
 
     rates_per_min: tuple[float, float] = (4.0, 40.0)

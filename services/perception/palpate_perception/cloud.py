@@ -13,7 +13,7 @@ excludes frames in which the pixel shows something behind an edge.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,7 @@ from palpate_models.numerics.frames import Array, apply, inverse
 from palpate_models.scenario.schema import Exam
 
 
-@dataclass(frozen=True)
-class CloudTuning:
+class CloudTuning(NamedTuple):
     """Limits of the cropped cloud."""
 
     height_m: tuple[float, float] = (-0.16, 0.06)

@@ -9,8 +9,8 @@ pixels show the drift alone,
 and its part slower than `DRIFT.tau_s` is subtracted from all depths.
 """
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ from palpate_perception.tracker import NOTHING, Followed, Tracker, WallAverage, 
 from palpate_perception.wall import WALL_FIT, WallNotVisibleError, WallPixels, steady
 
 
-@dataclass(frozen=True)
-class MaskMargins:
+class MaskMargins(NamedTuple):
     """Margins of the arm's mask."""
 
     arm_m: float = 0.02
@@ -102,8 +101,7 @@ def passes(a: Array, p: Array, q: Array, reach: Array) -> NDArray[np.bool_]:
     return found
 
 
-@dataclass(frozen=True)
-class DriftTuning:
+class DriftTuning(NamedTuple):
     """Tuning of the camera's drift."""
 
     table_distance_m: float = 0.04
@@ -147,8 +145,7 @@ class CameraDrift:
         return self.drift
 
 
-@dataclass(frozen=True)
-class FollowerTuning:
+class FollowerTuning(NamedTuple):
     """End of the observation that follows a trigger."""
 
     longest_s: float = 10.0

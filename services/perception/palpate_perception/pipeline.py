@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +19,7 @@ from palpate_perception.visibility import Gaps, ViewReason
 from palpate_perception.wall import BreathingMode
 
 
-@dataclass(frozen=True)
-class PipelineTuning:
+class PipelineTuning(NamedTuple):
     """Sizes and limits of the five steps."""
 
     margin_m: float = 0.03

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -36,8 +35,7 @@ FRAME: Final = contract().topics["perception/targets"].frame or ""
 MOTION_FRAME: Final = contract().topics["perception/motion"].frame or ""
 
 
-@dataclass(frozen=True)
-class PerceptionTimes:
+class PerceptionTimes(NamedTuple):
     """Times of the service."""
 
     correction_period_ns: int = 5 * NS

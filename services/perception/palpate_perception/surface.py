@@ -9,7 +9,7 @@ set by the length at which the gain is one half, which does not depend on noise 
 """
 
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +20,7 @@ from scipy.sparse import coo_array, csr_array, kron
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class SurfaceTuning:
+class SurfaceTuning(NamedTuple):
     """Tuning of the surface fit."""
 
     cutoff_m: float = 0.03

@@ -31,7 +31,7 @@ the surface.
 
 from dataclasses import dataclass
 from enum import Enum, auto
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,7 @@ from palpate_perception.surface import FittedSurface
 from palpate_perception.wall import WallPixels
 
 
-@dataclass(frozen=True)
-class ShiftTuning:
+class ShiftTuning(NamedTuple):
     """Tuning of the registration of a patient who has moved."""
 
     prior_sd: tuple[float, ...] = (0.010, 0.015, 0.015, 0.05)
@@ -84,8 +83,7 @@ def shift_between(before: WallPixels, after: WallPixels, middle: Array, drift: f
     return np.asarray(motion[1:3])
 
 
-@dataclass(frozen=True)
-class AverageTuning:
+class AverageTuning(NamedTuple):
     """Tuning of the surface correction from the mean of all small images."""
 
     least_images: int = 30
@@ -131,8 +129,7 @@ FORECAST_S: Final[Array] = 0.050 * np.arange(11.0)
 """Forecast times after an exposure [s]."""
 
 
-@dataclass(frozen=True)
-class TrackerTuning:
+class TrackerTuning(NamedTuple):
     """Tuning of the tracking of breathing."""
 
     patch_m: float = 0.11
@@ -162,8 +159,7 @@ class TrackerTuning:
 TRACKING: Final = TrackerTuning()
 
 
-@dataclass(frozen=True)
-class PatientMotionTuning:
+class PatientMotionTuning(NamedTuple):
     """Tuning of the detection of patient motion."""
 
     memory: float = 0.7

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,8 +12,7 @@ from palpate_models.scenario.schema import Exam
 from palpate_perception.cloud import project
 
 
-@dataclass(frozen=True)
-class VisibilityTuning:
+class VisibilityTuning(NamedTuple):
     """Sizes of the search for gaps."""
 
     cell_m: float = 0.01

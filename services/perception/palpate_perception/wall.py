@@ -10,7 +10,7 @@ Errors that are fixed to the image cancel, since only changes of a pixel count.
 """
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.polynomial import legendre
@@ -24,8 +24,7 @@ from palpate_perception import cloud, surface
 from palpate_perception.cloud import CROP, Image, Intrinsics, RegionBox
 
 
-@dataclass(frozen=True)
-class WallFitTuning:
+class WallFitTuning(NamedTuple):
     """Tuning of the wall model."""
 
     margin_m: float = 0.12

@@ -6,7 +6,6 @@ F_S - R_SW m g at rest while nothing is touched, in whatever orientations. Torqu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -55,8 +54,7 @@ class ForceCompensation:
         return np.asarray(R_WS @ (wrench_S[:3] - self.bias) - self.weight_W + self.mass * a_W)
 
 
-@dataclass(frozen=True)
-class ContactThresholds:
+class ContactThresholds(NamedTuple):
     """Contact force at which contact begins and ends."""
 
     on_n: float = 0.3

@@ -12,12 +12,10 @@ with F the normal force, L the magnitude of the whole force (a hard edge pushes 
 magnitude expected when the command takes effect.
 """
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 
-@dataclass(frozen=True)
-class DepthTuning:
+class DepthTuning(NamedTuple):
     """Constants of the law above."""
 
     exponent: float = 1.45

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -30,8 +30,7 @@ from palpate_planning.waits import FOR_FINDINGS, FOR_PERCEPTION, FOR_PLAN, FOR_R
 from palpate_planning.wall.wall import Wall, plane
 
 
-@dataclass(frozen=True)
-class ExamTuning:
+class ExamTuning(NamedTuple):
     """Limits of repetition and time of the phases."""
 
     rescans_max: int = 2

@@ -2,8 +2,8 @@
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,8 +21,7 @@ from palpate_planning.strokes.segments import Segment
 from palpate_planning.wall.breath import Breath
 
 
-@dataclass(frozen=True)
-class WallTuning:
+class WallTuning(NamedTuple):
     """Times and limits for a wall that cannot be tracked or touched."""
 
     calm_s: float = 1.0
@@ -38,8 +37,7 @@ class WallTuning:
     """With gated breathing, samples count up to this distance from the end of expiration, where the wall moves most."""
 
 
-@dataclass(frozen=True)
-class RecoveryTuning:
+class RecoveryTuning(NamedTuple):
     """Limits and speeds for strokes that are taken up again."""
 
     soft_stops_max: int = 3
@@ -58,8 +56,7 @@ class RecoveryTuning:
     return_acceleration_mps2: float = 0.8
 
 
-@dataclass(frozen=True)
-class SurgeTuning:
+class SurgeTuning(NamedTuple):
     """A force that rises as no stroke of the arm lets it: the patient coughs or tenses."""
 
     over: int = 3

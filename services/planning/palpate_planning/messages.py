@@ -20,32 +20,21 @@ COINCIDENT_M = 1e-4
 
 def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None) -> Message:
     """Return `palpation_msgs/ExamState`; without a contact (before the first reading of the robot) nothing is measured."""
-    p, n = np.zeros(3), np.array((0.0, 0.0, 1.0))
-    if contact is not None:
-        p, n = contact.skin
+    p, n = (np.zeros(3), np.array((0.0, 0.0, 1.0))) if contact is None else contact.skin
+    fields = {name: value for name, value in vars(status).items() if name not in ("phase", "cause")}
     return ExamState(
         header=header(t, "world"),
         phase=int(status.phase),
-        message=status.message,
-        target_index=status.target_index,
-        target_count=status.target_count,
-        targets_skipped=status.targets_skipped,
+        reason=int(status.cause.reason),
+        culprit=status.cause.culprit,
         in_contact=contact is not None and contact.touching,
-        steady=status.steady,
-        force_limited=status.force_limited,
-        view_blocked=status.view_blocked,
-        depth_setpoint=status.depth_setpoint,
         depth=0.0 if contact is None else contact.depth,
         normal_force=0.0 if contact is None else contact.force,
         surface_point=point_message(p),
         surface_normal=vector_message(n),
-        end_tick=status.end_tick,
         depth_uncertainty=0.0 if contact is None else contact.wall.sigma,
         wall_displacement=0.0 if contact is None else contact.wall.displacement,
-        stroke=status.stroke,
-        patient_moved=status.patient_moved,
-        reason=int(status.cause.reason),
-        culprit=status.cause.culprit,
+        **fields,
     )
 
 

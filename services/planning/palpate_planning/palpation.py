@@ -11,7 +11,6 @@
 | wall against its forecast | lifts | examined from shortly before; skipped after several repeats |
 """
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -44,8 +43,7 @@ from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_REQUEST, FOR_WALL, S
 from palpate_planning.wall.wall import PublishedTouch, Wall
 
 
-@dataclass(frozen=True)
-class PalpationTuning:
+class PalpationTuning(NamedTuple):
     """Tuning of repeated and requested strokes."""
 
     unnoticed_m: float = 0.03
@@ -310,7 +308,7 @@ class Palpation:
             return STROKE.hop_height_m
         if following[0].free is not None:
             return self._motion.free_height(t)
-        return clearance(wall.sigma(wall.perceived.xy(following[0].path.p[-1]), t))
+        return clearance(wall.at(wall.perceived.xy(following[0].path.p[-1]), t).sigma)
 
     def _report(self, t: int, contact: ContactMeasurement, rate: float) -> PalpationStep:
         motion, descent = self._motion, self.descent

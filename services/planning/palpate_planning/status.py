@@ -87,9 +87,9 @@ class Observation(NamedTuple):
     """Force at the tool by the joints alone [N]."""
 
 
-@dataclass(slots=True)
+@dataclass
 class ExamStatus:
-    """Fields of exam/state other than the measured contact."""
+    """Fields of exam/state other than the measured contact, by their names there."""
 
     phase: Phase = Phase.HOME
     message: str = "waiting for the robot"

@@ -7,7 +7,6 @@ indenter (`StrokeMotion`) and yields the stage of the stroke. The planning servi
 from __future__ import annotations
 
 from collections.abc import Callable, Generator
-from dataclasses import dataclass
 from enum import Enum
 from typing import Final, NamedTuple, TypeVar
 
@@ -19,8 +18,7 @@ from palpate_planning.wall.touch import FELT_N, Onset
 from palpate_planning.wall.wall import PublishedTouch
 
 
-@dataclass(frozen=True)
-class StrokeTuning:
+class StrokeTuning(NamedTuple):
     """Tolerances, times and heights of a stroke."""
 
     hop_height_m: float = 0.010
@@ -38,8 +36,7 @@ class StrokeTuning:
     """Samples count from this fraction of the path's speed on."""
 
 
-@dataclass(frozen=True)
-class TouchTuning:
+class TouchTuning(NamedTuple):
     """Times of taring, speeds and range of the search for the skin."""
 
     descend_mps: float = 0.08

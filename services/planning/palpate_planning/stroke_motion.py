@@ -1,7 +1,6 @@
 """Motion of the commanded indenter in a stroke: position along the path, depth below the surface, feed-forward force."""
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -21,8 +20,7 @@ from palpate_planning.strokes.segments import SEGMENTS, Segment
 from palpate_planning.wall.wall import Wall
 
 
-@dataclass(frozen=True)
-class MotionTuning:
+class MotionTuning(NamedTuple):
     """Speeds and accelerations of the commanded indenter."""
 
     depth_acceleration_mps2: float = 0.5

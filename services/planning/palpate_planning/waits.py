@@ -1,13 +1,11 @@
 """Waits of the examination: for what, from when on they are reported, and when they end."""
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 
 
-@dataclass(frozen=True)
-class WaitTuning:
+class WaitTuning(NamedTuple):
     """Time limits of the waits."""
 
     reported_s: float = 5.0

@@ -1,7 +1,6 @@
 """Tests of the waits: each says for what within some seconds, and ends within a bound that counts all of it."""
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -53,7 +52,7 @@ def reached(world: World, stage: StrokeStage, stroke: int) -> float:
 @pytest.fixture
 def limit_s(monkeypatch: pytest.MonkeyPatch) -> float:
     """Make the waits of strokes end early, to save time; return the limit."""
-    short = replace(WAIT, limit_s=20.0)
+    short = WAIT._replace(limit_s=20.0)
     monkeypatch.setattr(waits, "WAIT", short)
     return short.limit_s
 

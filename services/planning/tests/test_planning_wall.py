@@ -121,7 +121,7 @@ def test_errors_agree_with_the_reported_sd() -> None:
         correction = TouchCorrection()
         for place, height in zip(PLACES, truth, strict=False):
             correction.touch(HeightMeasurement(place, float(height + 4e-4 * rng.standard_normal()), 4e-4))
-        scores += [(correction.height(p) - h) / correction.sigma(p) for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
+        scores += [(correction.height(p) - h) / correction.at(p)[1] for p, h in zip(BETWEEN, truth[len(PLACES) :], strict=True)]
     assert np.std(scores) == pytest.approx(1.0, abs=0.2)
 
 
@@ -134,8 +134,8 @@ def test_touches_determine_the_roughness_of_the_error(rough_m: float, most_m: fl
     for place in places:
         height = tilted(place) + rough_m * rng.standard_normal() + 2e-4 * rng.standard_normal()
         correction.touch(HeightMeasurement(place, float(height), 2.5e-4))
-    assert roughness[0] <= correction.roughness <= roughness[1]
-    assert correction.sigma(np.array((0.02, 0.02))) < most_m
+    assert roughness[0] <= correction._fit.roughness <= roughness[1]
+    assert correction.at(np.array((0.02, 0.02)))[1] < most_m
 
 
 def test_the_latest_touch_can_be_revised() -> None:
@@ -146,16 +146,16 @@ def test_the_latest_touch_can_be_revised() -> None:
     revised.revise(HeightMeasurement(PLACES[1], 0.005, 4e-4))
     right.touch(HeightMeasurement(PLACES[1], 0.005, 4e-4))
     assert revised.height(PLACES[2]) == pytest.approx(right.height(PLACES[2]))
-    assert revised.sigma(PLACES[2]) == pytest.approx(right.sigma(PLACES[2]))
+    assert revised.at(PLACES[2])[1] == pytest.approx(right.at(PLACES[2])[1])
 
 
 def test_a_new_scan_keeps_offset_and_tilt_learned_from_touches() -> None:
     correction = TouchCorrection()
     for place in PLACES:
         correction.touch(HeightMeasurement(place, float(tilted(place)), 3e-4))
-    before = correction.sigma(PLACES[0])
+    before = correction.at(PLACES[0])[1]
     correction.blur()
-    assert correction.sigma(PLACES[0]) > before
+    assert correction.at(PLACES[0])[1] > before
     for place in BETWEEN:
         assert correction.height(place) == pytest.approx(float(tilted(place)), abs=5e-4)
 
@@ -170,10 +170,10 @@ def test_a_better_surface_needs_a_smaller_correction() -> None:
     for place, field in zip(PLACES, bent, strict=True):
         correction.touch(HeightMeasurement(place, float(tilted(place) + field), 2e-4))
     better = correction.averaged(lambda xy: bent[[int(np.argmin(np.sum((PLACES - p) ** 2, axis=1))) for p in xy]])
-    assert better.roughness < correction.roughness
+    assert better._fit.roughness < correction._fit.roughness
     heights, sigmas = better.over(BETWEEN)
     assert heights == pytest.approx(tilted(BETWEEN), abs=2e-4)
-    assert (sigmas < [correction.sigma(place) for place in BETWEEN]).all()
+    assert (sigmas < [correction.at(place)[1] for place in BETWEEN]).all()
 
 
 def test_successive_touches_share_the_error_of_the_breath() -> None:
@@ -183,8 +183,8 @@ def test_successive_touches_share_the_error_of_the_breath() -> None:
         hasty.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number / 3.0))
         slow.touch(HeightMeasurement(place, 0.004, 1e-4, 5e-4, number * 20.0))
     middle = PLACES[4]
-    assert hasty.sigma(middle) == pytest.approx(5e-4, rel=0.2)
-    assert slow.sigma(middle) < 0.7 * hasty.sigma(middle)
+    assert hasty.at(middle)[1] == pytest.approx(5e-4, rel=0.2)
+    assert slow.at(middle)[1] < 0.7 * hasty.at(middle)[1]
 
 
 def descent(onset: float, stiffness: float, exponent: float, bias: float, noise: float, seed: int = 0) -> np.ndarray:

@@ -8,7 +8,7 @@ stiffness: pressed tissue pushes the arm away, so the force falls. An arm that t
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -17,8 +17,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.robot.chain import Arm
 
 
-@dataclass(frozen=True)
-class DriverTuning:
+class DriverTuning(NamedTuple):
     """Limits on commands, and the braking phase of a hold."""
 
     brake_factor: float = 5.0

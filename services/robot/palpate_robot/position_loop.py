@@ -9,7 +9,7 @@ reference at the end of the step h, and the terms in v are implicit, so any gain
 """
 
 from collections import deque
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ from palpate_models.robot.chain import Arm
 from palpate_robot.plant import DT
 
 
-@dataclass(frozen=True)
-class PositionLoopTuning:
+class PositionLoopTuning(NamedTuple):
     """Constants of the loop (assumed): those of a geared arm with a servo at 500 Hz."""
 
     stiffness_per_torque: float = 100.0

@@ -13,9 +13,8 @@ adds one row to each Cholesky factor, so an update takes about a millisecond.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from itertools import product
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +31,7 @@ from palpate_plugins import PluginKind
 from palpate_search.presses import PRESSES, Budget, Press, Task, press_duration
 
 
-@dataclass(frozen=True)
-class LumpPrior:
+class LumpPrior(NamedTuple):
     """Hypotheses of a lump, and when one is found."""
 
     radii_m: tuple[float, float, float] = (0.014, 0.022, 0.030)
@@ -60,8 +58,7 @@ CONTRAST: Final = (float(np.log(2.0)), 0.25)
 """Prior mean and standard deviation of a lump's log-contrast."""
 
 
-@dataclass(frozen=True)
-class FieldPrior:
+class FieldPrior(NamedTuple):
     """Natural variation of the log-force, and errors of the depth."""
 
     natural_sd: tuple[float, float, float, float, float, float] = (0.025, 0.060, 0.13, 0.105, 0.16, 0.048)

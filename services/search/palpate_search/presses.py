@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -12,8 +12,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import ExamInput
 
 
-@dataclass(frozen=True)
-class PressTuning:
+class PressTuning(NamedTuple):
     """Places, depths and durations of presses."""
 
     places_m: float = 0.010

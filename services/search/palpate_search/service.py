@@ -1,8 +1,7 @@
 """Search service: samples in, next press out, until the budget is spent or a missed lump is improbable."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -23,8 +22,7 @@ FRAME: Final = contract().topics["assessment/map"].frame or ""
 PALPATING: Final = frozenset({ExamState.PHASE_INDENT, ExamState.PHASE_SCAN, ExamState.PHASE_RETRACT})
 
 
-@dataclass(frozen=True)
-class SearchTuning:
+class SearchTuning(NamedTuple):
     """Numbers of presses, and tolerances."""
 
     least_uncertainty_m: float = 0.0002

@@ -1,7 +1,6 @@
 """Judges the comparison of the two senses of force: which sensor is dead, wrong or late. Numbers in, breaches out."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -12,8 +11,7 @@ from palpate_supervisor.watch import Breach, Level, StopCause
 FT, JOINTS, STATUS, EXAM = "ft/wrench", "joint_states", "robot/status", "exam/state"
 
 
-@dataclass(frozen=True)
-class JudgeTuning:
+class JudgeTuning(NamedTuple):
     """Limits of the comparison. `research/senses.py` has the largest values of undisturbed examinations."""
 
     disagreement_sd: float = 3.5

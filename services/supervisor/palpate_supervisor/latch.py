@@ -2,12 +2,12 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from palpate_supervisor.watch import Breach, DriverHold, Level, StopCause
 
 
-@dataclass(frozen=True)
-class LatchTuning:
+class LatchTuning(NamedTuple):
     """Timing and tolerance of a release."""
 
     driver_grace_ns: int = 50_000_000
@@ -23,15 +23,10 @@ class LatchTuning:
 TUNING = LatchTuning()
 RECOVERABLE = frozenset({StopCause.DEPTH, StopCause.WORKSPACE})
 """Causes that only motion can end. After a release they are ignored until the tool is back within the limit or goes further."""
-HARMLESS = frozenset(
-    {
-        (StopCause.FORCE, DriverHold.NONE),
-        (StopCause.SILENT, DriverHold.NONE),
-        (StopCause.DRIVER, DriverHold.COMMAND_EXPIRED),
-        (StopCause.DRIVER, DriverHold.FORCE_LIMIT),
-        (StopCause.DRIVER, DriverHold.STOP_REQUESTED),
-    }
-)
+_HARMLESS_HOLDS = (DriverHold.COMMAND_EXPIRED, DriverHold.FORCE_LIMIT, DriverHold.STOP_REQUESTED)
+HARMLESS = frozenset({(cause, DriverHold.NONE) for cause in (StopCause.FORCE, StopCause.SILENT)}) | {
+    (StopCause.DRIVER, hold) for hold in _HARMLESS_HOLDS
+}
 """Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""
 
 

@@ -1,8 +1,7 @@
 """Supervisor service: converts messages to numbers and publishes the latched stop."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
@@ -28,8 +27,7 @@ WATCHED = ("robot/status", "exam/state")
 """Topics whose age is checked."""
 
 
-@dataclass(frozen=True)
-class ServiceTuning:
+class ServiceTuning(NamedTuple):
     """Delays of the presence checks and the range of the published depth."""
 
     retreat_ns: int = 4000 * MS

@@ -1,6 +1,5 @@
 """Position, speed and external force of the tool, from joint state and F/T reading only; the perceived rest surface."""
 
-from dataclasses import dataclass
 from math import sqrt
 from typing import NamedTuple
 
@@ -16,8 +15,7 @@ from palpate_supervisor.observer import MomentumObserver
 from palpate_supervisor.senses import BY_CURRENT, BY_SENSORS, ForceComparison, ForceSenses, Measurement
 
 
-@dataclass(frozen=True)
-class BiasTuning:
+class BiasTuning(NamedTuple):
     """Limits within which a reading counts as sensor bias."""
 
     still_mps: float = 0.005

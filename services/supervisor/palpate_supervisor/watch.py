@@ -3,6 +3,7 @@
 from collections import deque
 from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +12,7 @@ from palpate_models.scenario.schema import Limits
 from palpate_supervisor.tool import Tool
 
 
-@dataclass(frozen=True)
-class SupervisorTuning:
+class SupervisorTuning(NamedTuple):
     """Margins and delays of the limit checks."""
 
     lookahead_s: float = 0.1

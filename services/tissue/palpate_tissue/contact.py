@@ -9,7 +9,6 @@ P removes the component along the normal. It is passive: k is constant, and slip
 """
 
 import math
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -72,8 +71,7 @@ class VertexSearch:
         return Near(p, max(self._margin, float(distance) - ball), radius, index[keep], n[keep], X[keep])
 
 
-@dataclass(frozen=True)
-class ReferenceWall:
+class ReferenceWall(NamedTuple):
     """A half-space, and the wall and contact that correspond to it."""
 
     k_w_n_per_m3: float = 1.7e5

@@ -1,9 +1,8 @@
 """The camera as a service that passes on the images of a ROS 2 depth camera."""
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from time import monotonic, sleep, time_ns
-from typing import Any, ClassVar, Final
+from typing import Any, ClassVar, Final, NamedTuple
 
 from palpate_bus.messages import TFMessage, Transform, TransformStamped
 from palpate_bus.messages.stamps import header, nanoseconds
@@ -17,8 +16,7 @@ from palpate_camera.messages import FRAME
 from palpate_models.scenario.schema import RosCamera, Scenario
 
 
-@dataclass(frozen=True)
-class RosCameraTuning:
+class RosCameraTuning(NamedTuple):
     """Times to wait for the camera, and the age of an image."""
 
     pose_wait_s: float = 20.0

@@ -1,6 +1,5 @@
 """Forward and inverse kinematics of robot and tool, on pinocchio."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +12,7 @@ from palpate_models.scenario.schema import Limits, Robot
 _WORLD_AXES = pin.ReferenceFrame.LOCAL_WORLD_ALIGNED
 
 
-@dataclass(frozen=True)
-class KinematicLimits:
+class KinematicLimits(NamedTuple):
     """Tolerances of the inverse kinematics, and limits of the elbow."""
 
     tolerance_m: float = 1e-4

@@ -4,8 +4,8 @@ Deterministic: OMPL's seed is set for each query before planner and sampler are 
 queries; planning ends on an iteration count, never on time; shortcuts are greedy, not random.
 """
 
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from ompl import base, geometric, util
@@ -18,8 +18,7 @@ from palpate_planning.motion.scene import COLLISION, CollisionScene
 from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, rounded
 
 
-@dataclass(frozen=True)
-class PlannerTuning:
+class PlannerTuning(NamedTuple):
     """Tuning of the motion planner."""
 
     iterations: int = 6000

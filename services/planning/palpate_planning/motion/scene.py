@@ -1,8 +1,8 @@
 """The collision scene: the arm's capsules, table, base and the perceived abdomen, checked with coal through pinocchio."""
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import coal
 import numpy as np
@@ -16,8 +16,7 @@ from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
 
-@dataclass(frozen=True)
-class CollisionTuning:
+class CollisionTuning(NamedTuple):
     """Margins and resolution of collision checks."""
 
     margin_m: float = 0.010

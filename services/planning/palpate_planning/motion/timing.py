@@ -4,7 +4,7 @@ from bisect import bisect_right
 from dataclasses import dataclass
 from itertools import pairwise
 from math import nan, sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import ruckig
@@ -16,8 +16,7 @@ from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.periods import MS
 
 
-@dataclass(frozen=True)
-class TimingTuning:
+class TimingTuning(NamedTuple):
     """Acceleration of free motions and their restart after a gap."""
 
     rise_s: float = 0.15

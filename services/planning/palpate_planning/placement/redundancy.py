@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import lru_cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +26,7 @@ from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_fr
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class ResolutionTuning:
+class ResolutionTuning(NamedTuple):
     """Numerical tuning of the redundancy resolution."""
 
     task_tolerance: float = 1e-5
@@ -119,8 +118,7 @@ class Batch:
         return np.where(wrong, np.maximum(residual, 1 - facing), residual), (residual < RESOLUTION.task_tolerance) & ~wrong
 
 
-@dataclass(frozen=True)
-class PostureTuning:
+class PostureTuning(NamedTuple):
     """Tuning of the optimised postures."""
 
     knots: int = 32

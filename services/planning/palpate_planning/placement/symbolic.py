@@ -4,7 +4,6 @@ A task is a position of the indenter's origin and the direction of its z axis: f
 elbow swivel are free. A base placement is (x [m], y [m], height [m], yaw [rad]) in world, shape (4,).
 """
 
-from dataclasses import dataclass
 from functools import lru_cache
 from importlib import import_module
 from typing import Any, Final, NamedTuple
@@ -17,8 +16,7 @@ from palpate_models.robot.arm import TOOL, arm_of, inertias
 from palpate_models.scenario.schema import Robot
 
 
-@dataclass(frozen=True)
-class PostureCost:
+class PostureCost(NamedTuple):
     """Scales of the cost of a posture, and the weights of its terms, each of order one (assumed)."""
 
     elbow_clearance_m: float = 0.15

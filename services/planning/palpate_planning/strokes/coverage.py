@@ -8,6 +8,7 @@ reachable targets may be out of reach.
 from collections.abc import Set
 from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +22,7 @@ Bools = NDArray[np.bool_]
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class CoverageTuning:
+class CoverageTuning(NamedTuple):
     """Sampling and joining of scan lines."""
 
     sample_m: float = 0.002

@@ -5,7 +5,6 @@ point lies `depth` below the surface point p along the inward normal. Spin about
 """
 
 from bisect import bisect_right
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -60,8 +59,7 @@ def angular_velocity(R0: Array, R1: Array, dt: float) -> Array:
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class PathLimits:
+class PathLimits(NamedTuple):
     """Limits of the motion along a path."""
 
     lateral_acceleration_mps2: float = 0.3
@@ -140,14 +138,9 @@ class SurfacePath:
         curvature = np.linalg.norm(np.gradient(dp, self.s, axis=0), axis=1)
         turn = np.linalg.norm(np.gradient(self.n, self.s, axis=0), axis=1)
         joints = np.abs(np.gradient(self.q, self.s, axis=0)) / turning
-        allowed = np.minimum.reduce(
-            [
-                np.full(len(self.s), speed),
-                np.sqrt(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6)),
-                LIMITS.turn_rate_radps / np.maximum(turn, 1e-6),
-                1.0 / np.maximum(joints.max(axis=1), 1e-6),
-            ]
-        )
+        turning_speed = np.minimum(LIMITS.turn_rate_radps / np.maximum(turn, 1e-6), 1.0 / np.maximum(joints.max(axis=1), 1e-6))
+        curving_speed = np.sqrt(LIMITS.lateral_acceleration_mps2 / np.maximum(curvature, 1e-6))
+        allowed = np.minimum(np.minimum(curving_speed, turning_speed), speed)
         return SpeedLimit(self.s, allowed, 0.7 * LIMITS.acceleration_mps2)
 
 

@@ -1,6 +1,7 @@
 """From perceived targets to a planned examination: reachable targets, strokes, their postures, the approach."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +24,7 @@ from palpate_planning.wall.surface import PerceivedSurface
 Ints = NDArray[np.int64]
 
 
-@dataclass(frozen=True)
-class ScanPostures:
+class ScanPostures(NamedTuple):
     """Camera view and turns of the arm during a scan of the surface."""
 
     view_margin_m: float = 0.03

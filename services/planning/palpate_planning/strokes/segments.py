@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -17,8 +18,7 @@ from palpate_planning.strokes.path import SurfacePath, centre, frames_along, lea
 from palpate_planning.wall.surface import PerceivedSurface
 
 
-@dataclass(frozen=True)
-class SegmentTuning:
+class SegmentTuning(NamedTuple):
     """Heights and sampling of segments."""
 
     hover_m: float = 0.025

@@ -1,7 +1,6 @@
 """Breathing motion from perception's forecasts (`perception/motion`), interpolated to any time."""
 
 from collections import deque
-from dataclasses import dataclass
 from math import exp, hypot, sqrt
 from typing import NamedTuple
 
@@ -16,8 +15,7 @@ HIDDEN_M = 0.002
 """Uncertainty up to which an occluded wall is followed by forecast."""
 
 
-@dataclass(frozen=True)
-class ForecastTuning:
+class ForecastTuning(NamedTuple):
     """Blending of forecasts and estimation of their error."""
 
     stale_ns: int = 500 * MS

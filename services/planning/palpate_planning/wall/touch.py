@@ -11,7 +11,6 @@ skin between mesh points (computed).
 """
 
 import math
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -23,8 +22,7 @@ FELT_N = 1.0
 """Force at which the descent has enough samples for the fit."""
 
 
-@dataclass(frozen=True)
-class OnsetTuning:
+class OnsetTuning(NamedTuple):
     """Fit of the onset law."""
 
     exponent: float = 1.3

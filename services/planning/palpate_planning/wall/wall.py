@@ -24,7 +24,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -41,8 +40,7 @@ ROUGHNESSES = 2.0 ** np.arange(-5, 2)
 """Candidate values of a."""
 
 
-@dataclass(frozen=True)
-class CorrectionPrior:
+class CorrectionPrior(NamedTuple):
     """Prior of the correction."""
 
     offset_m: float = 0.012
@@ -90,11 +88,6 @@ class TouchCorrection:
         """Variance added to each touch by later scans of the surface [m^2]."""
         self._learn()
 
-    @property
-    def roughness(self) -> float:
-        """Estimated roughness a of the error [1]."""
-        return self._fit.roughness
-
     def touch(self, touch: HeightMeasurement) -> None:
         """Add a touch."""
         self._touches = (*self._touches, touch)
@@ -130,10 +123,6 @@ class TouchCorrection:
     def height(self, xy_A: Array) -> float:
         """Return c [m] at a position, shape (2,)."""
         return float(_covariance(xy_A, self._places, self._fit.roughness) @ self._fit.weights)
-
-    def sigma(self, xy_A: Array) -> float:
-        """Return the SD of c [m] at a position, shape (2,)."""
-        return self.at(xy_A)[1]
 
     def at(self, xy_A: Array) -> tuple[float, float]:
         """Return c and its SD [m] at a position, shape (2,)."""
@@ -258,10 +247,6 @@ class Wall:
     def displacement(self, xy_A: Array, t: int) -> float:
         """Return the outward displacement by the breath [m] at a position, shape (2,), at `t` [ns]."""
         return self.perceived.breathing(xy_A) * self.breath.displacement(t)
-
-    def sigma(self, xy_A: Array, t: int) -> float:
-        """Return the SD of the wall's height [m] at a position, shape (2,), at `t` [ns]."""
-        return self.at(xy_A, t).sigma
 
     def at(self, xy_A: Array, t: int) -> WallEstimate:
         """Return the wall at a position, shape (2,), at `t` [ns]."""

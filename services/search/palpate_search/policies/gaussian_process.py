@@ -5,7 +5,7 @@ papers. The amplitude comes from the measurements; length and noise are set for 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.stats import norm
@@ -19,8 +19,7 @@ from palpate_search.posterior import Posterior
 from palpate_search.presses import PRESSES, Budget, Task
 
 
-@dataclass(frozen=True)
-class ProcessTuning:
+class ProcessTuning(NamedTuple):
     """Parameters of the process and of its acquisitions."""
 
     length_m: float = 0.020

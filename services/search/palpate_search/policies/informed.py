@@ -8,7 +8,6 @@ in nats. Under each hypothesis y is Gaussian, so H(y | h) has a closed form. The
 (Lindley 1956; MacKay 1992, "Information-based objective functions for active data selection").
 """
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -95,8 +94,7 @@ def information(unexplained: Array, contrast: Array, contrast_variance: Array, p
     return out
 
 
-@dataclass(frozen=True)
-class DeeperTuning:
+class DeeperTuning(NamedTuple):
     """When a deeper press is considered."""
 
     promising: int = 12

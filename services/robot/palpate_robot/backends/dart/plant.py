@@ -15,9 +15,8 @@ is identical to the bit.
 
 import tempfile
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import dartpy as dart
 import numpy as np
@@ -33,8 +32,7 @@ from palpate_robot.kinematics import Kinematics
 from palpate_robot.plant import DT, END_STOP_MARGIN_RAD, STICK_RADPS, Wrench, nominal
 
 
-@dataclass(frozen=True)
-class ClearanceTuning:
+class ClearanceTuning(NamedTuple):
     """When the step skips collision detection."""
 
     reach_m: float = 1.5

@@ -24,7 +24,7 @@ import logging
 import sys
 from collections import deque
 from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ from palpate_robot.backends.lbr.port import (
 PERIODS_MS: Final = range(1, 101)
 
 
-@dataclass(frozen=True)
-class SessionTuning:
+class SessionTuning(NamedTuple):
     """Times of an emulated session."""
 
     monitoring_s: float = 0.2

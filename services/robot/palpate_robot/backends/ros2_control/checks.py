@@ -1,8 +1,7 @@
 """Two checks of an arm that takes commands: it follows them, and its force pushes the tool away at the first contact."""
 
 from collections import deque
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -10,8 +9,7 @@ from palpate_bus.messages.stamps import NS
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class CheckTuning:
+class CheckTuning(NamedTuple):
     """Constants of the checks (assumed)."""
 
     window_s: float = 0.3

@@ -14,7 +14,7 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,8 +37,7 @@ from palpate_tissue.backends.elastic.solid import NodeGrid, graded_grid, skin_co
 from palpate_tissue.contact import REFERENCE
 
 
-@dataclass(frozen=True)
-class ComplianceTuning:
+class ComplianceTuning(NamedTuple):
     """Discretisation of the solid."""
 
     self_weight: float = 3.92

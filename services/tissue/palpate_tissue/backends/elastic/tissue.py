@@ -13,7 +13,7 @@ steps, and by S times the accumulated effect of the forces since then, which the
 """
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,8 +28,7 @@ from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPa
 from palpate_tissue.contact import Sphere, VertexSearch, add_friction, skin
 
 
-@dataclass(frozen=True)
-class ElasticTuning:
+class ElasticTuning(NamedTuple):
     """Extent of the stepped vertices, and the step of a standard press."""
 
     margin_m: float = 0.0025

@@ -10,7 +10,6 @@ its forces with those of the explicit steps.
 """
 
 import math
-from dataclasses import dataclass
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -226,8 +225,7 @@ def follow(wall: ImplicitWall, vertices: NDArray[np.intp], now: int, activation:
             return
 
 
-@dataclass(frozen=True)
-class ImplicitTuning:
+class ImplicitTuning(NamedTuple):
     """Accuracy of the implicit steps."""
 
     far_sweeps: int = 20
@@ -367,16 +365,8 @@ def implicit_wall(model: PhantomModel, stiffness: Stiffness, dt: float, longest:
     n, g, tau = len(model.vertices), np.array(stiffness.prony_g), np.array(stiffness.prony_tau_s)
     K = stiffness_matrix(model, stiffness)
     foundation = model.stiffness * model.areas
-    table = np.column_stack(
-        (
-            stiffness.dashpot_s * foundation / dt,
-            K.diagonal(),
-            foundation,
-            model.stiffening**2,
-            wall.straight_from(model.stiffening),
-            model.tension,
-        )
-    )
+    drag, bent = stiffness.dashpot_s * foundation / dt, wall.straight_from(model.stiffening)
+    table = np.column_stack((drag, K.diagonal(), foundation, model.stiffening**2, bent, model.tension))
     return ImplicitWall(
         u=np.zeros(n),
         s=np.zeros(n),

@@ -62,13 +62,8 @@ def stiffness_matrix(model: PhantomModel, stiffness: Stiffness) -> sparse.csr_ar
     diagonal = model.stiffness * model.areas + np.bincount(i, carried, n)
     inner = free[i] & free[j]
     index = np.flatnonzero(free)
-    matrix = sparse.csr_array(
-        (
-            np.concatenate((diagonal[index], -carried[inner])),
-            (np.concatenate((index, i[inner])), np.concatenate((index, j[inner]))),
-        ),
-        shape=(n, n),
-    )
+    values, rows, columns = np.append(diagonal[index], -carried[inner]), np.append(index, i[inner]), np.append(index, j[inner])
+    matrix = sparse.csr_array((values, (rows, columns)), shape=(n, n))
     matrix.sort_indices()
     return matrix
 
