@@ -11,7 +11,7 @@ each stroke. The error of registration is simulated as it is, without a distribu
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from math import exp
@@ -243,7 +243,7 @@ class _TaredSensor:
         drawn = draw_errors(scenario.errors, scenario.seed).force
         per_reading = contract().roles["robot"].period / NS
         quieter = {name: getattr(drawn.given, name) * np.sqrt(per_reading / PERIOD_S) for name in ("noise_n", "noise_nm")}
-        drawn = replace(drawn, given=drawn.given.model_copy(update=quieter))
+        drawn = drawn._replace(given=drawn.given.model_copy(update=quieter))
         self._sensor = FtSensor(drawn, generator(scenario.seed, "loop force"), PERIOD_S)
         self._begin = round(begin_s / PERIOD_S)
         self._normal: list[float] = []

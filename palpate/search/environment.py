@@ -88,23 +88,23 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         share = 0.5 * (np.clip(np.asarray(action, dtype=float), -1.0, 1.0) + 1.0)
         xy = task.low + share[:2] * (task.high - task.low)
         depth = task.shallowest + share[2] * (task.deepest - task.shallowest)
-        before, here = self._entropy(), self._posterior.here
+        before, here = self._entropy(), self.posterior.here
         felt = self._hand.press(xy, float(depth))
-        self._posterior.add(felt)
+        self.posterior.add(felt)
         reward = before - self._entropy() - REWARD.per_s * float(press_duration(here, xy))
         self._history[self._count] = (*(2 * share - 1), np.log(felt.force / 5.0), 1.0)
         self._count += 1
         over = self._count == self._presses
         if over:
             reward += max(float(np.log(max(self._truth(), 1e-12))), REWARD.least)
-        info = {"lump": self._posterior.lump, "truth": self._truth()} if over else {}
+        info = {"lump": self.posterior.lump, "truth": self._truth()} if over else {}
         return self._observed(), float(reward), over, False, info
 
     def _begin(self, patient: SearchCase) -> None:
         hands = SurrogateHand(patient.scenario, felt=patient.felt) if self._kind == "surrogate" else PatientHand(patient.scenario)
         self._case, self._hand, self._count = patient, hands, 0
         budget = Budget(self._presses, hands.task.budget.seconds)
-        self._posterior = Posterior(replace(hands.task, budget=budget), models=ONE_MODEL)
+        self.posterior = Posterior(replace(hands.task, budget=budget), models=ONE_MODEL)
         self._history = np.zeros((self._presses, 5), dtype=np.float32)
 
     @property
@@ -113,14 +113,9 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         return self._hand.task
 
     @property
-    def posterior(self) -> Posterior:
-        """Posterior of this episode."""
-        return self._posterior
-
-    @property
     def maps_shape(self) -> tuple[int, int, int]:
         """Number of layers, places along x and along y."""
-        return LAYERS, *shape(self._posterior)
+        return LAYERS, *shape(self.posterior)
 
     @property
     def usual_depth(self) -> float:
@@ -130,22 +125,22 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
 
     def _entropy(self) -> float:
         """Return the entropy of the posterior over no lump, or one at each place [nat]."""
-        p = np.append(self._posterior.by_place, self._posterior.none)
+        p = np.append(self.posterior.by_place, self.posterior.none)
         return float(-(p * np.log(np.maximum(p, 1e-300))).sum())
 
     def _truth(self) -> float:
         """Return the posterior probability of the truth."""
         centre: Array | None = self._case.centre
         if centre is None:
-            return self._posterior.none
+            return self.posterior.none
         near = np.linalg.norm(self._hand.task.places - centre, axis=1) <= REWARD.near_m
-        return float(self._posterior.by_place[near].sum())
+        return float(self.posterior.by_place[near].sum())
 
     def _observed(self) -> Observation:
         left = np.array([1 - self._count / self._presses], dtype=np.float32)
         seen: Observation = {"history": self._history.clip(-10, 10), "left": left}
         if self._maps:
-            seen["maps"] = maps(self._posterior).clip(-20, 20).astype(np.float32)
+            seen["maps"] = maps(self.posterior).clip(-20, 20).astype(np.float32)
         return seen
 
 

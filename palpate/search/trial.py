@@ -1,6 +1,5 @@
 """One search of one patient by one policy, and the population of such patients."""
 
-from dataclasses import dataclass
 from time import perf_counter
 from typing import Final, NamedTuple
 
@@ -31,8 +30,7 @@ _MODULI: Final = (1.2, 30.0)
 """Search interval of the modulus contrast."""
 
 
-@dataclass(frozen=True)
-class SearchCase:
+class SearchCase(NamedTuple):
     """A patient of the search population."""
 
     scenario: Scenario
@@ -63,8 +61,7 @@ def case(seed: int, errors: str = "typical") -> SearchCase:
     return SearchCase(scenario, felt, centre)
 
 
-@dataclass(frozen=True, eq=False)
-class Trial:
+class Trial(NamedTuple):
     """A search of n presses."""
 
     xy: Array

@@ -5,8 +5,7 @@ set about its greatest |e| in which e has the sign that it has there and |e| is 
 of A; areas are on the skin.
 """
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,7 @@ PALPABLE: Final = 0.05
 """A lump whose |e| is smaller everywhere in the examined region is not palpable."""
 
 
-@dataclass(frozen=True)
-class Lump:
+class Lump(NamedTuple):
     """Palpable properties of a lump."""
 
     palpable: bool

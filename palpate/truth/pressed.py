@@ -7,7 +7,6 @@ places is the palpable effect of the lump.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Final, NamedTuple
 
@@ -26,8 +25,7 @@ from palpate_models.patient.schema import Lesion, Structure
 from palpate_models.scenario.schema import Exam, Scenario
 
 
-@dataclass(frozen=True)
-class TrueBody:
+class TrueBody(NamedTuple):
     """The body at rest, as a mesh."""
 
     vertices: Array
@@ -119,8 +117,7 @@ if TYPE_CHECKING:
     from palpate_tissue.backend import TissueBackend
 
 
-@dataclass(frozen=True)
-class Pressed:
+class Pressed(NamedTuple):
     """Apparent stiffness of a patient by the standard press; p places, l lumps."""
 
     places: Array

@@ -5,9 +5,9 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
-from dataclasses import dataclass
 from importlib import metadata
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ OPTIMISE = ("-O3", "-ffp-contract=off", "-fno-sanitize=all", "-g0")
 """No contraction into fused operations, so that platforms agree to the last bits of libm."""
 
 
-@dataclass(frozen=True)
-class Platform:
+class Platform(NamedTuple):
     """A target by its folder names in FMI."""
 
     tuple_3: str

@@ -1,7 +1,7 @@
 """Simulation of an FMU: an abdomen is pressed, held and released along the normal; any other is run as it is and plotted."""
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -51,8 +51,7 @@ GAP_M = 0.002
 """Distance from the surface at which the motion starts and ends."""
 
 
-@dataclass(frozen=True)
-class Probing:
+class Probing(NamedTuple):
     """Result of a probing motion; all of shape (n,)."""
 
     time: Array

@@ -8,10 +8,9 @@ import tempfile
 import zipfile
 from collections.abc import Collection, Iterator, Mapping
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from math import prod
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 from palpate_errors import UserError
@@ -30,8 +29,7 @@ class FmuError(UserError):
     """An FMU that cannot be loaded, or one of its functions that failed: holds the FMU's messages."""
 
 
-@dataclass(frozen=True)
-class FmuVariable:
+class FmuVariable(NamedTuple):
     """A variable: a scalar, or an array in any FMI version."""
 
     name: str

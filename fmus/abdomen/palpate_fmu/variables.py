@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from enum import StrEnum
 from math import prod
-from typing import Any
+from typing import Any, NamedTuple
 
 LESIONS = 8
 """Most lesions that an FMU can have."""
@@ -35,8 +35,7 @@ class VariableRole(StrEnum):
     INDEPENDENT = "independent"
 
 
-@dataclass(frozen=True)
-class Sizes:
+class Sizes(NamedTuple):
     """The sizes of a phantom: of its mesh, and how many Prony branches it has."""
 
     vertices: int

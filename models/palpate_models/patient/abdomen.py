@@ -1,6 +1,5 @@
 """Parametric surface of the abdomen, with costal arch and iliac crests."""
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Final, NamedTuple
 
@@ -60,8 +59,7 @@ def bone_share(x: Array, y: Array, skeleton: Skeleton) -> Array:
     return np.maximum(ribs, smoothstep(2 * iliac_bump(x, y, skeleton) - 0.5))
 
 
-@dataclass(frozen=True)
-class Shape:
+class Shape(NamedTuple):
     """A closed surface in A: vertices (n, 3) [m], triangles (m, 3), outward normals (n, 3), fixed vertices (n,)."""
 
     vertices: Array

@@ -6,7 +6,6 @@ Fields are functions of position, made from random Fourier features (Rahimi and 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,8 +40,7 @@ VARIATION: Final = VariationTuning()
 Family = Callable[[Array], Array]
 
 
-@dataclass(frozen=True)
-class _Waves:
+class _Waves(NamedTuple):
     """sum_k weight_k cos(frequency_k . p + phase_k)."""
 
     frequency: Array

@@ -1,6 +1,5 @@
 """Triangle meshes from files: validated, oriented, refined in the examined region."""
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -32,8 +31,7 @@ LIMITS: Final = MeshLimits()
 SCALING: Final = "scale it, by 0.001 from millimetres, 0.01 from centimetres, 0.0254 from inches or 0.3048 from feet"
 
 
-@dataclass(frozen=True)
-class TriangleMesh:
+class TriangleMesh(NamedTuple):
     """Vertices (n, 3) [m] in A and triangles (m, 3), counter-clockwise seen from outside."""
 
     vertices: Array

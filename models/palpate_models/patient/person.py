@@ -3,7 +3,6 @@
 Marks of certainty: [V] read in the source, [C] computed from measurements, [M] from memory of the literature, [A] assumed.
 """
 
-from dataclasses import dataclass
 from functools import cache
 from math import dist
 from typing import Final, NamedTuple
@@ -100,8 +99,7 @@ def _moved_beside(first: schema.Lesion, second: schema.Lesion, rng: np.random.Ge
     return second.model_copy(update={"centre_m": (x, y)})
 
 
-@dataclass(frozen=True)
-class WallStatistics:
+class WallStatistics(NamedTuple):
     """Moments of ln k_w [N/m^3], ln length [m] and stiffening [1/m] of a place, in this order.
 
     Some fitted places do not stiffen, so the stiffening is not a logarithm.

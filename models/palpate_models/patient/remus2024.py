@@ -5,9 +5,9 @@ R. Remus et al., Frontiers in Bioengineering and Biotechnology 12:1384062, 2024,
 
 import csv
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
@@ -25,8 +25,7 @@ PLACES = ("1", "2", "3", "4", "5")
 PEOPLE = tuple(f"P{k:02d}" for k in range(1, 11))
 
 
-@dataclass(frozen=True)
-class Curve:
+class Curve(NamedTuple):
     """The force of one place of one person over the depth of their indenter."""
 
     name: str
@@ -86,8 +85,7 @@ def _curve(row: Mapping[str, str]) -> Curve:
     return Curve(f"{row['position']} {row['id']}", coefficients, 1e-3 * float(row["fitMaxDispl"]))
 
 
-@dataclass(frozen=True)
-class Fit:
+class Fit(NamedTuple):
     """The wall with which the surface tier reproduces a relaxed curve to 20 mm, and how well."""
 
     wall: WallParameters

@@ -10,6 +10,7 @@ so that the tool points along z of the last link. `urdf_arm` makes these tables 
 
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -19,8 +20,7 @@ from palpate_models.numerics.frames import Array
 Point = tuple[float, float, float]
 
 
-@dataclass(frozen=True, slots=True)
-class Inertia:
+class Inertia(NamedTuple):
     """Mass [kg], centre of mass [m] in the link frame, inertia about it [kg m^2], axes of the link frame."""
 
     mass: float
@@ -31,8 +31,7 @@ class Inertia:
     """ixy, ixz, iyz."""
 
 
-@dataclass(frozen=True, slots=True)
-class Capsule:
+class Capsule(NamedTuple):
     """A cylinder from `start` to `end` [m, link frame] with round ends of its radius [m]; a sphere if they coincide."""
 
     start: Point

@@ -1,6 +1,5 @@
 """The operating table and the robot's cubic base, as boxes in world."""
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -26,8 +25,7 @@ TABLE: Final = OperatingTable()
 BASE_SIDE_M: Final = 0.40
 
 
-@dataclass(frozen=True, slots=True)
-class Box:
+class Box(NamedTuple):
     """A box B, aligned with its own frame at its centre."""
 
     name: str

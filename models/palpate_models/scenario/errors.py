@@ -9,10 +9,9 @@ and scoring may call it; all other code uses the nominal equipment.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
-from typing import Annotated, Any, Final, Literal
+from typing import Annotated, Any, Final, Literal, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -221,8 +220,7 @@ def levels() -> dict[str, dict[str, dict[str, float]]]:
     }
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnForce:
+class DrawnForce(NamedTuple):
     """Drawn errors of an F/T sensor. Arrays: force [N], then moment [N m], in its axes."""
 
     given: ForceErrors
@@ -236,8 +234,7 @@ class DrawnForce:
     """Time constant of the reading."""
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnCamera:
+class DrawnCamera(NamedTuple):
     """Drawn errors of a depth camera."""
 
     given: CameraErrors
@@ -250,8 +247,7 @@ class DrawnCamera:
     """Patches: centre to the right and downwards as parts of the image's width and height, radius [px]; shape (n, 3)."""
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnArm:
+class DrawnArm(NamedTuple):
     """Drawn errors of an arm. Joints in order, shapes (7,) except for the origins."""
 
     given: ArmErrors
@@ -268,8 +264,7 @@ class DrawnArm:
     """True over nominal mass below the F/T sensor."""
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnTorque:
+class DrawnTorque(NamedTuple):
     """Drawn errors of the joint torque sensors. Joints in order, shapes (7,)."""
 
     given: TorqueErrors
@@ -280,8 +275,7 @@ class DrawnTorque:
     """True over nominal mass of each link from the first moving one."""
 
 
-@dataclass(frozen=True, eq=False)
-class DrawnErrors:
+class DrawnErrors(NamedTuple):
     """Drawn errors of one patient's equipment."""
 
     force: DrawnForce

@@ -99,19 +99,15 @@ class BreathFilter:
         """SD of the displacement at the time of the last prediction [m]."""
         return float(np.sqrt(max(self._H @ self._P @ self._H, 0.0)))
 
-    @property
-    def depth(self) -> float:
-        """Mean peak-to-peak depth of the breaths [m]: that of a sine of equal variance."""
-        return self._depth
-
     def _learn(self) -> None:
         d, t = np.array(self._seen), np.array(self._times)
         mean = float(d.mean())
         self._x[0] += self._mean - mean
         self._mean = mean
-        self._depth = max(float(2 * np.sqrt(2) * d.std()), TUNING.least_m)
+        self.depth = max(float(2 * np.sqrt(2) * d.std()), TUNING.least_m)
+        """Mean peak-to-peak depth of the breaths [m]: that of a sine of equal variance."""
         self._rate = 2 * np.pi / 60 * strongest_rate(t, d - mean)
-        scale = self._depth * np.array((TUNING.shares[0], TUNING.shares[1], TUNING.shares[1], TUNING.shares[2], TUNING.shares[2]))
+        scale = self.depth * np.array((TUNING.shares[0], TUNING.shares[1], TUNING.shares[1], TUNING.shares[2], TUNING.shares[2]))
         self._stationary = np.diag(scale**2)
 
     def _transition(self, h: Array) -> Array:

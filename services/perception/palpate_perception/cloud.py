@@ -12,7 +12,6 @@ excludes frames in which the pixel shows something behind an edge.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -40,8 +39,7 @@ class CloudTuning(NamedTuple):
 CROP: Final = CloudTuning()
 
 
-@dataclass(frozen=True, slots=True)
-class Intrinsics:
+class Intrinsics(NamedTuple):
     """Intrinsics and pose from camera_info and tf_static."""
 
     K: Array
@@ -56,8 +54,7 @@ class Intrinsics:
         return self.shape == other.shape and np.array_equal(self.K, other.K) and np.array_equal(self.X_WC, other.X_WC)
 
 
-@dataclass(frozen=True, slots=True)
-class Cloud:
+class Cloud(NamedTuple):
     """n points with their pixels."""
 
     p_W: Array
@@ -72,8 +69,7 @@ class Cloud:
         return Cloud(self.p_W[keep], self.sigma[keep], self.pixel[keep])
 
 
-@dataclass(frozen=True, slots=True)
-class RegionBox:
+class RegionBox(NamedTuple):
     """The region of interest with its margin: an axis-aligned box in A [m]."""
 
     low: tuple[float, float, float]
@@ -221,8 +217,7 @@ def frame_sigma(z: Image) -> Image:
     return np.asarray(0.0012 + 0.0019 * (z - 0.4) ** 2, np.float32)
 
 
-@dataclass(frozen=True, slots=True)
-class FusedDepth:
+class FusedDepth(NamedTuple):
     """Depth image fused from several; all arrays have the same shape."""
 
     depth: Image

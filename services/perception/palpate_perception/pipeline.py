@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,8 +40,7 @@ HERE: Final[Array] = np.zeros(2)
 """Shift of a patient who has not moved."""
 
 
-@dataclass(frozen=True, slots=True)
-class Targets:
+class Targets(NamedTuple):
     """Palpation points in the order in which they are visited."""
 
     p_W: Array
@@ -58,8 +56,7 @@ class Targets:
         return cls(np.empty((0, 3)), np.empty((0, 3)), np.empty(0, np.uint32))
 
 
-@dataclass(frozen=True, slots=True)
-class PerceivedMesh:
+class PerceivedMesh(NamedTuple):
     """The perceived surface, in world."""
 
     p_W: Array
@@ -72,8 +69,7 @@ class PerceivedMesh:
     """Breathing mode: displacement relative to the point that moves most [1], shape (n,); zero if unknown."""
 
 
-@dataclass(frozen=True, slots=True)
-class Perceived:
+class Perceived(NamedTuple):
     """Result of a burst of frames."""
 
     cloud: Cloud

@@ -8,7 +8,6 @@ passes a wave of length L with gain 1 / (1 + lambda (2 pi / L)^6 / rho) (Eilers 
 set by the length at which the gain is one half, which does not depend on noise or range.
 """
 
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -66,8 +65,7 @@ class KnotAxis:
         return np.asarray(b.T @ (np.tile(weight * self.step / 2, len(left))[:, np.newaxis] * b))
 
 
-@dataclass(frozen=True, slots=True)
-class FittedSurface:
+class FittedSurface(NamedTuple):
     """Fitted surface z = s(x, y) in A with its covariance."""
 
     x: KnotAxis

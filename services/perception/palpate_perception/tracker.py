@@ -239,12 +239,8 @@ class Tracker:
         self._usual = 1.0
         self._last_s = float(t_s[-1])
         self._votes = 0
-        self._moved = False
-
-    @property
-    def moved(self) -> bool:
+        self.moved = False
         """True if the patient has moved since the wall model was fitted."""
-        return self._moved
 
     def follow(self, t_s: float, depth: Array, hidden: NDArray[np.bool_]) -> Followed:
         """Process the wall's pixels of an image exposed at `t_s` [s]: depth [m] and mask of hidden pixels, (n,) each."""
@@ -254,10 +250,10 @@ class Tracker:
         y = np.where(use, y, 0.0)
         weight = np.where(use, self._certainty, 0.0)
         if float(weight @ self.wall.lifts**2) < TRACKING.least_share * self._whole:
-            return self._result(State.MOVED if self._moved else State.LOST, expected)
+            return self._result(State.MOVED if self.moved else State.LOST, expected)
         d, weight = self._displacement(y, weight, expected)
         if not weight.any():
-            return self._result(State.MOVED if self._moved else State.LOST, expected)
+            return self._result(State.MOVED if self.moved else State.LOST, expected)
         still = y - self.wall.lifts * d
         elapsed = min(t_s - self._last_s, TRACKING.gap_s)
         self._weigh_error(elapsed, still, weight)
@@ -275,7 +271,7 @@ class Tracker:
         else:
             self._filter.update(d, noise)
         self._filter.remember(d)
-        if self._moved:
+        if self.moved:
             return self._result(State.MOVED, d)
         quiet = t_s >= self._calm_s
         if quiet:
@@ -312,11 +308,11 @@ class Tracker:
         self._pull = MOTION.memory * self._pull + (1 - MOTION.memory) * weighted.T @ left
         moving = self.moved_by > MOTION.least_m and self.evidence > MOTION.threshold * self._usual
         self._votes = self._votes + 1 if moving else 0
-        if not self._votes and not self._moved:
+        if not self._votes and not self.moved:
             evidence = min(self.evidence, MOTION.mean_clip * self._usual)
             self._usual = max(1.0, self._usual + (1 - np.exp(-elapsed_s / MOTION.mean_tau_s)) * (evidence - self._usual))
             self._drift += (1 - np.exp(-elapsed_s / MOTION.drift_tau_s)) * (self._motion - self._drift)
-        self._moved = self._moved or self._votes >= MOTION.images
+        self.moved = self.moved or self._votes >= MOTION.images
 
     @property
     def _motion(self) -> Array:

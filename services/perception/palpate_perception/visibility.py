@@ -1,6 +1,5 @@
 """Coverage of the region of interest by the camera, and the reasons for gaps."""
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Final, NamedTuple
 
@@ -91,8 +90,7 @@ HINTS: Final = {
 }
 
 
-@dataclass(frozen=True, slots=True)
-class Gaps:
+class Gaps(NamedTuple):
     """Parts of the region that were not in view, by reason."""
 
     shares: dict[ViewReason, float]

@@ -9,7 +9,6 @@ of A, frame by frame; the singular value decomposition of their coefficients, wh
 Errors that are fixed to the image cancel, since only changes of a pixel count.
 """
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -57,8 +56,7 @@ class WallNotVisibleError(ValueError):
     """Too little of the wall was in view to fit the model."""
 
 
-@dataclass(frozen=True, slots=True)
-class BreathingMode:
+class BreathingMode(NamedTuple):
     """Breathing amplitude at a position, relative to the largest in the region: a polynomial in x and y of A."""
 
     low: Array
@@ -73,8 +71,7 @@ class BreathingMode:
         return np.clip(basis(p_A, self.low, self.high) @ self.coefficients, 0.0, 1.0)
 
 
-@dataclass(frozen=True, slots=True)
-class WallPixels:
+class WallPixels(NamedTuple):
     """Wall model at the n pixels of the small image that show it."""
 
     pixel: NDArray[np.intp]

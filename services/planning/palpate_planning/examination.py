@@ -20,7 +20,7 @@ from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
 from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, counted
 from palpate_planning.setpoints import joint_setpoint
-from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStatus, ExamStep, Observation, Phase
+from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation, Phase
 from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
@@ -77,13 +77,16 @@ class ExaminationSequence:
         WORKER.submit(self._planner.prepare)
         arm = FreeMotion(self._kinematics, self._planner, lockstep=lockstep)
         self._course = ExamCourse(arm, 0 if before is None else before.strokes)
+        self.status = self._course.status
+        """State of the examination."""
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart = RestartRamp()
         self._views = Views(look_postures(known))
         self._rest = Rest()
         self._requested = RequestedPresses(lockstep=lockstep)
         self._planning: BackgroundTask[ExamPlan] | None = None
-        self._skipped: dict[int, Cause] = {}
+        self.skipped: dict[int, Cause] = {}
+        """Skipped targets with the cause."""
         self._started = False
         self._began: int | None = None
         """Time of the first step [ns]."""
@@ -101,16 +104,6 @@ class ExaminationSequence:
         }
 
     @property
-    def status(self) -> ExamStatus:
-        """State of the examination."""
-        return self._course.status
-
-    @property
-    def skipped(self) -> dict[int, Cause]:
-        """Skipped targets with the cause."""
-        return dict(self._skipped)
-
-    @property
     def unfelt(self) -> dict[int, Cause]:
         """Targets that were to be felt and were not, with the cause: skipped ones, and those that an early end left."""
         course, wanted = self._course, self._rest.wanted
@@ -118,7 +111,7 @@ class ExaminationSequence:
             return self.skipped
         everything = frozenset(range(self.status.target_count)) if wanted is None else wanted
         remaining = everything if course.palpation is None else course.palpation.remaining
-        return dict.fromkeys(remaining, self.status.cause) | self._skipped
+        return dict.fromkeys(remaining, self.status.cause) | self.skipped
 
     def step(self, now: Observation) -> ExamStep:
         """Advance one planning period. Before the first reading of the robot, the arm is asked for nothing."""
@@ -239,7 +232,7 @@ class ExaminationSequence:
 
     def _give_up(self, now: Observation, out: ExamStep, cause: Cause) -> None:
         """End an examination that cannot be planned; measurements made before are assessed."""
-        rest, skipped = self._rest, self._skipped
+        rest, skipped = self._rest, self.skipped
         if not rest.begun:
             self._course.abort(now, cause)
             return
@@ -268,11 +261,11 @@ class ExaminationSequence:
                 self._give_up(now, out, Cause(Reason.NO_PATH, str(error)))
                 return
             planned_again = rest.wanted or frozenset()
-            self._skipped = {i: cause for i, cause in self._skipped.items() if i not in planned_again} | plan.skipped
+            self.skipped = {i: cause for i, cause in self.skipped.items() if i not in planned_again} | plan.skipped
             self._sense.wall.shift_A = self._sense.wall.breath.shift_A
             out.path, course.palpation = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m), None
             course.arm.start(plan.approach)
-            self.status.targets_skipped = len(self._skipped)
+            self.status.targets_skipped = len(self.skipped)
             course.enter(Phase.APPROACH, now.t, counted(plan.skipped.values()) or "approaching the first target")
         elif self._planning.late(now.t):
             self._planning = None
@@ -309,11 +302,11 @@ class ExaminationSequence:
 
     def _report(self, step: PalpationStep, palpation: Palpation, t: int) -> None:
         status = self.status
-        self._skipped |= palpation.recovery.skipped
+        self.skipped |= palpation.recovery.skipped
         status.stroke, status.patient_moved = palpation.descent.stroke, self._sense.wall.breath.moved
         status.steady, status.force_limited, status.depth_setpoint = step.steady, step.limited, step.depth_setpoint
         status.target_index = self._requested.done if self._known.exam.searched else step.target
-        status.targets_skipped = len(self._skipped)
+        status.targets_skipped = len(self.skipped)
         cause = palpation.recovery.failed or palpation.recovery.early_end or palpation.waits.reported
         self._course.enter(PHASE_OF[step.stage], t, cause.text or step.stage.value, cause)
 
@@ -372,7 +365,7 @@ class ExaminationSequence:
 
     def _conclude(self, t: int) -> None:
         """End the examination at `t` [ns]: complete, incomplete, or failed because faults have cost too many targets."""
-        count, skipped, unplanned = self.status.target_count, self._skipped, self._rest.unplanned
+        count, skipped, unplanned = self.status.target_count, self.skipped, self._rest.unplanned
         lost = Counter(cause for cause in skipped.values() if cause.loss in FAULTS)
         missing = [f"{len(skipped)} of {count} targets not felt: {counted(skipped.values())}"] if skipped else []
         missing += [f"the rest was left: {unplanned}"] if unplanned else []

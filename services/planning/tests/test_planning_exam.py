@@ -173,7 +173,7 @@ def test_soft_stop_skips_targets_then_gives_up() -> None:
 )
 def test_only_what_is_complete_is_called_so(cause: Cause, count: int, phase: Phase, text: str) -> None:
     exam = ExaminationSequence(known(), PERIOD_S, FRAME)
-    exam.status.target_count, exam._skipped = 20, dict.fromkeys(range(count), cause)
+    exam.status.target_count, exam.skipped = 20, dict.fromkeys(range(count), cause)
     exam._conclude(0)
     assert exam.status.phase is phase
     assert text in exam.status.message

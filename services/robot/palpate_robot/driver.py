@@ -6,7 +6,6 @@ without
 stiffness: pressed tissue pushes the arm away, so the force falls. An arm that takes positions stops and stays where it is.
 """
 
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any, Final, NamedTuple
 
@@ -68,8 +67,7 @@ class HoldCause(IntEnum):
     """The arm, its controller, its sensor or the connection to them."""
 
 
-@dataclass(slots=True)
-class Command:
+class Command(NamedTuple):
     """Joint torques without gravity [N m] or joint positions [rad], their stamp [ns] and expiry [ns]."""
 
     values: Array

@@ -1,7 +1,6 @@
 """Latched stop: which breach latches it, when a soft stop escalates to an emergency stop, when a release is granted."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from typing import NamedTuple
 
 from palpate_supervisor.watch import Breach, DriverHold, Level, StopCause
@@ -30,8 +29,7 @@ HARMLESS = frozenset({(cause, DriverHold.NONE) for cause in (StopCause.FORCE, St
 """Causes, and causes of the driver's hold, that do no harm once they are over: a cough, a late message, a stop requested here."""
 
 
-@dataclass(frozen=True, slots=True)
-class Stop:
+class Stop(NamedTuple):
     """A latched stop at time `t` [ns]."""
 
     t: int

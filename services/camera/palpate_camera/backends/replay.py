@@ -55,18 +55,13 @@ class ReplayedCamera(Service):
             first = decode(recorded[IMAGE][0].payload, rules.topics[IMAGE].type)
             frame = first.header.frame_id.lstrip("/")
             self._pose = self._transforms.need(WORLD, frame)
-            self._frames = _frames(recorded, IMAGE, INFO, frame)
+            self.frames = _frames(recorded, IMAGE, INFO, frame)
             self._small = _frames(recorded, SMALL_IMAGE, SMALL_INFO, frame)
         except (CameraError, CodecError) as error:
             raise RecordingError(f"{recording.path}: {error}") from error
         self._path = recording.path
         self._wanted = 0
         self._shown = self._ticks = 0
-
-    @property
-    def frames(self) -> Sequence[Frame]:
-        """Whole images with their intrinsics, in the order of their stamps."""
-        return self._frames
 
     @property
     def X_WC(self) -> Array:
@@ -84,7 +79,7 @@ class ReplayedCamera(Service):
         outbox = self._next_small(t)
         self._ticks += 1
         if self._wanted:
-            outbox |= messages.whole(t, *self._frames[self._shown % len(self._frames)])
+            outbox |= messages.whole(t, *self.frames[self._shown % len(self.frames)])
             self._wanted -= 1
             self._shown += 1
         return outbox
@@ -94,14 +89,14 @@ class ReplayedCamera(Service):
         return {
             "recording": str(self._path),
             "frames": self._shown,
-            "frames_recorded": len(self._frames),
+            "frames_recorded": len(self.frames),
             "transforms_left_out": self._transforms.left_out,
         }
 
     def _next_small(self, t: int) -> dict[str, Message]:
         if self._small:
             return messages.small(t, *self._small[self._ticks % len(self._small)])
-        return messages.small_of(t, *self._frames[self._ticks % len(self._frames)])
+        return messages.small_of(t, *self.frames[self._ticks % len(self.frames)])
 
 
 class _Logged(NamedTuple):

@@ -90,13 +90,10 @@ class RestartRamp:
         if self._last is not None and t - self._last > TIMING.braked_ns:
             self._restarted = t
         self._last = t
-        if self._restarted is None:
+        if self._restarted is None or t - self._restarted >= TIMING.restart_ns:
+            self._restarted = None
             return 1.0
-        rate = (t - self._restarted) / TIMING.restart_ns
-        if rate < 1.0:
-            return rate
-        self._restarted = None
-        return 1.0
+        return (t - self._restarted) / TIMING.restart_ns
 
 
 class SpeedLimit:

@@ -9,7 +9,6 @@ far from joint limits and singularities, little torque at the pressing force, el
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, NamedTuple
 
@@ -134,8 +133,7 @@ POSTURES = PostureTuning()
 _IPOPT_STEPS, _SAMPLES = 80, 16
 
 
-@dataclass(frozen=True, slots=True)
-class PostureSequence:
+class PostureSequence(NamedTuple):
     """A posture for each target, in the order of the targets."""
 
     q: Array

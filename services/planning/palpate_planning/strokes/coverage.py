@@ -6,7 +6,6 @@ reachable targets may be out of reach.
 """
 
 from collections.abc import Set
-from dataclasses import dataclass
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -34,8 +33,7 @@ class CoverageTuning(NamedTuple):
 TUNING = CoverageTuning()
 
 
-@dataclass(frozen=True, slots=True)
-class Stroke:
+class Stroke(NamedTuple):
     """A curve to follow at depth. A single sample is a point to indent."""
 
     xy: Array

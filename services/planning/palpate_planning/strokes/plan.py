@@ -1,6 +1,5 @@
 """From perceived targets to a planned examination: reachable targets, strokes, their postures, the approach."""
 
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -36,8 +35,7 @@ class ScanPostures(NamedTuple):
 SCAN = ScanPostures()
 
 
-@dataclass(frozen=True, slots=True)
-class PerceivedAbdomen:
+class PerceivedAbdomen(NamedTuple):
     """Result of perception: targets in coverage order and the surface. World frame."""
 
     positions: Array
@@ -51,8 +49,7 @@ class PerceivedAbdomen:
     surface: PerceivedSurface
 
 
-@dataclass(frozen=True, slots=True)
-class ExamPlan:
+class ExamPlan(NamedTuple):
     """All motions of an examination."""
 
     approach: JointTrajectory

@@ -15,8 +15,7 @@ Depth is then rounded to eighths of a pixel of disparity f b / z (Khoshelham, El
 Kinect depth data", Sensors 2012).
 """
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -114,8 +113,7 @@ def loss_probability(theta: Vector) -> Vector:
     return np.asarray(np.clip((theta - low) / (high - low), 0, 1), np.float32)
 
 
-@dataclass(slots=True)
-class _Statistics:
+class _Statistics(NamedTuple):
     """Inputs of the noise model at the n pixels that hit a surface."""
 
     view: View

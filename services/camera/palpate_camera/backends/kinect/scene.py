@@ -19,6 +19,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import trimesh
@@ -94,8 +95,7 @@ def rasterise(p_C: Array, triangles: NDArray[np.uint32], lens: Array, w: Image, 
 Triangles = NDArray[np.uint32]
 
 
-@dataclass(frozen=True, slots=True)
-class Mesh:
+class Mesh(NamedTuple):
     """Triangles in world."""
 
     vertices: Array

@@ -23,7 +23,6 @@ import argparse
 import logging
 import sys
 from collections import deque
-from dataclasses import dataclass
 from typing import Any, Final, NamedTuple
 
 import numpy as np
@@ -72,8 +71,7 @@ QUALITY: Final = ((0.02, ConnectionQuality.EXCELLENT), (0.10, ConnectionQuality.
 """Largest fraction of lost answers per quality (assumed); above the last it is POOR."""
 
 
-@dataclass(frozen=True, slots=True)
-class Drive:
+class Drive(NamedTuple):
     """Position and overlay applied by the arm's controller in a cycle."""
 
     position: Array

@@ -4,9 +4,8 @@ Arrays in, arrays out; no physics, no messages.
 """
 
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
 from enum import StrEnum
-from typing import ClassVar, Final
+from typing import ClassVar, Final, NamedTuple
 
 import numpy as np
 
@@ -23,8 +22,7 @@ class Stack(StrEnum):
     UR = "ur"
 
 
-@dataclass(frozen=True, slots=True)
-class Sensed:
+class Sensed(NamedTuple):
     """Measurements of an arm in a cycle."""
 
     q: Array

@@ -204,8 +204,7 @@ _CODE = tuple(Path(file) for file in (__file__, solid.__file__, field.__file__, 
 """Source files that the cached matrices depend on."""
 
 
-@dataclass(frozen=True)
-class Compliance:
+class Compliance(NamedTuple):
     """Compliance of an elastic solid on its free vertices."""
 
     matrix: Array32

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,8 +89,7 @@ MUSCLE = 1.06
 the press that defines the guarding ratio would measure 3 % less. With it the ratio is met within 2 %."""
 
 
-@dataclass(frozen=True)
-class VertexSprings:
+class VertexSprings(NamedTuple):
     """Elastic springs in parallel with the solid, one per vertex, m of them.
 
     q(u) = k_w A [sigma(u) + tension a max(u, 0)]

@@ -6,8 +6,8 @@ Base and sides are fixed.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from itertools import product
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cholesky, solve_triangular
@@ -15,8 +15,7 @@ from scipy.linalg import cholesky, solve_triangular
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class NodeGrid:
+class NodeGrid(NamedTuple):
     """Nodes of the layer: x and y in the plane of the skin, depth below it (0 first, the base last), all ascending [m]."""
 
     x: Array

@@ -9,9 +9,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +42,7 @@ _NAMED: dict[str, tuple[float, dict[str, int]]] = {
 }
 
 
-@dataclass(frozen=True)
-class Unit:
+class Unit(NamedTuple):
     """value [SI] = factor * value + offset."""
 
     exponents: tuple[int, ...]
@@ -118,8 +116,7 @@ def fill(message: Message, paths: Sequence[str], value: Any) -> None:
 Change = Callable[[Any], Any]
 
 
-@dataclass(frozen=True)
-class InputTopic:
+class InputTopic(NamedTuple):
     """A topic read by the FMU."""
 
     topic: Topic
@@ -135,8 +132,7 @@ class InputTopic:
             port.push()
 
 
-@dataclass(frozen=True)
-class OutputTopic:
+class OutputTopic(NamedTuple):
     """A topic filled by the FMU."""
 
     fmu: str

@@ -1,7 +1,7 @@
 """Matrices of the tissue, and the stability bound of its explicit step."""
 
 import math
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy import sparse
@@ -18,8 +18,7 @@ STEP_LIMIT = 1.8
 MOST_SUBSTEPS = 64
 
 
-@dataclass(frozen=True)
-class Mechanics:
+class Mechanics(NamedTuple):
     """Matrices of `C u' + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f` on the free vertices."""
 
     stiffness: sparse.csr_array
