@@ -39,14 +39,6 @@ def _links(robot: Robot) -> list[ElementTree.Element]:
     return list(ElementTree.fromstring(urdf(robot)).iter("link"))
 
 
-def test_limits_reach_the_reader_of_the_urdf(model: pin.Model) -> None:
-    degrees = np.rad2deg(model.upperPositionLimit)
-    np.testing.assert_allclose(degrees, [170, 120, 170, 120, 170, 120, 175])
-    np.testing.assert_array_equal(model.lowerPositionLimit, -model.upperPositionLimit)
-    np.testing.assert_allclose(np.rad2deg(model.velocityLimit), [98, 98, 100, 130, 140, 180, 180])
-    np.testing.assert_array_equal(model.effortLimit, [176, 176, 110, 110, 110, 40, 40])
-
-
 def test_joints_and_links_have_the_names_of_the_ros2_stack(model: pin.Model) -> None:
     assert tuple(model.names)[1:] == lbr.JOINT_NAMES
     assert all(model.existFrame(link) for link in LINKS)
@@ -71,14 +63,6 @@ def test_home_is_inside_the_limits_and_points_the_tool_down(model: pin.Model) ->
     X_WI = data.oMf[model.getFrameId("indenter")]
     np.testing.assert_allclose(X_WI.rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-9)
     assert X_WI.translation[0] < 0.285, "the tool is off the table, out of the camera's view"
-
-
-def test_inertias_are_physical() -> None:
-    for link, inertia in robot_arm.inertias(Robot()).items():
-        (ixx, iyy, izz), (ixy, ixz, iyz) = inertia.diagonal, inertia.products
-        principal = np.linalg.eigvalsh([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
-        assert principal[0] > 0, link
-        assert principal[0] + principal[1] >= principal[2] * (1 - 1e-6), f"{link}: triangle inequality"
 
 
 def test_urdf_refers_to_no_file_and_shapes_can_be_left_out() -> None:

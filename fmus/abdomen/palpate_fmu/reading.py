@@ -161,8 +161,7 @@ def read_variables(description: Any) -> dict[str, FmuVariable]:
         if shape is None or name in single or any(m.type != first.type for m in members.values()):
             continue
         references = tuple(members[index].references[0] for index in sorted(members))
-        rest = (first.causality, first.variability, first.type, first.unit, first.low, first.high, first.doc)
-        single[name] = FmuVariable(name, references, shape, *rest)
+        single[name] = first._replace(name=name, references=references, shape=shape)
         for member in members.values():
             del single[member.name]
     return single

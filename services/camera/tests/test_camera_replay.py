@@ -174,12 +174,6 @@ def test_a_recording_without_small_images_has_those_of_its_whole_ones(
     assert shown[SMALL_INFO][0].message.k.tolist() == pytest.approx(seen[SMALL_INFO][0].message.k.tolist())
 
 
-def test_frames_differ_as_their_noise_does(seen: dict[str, list[ReceivedMessage]]) -> None:
-    """Else the order would not be tested."""
-    first, second = (np.asarray(received.message.data) for received in seen[IMAGE][:2])
-    assert not np.array_equal(first, second)
-
-
 def test_a_recording_without_a_pose_is_refused_by_name(seen: dict[str, list[ReceivedMessage]], tmp_path: Path) -> None:
     folder = record(tmp_path / "recording_mcap", seen, (IMAGE, INFO))
     with pytest.raises(RecordingError, match="no message of tf_static"):

@@ -174,9 +174,9 @@ class ControlService(Service):
         if setpoint.mode is not ControlMode.CARTESIAN:
             return ""
         gap = setpoint.p_WD - (tool_pose(q, self._robot)[:3, 3] if self._positions else self.model.p_WI)
-        return (
-            f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m" if gap.dot(gap) > FARTHEST_M**2 else ""
-        )
+        if gap.dot(gap) <= FARTHEST_M**2:
+            return ""
+        return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m"
 
     def _wait(self, t: int, joints: Message | None) -> Outbox:
         """Return the command before the first set-point: zero torque, or the positions measured first."""

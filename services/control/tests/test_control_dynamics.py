@@ -161,17 +161,6 @@ def test_joint_mode_is_calm_where_torques_act_late(arm: ArmModel) -> None:
     assert np.abs(plant.q - posture).max() < 5e-4
 
 
-def test_joint_mode_needs_no_friction(arm: ArmModel) -> None:
-    """The springs are bounded for every mode, the light wrist's too, where the driver compensates all friction."""
-    smooth = Robot(joint_damping_nms=0.0, joint_friction_nm=0.0)
-    posture = WORKING[1]
-    hold = reference(setpoint(arm, posture, mode=ControlMode.JOINT))
-    plant = Plant(posture + 0.01, smooth)
-    simulate(plant, smooth, lambda t: hold, 1500)
-    assert plant.energy() < 1e-6
-    assert np.abs(plant.q - posture).max() < 1e-3
-
-
 def test_change_of_mode_is_bumpless(arm: ArmModel) -> None:
     """Joint hold, Cartesian hold, joint hold, in contact force: neither torque nor indenter jumps."""
     q = WORKING[1]

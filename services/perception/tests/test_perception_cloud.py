@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from palpate_models.numerics.frames import apply, inverse, look_at
+from palpate_models.numerics.frames import look_at
 from palpate_models.scenario.schema import Exam
 from palpate_perception import cloud
 from palpate_perception.cloud import Cloud, RegionBox
@@ -33,14 +33,6 @@ def test_projection_and_deprojection_are_inverse(p: tuple[float, float, float], 
     rows, columns = np.indices(depth.shape)
     np.testing.assert_allclose(u, columns.ravel() + column, atol=1e-9)
     np.testing.assert_allclose(v, rows.ravel() + row, atol=1e-9)
-
-
-def test_the_window_holds_the_box_and_not_much_more() -> None:
-    rows, columns = cloud.window(BOX, inverse(X_WC) @ X_WA, K, (480, 640))
-    p_A = np.random.default_rng(0).uniform(BOX.low, BOX.high, (500, 3))
-    u, v = cloud.project(apply(inverse(X_WC) @ X_WA, p_A), K)
-    assert ((v >= rows.start) & (v < rows.stop) & (u >= columns.start) & (u < columns.stop)).all()
-    assert (rows.stop - rows.start) * (columns.stop - columns.start) < 480 * 640 / 3
 
 
 def test_step_three_keeps_the_box_and_drops_the_table() -> None:

@@ -84,14 +84,6 @@ def test_a_breathing_surface_shows_as_motion_and_noise_does_not() -> None:
     assert breathing.motion(breathing.fused().depth, pixel) == pytest.approx(np.std(swing), rel=0.05)
 
 
-def test_errors_name_what_is_wrong() -> None:
-    with pytest.raises(ValueError, match="no depth frame"):
-        DepthFusion(WHOLE).fused()
-    fusion = fuse([np.ones(SHAPE, np.float32)])
-    with pytest.raises(ValueError, match="previous frames had"):
-        fusion.add(np.ones((5, 5), np.float32))
-
-
 K = np.array([[585.0, 0.0, 319.5], [0.0, 585.0, 239.5], [0.0, 0.0, 1.0]])
 X_AC = look_at(np.array([0.4, -0.45, 0.92]), np.array([0.0, 0.0, -0.03]))
 X_CA = inverse(X_AC)

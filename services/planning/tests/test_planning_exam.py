@@ -236,15 +236,6 @@ def test_a_blocked_view_is_reported_and_the_next_posture_tried() -> None:
     assert not np.allclose(world.q, world.exam._views.postures[0], atol=0.1)
 
 
-def test_three_blocked_views_abort() -> None:
-    world = World(known())
-    world.answers = [Cause(Reason.VIEW_BLOCKED, "view blocked by the arm")]
-    world.run()
-    assert world.exam.status.phase is Phase.ABORTED
-    assert world.exam.status.cause.reason is Reason.VIEW_BLOCKED
-    assert world.exam._views.failed == 3
-
-
 def test_the_scan_is_repeated_without_an_answer_then_given_up() -> None:
     world = World(known())
     world.run(lambda: world.exam.status.phase is Phase.LOOK)

@@ -127,14 +127,6 @@ def test_measured_velocity_is_the_derivative_of_measured_position() -> None:
     assert np.abs(speed - v).max() > 1e-3
 
 
-def test_an_arm_without_errors_is_measured_exactly() -> None:
-    joints = JointSensor(arm(), rng(), np.array(lbr.HOME), np.full(7, 50.0))
-    q, v = lbr.HOME + 0.1, np.full(7, 0.2)
-    joints.update(q, v, np.full(7, -20.0))
-    assert (joints.q.tobytes(), joints.v.tobytes()) == (q.tobytes(), v.tobytes())
-    assert [x.tobytes() for x in joints.read()] == [q.tobytes(), v.tobytes()]
-
-
 @pytest.mark.parametrize("plant", PLANTS)
 def test_the_tool_is_elsewhere_by_what_the_lengths_are_wrong(plant: Any) -> None:
     """To first order each joint's origin moves the tool as it is turned by the joints before it."""

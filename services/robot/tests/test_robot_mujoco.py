@@ -5,15 +5,10 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 
-from palpate.check.rig import RigSettings, ServiceRig
-from palpate_bus.messages.stamps import MS
 from palpate_models.robot import lbr
-from palpate_models.robot.arm import urdf
-from palpate_models.scenario.load import load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_robot.backends.dart import plant as in_dart
 from palpate_robot.backends.mujoco.plant import MujocoPlant
-from palpate_robot.backends.mujoco.service import create
 
 NO_DAMPING = np.zeros(7)
 
@@ -81,12 +76,3 @@ def test_forced_response_agrees_while_the_tool_moves_centimetres(friction: float
     assert np.ptp(dart_read, axis=0)[:3].max() > 20
     assert difference[:3].max() < 0.2, "N, of the F/T sensor, while the tool is accelerated"
     assert difference[3:].max() < 0.02, "N m"
-
-
-def test_it_starts_at_home_and_says_what_it_is() -> None:
-    service = create(load_scenario("clean"))
-    assert service.start()["robot_description"].data == urdf(load_scenario("clean").robot)
-    rig = ServiceRig(service, RigSettings(load_scenario("clean"), 0.0, True))
-    rig.run(0.01, {})
-    assert rig.t > 5 * MS
-    np.testing.assert_allclose(rig.last("joint_states").position, lbr.HOME, atol=1e-4)

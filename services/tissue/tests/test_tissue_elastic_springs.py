@@ -1,6 +1,5 @@
 """The elastic tissue: stiffening and guarding against an independent solution, their effect, energy; its service."""
 
-import math
 from dataclasses import replace
 from functools import cache
 from itertools import pairwise
@@ -19,7 +18,7 @@ from palpate_models.patient import wall
 from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_models.patient.tension import tension_of_ratio
-from palpate_models.patient.wall import FADING_S, MEDIAN
+from palpate_models.patient.wall import MEDIAN
 from palpate_models.scenario.load import load_scenario
 from palpate_tissue.backends.elastic.compliance import Compliance, compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE
@@ -128,24 +127,6 @@ def test_contracted_muscle_makes_the_ratio_of_the_scenario(ratio: float) -> None
     places = ((0.0, 0.0), (0.0012, 0.0007), (0.0003, 0.0004))
     felt_ratio = np.mean([felt((beta, tension), at) / felt((beta, 0.0), at) for at in places])
     assert felt_ratio == pytest.approx(ratio, rel=0.02)
-
-
-def test_voluntary_guarding_fades_under_a_slow_press_and_involuntary_stays() -> None:
-    relaxed, voluntary, involuntary = (
-        ElasticTissue(model(0.0, tension, kind), layer()) for tension, kind in ((0.0, False), (5.0, True), (5.0, False))
-    )
-    forces = []
-    for tissue in (relaxed, voluntary, involuntary):
-        pressed = [press(tissue, 0.010)]
-        for k in range(8000):
-            force, _ = tissue.step(k * 1e-3, np.array((0.0, 0.0, 0.0)), STILL, RADIUS_M)
-        forces.append((*pressed, force[2]))
-    ratios = np.array(forces[1:]) / forces[0]
-    assert ratios[0, 0] < 0.9 * ratios[1, 0]
-    assert ratios[0, 1] == pytest.approx(1, abs=0.12)
-    assert ratios[1, 1] > 2.3
-    assert voluntary.activation == pytest.approx(math.exp(-10 / FADING_S), rel=0.02)
-    assert involuntary.activation == 1
 
 
 @pytest.mark.parametrize(("stiffening", "tension", "dashpot_s"), [(300.0, 0.0, 0.05), (0.0, 20.0, 1e-4), (300.0, 5.0, 1e-4)])

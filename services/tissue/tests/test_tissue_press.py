@@ -1,13 +1,11 @@
 """Standard presses: each tier's fast way against its own steps of 1 ms."""
 
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_phantom
@@ -63,23 +61,6 @@ def test_the_fast_way_is_the_slow_one(make: type[TissueBackend]) -> None:
     assert len(set(np.round(slow, 3))) == 3 or make is not winkler
 
 
-@pytest.mark.parametrize(("name", "seed"), [("person", 1), ("obese", 2), ("rlq_guarding", 4)])
-def test_the_fast_way_is_the_slow_one_on_people(name: str, seed: int) -> None:
-    """Their walls stiffen, are curved, tense and hold lumps; presses of a sparse grid, limited or not, on the whole wall."""
-    words = ["phantom.breathing.kind=none", *(["phantom.draw.lumps=[1, 1]"] if name == "person" else ())]
-    scenario = load_scenario(name, words, seed)
-    tissue = true_tissue(scenario)
-    assert isinstance(tissue, WinklerTissue)
-    skin = TrueSurface(TrueBody(tissue.model.vertices, tissue.model.triangles, np.eye(4)))
-    grid = np.array((-0.08, 0.0, 0.08))
-    places, normals = skin.points(np.stack(np.meshgrid(grid, grid), axis=-1).reshape(-1, 2))
-    fast, ended = tissue.press(places, normals, scenario.robot.indenter_radius_m)
-    slow, truly = TissueBackend.press(tissue, places, normals, scenario.robot.indenter_radius_m)
-    same = ended == truly
-    assert fast[same] == pytest.approx(slow[same], rel=5e-3)
-    assert same.mean() > 0.9  # those that come within half a per cent of the limit may differ
-
-
 def test_a_press_lets_voluntary_guarding_fade_by_a_quarter_and_involuntary_stays() -> None:
     """The expected value is written by hand: 20 mm/s provoke a quarter of the contraction, a hold at 10 mm provokes nothing."""
     ends = np.array(ENDS_S)
@@ -89,15 +70,6 @@ def test_a_press_lets_voluntary_guarding_fade_by_a_quarter_and_involuntary_stays
     assert level[-1] == pytest.approx(at_depth * math.exp(-0.45 / FADING_S))
     assert level[-1] == pytest.approx(0.76, abs=0.005)
     assert contracted(False, ends, depths(ends)).tolist() == [1.0] * len(ends)
-
-
-@pytest.mark.parametrize("make", [WinklerTissue, solid])
-def test_a_press_into_voluntary_guarding_feels_less_than_into_involuntary(make: Callable[[PhantomModel], TissueBackend]) -> None:
-    plane = flat_phantom(0.06, 0.005)
-    relaxed, fading, staying = (
-        make(model).press(PLACES[:1], UP[:1], 0.015)[0][0] for model in (plane, tense(plane), tense(plane, voluntary=False))
-    )
-    assert 0.70 < (fading - relaxed) / (staying - relaxed) < 0.85
 
 
 def test_a_press_does_not_ask_what_was_touched_before() -> None:

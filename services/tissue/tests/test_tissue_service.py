@@ -143,23 +143,6 @@ def test_nearest_rest_point_against_brute_force():
         assert abs(surface.nearest(p).height) == pytest.approx(brute, abs=1e-5)
 
 
-def test_nearest_point_of_a_triangle_by_sampling():
-    rng = np.random.default_rng(1)
-    v, w = np.meshgrid(np.linspace(0, 1, 201), np.linspace(0, 1, 201))
-    inside = v + w <= 1
-    grid = np.column_stack(((1 - v - w)[inside], v[inside], w[inside]))
-    for _ in range(200):
-        corners, p = rng.normal(size=(3, 3)), 2 * rng.normal(size=3)
-        (square,), (weights,) = nearest_on_triangles(p, corners[None])
-        assert min(weights) >= -1e-12
-        assert sum(weights) == pytest.approx(1)
-        distance = np.linalg.norm(weights @ corners - p)
-        assert distance == pytest.approx(np.sqrt(square))
-        sampled = np.linalg.norm(grid @ corners - p, axis=1).min()
-        assert distance == pytest.approx(sampled, abs=1e-2)
-        assert distance <= sampled + 1e-12
-
-
 def test_a_process_that_stood_still_moves_the_tool_as_fast_as_it_went() -> None:
     """One millimetre in a tenth of a second: every sample received, only the last while catching up, or one late sample."""
     known = scenario()

@@ -1,6 +1,5 @@
 """The stiffening wall and the contracted muscle on the surface tier: law, contact, energy, stability."""
 
-import math
 from dataclasses import replace
 from itertools import pairwise
 
@@ -11,7 +10,7 @@ from palpate_models.patient import wall
 from palpate_models.patient.phantom import build_phantom, flat_phantom
 from palpate_models.patient.schema import Background, Lesion, Phantom, Stiffness
 from palpate_models.patient.tension import DEPTH_M, RADIUS_M, SPEED_MPS, tension_of_ratio
-from palpate_models.patient.wall import FADING_S, MEDIAN, Guarding
+from palpate_models.patient.wall import MEDIAN, Guarding
 from palpate_tissue.backends.winkler.mechanics import STEP_LIMIT, assemble
 from palpate_tissue.backends.winkler.tissue import WinklerTissue, stiffen
 
@@ -136,34 +135,3 @@ def test_a_guarded_body_has_the_ratio_in_the_middle_and_none_beside():
     area = (Guarding(centre_m=CENTRE),)
     assert force(area, *CENTRE) / force((), *CENTRE) == pytest.approx(2.6, rel=0.06)
     assert force(area, 0.08, 0.08) == pytest.approx(force((), 0.08, 0.08), rel=1e-3)
-
-
-def test_voluntary_guarding_fades_under_a_slow_gentle_press_and_involuntary_stays():
-    tension = tension_of_ratio(2.6, PERSON)
-    kinds = ((0.0, False), (tension, True), (tension, False))
-    tissues = [WinklerTissue(guarded_wall(muscle, 0.005, voluntary), PERSON) for muscle, voluntary in kinds]
-    relaxed, voluntary, involuntary = (even_press(tissue) for tissue in tissues)
-    assert involuntary / relaxed == pytest.approx(2.6, rel=0.08)
-    assert 1.4 < voluntary / relaxed < 2.3
-    held = []
-    for tissue in tissues:
-        for _ in range(10_000):
-            force, _ = tissue.step(0.0, np.array((0.0, 0.0, RADIUS_M - DEPTH_M)), STILL, RADIUS_M)
-        held.append(force[2])
-    assert held[1] / held[0] == pytest.approx(1, abs=0.06)
-    assert held[2] / held[0] > 2.5
-
-
-def test_voluntary_guarding_returns_with_a_quick_and_with_a_deep_press():
-    tissue = WinklerTissue(guarded_wall(tension_of_ratio(2.6, PERSON), 0.005, voluntary=True), PERSON)
-    even_press(tissue)
-    slow = tissue.activation
-    assert slow == pytest.approx(math.exp(-DEPTH_M / SPEED_MPS / FADING_S), rel=0.01)
-    for k in range(500):
-        tissue.idle(k * 1e-3)
-    assert tissue.activation == slow  # unchanged without contact
-    even_press(tissue, speed=0.1, depth=0.020)
-    assert tissue.activation > 0.85
-    tissue.activation = 0.0
-    even_press(tissue, speed=0.010, depth=0.030)
-    assert tissue.activation > 0.9

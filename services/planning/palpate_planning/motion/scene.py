@@ -88,7 +88,6 @@ class CollisionScene:
         robot: Robot,
         abdomen: tuple[Array, NDArray[np.int64]] | None = None,
         tool_may_touch: bool = False,
-        margin: float = COLLISION.margin_m,
     ) -> None:
         """`tool_may_touch`: allows contact of stand-off and sphere with the abdomen."""
         self._model = kinematics.model
@@ -109,7 +108,7 @@ class CollisionScene:
                     self._geometry.addCollisionPair(pin.CollisionPair(shape, obstacle))
         self._results = self._geometry.createData()
         for request in self._results.collisionRequests:
-            request.security_margin = margin
+            request.security_margin = COLLISION.margin_m
 
     def _add(self, name: str, joint: int, placement: pin.SE3, geometry: coal.CollisionGeometry) -> int:
         return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
@@ -104,8 +103,7 @@ class Mesh(NamedTuple):
     """Vertex indices, shape (m, 3)."""
 
 
-@dataclass(slots=True)
-class View:
+class View(NamedTuple):
     """A noise-free view, images of shape (height, width)."""
 
     w: Image
@@ -125,51 +123,36 @@ class View:
     def nearest(self, other: View) -> View:
         """Return the view of both scenes: at each pixel, what is nearer."""
         near = other.w > self.w
-        return View(*(np.where(near, b, a) for a, b in zip(self.images, other.images, strict=True)))
-
-    @property
-    def images(self) -> tuple[Image, Image, Image, Image]:
-        """w, gu, gv, cos."""
-        return self.w, self.gu, self.gv, self.cos
-
-
-class Caster:
-    """Casts a fixed camera's rays."""
-
-    def __init__(self, pinhole: Pinhole, X_WC: Array) -> None:
-        """A camera with true pose `X_WC` (optical frame in world), shape (4, 4)."""
-        self.pinhole = pinhole
-        self._X_CW = inverse(X_WC)
-
-    def cast(self, mesh: Mesh) -> View:
-        """Return the view of one mesh, either side of its triangles."""
-        view = View.empty(self.pinhole.height, self.pinhole.width)
-        lens = np.array((self.pinhole.fx, self.pinhole.fy, self.pinhole.cx, self.pinhole.cy))
-        rasterise(apply(self._X_CW, mesh.vertices), mesh.triangles, lens, *view.images)
-        return view
+        return View(*(np.where(near, b, a) for a, b in zip(self, other, strict=True)))
 
 
 class Scene:
-    """Layers of meshes before one camera."""
+    """Layers of meshes before one fixed camera."""
 
-    def __init__(self, caster: Caster) -> None:
-        self._caster = caster
+    def __init__(self, pinhole: Pinhole, X_WC: Array) -> None:
+        """A camera with true pose `X_WC` (optical frame in world), shape (4, 4)."""
+        self._pinhole, self._X_CW = pinhole, inverse(X_WC)
         self._layers: dict[str, tuple[Mesh, View]] = {}
         self._merged: View | None = None
+
+    def cast(self, mesh: Mesh) -> View:
+        """Return the view of one mesh, either side of its triangles."""
+        view = View.empty(self._pinhole.height, self._pinhole.width)
+        lens = np.array((self._pinhole.fx, self._pinhole.fy, self._pinhole.cx, self._pinhole.cy))
+        rasterise(apply(self._X_CW, mesh.vertices), mesh.triangles, lens, *view)
+        return view
 
     def put(self, name: str, mesh: Mesh, tolerance_m: float = 1e-5) -> None:
         """Set a layer's mesh. It is cast again only if a vertex moved by more than `tolerance_m` since the last cast."""
         old = self._layers.get(name)
         if old is not None and _same(old[0], mesh, tolerance_m):
             return
-        self._layers[name] = (mesh, self._caster.cast(mesh))
+        self._layers[name] = (mesh, self.cast(mesh))
         self._merged = None
 
     def view(self) -> View:
-        """Return the view of all layers; the same object as long as nothing changed. Raises ValueError without a layer."""
+        """Return the view of all layers; the same object as long as nothing changed."""
         if self._merged is None:
-            if not self._layers:
-                raise ValueError("the scene has no layer: put a mesh first")
             views = [self._layers[name][1] for name in sorted(self._layers)]
             merged = views[0]
             for view in views[1:]:
@@ -192,10 +175,8 @@ def _same(old: Mesh, new: Mesh, tolerance: float) -> bool:
 
 
 def merge(meshes: Iterable[Mesh]) -> Mesh:
-    """One mesh of several. Raises ValueError when there is none."""
+    """One mesh of one or several."""
     parts = list(meshes)
-    if not parts:
-        raise ValueError("nothing to merge: want at least one mesh")
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts[:-1])])
     triangles = [part.triangles + np.uint32(offset) for part, offset in zip(parts, offsets, strict=True)]
     return Mesh(np.concatenate([part.vertices for part in parts]), np.concatenate(triangles))

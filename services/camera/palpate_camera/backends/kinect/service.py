@@ -14,7 +14,7 @@ from palpate_bus.service import Inbox, Outbox, Service
 from palpate_camera import messages
 from palpate_camera.backends.kinect import scene
 from palpate_camera.backends.kinect.errors import DepthBias, KinectNoise
-from palpate_camera.backends.kinect.scene import Caster, Image, Mesh, Scene
+from palpate_camera.backends.kinect.scene import Image, Mesh, Scene
 from palpate_camera.messages import FRAME, Pinhole
 from palpate_models.numerics.frames import Array, look_at
 from palpate_models.scenario.errors import draw_errors
@@ -85,7 +85,7 @@ class _Picture:
         """Take every `spacing`-th pixel of the `sensor` in both directions."""
         self.pinhole = sensor.every(spacing)
         """Intrinsics of this resolution."""
-        self._scene = Scene(Caster(self.pinhole, X_WC))
+        self._scene = Scene(self.pinhole, X_WC)
         self._scene.put("furniture", furniture)
         self._noise, self._every = noise, slice(spacing // 2, None, spacing)
 

@@ -196,49 +196,45 @@ class Wiring:
         chosen = {key: self._variable(key, f"{name}.{entry.field}") for key, entry in entries.items()}
         ports = self._ports(chosen.values())
         moves = []
-        for variable_name, entry in entries.items():
-            where = f"{name}.{entry.field} -> {variable_name}"
-            variable = chosen[variable_name]
+        for key, entry in entries.items():
+            where, variable = f"{name}.{entry.field} -> {key}", chosen[key]
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
                 raise MapError(f"{where}: only inputs and tunable parameters can be set, this is {variable.causality}")
-            self._fit(topic, entry.field, variable, where)
-            turn = self._turn(entry, topic, where, into_fmu=True)
-            scale = self._scale(entry, topic, entry.field, variable, where, into_fmu=True)
-            moves.append((ports[variable_name][variable_name], entry.field, _chain(turn, scale)))
+            change = self._change(entry, topic, entry.field, variable, where, into_fmu=True)
+            moves.append((ports[key][key], entry.field, change))
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
 
     def _output(self, name: str, entries: Mapping[str, OutputEntry]) -> OutputTopic:
         topic = self._topic(name, {row.name for row in self._rules.outputs(self._table.role)}, "send")
-        constants: list[tuple[tuple[str, ...], Any]] = []
-        wanted: dict[str, tuple[FmuVariable, OutputEntry]] = {}
-        leaf_paths = {path: tuple(leaf.path for leaf in fields(topic.type, path)) for path in entries}
+        paths = {path: tuple(leaf.path for leaf in fields(topic.type, path)) for path in entries}
+        sources = {path: f"{entry.variable or entry.scenario or entry.value} -> {name}.{path}" for path, entry in entries.items()}
+        given = {path: entry.variable for path, entry in entries.items() if entry.variable is not None}
+        chosen = {path: self._variable(variable, sources[path]) for path, variable in given.items()}
+        ports = self._ports(dict.fromkeys(chosen.values()))
+        moves, constants = [], []
         for path, entry in entries.items():
-            where = f"{entry.variable or entry.scenario or entry.value} -> {name}.{path}"
-            if entry.variable is not None:
-                wanted[path] = (self._variable(entry.variable, where), entry)
-                self._fit(topic, path, wanted[path][0], where)
-            elif entry.scenario is not None:
+            where, value = sources[path], entry.value
+            if (variable := chosen.get(path)) is not None:
+                change = self._change(entry, topic, path, variable, where, into_fmu=False)
+                moves.append((paths[path], ports[variable.name][variable.name], change))
+                continue
+            if entry.scenario is not None:
                 if entry.scenario not in self._scenario:
                     raise MapError(f"{where}: the scenario gives only {', '.join(self._scenario) or 'nothing'}")
                 value = self._turn(entry, topic, where, into_fmu=False)(self._scenario[entry.scenario])
                 if size(topic.type, path) not in (None, np.size(value)):
                     raise MapError(f"{where}: {np.size(value)} values do not fit")
-                constants.append((leaf_paths[path], value))
-            else:
-                constants.append((leaf_paths[path], entry.value))
-        ports = self._ports({variable.name: variable for variable, _ in wanted.values()}.values())
-        moves = []
-        for path, (variable, entry) in wanted.items():
-            where = f"{variable.name} -> {name}.{path}"
-            scale = self._scale(entry, topic, path, variable, where, into_fmu=False)
-            turn = self._turn(entry, topic, where, into_fmu=False)
-            moves.append((leaf_paths[path], ports[variable.name][variable.name], _chain(scale, turn)))
+            constants.append((paths[path], value))
         return OutputTopic(self._fmu.path.name, topic, tuple(dict.fromkeys(ports.values())), tuple(moves), tuple(constants))
 
-    def _fit(self, topic: Topic, path: str, variable: FmuVariable, where: str) -> None:
+    def _change(self, entry: _Entry, topic: Topic, path: str, variable: FmuVariable, where: str, into_fmu: bool) -> Change:
+        """Return the change of frame and unit of a field's values on the way into the FMU, or back."""
         room = size(topic.type, path)
         if room is not None and room != variable.size:
             raise MapError(f"{where}: {room} values of {topic.type} against {variable.size} of the FMU")
+        turn, scale = self._turn(entry, topic, where, into_fmu), self._scale(entry, topic, path, variable, where, into_fmu)
+        first, second = (turn, scale) if into_fmu else (scale, turn)
+        return lambda values: second(first(values))
 
     def _turn(self, entry: _Entry, topic: Topic, where: str, into_fmu: bool) -> Change:
         """Return the change of frame from the topic to the FMU, or back, for points and vectors."""
@@ -281,7 +277,3 @@ class Wiring:
 
 def _same(values: Any) -> Any:
     return values
-
-
-def _chain(first: Change, second: Change) -> Change:
-    return lambda values: second(first(values))
