@@ -153,7 +153,7 @@ def write_evidence(
     if touched is not None:
         known |= {"touched_believed": touched.believed, "touched_true": touched.true}
     if pressed is not None:
-        known |= {f"pressed_{name}": values for name, values in vars(pressed).items()}
+        known |= {f"pressed_{name}": values for name, values in pressed._asdict().items()}
     truth = io.BytesIO()
     np.savez_compressed(truth, **known)
     messages = sorted(_messages(c), key=attrgetter("stamp"))
@@ -229,7 +229,7 @@ def read_evidence(folder: Path) -> Evidence:
         collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
         nowhere = np.empty((0, 3))
         touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
-        named = {name: known[f"pressed_{name}"] for name in Pressed.__dataclass_fields__ if f"pressed_{name}" in known}
+        named = {name: known[f"pressed_{name}"] for name in Pressed._fields if f"pressed_{name}" in known}
         return Evidence(collected, touched, Pressed(**named) if named else None, str(known["run"]))
     except (KeyError, TypeError) as error:
         raise EvidenceError(f"{path} is of another version of Palpate ({error}): run the examination again") from error

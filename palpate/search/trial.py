@@ -104,4 +104,5 @@ def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Po
         rows.append((*felt.xy, felt.depth, felt.force, hand.spent, near, belief.lump, *place))
         left = belief.left(hand.spent)
     table = np.array(rows).reshape(-1, 9)
-    return Trial(table[:, :2], *table[:, 2:7].T, table[:, 7:], computing_s / max(len(rows), 1))
+    depths, forces, seconds, nears, lumps = table[:, 2:7].T
+    return Trial(table[:, :2], depths, forces, seconds, nears, lumps, table[:, 7:], computing_s / max(len(rows), 1))
