@@ -81,6 +81,11 @@ class Trial(NamedTuple):
     computing_s: float
     """Mean computing time of policy and posterior per press [s]."""
 
+    def decided(self, threshold: float) -> int | None:
+        """Return the index of the first press after which `near` reaches `threshold`; None if it never does."""
+        above = np.flatnonzero(self.near >= threshold)
+        return int(above[0]) if len(above) else None
+
 
 def search(hand: Hand, policy: Policy, presses: int | None = None, posterior: Posterior | None = None) -> Trial:
     """Run a policy on a patient until the budget is spent, or for `presses` presses.

@@ -295,14 +295,9 @@ def draw_errors(errors: Errors, seed: int, joints: int = 7) -> DrawnErrors:
     drawn = draw_arm(errors.arm, arm, joints)
     if any(errors.chosen.indenter_m):  # the last joint turns about the tool's axis
         drawn.origin_m[-1, :2] += errors.chosen.indenter_m
-    return DrawnErrors(
-        _force(errors.force, errors.chosen, force),
-        _camera(errors.camera, camera),
-        _pose(errors.hand_eye, hand_eye),
-        _pose(errors.registration, registration),
-        drawn,
-        _torque(errors.torque, torque, joints),
-    )
+    poses = _pose(errors.hand_eye, hand_eye), _pose(errors.registration, registration)
+    sensors = _force(errors.force, errors.chosen, force), _camera(errors.camera, camera)
+    return DrawnErrors(*sensors, *poses, drawn, _torque(errors.torque, torque, joints))
 
 
 def _force(given: ForceErrors, chosen: ChosenErrors, rng: np.random.Generator) -> DrawnForce:

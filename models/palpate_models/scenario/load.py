@@ -107,13 +107,7 @@ View = Literal["scenario", "plant", "exam"]
 _PATIENT: dict[str, Any] = {"name": True, "description": True, "phantom": True, "tissue": True, "services": {"tissue"}}
 HIDDEN: Mapping[View, dict[str, Any]] = {"scenario": {}, "plant": _PATIENT, "exam": {**_PATIENT, "seed": True, "errors": True}}
 """Fields left out of each view: the patient for the plant; also seed and errors for the examination."""
-_VIEWS: Mapping[str, View] = {
-    "tissue": "scenario",
-    "dashboard": "scenario",
-    "recorder": "scenario",
-    "robot": "plant",
-    "camera": "plant",
-}
+_SEES_ALL, _SEES_ERRORS = ("tissue", "dashboard", "recorder"), ("robot", "camera")
 
 
 class ScenarioError(UserError):
@@ -211,7 +205,7 @@ def whole_scenario(source: str | Path | Scenario, seed: int | None = None) -> Sc
 
 def view_of(role: str) -> View:
     """Return the view of a role: everything for observers and tissue, errors for simulated hardware, else the examination."""
-    return _VIEWS.get(role, "exam")
+    return "scenario" if role in _SEES_ALL else "plant" if role in _SEES_ERRORS else "exam"
 
 
 def seen(scenario: Scenario, view: View) -> Scenario:
@@ -236,13 +230,8 @@ def plant_input(scenario: Scenario) -> PlantInput:
 
 
 def _exam(scenario: Scenario) -> dict[str, Any]:
-    return {
-        "X_WA": tuple(tuple(row) for row in matrix(scenario.exam.pose).tolist()),
-        "exam": scenario.exam,
-        "robot": scenario.robot,
-        "camera": scenario.camera,
-        "limits": scenario.limits,
-    }
+    X_WA = tuple(tuple(row) for row in matrix(scenario.exam.pose).tolist())
+    return {"X_WA": X_WA, **{name: getattr(scenario, name) for name in ("exam", "robot", "camera", "limits")}}
 
 
 def true_pose(scenario: Scenario) -> Pose:

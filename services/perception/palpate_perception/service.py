@@ -235,14 +235,6 @@ def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:
 def targets(t: int, perceived: Perceived) -> Message:
     """Return `palpation_msgs/PalpationTargets` in world."""
     found = perceived.targets
-    return PalpationTargets(
-        header(t, FRAME),
-        [point_message(p) for p in found.p_W],
-        [vector_message(n) for n in found.n_W],
-        found.line,
-        perceived.sigma,
-        perceived.frames,
-        perceived.coverage,
-        perceived.reason,
-        perceived.message,
-    )
+    points, normals = [point_message(p) for p in found.p_W], [vector_message(n) for n in found.n_W]
+    facts = (perceived.sigma, perceived.frames, perceived.coverage, perceived.reason, perceived.message)
+    return PalpationTargets(header(t, FRAME), points, normals, found.line, *facts)

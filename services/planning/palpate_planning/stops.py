@@ -92,9 +92,9 @@ class Stops:
             course.interrupted = course.phase
             self._hold(now)
         if now.lost or now.stop.final:
-            self._end_after_loss(now, now.lost or now.stop.cause)
+            self._end(now, now.lost or now.stop.cause, lost=True)
         elif now.end:
-            self._end_at_home(now, now.end)
+            self._end(now, now.end, lost=False)
 
     def step(self, now: Observation) -> Setpoint | None:
         """Advance a held examination; return None where the arm's free motion or rest gives the set-point."""
@@ -161,25 +161,21 @@ class Stops:
             return goal
         return None
 
-    def _end_after_loss(self, now: Observation, cause: Cause) -> None:
-        """End the examination: in contact by lifting off and going home, if planning moves the arm, else where the arm is."""
-        course, held, palpation = self._course, self._course.phase is Phase.HELD, self._palpation
-        if palpation is None:
-            course.abort(now, cause)
-            return
-        palpation.abandon(cause)
-        if held and self._soft:
-            course.enter(course.interrupted, now.t, cause.text, cause)
-        elif held:
-            course.abort(now, cause)
+    def _end(self, now: Observation, cause: Cause, *, lost: bool) -> None:
+        """End the examination.
 
-    def _end_at_home(self, now: Observation, cause: Cause) -> None:
-        """End the examination at home: a held one after the release, but strokes that planning lifts at once."""
+        Strokes that planning moves are lifted, and the arm goes home. After a loss all others end where the arm is; otherwise
+        at home, held ones after the release.
+        """
         course, held, palpation = self._course, self._course.phase is Phase.HELD, self._palpation
         if palpation is not None:
             palpation.abandon(cause)
             if held and self._soft:
                 course.enter(course.interrupted, now.t, cause.text, cause)
+            elif held and lost:
+                course.abort(now, cause)
+        elif lost:
+            course.abort(now, cause)
         elif held:
             course.failure, course.interrupted = cause, Phase.RETURN
         else:

@@ -177,16 +177,6 @@ class RobotService(Service):
         self._friction_torques.clear()
         self._joint_readings.clear()
         self._ft_readings.clear()
-        return RobotStatus(
-            Header(stamp, ""),
-            int(driver.mode),
-            int(driver.cause),
-            driver.reason,
-            mean[: len(self._names)],
-            mean[len(self._names) :],
-            wrench_message(wrench),
-            self._applied,
-            driver.rejected,
-            driver.culprit,
-            self._measured_torque,
-        )
+        state, n = (int(driver.mode), int(driver.cause), driver.reason), len(self._names)
+        sensed, faults = (mean[:n], mean[n:], wrench_message(wrench)), (driver.rejected, driver.culprit)
+        return RobotStatus(Header(stamp, ""), *state, *sensed, self._applied, *faults, self._measured_torque)

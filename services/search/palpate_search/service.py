@@ -108,15 +108,9 @@ class SearchService(Service):
         else:
             place, depth = next_press(self._policy, posterior, posterior.left(self._spent_s))
         self._asked = np.asarray(place, dtype=float)
-        return SearchRequest(
-            header(t, FRAME),
-            self._number,
-            SearchRequest.DONE if self._ended else SearchRequest.PRESS,
-            Point(float(place[0]), float(place[1]), 0.0),
-            float(depth),
-            posterior.lump,
-            self._ended,
-        )
+        kind, x, y = SearchRequest.DONE if self._ended else SearchRequest.PRESS, float(place[0]), float(place[1])
+        point = Point(x, y, 0.0)
+        return SearchRequest(header(t, FRAME), self._number, kind, point, float(depth), posterior.lump, self._ended)
 
     def _over(self) -> str:
         """Return the reason for the end; empty while the search continues."""
@@ -173,16 +167,10 @@ def outline(lump: Bump, posterior: Posterior) -> list[Array]:
 
 
 def _press(sample: Message) -> Press:
-    return Press(
-        sample.position.x,
-        sample.position.y,
-        sample.depth,
-        sample.normal_force,
-        nanoseconds(sample.header.stamp) / NS,
-        limited=sample.force_limited,
-        depth_uncertainty=max(sample.depth_uncertainty, TUNING.least_uncertainty_m),
-        stroke=int(sample.stroke),
-    )
+    x, y, t = sample.position.x, sample.position.y, nanoseconds(sample.header.stamp) / NS
+    sd, stroke = max(sample.depth_uncertainty, TUNING.least_uncertainty_m), int(sample.stroke)
+    limited = sample.force_limited
+    return Press(x, y, sample.depth, sample.normal_force, t, limited=limited, depth_uncertainty=sd, stroke=stroke)
 
 
 def create(scenario: Scenario) -> Service:

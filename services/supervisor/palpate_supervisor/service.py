@@ -118,10 +118,10 @@ class SupervisorService(Service):
 
     def _presence(self, t: int, inbox: Inbox) -> list[Breach]:
         """Return breaches for lost roles and for watched topics that are too old."""
-        lost = [(role, level) for role, level in LOSS_LEVELS if inbox.lost(role)]
         found = [
             Breach(level, StopCause.LOST, f"the service of role {role} is lost", TUNING.retreat_ns, culprit=role)
-            for role, level in lost
+            for role, level in LOSS_LEVELS
+            if inbox.lost(role)
         ]
         self._began = t if self._began is None else self._began
         if t - self._began <= TUNING.settle_ns:

@@ -100,16 +100,10 @@ class ExamPlanner:
         known, exam, mesh = self._known, self._known.exam, (perceived.vertices, perceived.triangles)
         free, contact = (CollisionScene(self._kinematics, known.robot, mesh, touch) for touch in (False, True))
         xy = apply(inverse(np.array(known.X_WA)), perceived.positions)[:, :2]
-        postures, skipped = self._reachable(perceived, xy, q_now, contact, bend or KINEMATIC_LIMITS.straight_rad)
+        least = bend or KINEMATIC_LIMITS.straight_rad
+        postures, skipped = self._reachable(perceived, xy, q_now, contact, least)
         segments = SegmentPlanner(
-            self._kinematics,
-            contact,
-            perceived.surface,
-            postures,
-            known.robot.indenter_radius_m,
-            exam.depth_m,
-            bend or KINEMATIC_LIMITS.straight_rad,
-            lambda q0, q1: self._motion(free, q0, q1),
+            self._kinematics, contact, perceived.surface, postures, known, least, lambda q0, q1: self._motion(free, q0, q1)
         )
         joined = scan_of(exam, perceived.surface.in_A).joined
         breaks: set[int] = set()
@@ -141,14 +135,9 @@ class ExamPlanner:
         """Return a posture for each target, shape (n, 7), and the targets that none reaches, with the cause."""
         p, n = perceived.surface.at(xy)
         robot, limits = self._known.robot, self._known.limits
-        chosen = plan_redundancy(
-            robot,
-            centre(p, n, robot.indenter_radius_m, self._known.exam.depth_m),
-            n,
-            q_now,
-            joint_margin_rad=limits.joint_margin_rad,
-            force_n=limits.force_working_n,
-        )
+        centres = centre(p, n, robot.indenter_radius_m, self._known.exam.depth_m)
+        margin, force_n = limits.joint_margin_rad, limits.force_working_n
+        chosen = plan_redundancy(robot, centres, n, q_now, joint_margin_rad=margin, force_n=force_n)
         skipped: dict[int, Cause] = {}
         for i, q in enumerate(chosen.q):
             if not chosen.reachable[i]:

@@ -8,6 +8,7 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from palpate_models.numerics.frames import Array, rigid
+from palpate_models.scenario.schema import ExamInput
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.planner import NoPathError
 from palpate_planning.motion.scene import CollisionScene
@@ -79,8 +80,7 @@ class SegmentPlanner:
         scene: CollisionScene,
         surface: PerceivedSurface,
         postures: Array,
-        radius: float,
-        depth: float,
+        known: ExamInput,
         bend: float,
         free_motion: Callable[[Array, Array], JointTrajectory],
     ) -> None:
@@ -91,13 +91,13 @@ class SegmentPlanner:
             scene: in which the tool may touch the abdomen.
             surface: the perceived surface.
             postures: of the targets [rad], shape (n, 7).
-            radius: of the sphere [m].
-            depth: of the examination [m].
+            known: examination and tool.
             bend: least bend of the elbow in strokes and on straight paths [rad].
             free_motion: plans from q0 to q1 [rad] without contact, or raises NoPathError.
         """
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
-        self._postures, self._radius, self._depth, self._bend, self._free_motion = postures, radius, depth, bend, free_motion
+        self._radius, self._depth = known.robot.indenter_radius_m, known.exam.depth_m
+        self._postures, self._bend, self._free_motion = postures, bend, free_motion
         self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Infeasible]] = {}
         self._hovers: dict[Place, Array | None] = {}
         self._paths: dict[tuple[Place, Place], tuple[Segment | None, Cause]] = {}
