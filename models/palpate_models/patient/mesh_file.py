@@ -46,7 +46,8 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     content = read_bytes(path, MeshError)
     try:
         if path.suffix.lower() == ".stl":
-            as_text = _is_text_stl(content)
+            # One of text; a binary one has zeros, and its header may begin with `solid` too.
+            as_text = content[:5].lower() == b"solid" and b"facet" in content[:1000].lower() and b"\0" not in content[:1000]
             content = _utf8(content.lower()) if as_text else content
             _check_stl(content, as_text)
         elif path.suffix.lower() == ".obj":
@@ -65,20 +66,16 @@ def read_mesh(path: Path) -> tuple[Array, IntArray]:
     except Exception as error:
         raise MeshError(f"cannot be read as {path.suffix.lower()}, it is damaged or not whole: {error}") from error
     _check_counts(len(vertices), len(triangles))
-    _check_indices(triangles, 0, len(vertices) - 1)
+    wrong = np.argwhere((triangles < 0) | (triangles >= len(vertices)))
+    if len(wrong):
+        face, corner = wrong[0]
+        raise MeshError(f"face {face} names vertex {triangles[face, corner]}, the vertices are 0 to {len(vertices) - 1}")
     return vertices, triangles
 
 
 def _check_counts(*counts: int) -> None:
     if max(counts, default=0) > bounds().elements:
         raise over("the mesh", f"{max(counts)} vertices or faces", "elements", MeshError)
-
-
-def _check_indices(faces: IntArray, first: int, last: int) -> None:
-    wrong = np.argwhere((faces < first) | (faces > last))
-    if len(wrong):
-        face, corner = wrong[0]
-        raise MeshError(f"face {face} names vertex {faces[face, corner]}, the vertices are {first} to {last}")
 
 
 def _utf8(text: bytes) -> bytes:
@@ -113,11 +110,6 @@ def _check_ply(loaded: trimesh.Trimesh) -> None:
         short = [row for row in columns[0] if name == "face" and isinstance(row, list | np.ndarray) and len(row) < 3]
         if short:
             raise MeshError(f"a face names {len(short[0])} vertices, want at least 3: the file is not whole")
-
-
-def _is_text_stl(content: bytes) -> bool:
-    """Return True for an STL of text: a binary one has zeros, and its header may begin with `solid` too."""
-    return content[:5].lower() == b"solid" and b"facet" in content[:1000].lower() and b"\0" not in content[:1000]
 
 
 def _check_stl(content: bytes, as_text: bool) -> None:

@@ -182,7 +182,12 @@ def drawn(phantom: schema.Phantom, seed: int) -> schema.Phantom:
         dome_m=dome,
         exponent=exponent,
         skeleton=_skeleton(rng, length),
-        muscles=_muscles(rng),
+        muscles=schema.Muscles(  # at rest 0.9 to 1.4 times as stiff as the sides [A, within the measured variation]
+            linea_alba_m=rng.uniform(0.012, 0.022),
+            rectus_m=rng.uniform(0.055, 0.075),
+            linea_alba=rng.uniform(0.9, 1.4),
+            rectus=rng.uniform(1.0, 1.4),
+        ),
         variation=_variation(statistics),
     )
     lumps = drawn_lumps(phantom.draw, generator(seed, "lumps"))
@@ -252,16 +257,6 @@ def _skeleton(rng: np.random.Generator, length: float) -> schema.Skeleton:
         costal_arch_m=scale * rng.uniform(0.16, 0.20),
         costal_slope=rng.uniform(0.5, 0.9),
         iliac_crest_m=(scale * rng.uniform(0.125, 0.145), -scale * rng.uniform(0.10, 0.14)),
-    )
-
-
-def _muscles(rng: np.random.Generator) -> schema.Muscles:
-    """Draw rectus and linea alba: at rest 0.9 to 1.4 times as stiff as the sides [A, within the measured variation]."""
-    return schema.Muscles(
-        linea_alba_m=rng.uniform(0.012, 0.022),
-        rectus_m=rng.uniform(0.055, 0.075),
-        linea_alba=rng.uniform(0.9, 1.4),
-        rectus=rng.uniform(1.0, 1.4),
     )
 
 

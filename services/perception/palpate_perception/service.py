@@ -161,7 +161,9 @@ class PerceptionService(Service):
             burst.fusion = self._pipeline.fusion(burst.camera)
         if burst.fusion is not None:
             for image in burst.waiting[: burst.wanted - burst.fusion.frames]:
-                burst.wrong = burst.wrong or _disagreement(image, burst.camera)
+                height, width = burst.camera.shape
+                if (image.height, image.width) != (height, width) and not burst.wrong:
+                    burst.wrong = f"depth image is {image.width} x {image.height}, camera_info says {width} x {height}"
                 if burst.wrong:
                     continue
                 try:
@@ -204,14 +206,6 @@ def _intrinsics(inbox: Inbox, topic: str, image: Message) -> Intrinsics | None:
     if info is None or X_WC is None:
         return None
     return Intrinsics(np.array(info.k, np.float64).reshape(3, 3), X_WC, (int(info.height), int(info.width)))
-
-
-def _disagreement(frame: Message, camera: Intrinsics) -> str:
-    """Describe why the intrinsics do not fit a frame; empty if they do."""
-    height, width = camera.shape
-    if (frame.height, frame.width) == (height, width):
-        return ""
-    return f"depth image is {frame.width} x {frame.height}, camera_info says {width} x {height}"
 
 
 def _nothing(burst: _Burst, inbox: Inbox) -> Perceived:

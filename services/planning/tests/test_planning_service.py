@@ -192,29 +192,18 @@ def test_a_lost_robot_aborts() -> None:
     assert (state.reason, state.phase, state.end_tick) == (Reason.SERVICE_LOST, Phase.ABORTED, 1020 * MS)
 
 
-def test_a_damaged_surface_causes_a_new_scan() -> None:
-    world, damaged = BusWorld(), []
-
-    def damage(mesh: Any) -> None:
-        if not damaged:
-            mesh.triangles[7] = 4294967269
-        damaged.append(mesh)
-
-    world.seen = damage
-    world.run()
-    assert world.exam.status.phase is Phase.DONE
-    assert len(damaged) == 2
-
-
-def test_coincident_targets_cause_a_new_scan() -> None:
+@pytest.mark.parametrize("coincident", [False, True])
+def test_a_damaged_surface_and_coincident_targets_cause_a_new_scan(coincident: bool) -> None:
     world, looks = BusWorld(), []
 
-    def double(targets: Any) -> None:
-        looks.append(targets)
-        if len(looks) == 1:
-            targets.positions[1] = targets.positions[0]
+    def damage(message: Any) -> None:
+        looks.append(message)
+        if len(looks) == 1 and coincident:
+            message.positions[1] = message.positions[0]
+        elif len(looks) == 1:
+            message.triangles[7] = 4294967269
 
-    world.targets = double
+    setattr(world, "targets" if coincident else "seen", damage)
     world.run()
     assert world.exam.status.phase is Phase.DONE
     assert len(looks) == 2

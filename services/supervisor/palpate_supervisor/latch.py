@@ -77,7 +77,8 @@ class Latch:
             if breach.level > self.level:
                 self._latch(t, breach)
             elif breach.cause is StopCause.SENSOR and self.cause is not StopCause.SENSOR:
-                self._explain(breach)
+                # Name the wrong sensor: wrong force or speed is noticed before the senses are compared.
+                self.cause, self.culprit, self.reason = breach.cause, breach.culprit, f"{breach.reason}; before it: {self.reason}"
         for breach in standing:
             began = self._since if breach.cause is self.cause else max(self._since, self._begun[breach.cause])
             if self.level is Level.SOFT_STOP and t - began > breach.timeout_ns:
@@ -103,10 +104,6 @@ class Latch:
         self.level, self.cause, self.reason, self.culprit = breach.level, breach.cause, breach.reason, breach.culprit
         self._since = t
         self.stops.append(Stop(t, breach.level, breach.cause, breach.reason))
-
-    def _explain(self, breach: Breach) -> None:
-        """Name the wrong sensor in a stop with another cause: wrong force or speed is noticed before the senses are compared."""
-        self.cause, self.culprit, self.reason = breach.cause, breach.culprit, f"{breach.reason}; before it: {self.reason}"
 
     def _release(self, t: int, standing: list[Breach]) -> list[Breach]:
         """Grant a release unless a breach that motion cannot end is present; return the breaches still to be judged."""

@@ -70,7 +70,7 @@ class MovingBody(Service):
             self._v_A, self._w_A = self._motion.twist(t_s)
             self._evaluated_s = t_s
         for part in self._tissue.parts(t, _ConvertedInbox(inbox, self._seen_from_body)):
-            yield {topic: self._to_world.get(topic, _unchanged)(message) for topic, message in part.items()}
+            yield {topic: self._to_world.get(topic, lambda same: same)(message) for topic, message in part.items()}
 
     def finish(self) -> Mapping[str, Any]:
         """Return the tissue's facts, the time of the motion, and the displacement of the body's origin."""
@@ -124,10 +124,6 @@ class _ConvertedInbox:
 
     def lost(self, role: str) -> bool:
         return self._inbox.lost(role)
-
-
-def _unchanged(message: Message) -> Message:
-    return message
 
 
 def _transformed(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:

@@ -56,7 +56,7 @@ def timed_motion(
     points = plan(scene, q0, q1, (kinematics.lower, kinematics.upper), seed)
     for blend in TUNING.blends_rad:
         smooth = rounded(points, blend)
-        if len(points) == 2 or scene.path_free(smooth):
+        if len(points) == 2 or all(scene.motion_free(a, b) for a, b in pairwise(smooth)):
             return joint_trajectory(kinematics, smooth, limits, period_s)
     raise NoPathError(f"corners of the motion to {np.round(q1, 3).tolist()} cannot be rounded without collision")
 

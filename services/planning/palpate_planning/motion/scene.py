@@ -1,7 +1,6 @@
 """The collision scene: the arm's capsules, table, base and the perceived abdomen, checked with coal through pinocchio."""
 
-from collections.abc import Iterable, Iterator
-from itertools import pairwise
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import coal
@@ -93,7 +92,8 @@ class CollisionScene:
         self._model = kinematics.model
         self._data = self._model.createData()
         self._geometry = pin.GeometryModel()
-        arm, links = self._add_arm(robot), link_names(robot)
+        links, shapes = link_names(robot), _arm_shapes(self._model, robot)
+        arm = [(link, self._add(f"{link}_{k}", joint, pose, shape)) for k, (link, joint, pose, shape) in enumerate(shapes)]
         obstacles = [(box.name, self._add(box.name, 0, pin.SE3(box.X_WB), coal.Box(*box.size))) for box in table.boxes(robot)]
         if abdomen is not None:
             vertices, triangles = with_skirt(*abdomen, table.TABLE.top_m)
@@ -112,11 +112,6 @@ class CollisionScene:
 
     def _add(self, name: str, joint: int, placement: pin.SE3, geometry: coal.CollisionGeometry) -> int:
         return int(self._geometry.addGeometryObject(pin.GeometryObject(name, joint, placement, geometry)))
-
-    def _add_arm(self, robot: Robot) -> list[tuple[str, int]]:
-        """Add the arm's capsules; return link name and geometry index of each, base first."""
-        shapes = _arm_shapes(self._model, robot)
-        return [(link, self._add(f"{link}_{k}", joint, pose, shape)) for k, (link, joint, pose, shape) in enumerate(shapes)]
 
     def free(self, q: Array) -> bool:
         """Return True if the arm at q [rad] keeps its margin to all obstacles and to itself."""
@@ -137,11 +132,6 @@ class CollisionScene:
         steps = max(1, int(np.ceil(float(np.abs(q1 - q0).max()) / COLLISION.step_rad)))
         order = sorted(range(steps + 1), key=lambda k: -(k & -k) if k else -steps)  # coarse first, to fail early
         return all(self.free(q0 + (q1 - q0) * (k / steps)) for k in order)
-
-    def path_free(self, path: Iterable[Array]) -> bool:
-        """Return True if a polyline of postures is free."""
-        points = list(path)
-        return all(self.motion_free(a, b) for a, b in pairwise(points))
 
 
 class ViewPyramid:

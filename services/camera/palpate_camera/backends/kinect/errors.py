@@ -107,12 +107,6 @@ def lateral_sigma(theta: Vector) -> Vector:
     return np.asarray(0.8 + 0.035 * theta / (np.pi / 2 - theta), np.float32)
 
 
-def loss_probability(theta: Vector) -> Vector:
-    """Probability that a pixel has no depth: 0 up to 70 deg of incidence, rising linearly to 1 at 85 deg."""
-    low, high = GRAZING_RAD
-    return np.asarray(np.clip((theta - low) / (high - low), 0, 1), np.float32)
-
-
 class _Statistics(NamedTuple):
     """Inputs of the noise model at the n pixels that hit a surface."""
 
@@ -182,9 +176,10 @@ class KinectNoise:
             v, u = np.divmod(pixel.astype(np.int32), np.int32(view.w.shape[1]))
             z = np.asarray(1 / view.w.ravel()[pixel], np.float32)
             theta = np.asarray(np.arccos(np.minimum(view.cos.ravel()[pixel], 1)), np.float32)
-            loss = loss_probability(theta)
+            low, high = GRAZING_RAD  # from no lost pixels to all
+            loss = np.asarray(np.clip((theta - low) / (high - low), 0, 1), np.float32)
             grazing = np.flatnonzero(loss)
-            theta = np.asarray(np.minimum(theta, GRAZING_RAD[1]), np.float32)  # beyond, all pixels are lost: stay off the pole
+            theta = np.asarray(np.minimum(theta, high), np.float32)  # beyond, all pixels are lost: stay off the pole
             axial = np.zeros(view.w.size, np.float32)
             axial[pixel] = self._scale * axial_sigma(z, theta)
             lateral = self._scale / self._spacing * lateral_sigma(theta)

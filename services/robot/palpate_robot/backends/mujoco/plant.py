@@ -21,7 +21,7 @@ import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import TOOL, arm_of, base_pose, capsules, inertias, link_names, mounted
-from palpate_models.robot.chain import Arm, Capsule, Inertia
+from palpate_models.robot.chain import Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
 from palpate_models.scenario.schema import Robot
@@ -52,18 +52,6 @@ def _add_link(parent: Any, link: str, position: tuple[float, float, float] | Arr
     body.ipos = inertia.com
     body.fullinertia = [*inertia.diagonal, *inertia.products]
     return body
-
-
-def _add_joint(body: Any, arm: Arm, i: int) -> None:
-    body.add_joint(
-        name=arm.joint_names[i],
-        type=mujoco.mjtJoint.mjJNT_HINGE,
-        axis=arm.axis[i],
-        limited=True,
-        range=(float(arm.lower_rad[i]) - END_STOP_MARGIN_RAD, float(arm.upper_rad[i]) + END_STOP_MARGIN_RAD),
-        solref_limit=_STOP,
-        solimp_limit=_IMPEDANCE,
-    )
 
 
 def _add_shape(body: Any, capsule: Capsule) -> None:
@@ -114,7 +102,15 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
             body = _add_link(body, link, fixed[link], masses[link])
         else:
             body = _add_link(body, link, arm.origin_m[i - 1] + drawn.origin_m[i - 1], masses[link])
-            _add_joint(body, arm, i - 1)
+            body.add_joint(
+                name=arm.joint_names[i - 1],
+                type=mujoco.mjtJoint.mjJNT_HINGE,
+                axis=arm.axis[i - 1],
+                limited=True,
+                range=(float(arm.lower_rad[i - 1]) - END_STOP_MARGIN_RAD, float(arm.upper_rad[i - 1]) + END_STOP_MARGIN_RAD),
+                solref_limit=_STOP,
+                solimp_limit=_IMPEDANCE,
+            )
         for capsule in () if i < at_base else shapes[link]:
             _add_shape(body, capsule)
         if link == "ft_sensor":
