@@ -62,7 +62,7 @@ def test_axial_noise_and_rounding_have_the_models_variance(z: float) -> None:
 def test_lateral_jitter_shows_on_a_slope(degrees: float) -> None:
     tilt = np.deg2rad(degrees)
     view = plane(1.0, tilt)
-    view.w += view.gu * (np.arange(SHAPE[1]) - SHAPE[1] / 2)
+    view.w[:] += view.gu * (np.arange(SHAPE[1]) - SHAPE[1] / 2)
     z = 1 / view.w
     image = noise().image(view, NONE)
     lateral = z**2 * view.gu * lateral_sigma(np.full(SHAPE, tilt, np.float32))
