@@ -43,11 +43,11 @@ class Setpoint:
     damping_ratio: Array
     """[1], shape (6,)."""
     q: Array
-    """JOINT: target; CARTESIAN: null-space posture [rad], shape (7,)."""
+    """JOINT: target; CARTESIAN: null-space posture [rad], shape (n,)."""
     qd: Array
-    """Velocity of `q` [rad/s], shape (7,)."""
+    """Velocity of `q` [rad/s], shape (n,)."""
     joint_stiffness: Array
-    """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (7,)."""
+    """JOINT: joint stiffness; CARTESIAN: null-space stiffness [N m/rad], shape (n,)."""
 
     def message(self) -> ImpedanceSetpoint:
         """Return the `ImpedanceSetpoint`, valid until the contract's expiry."""

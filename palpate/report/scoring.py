@@ -99,7 +99,7 @@ def score(found: Sequence[FindingRow], found_map: Map | None, truth: Truth, cand
 
 
 def depth_errors(depth: Array, wanted: Array, in_lump: Mask) -> dict[str, float | None]:
-    """Return the RMS of `depth` - `wanted` [m] over all, beside and in lumps, by the ends of its names; None without values."""
+    """Return the RMS of `depth` - `wanted` [m] over all, outside and in lumps, by the ends of its names; None without values."""
 
     def rms(chosen: Mask) -> float | None:
         return float(np.sqrt(np.mean((depth - wanted)[chosen] ** 2))) if chosen.any() else None
