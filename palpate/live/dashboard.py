@@ -111,10 +111,9 @@ def _drawn(source: Path, place: Path) -> Path:
     from palpate_dashboard.sinks import Live
     from palpate_models.scenario.load import load_scenario
 
-    if source.suffix == ".rrd" and source.is_file():
-        return source
-    if (source / FILE).is_file():
-        return source / FILE
+    for made in (source, source / FILE):
+        if made.suffix == ".rrd" and made.is_file():
+            return made
     if source.suffix == ".mcap" and source.is_file():
         scenario = source.parent.parent / "scenario.yaml"
         if not scenario.is_file():

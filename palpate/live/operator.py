@@ -1,5 +1,6 @@
 """`palpate stop`, `release`, `pause`, `resume`, `step`: control of a run from another terminal."""
 
+from contextlib import suppress
 from time import monotonic, sleep
 from typing import Annotated
 
@@ -72,11 +73,9 @@ def _request(word: str, reason: str, name: str | None, *, everyone: bool = False
 
 def _answer(joined: zenoh.Session, bus: BusTarget, word: str, reason: str, ms: int) -> tuple[str, float]:
     """Return the answer to a request; asks again until the run is discovered, since links to its peers come up one by one."""
-    begin, key = monotonic(), bus.secret()
-    while True:
-        try:
+    end, key = monotonic() + 1.0, bus.secret()
+    while monotonic() < end:
+        with suppress(NoConductorError):
             return ask(joined, bus.domain, word, reason, ms, key)
-        except NoConductorError:
-            if monotonic() - begin > 1.0:
-                raise
-            sleep(0.05)
+        sleep(0.05)
+    return ask(joined, bus.domain, word, reason, ms, key)

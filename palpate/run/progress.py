@@ -70,7 +70,7 @@ class Narration:
         elif not began or not (self._touching(state) or self._scanning):
             return None  # the first descent after the touches ends them; the scan begins at depth
         else:
-            sentence = self._touching_text() if name == "touch" else self._scanning_text(state)
+            sentence = self._stroke_text(name, state)
         now = (name, int(state.reason), state.target_index if in_stroke else str(state.message))
         if now == self._last:
             return None
@@ -81,12 +81,10 @@ class Narration:
         """Return True if this stroke is one of the touches before the scan."""
         return not self._scanning and state.stroke - self._strokes_before <= self._outlook.touches
 
-    def _touching_text(self) -> str:
-        count = self._outlook.touches
-        places = "a place" if count == 1 else f"{count} places"
-        return f"touching the skin at {places} to correct its position, which the camera measures to some millimetres"
-
-    def _scanning_text(self, state: Any) -> str:
+    def _stroke_text(self, part: str, state: Any) -> str:
+        if part == "touch":
+            places = "a place" if self._outlook.touches == 1 else f"{self._outlook.touches} places"
+            return f"touching the skin at {places} to correct its position, which the camera measures to some millimetres"
         depth = f"{1e3 * self._exam.depth_m:.0f} mm deep"
         if self._exam.searched:
             return f"pressing where it is most informative until the result is certain, at most {self._outlook.presses} times"

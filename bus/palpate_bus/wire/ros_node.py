@@ -17,14 +17,9 @@ from palpate_bus.wire.zenoh_config import BusOptions, close_session, open_sessio
 RING = 16
 """Messages kept per topic."""
 QOS = Qos(
-    name="ros",
-    priority="REAL_TIME",
-    congestion="DROP",
-    express=True,
-    reliability="RELIABLE",
-    depth=1,
+    name="ros", priority="REAL_TIME", congestion="DROP", express=True, reliability="RELIABLE", depth=1,
     reason="as ros2_control's controllers subscribe: reliable, the newest alone",
-)
+)  # fmt: skip
 LATCHED = QOS.model_copy(update={"transient_local": True, "congestion": "BLOCK", "priority": "DATA"})
 
 

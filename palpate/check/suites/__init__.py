@@ -16,16 +16,9 @@ from palpate_bus.contract.port_check import Checker
 from palpate_bus.messages.stamps import MS
 
 SUITES = {
-    "robot": 9.0,
-    "tissue": 4.0,
-    "control": 7.0,
-    "planning": 2.0,
-    "camera": 2.5,
-    "perception": 4.5,
-    "assessment": 31.0,
-    "search": 7.5,
-    "supervisor": 26.0,
-}
+    "robot": 9.0, "tissue": 4.0, "control": 7.0, "planning": 2.0, "camera": 2.5, "perception": 4.5, "assessment": 31.0,
+    "search": 7.5, "supervisor": 26.0,
+}  # fmt: skip
 """Roles, each with a module of this package, and the duration of their suites [s] on the rig's clock with a conforming
 implementation."""
 
