@@ -54,7 +54,7 @@ def main(folder: Path) -> None:
     moments = moments_of([decode(recorded.payload) for recorded in recording.messages(["exam/state"])])
     after: dict[tuple[str, str], list[float | None]] = defaultdict(list)
     windows = {moment: window(recording, moments[moment]) for moment in MOMENTS}
-    for case in cases(()):
+    for case in cases(("lockstep",), ()):
         topic, path, kind, amount, moment = case.where.split()
         lie = Lie(topic, path, kind, float(amount), moments[moment])
         if windows[moment][topic]:

@@ -32,7 +32,7 @@ def faults(
 ) -> None:
     """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the findings.
 
-    `--kind lie`: services that send wrong values, in lockstep.
+    `--kind lie`: services that send wrong values.
     """
     from palpate.study.folder import code_digest
     from palpate_benchmarks import lies
@@ -47,7 +47,7 @@ def faults(
     found = _load(out)
     todo = list(cases(modes, kinds, only or ()))
     if LIE in kinds:
-        todo += [*lies.cases(only or ()), *lies.drawn(random, seed)]
+        todo += [*lies.cases(modes, only or ()), *lies.drawn(random, seed, modes)]
     else:
         todo += drawn(random, seed, modes)
     if not todo:
@@ -60,7 +60,7 @@ def faults(
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
         findings = (run_case(case, Path(folder)) for case in todo if case.kind != LIE)
-        lying = lies.run_lies([case for case in todo if case.kind == LIE]) if LIE in kinds else ()
+        lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
         for number, finding in enumerate(chain(findings, lying), 1):
             finding.code = code
             found = [f for f in found if f.identity != finding.identity] + [finding]

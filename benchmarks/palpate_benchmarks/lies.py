@@ -9,18 +9,21 @@ itself complete on less than its twin felt, and the liar was named, or did no ha
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from itertools import cycle
+from pathlib import Path
 from random import Random
 from time import monotonic
 from typing import Any, Final
 
 from palpate.apart import guarded
+from palpate.environment import given
 from palpate.run.composed import load_services
+from palpate.run.distributed import run_distributed
 from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.liar import WHOLE, Lie
-from palpate_benchmarks.struck import SETTINGS, Watched
+from palpate_benchmarks.struck import SETTINGS, Watched, kept_rate
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.contract.port_check import leaves
 from palpate_bus.messages import ExamState
@@ -28,7 +31,7 @@ from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_conductor.collector import Collected, Collector, FrameTree
-from palpate_conductor.outcome import RunProgress, RunResult, gave_up
+from palpate_conductor.outcome import RunProgress, RunResult, Timing, gave_up
 from palpate_errors import RunError
 from palpate_models.scenario.load import exam_input, load_scenario
 
@@ -50,6 +53,8 @@ NOISE: Final = {"N": 0.05, "N m": 0.002, "rad": 1e-6, "rad/s": 1e-4, "m": 0.002}
 """Noise of a live sensor by unit, standard deviation; `noise` adds twenty times as much."""
 FACTORS: Final = {"gain": 0.3, "unnormalised": 1.5, "delayed": 100.0, "stale": 0.5}
 DELAYS_MS: Final = (20, 50, 200)
+LIVE_KINDS: Final = ("zero", "stale")
+"""Further kinds of the cases in wall-clock mode."""
 
 
 @dataclass(frozen=True)
@@ -155,8 +160,8 @@ def _kinds(topic: Topic, path: str) -> Iterator[tuple[str, float]]:
         yield "permuted", 0.0
 
 
-def cases(only: Sequence[str]) -> Iterator[FaultCase]:
-    """Yield cases in lockstep: one per topic and kind, then other fields, then other moments.
+def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
+    """Yield lockstep cases: one per topic and kind, then other fields, then other moments; and those in wall-clock mode.
 
     `only` restricts them to topics, roles, kinds and moments.
     """
@@ -173,18 +178,23 @@ def cases(only: Sequence[str]) -> Iterator[FaultCase]:
         seen.add((topic.name, kind))
     for _, topic, kind, where in sorted(ranked, key=lambda case: case[0]):
         moment = where.split()[-1]
-        if not only or {topic.name, topic.producer, kind, moment} & set(only):
+        if only and not {topic.name, topic.producer, kind, moment} & set(only):
+            continue
+        if "lockstep" in modes:
             yield FaultCase(LIE, where, wallclock=False)
+        live = kind in ("frozen", "repeated") or (topic.name in SENSED and kind in LIVE_KINDS)
+        if "wallclock" in modes and live and moment == "depth":
+            yield FaultCase(LIE, where, wallclock=True)
 
 
-def drawn(count: int, seed: int) -> Iterator[FaultCase]:
+def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
     """Yield `count` random lies: a cell, an amount of 0.1 to 3 times its own, and a share of the twin's time."""
     draw, known = Random(seed), list(cells())
     for _ in range(count):
         topic, path, kind, amount = draw.choice(known)
         amount = float(f"{amount * 10 ** draw.uniform(-1, 0.5):.2g}")
         where = f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}"
-        yield FaultCase(LIE, where, wallclock=False)
+        yield FaultCase(LIE, where, draw.choice(modes) == "wallclock")
 
 
 def lie_of(where: str, healthy: Healthy) -> Lie:
@@ -252,6 +262,20 @@ class Lockstep:
         return watched
 
 
+def by_wall_clock(lie: Lie, folder: Path) -> Watched:
+    """Return an examination with a lie in wall-clock mode, at the rate that this machine keeps."""
+    watched = Watched(RunResult("wallclock", Collected()))
+
+    def on_progress(progress: RunProgress) -> None:
+        if progress.t >= lie.at_s * NS:
+            watched.add(progress, progress.t / 1e6 - lie.at_s * 1e3)
+
+    with given({liar.VARIABLE: str(lie)}):
+        scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
+        watched.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=kept_rate()))
+    return watched
+
+
 def healthy(result: RunResult) -> Healthy:
     """Return the figures of the run without a lie. Raises RunError if the run failed."""
     if result.failure is not None:
@@ -284,13 +308,17 @@ def _felt(c: Collected) -> tuple[int, int, float]:
     return felt, 0 if c.findings is None else len(c.findings.findings), background
 
 
-def run_lies(todo: Sequence[FaultCase]) -> Iterator[FaultFinding]:
-    """Yield the findings of the cases in the order of their times."""
+def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
+    """Yield the findings of the cases, those in lockstep in the order of their times."""
     lockstep = Lockstep()
-    for case in sorted(todo, key=lambda case: start_s(lie_of(case.where, lockstep.twin))):
-        begin, lie = monotonic(), lie_of(case.where, lockstep.twin)
+    twin = lockstep.twin
+    for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.where, twin)))):
+        begin, lie = monotonic(), lie_of(case.where, twin)
         finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
-        finding = lockstep.judged(finding, lie)
+        if case.wallclock:
+            finding = judged(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+        else:
+            finding = lockstep.judged(finding, lie)
         finding.wall_s = round(monotonic() - begin, 1)
         yield finding
 

@@ -60,8 +60,10 @@ def lies(findings: Sequence[FaultFinding]) -> str:
         if mine := [f for f in findings if f.where.split()[2] == kind]:
             counts = Counter(f.lie_verdict for f in mine)
             rows.append((kind, str(len(mine)), *(str(counts[one]) for one in RANKS), f"{_largest(mine):.1f}"))
+    wallclock = sum(f.mode == "wall clock" for f in findings)
     codes = Counter(f.code or "earlier code" for f in findings).most_common()
-    lines = [f"{_passed(findings)}. Cases by code: {', '.join(f'{code} {count}' for code, count in codes)}.\n",
+    lines = [f"{_passed(findings)}, {wallclock} of them in wall-clock mode. Cases by code: "
+             f"{', '.join(f'{code} {count}' for code, count in codes)}.\n",
              table(("lie", "cases", *RANKS, "largest force [N]"), rows)]  # fmt: skip
     lines += [f"- **!** {f.where}: {f.ended}" for f in findings if not f.good]
     lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]

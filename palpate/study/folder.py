@@ -204,6 +204,8 @@ class Folder:
                 raise ValueError(f"{HASH} is {known!r}, not the hash of its content: the file was changed")
             if not case_id == outcome.case.case_id == outcome.case.content_id:
                 raise ValueError(f"it has the case {outcome.case.case_id}, whose content has the id {outcome.case.content_id}")
+            if outcome.status == "done" and not outcome.code:
+                raise ValueError("code is empty: want the SHA-256 of the code that made it")
         except FileNotFoundError:
             return None
         except (OSError, ValueError, RecursionError) as error:
@@ -241,14 +243,20 @@ class Folder:
         write_text(self._failures_file(case_id), json.dumps(causes) + "\n")
 
     def sessions(self) -> list[Session]:
-        """Return all calls of the command. Raises StudyError for a line that cannot be read."""
+        """Return all calls of the command, without a last one whose line a kill or a full disk cut.
+
+        Raises StudyError for any other line that cannot be read.
+        """
         path = self.path / SESSIONS
-        try:
-            return [Session.model_validate_json(line) for line in path.read_text(encoding="utf-8").splitlines()]
-        except FileNotFoundError:
-            return []
-        except ValueError as error:
-            raise StudyError(f"{path} has a line that is not a session ({error}): remove it") from error
+        lines = path.read_text(encoding="utf-8", errors="replace").splitlines() if path.is_file() else []
+        found = []
+        for number, line in enumerate(lines, start=1):
+            try:
+                found.append(Session.model_validate_json(line))
+            except ValueError as error:
+                if number < len(lines):
+                    raise StudyError(f"{path}, line {number} is not a session ({error}): remove it") from error
+        return found
 
     def write_sessions(self, sessions: Iterable[Session]) -> None:
         """Write all calls of the command, atomically."""

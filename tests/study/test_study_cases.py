@@ -238,11 +238,23 @@ def test_a_changed_outcome_is_refused_before_anything_is_written(
     assert not (tmp_path / "whole").exists()
 
 
-def test_a_line_that_is_no_session_is_refused(tmp_path: Path, cases: list[Case]) -> None:
+def test_an_outcome_needs_the_code_that_made_it(tmp_path: Path, cases: list[Case]) -> None:
     folder = folder_of(tmp_path, cases)
-    sessions = [Session(workers=1, cases=2, elapsed_s=k) for k in range(2)]
-    folder.write_sessions(sessions)
-    assert folder.sessions() == sessions
-    (tmp_path / SESSIONS).write_text("{}\n")
-    with pytest.raises(StudyError, match="not a session"):
+    outcome = folder.outcome(cases[0].case_id)
+    assert outcome is not None
+    folder.write(outcome.model_copy(update={"code": ""}))
+    with pytest.raises(StudyError, match="code is empty"):
+        folder.outcomes(manifest_of("toy", cases))
+
+
+def test_a_session_that_was_cut_is_left_out(tmp_path: Path, cases: list[Case]) -> None:
+    folder = folder_of(tmp_path, cases)
+    sessions = [Session(workers=1, cases=2, elapsed_s=k) for k in range(3)]
+    folder.write_sessions(sessions[:2])
+    path = tmp_path / SESSIONS
+    path.write_text(path.read_text()[:-9])
+    folder.write_sessions([*folder.sessions(), sessions[2]])
+    assert folder.sessions() == [sessions[0], sessions[2]]
+    path.write_text("{}\n" + path.read_text())
+    with pytest.raises(StudyError, match="line 1"):
         folder.sessions()
