@@ -175,3 +175,25 @@ def test_over_zenoh_as_rmw_zenoh_sends_it(tmp_path: Path) -> None:
     image = out["camera/depth/image_raw"]
     np.testing.assert_allclose(np.asarray(image.data).view("<f4").reshape(2, 3), METRES, atol=1e-3)
     node.close()
+
+
+@pytest.mark.parametrize(
+    ("info", "frame", "problem"),
+    [
+        (ros_info(d=0.1), FRAME, "rectified"),
+        (larger(), FRAME, "3 x 2, camera_info says 6 x 4"),
+        # Depth that is aligned to colour is in the colour camera's frame.
+        (ros_info(), "camera_color_optical_frame", "set camera.ros.frame=camera_color_optical_frame"),
+    ],
+)
+def test_an_image_that_does_not_fit_is_refused_with_the_reason(info: Any, frame: str, problem: str) -> None:
+    port = Port()
+    service, inbox, image = RosCameraService(port), asked(1), ros_image()
+    port.intrinsics = info  # the driver was restarted
+    service.step(0, inbox)
+    image.header.frame_id = frame
+    port.waiting = [image]
+    assert service.step(100_000_000, inbox) == {}
+    facts = service.finish()
+    assert (facts["frames"], facts["frames_rejected"]) == (0, 1)
+    assert problem in str(facts["problem"])

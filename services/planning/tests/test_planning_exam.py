@@ -267,3 +267,12 @@ def test_speed_of_the_tool_in_contact_is_the_one_asked_for(snake: World) -> None
     speeds = [np.linalg.norm(s.V_WD[:3]) for s, row in zip(snake.setpoints, snake.rows, strict=True) if row[0] is Phase.SCAN]
     assert np.median(speeds) == pytest.approx(0.03, rel=0.05)
     assert max(speeds) < 0.036
+
+
+def test_three_blocked_views_abort() -> None:
+    world = World(known())
+    world.answers = [Cause(Reason.VIEW_BLOCKED, "view blocked by the arm")]
+    world.run()
+    assert world.exam.status.phase is Phase.ABORTED
+    assert world.exam.status.cause.reason is Reason.VIEW_BLOCKED
+    assert world.exam._views.failed == 3

@@ -21,6 +21,7 @@ from palpate_conductor.collector import Collector
 from palpate_models.robot import lbr
 from palpate_models.scenario.load import load_scenario, plant_input, seen
 from palpate_models.scenario.schema import RobotDriver
+from palpate_robot.backends.hardware import TAKE_OVER_NS
 from palpate_robot.backends.lbr.emulator import Emulator
 from palpate_robot.backends.lbr.port import TORQUE_COMMAND, LBRTorqueCommand, SessionState, ZenohPort
 from palpate_robot.backends.lbr.watchdog import lbr_watchdog
@@ -220,3 +221,12 @@ def test_an_examination_completes(level: str) -> None:
     errors = np.array([true[nanoseconds(s.header.stamp)] - s.depth_setpoint for s in states])
     assert len(errors) > 100
     assert np.sqrt(np.mean(errors**2)) < 1e-3
+
+
+def test_a_new_driver_takes_over_from_a_watchdog_that_still_commands() -> None:
+    rig = Rig()
+    for _ in range(TAKE_OVER_NS // MS // 2):
+        rig.port.commanded_by = [b"watchdog"]
+        rig.tick(1)
+    rig.tick(600)
+    assert rig.status.mode == RobotStatus.MODE_ACTIVE, rig.status.reason
