@@ -249,9 +249,19 @@ def with_two_holes(vertices, faces):
 
 
 UNUSABLE = {
-    "in millimetres": (lambda v, f: (1000 * v, f), r"size is 460.*by 0\.001 from millimetres"),
-    "too small": (lambda v, f: (v / 1000, f), "size is 0.0004"),
-    "feet": (lambda v, f: (v / 0.3048, f), r"1\.18 m wide and 0\.656 m thick.*0\.3048 from feet"),
+    "in millimetres": (lambda v, f: (1000 * v, f), r"millimetres.*0\.001"),
+    "too small": (lambda v, f: (v / 1000, f), "in kilometres it is 0.46 m"),
+    "inches": (
+        lambda v, f: (v / 0.0254, f),
+        r"size is 18\.\d+.*in centimetres it is 0\.18 m .*in inches it is 0\.46 m \(scale it by 0\.0254\)",
+    ),
+    "feet": (
+        lambda v, f: (v / 0.3048, f),
+        r"1\.18 m wide and 0\.656 m thick.*in decimetres it is 0\.15 m.*in feet it is 0\.46 m",
+    ),
+    "decimetres": (lambda v, f: (v / 0.1, f), r"in decimetres it is 0\.46 m \(scale it by 0\.1\)"),
+    "micrometres": (lambda v, f: (v / 1e-6, f), r"in micrometres it is 0\.46 m"),
+    "a person in feet": (lambda v, f: (v * (1.2, 3.9, 1.0) / 0.3048, f), r"size is 5\.88.*in feet it is 1\.8 m"),
     "degenerate": (lambda v, f: with_vertex(v, f, v[f[0][:2]].mean(axis=0)), "1 degenerate triangles"),
     "three triangles on an edge": (lambda v, f: with_vertex(v, f, (0.0, 0.0, 0.05)), "non-manifold: 1 edges"),
     "touch in a vertex": (mirrored, "touch in 1 single vertices"),

@@ -21,6 +21,7 @@ class MeshLimits(NamedTuple):
     region_half_m: float = 0.112
     """Half size of the region in which a coarse mesh is refined: the default examined region and a margin."""
     near_umbilicus_m: float = 0.03
+    smallest_body_m: float = 0.15
     widest_m: float = 0.9
     """Width of the body across the umbilicus, and its thickness there."""
     thickest_m: float = 0.5
@@ -28,7 +29,10 @@ class MeshLimits(NamedTuple):
 
 
 LIMITS: Final = MeshLimits()
-SCALING: Final = "scale it, by 0.001 from millimetres, 0.01 from centimetres, 0.0254 from inches or 0.3048 from feet"
+UNITS_M = {
+    **{"micrometres": 1e-6, "millimetres": 1e-3, "centimetres": 1e-2, "decimetres": 0.1, "kilometres": 1e3},
+    **{"inches": 0.0254, "feet": 0.3048, "yards": 0.9144},
+}
 
 
 class TriangleMesh(NamedTuple):
@@ -81,7 +85,8 @@ def check(vertices: Array, triangles: IntArray) -> None:
 
     size = float(np.ptp(vertices, axis=0).max())
     if not LIMITS.smallest_m <= size <= LIMITS.largest_m:
-        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres: {SCALING}")
+        fitting = _fitting_units(vertices, triangles)
+        raise MeshError(f"its size is {size:.4g}, want {LIMITS.smallest_m} to {LIMITS.largest_m} metres; {fitting}")
     corners = vertices[triangles]
     double_areas = np.linalg.norm(np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]), axis=1)
     longest = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
@@ -101,6 +106,19 @@ def check(vertices: Array, triangles: IntArray) -> None:
     if (pieces := len(trimesh.graph.connected_components(unique))) > 1:
         raise MeshError(f"it is in {pieces} separate pieces: keep the one surface that is to be palpated")
     _check_fans(vertices, triangles)
+
+
+def _fitting_units(vertices: Array, triangles: IntArray) -> str:
+    """Return the units in which a surface can be a body, each with its size."""
+    size, (width, thickness) = float(np.ptp(vertices, axis=0).max()), _across(vertices, triangles)
+    fitting = [
+        f"in {unit} it is {size * factor:.2g} m (scale it by {factor:g})"
+        for unit, factor in UNITS_M.items()
+        if LIMITS.smallest_body_m <= size * factor <= LIMITS.largest_m
+        and width * factor <= LIMITS.widest_m
+        and thickness * factor <= LIMITS.thickest_m
+    ]
+    return ", ".join(fitting) or "no unit fits"
 
 
 def _across(vertices: Array, triangles: IntArray) -> tuple[float, float]:
@@ -128,7 +146,7 @@ def check_place(vertices: Array, triangles: IntArray) -> None:
     if width > LIMITS.widest_m or thickness > LIMITS.thickest_m:
         raise MeshError(
             f"at the umbilicus it is {width:.3g} m wide and {thickness:.3g} m thick, want up to {LIMITS.widest_m} and "
-            f"{LIMITS.thickest_m} metres: {SCALING}"
+            f"{LIMITS.thickest_m} metres; {_fitting_units(vertices, triangles)}"
         )
     cross = _cross(vertices, triangles)[away <= away.min() + 1e-6].sum(axis=0)
     normal = cross / max(np.linalg.norm(cross), 1e-300)
