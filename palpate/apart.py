@@ -226,7 +226,7 @@ def _serve(work: Callable[[Send], Any], pipe: Connection, parent: int, mask: Any
 
 
 def _portable(error: BaseException) -> BaseException:
-    """Return an exception that can be sent; prints the traceback of an unexpected one."""
+    """Return an exception that can be sent. The traceback of an unexpected one is printed."""
     if not isinstance(error, UserError | RunError | KeyboardInterrupt):
         if not isinstance(error, SystemExit):
             traceback.print_exception(error)

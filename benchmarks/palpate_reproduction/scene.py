@@ -1,4 +1,4 @@
-"""Pictures of a recorded run at a given time: robot, table and deformed abdomen, drawn triangle by triangle, the nearest last."""
+"""Pictures of a recorded run at a given time: robot, table and deformed abdomen, drawn triangle by triangle, from far to near."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass

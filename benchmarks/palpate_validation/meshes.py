@@ -15,7 +15,7 @@ from scipy.linalg import solveh_banded
 from scipy.sparse.linalg import spsolve
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.phantom import flat_phantom
+from palpate_models.patient.phantom import PhantomModel, flat_phantom
 from palpate_models.patient.schema import Lesion, Stiffness
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import COLOURS, INK, Check, PageSection
@@ -165,9 +165,9 @@ def measure_superposition() -> tuple[float, float]:
     return float(static), float(np.abs(both - alone[0] - alone[1]).max() / np.abs(both).max())
 
 
-def _recover(model: object, start: Array, steps: int = 200) -> Array:
+def _recover(model: PhantomModel, start: Array, steps: int = 200) -> Array:
     """Return the displacement after recovery from `start` [m] without contact."""
-    tissue = WinklerTissue(model, Stiffness())  # type: ignore[arg-type]
+    tissue = WinklerTissue(model, Stiffness())
     tissue.displacement[:] = start
     tissue.disturbed = True
     for k in range(steps):

@@ -17,7 +17,7 @@ from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, w
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
-from palpate_bus.runtime.composed import BETWEEN, Composed, ServiceFailed
+from palpate_bus.runtime.composed import NO_ROLE, Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode
 from palpate_bus.runtime.observer import RawRecorder
 from palpate_bus.runtime.process import rare_collections
@@ -51,18 +51,18 @@ class ChildPlace:
     def shared(cls) -> ChildPlace:
         """Return a place that a forked process shares."""
         place = cls(shared_numbers())
-        place.cells[0] = BETWEEN
+        place.cells[0] = NO_ROLE
         return place
 
     def enter(self, stage: ChildStage, role: str | None = None) -> None:
         """Set stage and role."""
-        self.cells[0] = BETWEEN if role is None else tuple(contract().roles).index(role)
+        self.cells[0] = NO_ROLE if role is None else tuple(contract().roles).index(role)
         self.cells[2] = stage
 
     def now(self) -> tuple[str | None, int, ChildStage]:
         """Return the role whose code runs, None between two steps; simulated time [ns]; present activity."""
         number, t, stage = self.cells[:3]
-        return None if number == BETWEEN else tuple(contract().roles)[number], t, ChildStage(stage)
+        return None if number == NO_ROLE else tuple(contract().roles)[number], t, ChildStage(stage)
 
 
 @dataclass(frozen=True)

@@ -126,7 +126,7 @@ def _check_fmu(scenario: Scenario) -> None:
 
 
 def write_scenario_files(scenario: Scenario, out: Path) -> dict[str, Path]:
-    """Make the results folder, names its run and write its scenario files; returns the file that each role may read.
+    """Make the results folder with its run's name and scenario files. Return the file that each role may read.
 
     Only scenario.yaml names the run, so that the inputs of the examination do not depend on its time.
     """

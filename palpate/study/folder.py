@@ -159,7 +159,7 @@ class Folder:
         self.path = path
 
     def open(self, manifest: Manifest) -> None:
-        """Create the folder, or reuses one of the same study, split and settings. Raises StudyError for any other."""
+        """Create the folder, or reuse one of the same study, split and settings. Raises StudyError for any other."""
         old = self.manifest()
         if old is not None and (old.study, old.split) != (manifest.study, manifest.split):
             raise StudyError(f"{self.path} holds {old.study}, split {old.split}: give {manifest.study} another folder with -o")
@@ -282,7 +282,7 @@ def manifest_of(study: str, cases: Sequence[Case], command: str = "") -> Manifes
 
 
 def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> tuple[Folder, Manifest]:
-    """Create or reopens the folder of a study of these cases, which `command` runs again.
+    """Create or reopen the folder of a study of these cases, which `command` runs again.
 
     Raises StudyError for the folder of another study and, unless `keep`, for cases of another version of the code.
     """

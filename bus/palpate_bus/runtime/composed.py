@@ -15,7 +15,7 @@ Tap = Callable[[Topic, bytes, int, int], None]
 """Called for every message: topic, payload, stamp [ns], sequence."""
 CONDUCTOR = "conductor"
 """The only observer that every run needs, since it makes the result."""
-BETWEEN = -1
+NO_ROLE = -1
 """The number of no role, between two steps."""
 
 
@@ -49,7 +49,7 @@ class Composed:
         rules = rules or contract()
         self._group = Group(services, rules)
         self.steppers = self._group.steppers
-        self._at: MutableSequence[int] = [BETWEEN, 0] if at is None else at
+        self._at: MutableSequence[int] = [NO_ROLE, 0] if at is None else at
         numbers = {role: number for number, role in enumerate(rules.roles)}
         self._numbers = {stepper: numbers[role] for role, stepper in self.steppers.items()}
         self._taps = tuple(taps)
@@ -94,7 +94,7 @@ class Composed:
                 self._leave_out(stepper.role.name, t, Failure.of(error, stepper.role.name, stepper.buffers.values()).text)
                 self._group.leave_out(frozenset(self.lost))
                 continue
-            at[0] = BETWEEN
+            at[0] = NO_ROLE
             if sent:
                 self._send(sent, t)
         self.t = t + self._group.period

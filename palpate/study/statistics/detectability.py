@@ -86,7 +86,7 @@ class Surface(Row, allow_inf_nan=False):
         """Return the value of the covariate `name` at which P(found) is `chance`; other covariates at their medians if not given.
 
         It is the least such value where more of the covariate helps, and the greatest where it hinders. None where that is
-        not within the range of the lumps: a surface says nothing of lumps that it has not seen.
+        not within the range of the lumps: the surface is not extrapolated.
         """
         i = self.covariates.index(name)
         z = self._z({key: np.array([others.get(key, self.typical(key))]) for key in self.covariates})[0]

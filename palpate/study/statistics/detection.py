@@ -109,7 +109,7 @@ def roc(variant: Variant, bootstrap: Bootstrap) -> Roc | None:
     """Return the curve of patients with palpable lumps against those without any lump; None if either group is empty.
 
     The AUC is the probability that a patient with a lump has the greater score, ties counted half (Hanley and McNeil,
-    Radiology 1982;143:29): its replicates are Mann-Whitney's statistic with each patient counted as often as he was drawn.
+    Radiology 1982;143:29): its replicates are Mann-Whitney's statistic with each patient counted as often as drawn.
     """
     cases = variant.cases
     ill, healthy = cases[cases["ill"]], cases[cases["healthy"]]

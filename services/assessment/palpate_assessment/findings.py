@@ -21,9 +21,9 @@ Mask = NDArray[np.bool_]
 
 Z90 = 1.6449
 """Two-sided 90 % quantile of the normal distribution."""
-WEIGHED = 0.01
+CANDIDATE_PROBABILITY_MIN = 0.01
 """Probability from which an area is reported as a candidate."""
-HALF = 0.5
+OUTLINE_FRACTION = 0.5
 """The outline is where the log-contrast is this part of its peak."""
 
 
@@ -80,7 +80,7 @@ class Area:
     kind: Kind
     """The most probable of these."""
     strength: float
-    """Its log-contrast over the SD of that."""
+    """Absolute log-contrast divided by its SD."""
     length: float
     """Length of a ridge [m]; 0 for a disc."""
 
@@ -93,9 +93,9 @@ def areas(
     shift: float = 0.0,
     marked: Sequence[Marked] = (),
 ) -> list[Area]:
-    """The areas of candidates, most probable first; a candidate that lies in the area of a more probable one belongs to that.
+    """Return the areas of candidates, the likeliest first; a candidate within the area of a likelier one belongs to that.
 
-    What is there, but surely of less contrast than a lump, is none: a navel, say, where everything else is known well.
+    Structures whose contrast is surely below a lump's, such as the navel, are left out.
     """
     if regression.observations.standard.anatomy is not None:
         candidates = [candidate for candidate in candidates if candidate.beyond > -SURE]
@@ -110,7 +110,7 @@ def areas(
         logits, kinds = causes(regression.observations.standard.calibration, features, signs, evidence, shift)
     found: list[Area] = []
     for index in np.argsort(-kinds.sum(axis=1) - kinds[:, Kind.LUMP]):
-        if kinds[index].sum() < WEIGHED:
+        if kinds[index].sum() < CANDIDATE_PROBABILITY_MIN:
             break
         area = _area(regression, candidates[index], grid, assessed, float(logits[index]), kinds[index])
         if area is not None and not any((area.nodes & other.nodes).any() for other in found):
@@ -135,9 +135,9 @@ def causes(calibration: Calibration, features: Array, signs: Array, evidence: Ar
     """
     softer = features[:, SOFTER] > 0
     lump, muscle = calibration.logit(features), np.where(softer, -np.inf, calibration.muscle(signs))
-    ridge, bone, soft = calibration.structures(evidence).T
-    soft = np.logaddexp(ridge, soft)  # a long one is a diastasis
-    structures = (*np.where(softer, -np.inf, (ridge, bone)), np.where(softer, soft, -np.inf))
+    scar, bone, soft = calibration.structures(evidence).T
+    soft = np.logaddexp(scar, soft)  # a long one is a diastasis
+    structures = (*np.where(softer, -np.inf, (scar, bone)), np.where(softer, soft, -np.inf))
     weights = np.column_stack((lump, muscle, *(lump + one for one in structures)))
     other = np.logaddexp.reduce(np.column_stack((weights[:, 1:], np.zeros(len(lump)))), axis=1)
     weights[:, Kind.LUMP] += shift
@@ -171,7 +171,7 @@ def _area(regression: Regression, candidate: Candidate, grid: MapGrid, assessed:
     excess = np.zeros(len(xy))
     excess[near] = sign * mean
     peak = int(np.argmax(np.where(assessed, excess, 0.0)))
-    parts, _ = label((excess > HALF * excess[peak]).reshape(grid.z.shape))
+    parts, _ = label((excess > OUTLINE_FRACTION * excess[peak]).reshape(grid.z.shape))
     nodes = (parts.ravel() == parts.ravel()[peak]) & (excess > 0) & assessed
     if not nodes.any():
         return None

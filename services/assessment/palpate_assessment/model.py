@@ -31,7 +31,7 @@ class Prior:
     bone_sd: float = 0.5
     """Median amplitude of bone."""
     level_sd: float = 3.0
-    """SD of the patient's own level about the median of his samples."""
+    """SD of the patient's own level about the median of the samples."""
     sure: float = 0.7
     """SD of the logarithms of the fields' amplitudes about their medians."""
     unsure: float = 1.2

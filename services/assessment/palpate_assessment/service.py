@@ -132,7 +132,7 @@ class AssessmentService(Service):
             self._skin = skin_of(self._perceived, message, self._X_AW)
 
     def take(self, state: Message) -> list[ForceSample]:
-        """Take the next `exam/state`; returns the samples that are complete now. The last ones are at the end of the scan."""
+        """Take the next `exam/state`; return the samples that are complete now. The last ones are at the end of the scan."""
         if state.patient_moved:
             self._forget_motion(nanoseconds(state.header.stamp) / NS)
             return []

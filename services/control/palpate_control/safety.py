@@ -5,7 +5,7 @@ import numpy as np
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
 
-TORQUE_RATE_NM = 1.0
+TORQUE_RATE_NM_PER_MS = 1.0
 """Largest change of a joint's torque in one millisecond [N m] (libfranka and CRISP bound it to 0.5 to 1.0)."""
 REPULSION_FRACTION = 0.3
 """Repulsion at a joint limit, as a fraction of the joint's torque limit."""
@@ -24,7 +24,7 @@ class SafetyNet:
         """
         gain = REPULSION_FRACTION * torque_limit / zone**2 if zone > 0 else np.zeros_like(lower)
         self._joints = np.stack(((lower + upper) / 2, (upper - lower) / 2 - zone, gain, torque_limit))
-        self._rate = TORQUE_RATE_NM * period_s / 1e-3
+        self._rate = TORQUE_RATE_NM_PER_MS * period_s / 1e-3
         self._last = np.zeros_like(torque_limit)
 
     def reset(self) -> None:

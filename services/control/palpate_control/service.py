@@ -33,7 +33,7 @@ class Problem(NamedTuple):
     text: str
 
 
-FARTHEST_M: Final = 0.1
+SETPOINT_DISTANCE_MAX_M: Final = 0.1
 """A Cartesian set-point that is farther from the tool does not come from planning, which starts where the arm is."""
 NO_PROBLEM: Final = Problem("", "")
 _NONE: Final = np.zeros(0)
@@ -174,9 +174,9 @@ class ControlService(Service):
         if setpoint.mode is not ControlMode.CARTESIAN:
             return ""
         gap = setpoint.p_WD - (tool_pose(q, self._robot)[:3, 3] if self._positions else self.model.p_WI)
-        if gap.dot(gap) <= FARTHEST_M**2:
+        if gap.dot(gap) <= SETPOINT_DISTANCE_MAX_M**2:
             return ""
-        return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {FARTHEST_M:g} m"
+        return f"{TOPIC}: {np.linalg.norm(gap):.2f} m from the tool, limit {SETPOINT_DISTANCE_MAX_M:g} m"
 
     def _wait(self, t: int, joints: Message | None) -> Outbox:
         """Return the command before the first set-point: zero torque, or the positions measured first."""
@@ -191,7 +191,7 @@ class ControlService(Service):
         return self._command(t, self._last, self._full_validity, problem)
 
     def _sense(self, admittance: AdmittanceController, t: int, inbox: Inbox) -> Problem | None:
-        """Hand the newest F/T reading on; return a problem if it is stale."""
+        """Pass the newest F/T reading to the law; return a problem if it is stale."""
         for message in inbox.new("robot/status"):
             admittance.sense(wrench(message.wrench)[:3], commanded=message.mode == RobotStatus.MODE_ACTIVE)
         received = inbox.stamp("robot/status")

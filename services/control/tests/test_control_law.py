@@ -28,7 +28,7 @@ def arm() -> ArmModel:
 @pytest.fixture
 def unlimited(arm: ArmModel, monkeypatch: pytest.MonkeyPatch) -> ImpedanceController:
     """Return the law without its rate limit."""
-    monkeypatch.setattr(safety, "TORQUE_RATE_NM", 1e9)
+    monkeypatch.setattr(safety, "TORQUE_RATE_NM_PER_MS", 1e9)
     return ImpedanceController(arm)
 
 
@@ -99,7 +99,7 @@ def test_torque_changes_by_at_most_a_newton_metre_a_millisecond(arm: ArmModel, m
     before = np.zeros(7)
     for _ in range(200):
         after = controller.command(q, REST, ref)
-        assert np.abs(after - before).max() <= ms * safety.TORQUE_RATE_NM + 1e-12
+        assert np.abs(after - before).max() <= ms * safety.TORQUE_RATE_NM_PER_MS + 1e-12
         before = after
     assert np.abs(before).max() > 20
 

@@ -103,7 +103,7 @@ class ContactMeasurement(NamedTuple):
     touching: bool
     """True in contact by the F/T sensor; False before the first tare, when the sensor's bias would look like contact."""
     joints_only: bool = False
-    """True if the joints feel a contact that the F/T sensor does not."""
+    """True if the joint torques show a contact and the F/T sensor does not."""
 
 
 class ContactSensing:

@@ -25,7 +25,7 @@ from palpate_planning.stops import ExamCourse, Stops
 from palpate_planning.stroke import StrokeStage
 from palpate_planning.strokes.path import compile_ahead
 from palpate_planning.strokes.plan import ExamPlan, ExamPlanner, PerceivedAbdomen, look_postures
-from palpate_planning.views import Rest, Views
+from palpate_planning.views import Remainder, Views
 from palpate_planning.waits import FOR_FINDINGS, FOR_PERCEPTION, FOR_PLAN, FOR_ROBOT, WAIT
 from palpate_planning.wall.wall import Wall, plane
 
@@ -34,9 +34,9 @@ class ExamTuning(NamedTuple):
     """Limits of repetition and time of the phases."""
 
     rescans_max: int = 2
-    """The surface is not scanned more often again because the patient moved or no tissue was felt."""
+    """Maximum number of repeated views of the surface, after the patient moved or no tissue was felt."""
     replans_max: int = 3
-    """The rest is not planned again more often because the arm would stretch or hides the wall."""
+    """Maximum number of plans for the remainder after the arm would have stretched, or hid the wall."""
     resume_distance_m: float = 0.015
     """Resume is refused if the wall moved by more than this."""
     rest_ns: int = 200 * MS
@@ -82,7 +82,7 @@ class ExaminationSequence:
         self._stops = Stops(self._course, known.limits.release_patience_s)
         self._restart = RestartRamp()
         self._views = Views(look_postures(known))
-        self._rest = Rest()
+        self._remainder = Remainder()
         self._requested = RequestedPresses(lockstep=lockstep)
         self._planning: BackgroundTask[ExamPlan] | None = None
         self.skipped: dict[int, Cause] = {}
@@ -106,7 +106,7 @@ class ExaminationSequence:
     @property
     def unfelt(self) -> dict[int, Cause]:
         """Targets that were to be felt and were not, with the cause: skipped ones, and those that an early end left."""
-        course, wanted = self._course, self._rest.wanted
+        course, wanted = self._course, self._remainder.wanted
         if course.phase is Phase.DONE or self._known.exam.searched:
             return self.skipped
         everything = frozenset(range(self.status.target_count)) if wanted is None else wanted
@@ -204,13 +204,13 @@ class ExaminationSequence:
 
     def _accept_view(self, now: Observation, perceived: PerceivedAbdomen) -> None:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
-        course, rest, sense, before = self._course, self._rest, self._sense, self._before
+        course, remainder, sense, before = self._course, self._remainder, self._sense, self._before
         course.perceived, self._averaged = perceived, None
-        sense.wall = sense.wall.rescanned(perceived.surface) if rest.rescans else Wall(perceived.surface, sense.wall.breath)
+        sense.wall = sense.wall.rescanned(perceived.surface) if remainder.rescans else Wall(perceived.surface, sense.wall.breath)
         count = self.status.target_count = len(perceived.positions)
         self.status.view_blocked = False
         text = f"planning over {count} targets"
-        if before is not None and not rest.rescans:
+        if before is not None and not remainder.rescans:
             X_WA = np.array(self._known.X_WA)
             if (away := perceived.surface.away_from(apply(X_WA, before.surface))) > EXAM.resume_distance_m:
                 limit = f"limit {EXAM.resume_distance_m * 1e3:.0f} mm"
@@ -219,8 +219,8 @@ class ExaminationSequence:
                 return
             if not self._known.exam.searched:
                 targets = apply(inverse(X_WA), perceived.positions)[:, :2]
-                rest.wanted = before.wanted(targets, self._known.exam.spacing_m)
-                text = f"planning over {len(rest.wanted)} of {count} targets that are left"
+                remainder.wanted = before.wanted(targets, self._known.exam.spacing_m)
+                text = f"planning over {len(remainder.wanted)} of {count} targets that are left"
         course.enter(Phase.PLAN, now.t, text)
 
     def _look_again(self, now: Observation, out: ExamStep, cause: Cause) -> None:
@@ -232,25 +232,25 @@ class ExaminationSequence:
 
     def _give_up(self, now: Observation, out: ExamStep, cause: Cause) -> None:
         """End an examination that cannot be planned; measurements made before are assessed."""
-        rest, skipped = self._rest, self.skipped
-        if not rest.begun:
+        remainder, skipped = self._remainder, self.skipped
+        if not remainder.begun:
             self._course.abort(now, cause)
             return
-        rest.unplanned = cause.text
-        for i in (rest.wanted or frozenset()) & skipped.keys():
+        remainder.unplanned = cause.text
+        for i in (remainder.wanted or frozenset()) & skipped.keys():
             skipped[i] = skipped[i]._replace(text=f"{skipped[i].text}: {cause.text}")
         self._correct(out)
         self._course.go_home(now)
 
     def _plan(self, now: Observation, out: ExamStep) -> None:
-        course, rest = self._course, self._rest
+        course, remainder = self._course, self._remainder
         if self._planning is None:
             perceived, start = course.perceived, course.arm.q.copy()
             assert perceived is not None
             self._planning = BackgroundTask(
                 now.t,
                 EXAM.planning_ns,
-                lambda: self._planner.examination(perceived, start, rest.wanted, rest.bend),
+                lambda: self._planner.examination(perceived, start, remainder.wanted, remainder.bend),
                 lockstep=self._lockstep,
             )
         elif self._planning.due(now.t):
@@ -260,7 +260,7 @@ class ExaminationSequence:
             except NoPathError as error:
                 self._give_up(now, out, Cause(Reason.NO_PATH, str(error)))
                 return
-            planned_again = rest.wanted or frozenset()
+            planned_again = remainder.wanted or frozenset()
             self.skipped = {i: cause for i, cause in self.skipped.items() if i not in planned_again} | plan.skipped
             self._sense.wall.shift_A = self._sense.wall.breath.shift_A
             out.path, course.palpation = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m), None
@@ -278,7 +278,7 @@ class ExaminationSequence:
         elif now.t - course.since >= EXAM.rest_ns:
             assert course.plan is not None
             course.palpation = Palpation(course.plan.segments, known, self._step_s, self._sense.wall, self.status.stroke)
-            course.palpation.more, course.palpation.looked_again = course.plan.presses is not None, self._rest.looked_again
+            course.palpation.more, course.palpation.looked_again = course.plan.presses is not None, self._remainder.looked_again
             return self._palpate(now, out)
         return None
 
@@ -313,23 +313,23 @@ class ExaminationSequence:
     def _end_strokes(self, now: Observation, out: ExamStep, palpation: Palpation) -> None:
         """Go home, or continue with the targets that are left: after a new view if the patient has moved, else by a new plan."""
         assert now.reading is not None
-        course, rest, cause = self._course, self._rest, palpation.recovery.early_end
+        course, remainder, cause = self._course, self._remainder, palpation.recovery.early_end
         course.arm.hold(now.reading.q)
         self._requested.drop_plan()
         more = not palpation.recovery.failed and (palpation.more or bool(palpation.ahead))
         wanted = None if palpation.more else palpation.ahead
-        if more and (palpation.moved or cause.reason is Reason.NO_TISSUE) and rest.rescans < EXAM.rescans_max:
-            rest.rescans, rest.wanted, rest.bend = rest.rescans + 1, wanted, None
-            rest.looked_again = rest.looked_again or not palpation.moved
+        if more and (palpation.moved or cause.reason is Reason.NO_TISSUE) and remainder.rescans < EXAM.rescans_max:
+            remainder.rescans, remainder.wanted, remainder.bend = remainder.rescans + 1, wanted, None
+            remainder.looked_again = remainder.looked_again or not palpation.moved
             why = MOVED if palpation.moved else cause
             self._views.restart()
             course.enter(Phase.LOOK, now.t, f"{why.text}: looking again", why)
-        elif more and cause.reason in REPLANNED and rest.replans < EXAM.replans_max:
-            rest.replans, rest.wanted = rest.replans + 1, wanted
-            rest.bend = max(rest.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
+        elif more and cause.reason in REPLANNED and remainder.replans < EXAM.replans_max:
+            remainder.replans, remainder.wanted = remainder.replans + 1, wanted
+            remainder.bend = max(remainder.bend or KINEMATIC_LIMITS.straight_rad, palpation.bend_needed)
             course.enter(Phase.PLAN, now.t, f"{cause.text}: planning again", cause)
         else:
-            rest.unplanned = cause.text if palpation.more else rest.unplanned  # a search that did not end by itself
+            remainder.unplanned = cause.text if palpation.more else remainder.unplanned  # a search that did not end by itself
             self._correct(out)
             course.go_home(now, palpation.recovery.failed)
             if cause and not palpation.recovery.failed:
@@ -338,7 +338,7 @@ class ExaminationSequence:
     def _correct(self, out: ExamStep) -> None:
         """Publish the final surface correction, unless the patient moved."""
         perceived, wall = self._course.perceived, self._sense.wall
-        if perceived is not None and not self._rest.rescans and not wall.breath.moved:
+        if perceived is not None and not self._remainder.rescans and not wall.breath.moved:
             out.correction = wall.corrected(perceived.vertices, self._averaged)
 
     def _held(self, now: Observation, out: ExamStep) -> Setpoint | None:
@@ -365,7 +365,7 @@ class ExaminationSequence:
 
     def _conclude(self, t: int) -> None:
         """End the examination at `t` [ns]: complete, incomplete, or failed because faults have cost too many targets."""
-        count, skipped, unplanned = self.status.target_count, self.skipped, self._rest.unplanned
+        count, skipped, unplanned = self.status.target_count, self.skipped, self._remainder.unplanned
         lost = Counter(cause for cause in skipped.values() if cause.loss in FAULTS)
         missing = [f"{len(skipped)} of {count} targets not felt: {counted(skipped.values())}"] if skipped else []
         missing += [f"the rest was left: {unplanned}"] if unplanned else []

@@ -60,7 +60,7 @@ class BackgroundTask(Generic[T]):
         return t - self._due > WAIT.limit_s * SECOND
 
     def result(self) -> T:
-        """Return the result, or raise the exception of the work; waits for it."""
+        """Wait for the work; return its result or raise its exception."""
         return self._future.result()
 
 

@@ -57,7 +57,7 @@ class RecoveryTuning(NamedTuple):
 
 
 class SurgeTuning(NamedTuple):
-    """A force that rises as no stroke of the arm lets it: the patient coughs or tenses."""
+    """A force that rises faster than any motion of the arm can cause: the patient coughs or tenses."""
 
     over: int = 3
     """Periods over which the rate is measured."""
@@ -234,13 +234,13 @@ class Recovery:
             return self.resume_at - MOTION.end_tolerance_m
         return position - (0.0 if slid else MOTION.end_tolerance_m)
 
-    def measure_displacement(self, contact: ContactMeasurement, point: PathPoint, radius: float) -> float:
-        """Return the lateral distance [m] of the arm from its path point; the return to the path begins there.
+    def begin_return(self, contact: ContactMeasurement, point: PathPoint, centre_height: float) -> float:
+        """Begin the return of the arm to its path point; return its lateral distance [m] from there.
 
-        `radius` [m]: distance of the sphere's centre from the perceived surface at zero depth.
+        `centre_height` [m]: distance of the sphere's centre from the perceived surface at zero depth.
         """
         p_WI = contact.X_WI[:3, 3]
-        gap = p_WI - centre(point.p, point.n, radius, contact.depth)
+        gap = p_WI - centre(point.p, point.n, centre_height, contact.depth)
         pushed = float(np.linalg.norm(gap)) > RECOVERY.on_path_m
         self.displacement = Displacement(gap, self._period_s) if pushed else None
         gap = p_WI - point.p

@@ -83,7 +83,7 @@ class PalpationStep(NamedTuple):
 class Palpation:
     """Executes the segments of a plan; one `step` each planning period until `stage` is DONE.
 
-    An interruption replaces what the arm does by a lift, after which the segment is taken up again.
+    An interruption lifts the tool; then the segment is resumed.
     """
 
     def __init__(self, segments: tuple[Segment, ...], known: ExamInput, period_s: float, wall: Wall, strokes: int = 0) -> None:
@@ -192,9 +192,9 @@ class Palpation:
         if self._motion.segment.free is not None:
             return
         centre_height = self._motion.centre_height(t)
-        lateral = self.recovery.measure_displacement(contact, self._motion.point, centre_height)
+        lateral = self.recovery.begin_return(contact, self._motion.point, centre_height)
         if lateral > RECOVERY.displaced_max_m:
-            self.abandon(Cause(Reason.ARM_DISPLACED, f"the arm was moved {lateral * 1e3:.0f} mm aside while it was held"))
+            self.abandon(Cause(Reason.ARM_DISPLACED, f"the arm was pushed {lateral * 1e3:.0f} mm off its path while it was held"))
         self._motion.restart(contact)
 
     def skip_free_motion(self) -> None:
@@ -299,7 +299,7 @@ class Palpation:
             yield from self._press()
 
     def _height(self, t: int) -> float:
-        """Return the height to lift to at `t` [ns]; in metres."""
+        """Return the height of the lift [m] at `t` [ns]."""
         wall, following = self._motion.wall, self._segments[self._number + 1 : self._number + 2]
         certain = self._watch.calm and not self.recovery.paused
         if self.recovery.ending or not certain or not following:

@@ -45,7 +45,7 @@ class TouchTuning(NamedTuple):
     sigmas: float = 3.0
     """The skin is sought within this many standard deviations of its estimate."""
     blind_m: float = 0.020
-    """The skin is sought no deeper than this below where it is believed: three SD of camera and arm together (6.5 mm with typical
+    """Maximum search depth below the estimated wall: three SD of camera and arm together (6.5 mm with typical
     errors, 1,000 tuning seeds)."""
     margin_m: float = 0.003
     """The search begins at this height above that range: the fit of the onset needs samples in air."""
@@ -287,7 +287,7 @@ class Descent:
         if contact.force >= FELT_N and not near:
             self.failed = Cause(Reason.UNEXPECTED_CONTACT, "contact force above the skin")
         elif contact.joints_only and contact.force < FELT_N:
-            self.failed = Cause(Reason.UNEXPECTED_CONTACT, "the joints feel a contact that the F/T sensor does not", "ft/wrench")
+            self.failed = Cause(Reason.UNEXPECTED_CONTACT, "joint torques show a contact, the F/T sensor does not", "ft/wrench")
         elif contact.force >= FELT_N or (there and contact.touching):
             self._found = True
             self.learn(now)

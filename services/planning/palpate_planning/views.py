@@ -36,7 +36,7 @@ class Views:
 
 
 @dataclass
-class Rest:
+class Remainder:
     """The part of the examination that is planned, and planned again after an interruption."""
 
     wanted: frozenset[int] | None = None

@@ -83,7 +83,7 @@ class StrokeWaits:
         self.pressed = False
         """True if a stroke has reached its depth."""
         self.reported = NO_CAUSE
-        """The present wait, once the arm has waited for long enough to say so."""
+        """The present wait, once it has lasted for `reported_s`."""
 
     def reach(self, segment: int, position: float, *, at_depth: bool) -> None:
         """A stroke touches the skin or slides; it makes progress if it was not as far before."""

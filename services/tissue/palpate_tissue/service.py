@@ -76,7 +76,7 @@ class TissueService(Service):
         self._touching = False
 
     def start(self) -> Outbox:
-        """Publish the latched ground truth of the phantom; logs the facts."""
+        """Publish the latched ground truth of the phantom and log the facts."""
         truth = self._truth
         _log.info("%s", ", ".join(f"{name} {value}" for name, value in self._facts.items()))
         surface = SurfaceMesh(

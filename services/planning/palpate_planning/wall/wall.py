@@ -212,7 +212,7 @@ class Wall:
         """Foot of the latest touch and the correction there before it [m]."""
 
     def rescanned(self, perceived: PerceivedSurface) -> Wall:
-        """Return the wall for a new perceived surface; keeps the offset and tilt learned from touches."""
+        """Return the wall for a new perceived surface, with the offset and tilt learned from touches."""
         wall = Wall(perceived, self.breath)
         wall.correction, wall._first = self.correction, self._first
         wall.correction.blur()

@@ -220,7 +220,7 @@ class HardwareService(Service):
         return outbox
 
     def finish(self) -> Mapping[str, Any]:
-        """Return safe holds, counts, and the largest force and torques; leaves the arm without torque."""
+        """Leave the arm without torque. Return safe holds, counts, and the largest force and torques."""
         if self._arm.received is not None and not self._positions:
             self._relax()
         self._port.close()

@@ -31,7 +31,7 @@ class MeasuredLbr(MeasuredArm):
         return self.session is SessionState.COMMANDING_ACTIVE
 
     def update(self, t: int, state: Any) -> bool:
-        """Take a state received at `t` [ns]; returns True if it is new and usable.
+        """Take a state received at `t` [ns]; return True if it is new and usable.
 
         Velocities restart from zero after the controller's clock was set.
         """

@@ -113,7 +113,7 @@ class FriSession:
             self._target = Drive(position, torque)
 
     def cycle(self, q: Array, gravity: Array, *, answered: bool = True) -> Drive:
-        """Run one send period at measured positions q [rad] and gravity torques [N m]; returns the applied drive."""
+        """Run one send period at measured positions q [rad] and gravity torques [N m]; return the applied drive."""
         self._in_state += self._dt
         self._answers.append(answered)
         lost = 1.0 - sum(self._answers) / len(self._answers)
