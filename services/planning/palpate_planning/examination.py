@@ -206,7 +206,10 @@ class ExaminationSequence:
         """Start planning: all targets, or on resume the remaining ones. Abort a resumed examination if the wall is elsewhere."""
         course, remainder, sense, before = self._course, self._remainder, self._sense, self._before
         course.perceived, self._averaged = perceived, None
-        sense.wall = sense.wall.rescanned(perceived.surface) if remainder.rescans else Wall(perceived.surface, sense.wall.breath)
+        if remainder.rescans:
+            sense.wall.rescan(perceived.surface)
+        else:
+            sense.wall = Wall(perceived.surface, sense.wall.breath)
         count = self.status.target_count = len(perceived.positions)
         self.status.view_blocked = False
         text = f"planning over {count} targets"

@@ -211,12 +211,10 @@ class Wall:
         self._touched: tuple[Foot, float] | None = None
         """Foot of the latest touch and the correction there before it [m]."""
 
-    def rescanned(self, perceived: PerceivedSurface) -> Wall:
-        """Return the wall for a new perceived surface, with the offset and tilt learned from touches."""
-        wall = Wall(perceived, self.breath)
-        wall.correction, wall._first = self.correction, self._first
-        wall.correction.blur()
-        return wall
+    def rescan(self, perceived: PerceivedSurface) -> None:
+        """Take a new perceived surface; the offset and tilt learned from touches stay."""
+        self.perceived, self.shift_A, self._touched = perceived, np.zeros(2), None
+        self.correction.blur()
 
     def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
         """Return the height of the skin above vertices of the perceived surface and its SD [m], shapes (n,).
