@@ -28,7 +28,7 @@ def nothing_starts(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
 
     monkeypatch.setattr(subprocess, "run", started)
     monkeypatch.setattr(subprocess, "Popen", started)
-    monkeypatch.setattr("palpate_benchmarks.bench.measure", started)
+    monkeypatch.setattr("palpate_benchmarks.bench.run_cases", started)
     monkeypatch.chdir(tmp_path)
 
 

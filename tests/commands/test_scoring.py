@@ -241,7 +241,7 @@ def test_a_lumps_area_is_in_one_piece() -> None:
     """Another place with the same contrast is not part of it."""
     both = [(CENTRE, 0.02), (np.array((0.06, 0.05)), 0.019)]
     true = truth(both)
-    one = Pressed(**{**vars(true.felt.pressed), "alone": true.felt.pressed.healthy[None]})
+    one = true.felt.pressed._replace(alone=true.felt.pressed.healthy[None])
     (lump,) = Felt(one, true.felt.surface, EXAM).lumps
     assert lump.area == pytest.approx(np.pi * 0.02**2, rel=0.02)
 

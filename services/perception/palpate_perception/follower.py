@@ -183,8 +183,8 @@ class Watch:
             seen[arm.hides(q, self.camera.X_WC[:3, 3], self._r_W, z).reshape(image.shape)] = np.nan
         self._times.append(t_s)
         self._images.append(seen)
-        with np.errstate(invalid="ignore"):
-            self._depths.append(float(np.nanmean(seen[self._middle])))
+        middle = seen[self._middle]
+        self._depths.append(float(np.nanmean(middle)) if np.isfinite(middle).any() else np.nan)
 
     def over(self) -> bool:
         """True after two breaths, with a still wall, or at the time limit."""
