@@ -29,7 +29,6 @@ from scipy import stats
 
 from palpate.console import refuse
 from palpate.report.files import write_text
-from palpate.run.group import group_members
 
 HOUR_S = 3600.0
 SAMPLES, GROWTHS = "soak.csv", "soak.json"
@@ -162,7 +161,7 @@ def _processes(at_s: float, number: int) -> Iterator[ProcessSample]:
         with suppress(psutil.Error, OSError):  # it may end during this
             command = process.cmdline()
             if command[1:3] == ["-m", "palpate.run.group"]:
-                role = "+".join(group_members(Path(command[3])))
+                role = "+".join(json.loads(Path(command[3]).read_text(encoding="utf-8")))
             elif process.ppid() == here.pid:
                 role = "conductor"
             else:

@@ -142,7 +142,6 @@ class Plots:
     def __init__(self, canvas: Canvas, legend: str) -> None:
         """`legend`: a page in Markdown."""
         self._canvas = canvas
-        self._states: dict[str, str] = {}
         self._texts: dict[str, str] = {}
         self._health_lines: set[str] = set()
         canvas.log("text/legend", rr.TextDocument(legend, media_type=rr.MediaType.MARKDOWN))
@@ -160,11 +159,9 @@ class Plots:
 
     def state(self, t: int, path: str, name: str) -> bool:
         """Write a state when it changes; return True if it did."""
-        if self._states.get(path) == name:
-            return False
-        self._states[path] = name
-        self._canvas.log(path, rr.StateChange(state=name), t)
-        return True
+        if changes := self._changes(path, name):
+            self._canvas.log(path, rr.StateChange(state=name), t)
+        return changes
 
     def health(self, t: int, row: Health) -> None:
         """Draw the health line of a service or topic, and log its message unless it is ok."""

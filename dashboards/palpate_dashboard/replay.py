@@ -28,7 +28,7 @@ from palpate_bus.runtime.observer import LIMITS, ObservedService
 from palpate_bus.security.access import OPERATOR
 from palpate_bus.settings import RECORDING
 from palpate_bus.wire.zenoh_config import session
-from palpate_dashboard.service import FILE, DashboardService
+from palpate_dashboard.service import DashboardService
 from palpate_dashboard.sinks import Live
 from palpate_inputs import InputFile
 from palpate_models.scenario.load import load_scenario
@@ -110,21 +110,12 @@ def draw(
     return last
 
 
-def replay(files: Sequence[Path], service: DashboardService, progress: Callable[[int], None] | None = None) -> None:
-    """Step `service` through the messages of a recording and finish it. Raises OSError."""
-    draw(messages(files), service, progress)
-    service.finish()
-
-
-def main(folder: Path, progress: Callable[[int], None] | None = None) -> Path:
-    """Draw the run in `folder`; return the file. Raises FileNotFoundError naming the missing file."""
-    files, scenario = recording_of(folder), folder / "scenario.yaml"
-    if not files or not scenario.is_file():
-        needed = scenario if files else folder / RECORDING
-        raise FileNotFoundError(f"{needed}: not found; give the folder of a recorded run")
-    target = folder / FILE
+def replay(files: Sequence[Path], scenario: Path, target: Path, progress: Callable[[int], None] | None = None) -> Path:
+    """Draw the recording of a run with the file `scenario` into the file `target`, which is returned. Raises OSError."""
+    service = DashboardService(load_scenario(str(scenario)), target, Live(), paced=False)
     try:
-        replay(files, DashboardService(load_scenario(str(scenario)), target, Live(), paced=False), progress)
+        draw(messages(files), service, progress)
+        service.finish()
     except BaseException:
         target.unlink(missing_ok=True)  # a partial file would pass for a complete one
         raise

@@ -61,7 +61,8 @@ def test_a_recording_in_several_files_is_read_whole(tmp_path: Path) -> None:
 def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) -> None:
     record(tmp_path, 1.0)
     received: list[int] = []
-    assert replay.main(tmp_path, received.append) == tmp_path / FILE
+    source = replay.recording_of(tmp_path), tmp_path / "scenario.yaml"
+    assert replay.replay(*source, tmp_path / FILE, received.append) == tmp_path / FILE
     assert received == sorted(received)
     assert received[-1] >= 0.9e9
 
@@ -70,7 +71,7 @@ def test_a_folder_without_a_drawing_is_drawn_from_its_recording(tmp_path: Path) 
 
     (tmp_path / FILE).unlink()
     with pytest.raises(KeyboardInterrupt):
-        replay.main(tmp_path, interrupted)
+        replay.replay(*source, tmp_path / FILE, interrupted)
     assert not (tmp_path / FILE).exists(), "half a drawing would be taken for the whole"
 
 

@@ -268,10 +268,9 @@ def test_a_replay_draws_what_the_run_drew(tmp_path: Path) -> None:
     steps = [(t, {k: v for k, v in new.items() if k in OBSERVED}) for t, new in run(3.0, scenario.robot)]
     draw(tmp_path / "live.rrd", steps)
     write_recording(tmp_path, steps)
-    with pytest.raises(FileNotFoundError, match=r"scenario\.yaml"):
-        replay.main(tmp_path)
-    (tmp_path / "scenario.yaml").write_text(dump_scenario(scenario), encoding="utf-8")
-    again = Recording(replay.main(tmp_path))
+    file = tmp_path / "scenario.yaml"
+    file.write_text(dump_scenario(scenario), encoding="utf-8")
+    again = Recording(replay.replay(replay.recording_of(tmp_path), file, tmp_path / FILE))
     live = Recording(tmp_path / "live.rrd")
     speed = "/plots/speed/real_time_factor"  # of wall time, which a replay does not have
     assert live.temporal.pop(speed)

@@ -21,7 +21,7 @@ from palpate.apart import guarded, shared_numbers
 from palpate.check.rig import ConformanceReport, Feed, ReceivedMessage, Rig, RigSettings, ServiceRig, Verdict
 from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
-from palpate.live.topic import TopicReader
+from palpate.live.topic import every_sender
 from palpate_bus import implementations
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.codec import Message
@@ -71,7 +71,7 @@ class LiveRig(Rig):
         self._publishers = {t.name: self._members[t.producer].publisher(t) for t, _ in self.rules.inputs(role)}
         self._control = self._members["conductor"].internal_publisher("palpate/control", CONTROL_TYPE, "event")
         self._reports = self._members["conductor"].internal_subscription(f"palpate/report/{role}", REPORT_TYPE)
-        self._readers = {topic.name: TopicReader(session, topic, domain) for topic in self.rules.outputs(role)}
+        self._readers = {topic.name: every_sender(session, topic, domain) for topic in self.rules.outputs(role)}
         self._sequences = dict.fromkeys([*self._publishers, "control"], 0)
         self._epoch = 0
         self._last_control = 0.0
@@ -241,13 +241,13 @@ class LiveRig(Rig):
     def _drain(self) -> None:
         for name, reader in self._readers.items():
             kind = self.rules.topics[name].type
-            while (received := reader.get()) is not None:
+            while (received := reader.get(0)) is not None:
                 try:
                     message = codec.decode(received.payload, kind)
                 except codec.CodecError as error:
                     self.undecodable.append(f"{name}: {error}")
                     continue
-                self.log[name].append(ReceivedMessage(self.t, message, received.sequence, received.sent_ns))
+                self.log[name].append(ReceivedMessage(self.t, message, received.sequence, received.sent))
 
 
 @contextmanager

@@ -3,16 +3,13 @@
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import Annotated
+from typing import Annotated, NamedTuple
 
 import typer
 import zenoh
 
-from palpate_bus.contract import Contract
 from palpate_bus.runs.announcement import BusTarget, NoBus, find
-from palpate_bus.security.access import public
 from palpate_bus.wire.zenoh_config import BusOptions, session
 
 _ENDPOINT = "Endpoint to join, e.g. tcp/10.0.0.5:7447; may be repeated."
@@ -24,21 +21,11 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print JSON.")]
 LINK_TIMEOUT_S = 1.0
 
 
-@dataclass(frozen=True)
-class Joined:
+class Joined(NamedTuple):
     """A zenoh session on the bus of a run."""
 
     session: zenoh.Session
     target: BusTarget
-
-    @property
-    def domain(self) -> int:
-        """ROS domain."""
-        return self.target.domain
-
-    def readable_topics(self, rules: Contract) -> list[str]:
-        """Return the topics that may be subscribed to: all, or the public ones on a secure bus."""
-        return list(rules.topics) if self.target.options.tls is None else public(rules)
 
 
 @contextmanager

@@ -6,7 +6,6 @@ import os
 import subprocess
 import tempfile
 import webbrowser
-from collections.abc import Sequence
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -107,32 +106,22 @@ def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console:
 def _drawn(source: Path, place: Path) -> Path:
     """Return the .rrd of a source, drawn from the MCAP recording if there is none (into `place` for a single file)."""
     from palpate_dashboard import replay
-    from palpate_dashboard.service import FILE, DashboardService
-    from palpate_dashboard.sinks import Live
-    from palpate_models.scenario.load import load_scenario
+    from palpate_dashboard.service import FILE
 
     for made in (source, source / FILE):
         if made.suffix == ".rrd" and made.is_file():
             return made
-    if source.suffix == ".mcap" and source.is_file():
-        scenario = source.parent.parent / "scenario.yaml"
-        if not scenario.is_file():
-            raise UserError(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml, two folders up")
-        drawn = DashboardService(load_scenario(str(scenario)), place / FILE, Live(), paced=False)
-        with _drawing((source,), reached := [0]):
-            replay.replay((source,), drawn, partial(reached.__setitem__, 0))
-        return place / FILE
-    if files := replay.recording_of(source):
-        with _drawing(files, reached := [0]):
-            return replay.main(source, partial(reached.__setitem__, 0))
-    raise UserError(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
-
-
-def _drawing(files: Sequence[Path], reached: list[int]) -> TimeLeft:
-    """Return a bar with the remaining time; `reached`: the time drawn so far [ns]."""
-    from palpate_dashboard import replay
-
-    return TimeLeft(lambda: "drawing", lambda: reached[0], 0, replay.end_of(files) or 0)
+    alone = source.suffix == ".mcap" and source.is_file()
+    files = (source,) if alone else replay.recording_of(source)
+    if not files:
+        raise UserError(f"{source}: neither a .rrd nor a .mcap file, nor the folder of a run that was recorded")
+    scenario = (source.parent.parent if alone else source) / "scenario.yaml"
+    if not scenario.is_file():
+        where = ", two folders up" if alone else ""
+        raise UserError(f"{scenario} is not there: a recording is drawn with its run's scenario.yaml{where}")
+    reached = [0]
+    with TimeLeft(lambda: "drawing", lambda: reached[0], 0, replay.end_of(files) or 0):
+        return replay.replay(files, scenario, (place if alone else source) / FILE, partial(reached.__setitem__, 0))
 
 
 def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:

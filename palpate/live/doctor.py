@@ -21,6 +21,7 @@ from palpate_bus.monitor.monitor import LiveMonitor
 from palpate_bus.runs.announcement import live as live_runs
 from palpate_bus.runs.announcement import versions
 from palpate_bus.runs.run_folder import remove_leftovers
+from palpate_bus.security.access import public
 from palpate_bus.wire.liveliness import mismatches
 from palpate_errors import ExitStatus
 
@@ -116,11 +117,12 @@ def _endpoints(bus: Joined, live: LiveMonitor) -> Iterator[Remark]:
     there = {entity.node: entity.zid for entity in live.graph.alive.values()}
     if run is None or options.mode == "client":
         where = ", ".join((*options.connect, *([options.router] if options.router else [])))
-        yield Remark("endpoints", Severity.OK if links else Severity.BAD, f"{where}: {len(links)} links, domain {bus.domain}")
+        text = f"{where}: {len(links)} links, domain {bus.target.domain}"
+        yield Remark("endpoints", Severity.OK if links else Severity.BAD, text)
         return
     silent = [role for role in run.endpoints if there.get(role) not in links]
     count, reached = len(run.endpoints), len(run.endpoints) - len(silent)
-    text = f"{run.name}, process {run.pid}, {run.runtime}, domain {bus.domain}: {reached} of {count} endpoints answer"
+    text = f"{run.name}, process {run.pid}, {run.runtime}, domain {bus.target.domain}: {reached} of {count} endpoints answer"
     yield Remark("endpoints", Severity.WARN if silent else Severity.OK, text)
     yield from (Remark("endpoints", Severity.WARN, f"{role} does not answer at {run.endpoints[role]}") for role in silent)
 
@@ -221,7 +223,8 @@ def doctor(
 
 
 def _monitor(bus: Joined) -> LiveMonitor:
-    return LiveMonitor(bus.session, contract(), bus.domain, bus.readable_topics(contract()), bus.target.rate)
+    readable = None if bus.target.options.tls is None else public(contract())
+    return LiveMonitor(bus.session, contract(), bus.target.domain, readable, bus.target.rate)
 
 
 def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:

@@ -22,7 +22,7 @@ QUIET_S = 0.3
 def present(bus: Joined) -> list[Entity]:
     """Return the entities on the bus, sorted by token. Waits for the run's roles and until no new token arrives."""
     expected = set(bus.target.run.endpoints) if bus.target.run is not None else set()
-    watch = GraphWatch(bus.session, bus.domain)
+    watch = GraphWatch(bus.session, bus.target.domain)
     try:
         end = monotonic() + 3.0
         quiet = monotonic()

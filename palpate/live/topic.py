@@ -2,12 +2,11 @@
 
 from collections import deque
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, fields, is_dataclass
 from math import inf
-from queue import Empty, SimpleQueue
 from time import monotonic
-from typing import Annotated, Any, Final, NamedTuple
+from typing import Annotated, Any, Final
 
 import numpy as np
 import typer
@@ -23,8 +22,8 @@ from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_bus.runs.announcement import NoBus
 from palpate_bus.wire.liveliness import Entity, EntityKind
-from palpate_bus.wire.rmw import WireError, topic_key, unpack
-from palpate_bus.wire.transport import subscribe
+from palpate_bus.wire.rmw import parse_key, topic_key
+from palpate_bus.wire.transport import ReceivedSample, Subscription
 
 
 @dataclass(frozen=True)
@@ -134,7 +133,7 @@ def echo(  # noqa: PLR0913 - the options of a command
         for received in _until(reader, seconds):
             value = plain(_message(received, topic), full=full or as_json, path=field)
             if as_json:
-                print_line({"topic": topic.name, "sequence": received.sequence, "sent_ns": received.sent_ns, "message": value})
+                print_line({"topic": topic.name, "sequence": received.sequence, "sent_ns": received.sent, "message": value})
             else:
                 print(yaml.safe_dump(value, sort_keys=False, allow_unicode=True, width=120), end="---\n", flush=True)
             left = None if left is None else left - 1
@@ -155,7 +154,7 @@ def hz(
     with _subscribed(name, connect, run, domain) as (topic, reader):
         rows: deque[tuple[int, int | None]] = deque(maxlen=TOPIC.spacing_messages)
         for received in _each_period(reader, seconds):
-            rows.extend((message.sent_ns, _stamp_ns(message, topic)) for message in received)
+            rows.extend((message.sent, _stamp_ns(message, topic)) for message in received)
             _print_rate(list(rows)[-len(received) - 1 :], topic, as_json)
         if len(rows) > 1:
             _print_rate(list(rows), topic, as_json, whole=True)
@@ -184,40 +183,9 @@ def bw(
                 print(f"{bandwidth(rate)}; {size}; {len(sizes)} messages", flush=True)
 
 
-class Received(NamedTuple):
-    """A message from the wire."""
-
-    sequence: int
-    sent_ns: int
-    """Source time, wall clock."""
-    payload: bytes
-
-
-class TopicReader:
-    """Receives every message of a topic from any sender; of a latched topic also the last one sent before."""
-
-    def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
-        self._queue: SimpleQueue[zenoh.Sample] = SimpleQueue()
-        self.name = topic.name
-        key = topic_key(topic, domain)
-        handler = zenoh.handlers.Callback(self._queue.put, indirect=False)
-        self._subscriber = subscribe(session, key, handler, history=topic.latched)
-
-    def get(self, timeout: float = 0.0) -> Received | None:
-        """Return the next message, or None after `timeout` [s]; 0 does not wait."""
-        while True:
-            try:
-                sample = self._queue.get(timeout=timeout) if timeout else self._queue.get_nowait()
-            except Empty:
-                return None
-            with suppress(WireError, AttributeError):  # without a valid attachment
-                attachment: Any = sample.attachment
-                sequence, sent_ns, _ = unpack(attachment.to_bytes())
-                return Received(sequence, sent_ns, sample.payload.to_bytes())
-
-    def close(self) -> None:
-        """Unsubscribes."""
-        self._subscriber.undeclare()
+def every_sender(session: zenoh.Session, topic: Topic, domain: int) -> Subscription:
+    """Subscribe to the messages of all senders of a topic; of a latched topic also to the last one sent before."""
+    return Subscription(session, topic_key(topic, domain), topic.latched, decode=bytes)
 
 
 def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
@@ -235,7 +203,9 @@ def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
 
 
 @contextmanager
-def _subscribed(name: str, connect: list[str] | None, run: str | None, domain: int | None) -> Iterator[tuple[Topic, TopicReader]]:
+def _subscribed(
+    name: str, connect: list[str] | None, run: str | None, domain: int | None
+) -> Iterator[tuple[Topic, Subscription]]:
     """Join the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
     with joined(connect, run, domain) as bus:
         name = name.strip("/")
@@ -251,18 +221,15 @@ def _subscribed(name: str, connect: list[str] | None, run: str | None, domain: i
             except codec.CodecError as error:
                 raise NoBus(f"topic {name}: {error}") from error
             row = Topic(name=name, type=kind, producer="", readers={}, qos="event", event=True, doc="")
-        reader = TopicReader(bus.session, row, bus.domain)
-        try:
+        with closing(every_sender(bus.session, row, bus.target.domain)) as reader:
             yield row, reader
-        finally:
-            reader.close()
 
 
 def _unknown(name: str) -> NoBus:
     return NoBus(f"no topic {name!r} on the bus or in the contract; palpate topic list shows those that are")
 
 
-def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
+def _until(reader: Subscription, seconds: float | None) -> Iterator[ReceivedSample]:
     """Yield messages until the time is over. Says once that none arrives."""
     begin = monotonic()
     end, silent = None if seconds is None else begin + seconds, True
@@ -273,10 +240,10 @@ def _until(reader: TopicReader, seconds: float | None) -> Iterator[Received]:
         elif silent and monotonic() - begin > TOPIC.silent_s:
             silent = False
             limit = "until Ctrl-C" if seconds is None else f"{seconds:g} s at most"
-            say(f"no message on {reader.name} for {TOPIC.silent_s:g} s; waiting {limit}")
+            say(f"no message on {parse_key(reader.key).topic} for {TOPIC.silent_s:g} s; waiting {limit}")
 
 
-def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Received]]:
+def _each_period(reader: Subscription, seconds: float | None) -> Iterator[list[ReceivedSample]]:
     """Yield the messages of each report period until the time is over."""
     left = inf if seconds is None else seconds
     while left > 0:
@@ -284,14 +251,14 @@ def _each_period(reader: TopicReader, seconds: float | None) -> Iterator[list[Re
         left -= TOPIC.report_period_s
 
 
-def _message(received: Received, topic: Topic) -> Any:
+def _message(received: ReceivedSample, topic: Topic) -> Any:
     try:
         return codec.decode(received.payload, topic.type)
     except codec.CodecError as error:
         raise NoBus(f"{topic.name}: a message of {len(received.payload)} bytes is not {topic.type}: {error}") from error
 
 
-def _stamp_ns(received: Received, topic: Topic) -> int | None:
+def _stamp_ns(received: ReceivedSample, topic: Topic) -> int | None:
     header = getattr(_message(received, topic), "header", None)
     return None if header is None else nanoseconds(header.stamp)
 

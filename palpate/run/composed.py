@@ -41,18 +41,15 @@ class ChildStage(IntEnum):
     FINISH = 2
 
 
-@dataclass(frozen=True)
 class ChildPlace:
-    """Progress of the child, in memory that it shares with its parent: number of a role, simulated time [ns], stage."""
+    """Progress of the child, in memory that it shares with its parent, and how long it may stay at a place."""
 
-    cells: MutableSequence[int]
-
-    @classmethod
-    def shared(cls) -> ChildPlace:
-        """Return a place that a forked process shares."""
-        place = cls(shared_numbers())
-        place.cells[0] = NO_ROLE
-        return place
+    def __init__(self, foreign: frozenset[str] = frozenset()) -> None:
+        """`foreign`: roles that are played by code of the user."""
+        self.cells: MutableSequence[int] = shared_numbers()
+        """Number of a role, simulated time [ns], stage."""
+        self.cells[0] = NO_ROLE
+        self._foreign, self._settings, self.patience = foreign, Settings.read(), Patience()
 
     def enter(self, stage: ChildStage, role: str | None = None) -> None:
         """Set stage and role."""
@@ -63,6 +60,36 @@ class ChildPlace:
         """Return the role whose code runs, None between two steps; simulated time [ns]; present activity."""
         number, t, stage = self.cells[:3]
         return None if number == NO_ROLE else tuple(contract().roles)[number], t, ChildStage(stage)
+
+    def limit_s(self) -> float:
+        """Return the limit at the present place [s]."""
+        role, _, stage = self.now()
+        if role in self._foreign:
+            return self._settings.start_limit_s if stage is ChildStage.LOAD else self._settings.step_limit_s
+        return self.patience.start if stage is ChildStage.LOAD else self.patience.hard
+
+    def wait_text(self) -> str:
+        """Return a text for a child that stays at its present place."""
+        role, t, stage = self.now()
+        doing = {
+            ChildStage.LOAD: "start; a first run compiles, which takes a minute or more",
+            ChildStage.FINISH: "finish its files",
+        }
+        what = doing.get(stage, f"finish its step at {t / NS:.3f} s")
+        return f"waiting for {role or 'the process of all services'} to {what} ({self.limit_s():g} s at most)"
+
+    def failure(self, error: RunError) -> Failure:
+        """Return the failure of a run whose child ended with `error`."""
+        role, t, stage = self.now()
+        hangs = isinstance(error, ChildLost) and error.late
+        when = {ChildStage.LOAD: "at start", ChildStage.STEP: f"at {t / NS:.3f} s", ChildStage.FINISH: "at its end"}[stage]
+        where = " in its step" if role and stage is ChildStage.STEP else ""
+        text = f"{role or 'the process of all services'} lost {when}: {error}{where}"
+        if hangs and role in self._foreign:
+            text += f" ({variable('start_limit_s' if stage is ChildStage.LOAD else 'step_limit_s')})"
+        codes = {ChildStage.LOAD: FailureCode.NO_ANSWER if hangs else FailureCode.START_FAILED}
+        code = codes.get(stage, FailureCode.BLOCKED if hangs else FailureCode.ROLE_LOST)
+        return Failure(code, text, () if role is None else (role,))
 
 
 @dataclass(frozen=True)
@@ -94,8 +121,7 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     """Run all services in one child process. Raises PluginError for a service that cannot be made."""
     begin = perf_counter()
     write_scenario_files(scenario, out)
-    place = ChildPlace.shared()
-    limits = _Limits(place, foreign_roles(scenario))
+    place = ChildPlace(foreign_roles(scenario))
     collected = Collector().collected
     start = 0.0
     waits: list[str] = []
@@ -114,10 +140,10 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         trouble.extend(news.trouble[len(trouble) - len(waits) :])
         show(news.t)
 
-    limit = TimeLimit(place.now, limits.limit_s)
+    limit = TimeLimit(place.now, place.limit_s)
 
     def check() -> None:
-        if limit.there_s > limits.patience.quiet and (text := limits.wait_text()) not in waits:
+        if limit.there_s > place.patience.quiet and (text := place.wait_text()) not in waits:
             waits.append(text)
             trouble.append(text)
             show(place.now()[1])
@@ -129,49 +155,11 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         raise
     except Exception as error:  # the report needs what was measured
         now, (role, t, _) = perf_counter(), place.now()
-        failure = limits.failure(error) if isinstance(error, RunError) else failure_of(error, t)
+        failure = place.failure(error) if isinstance(error, RunError) else failure_of(error, t)
         times: dict[str, Any] = {"sim_time_s": t / NS, "wall_time_s": now - (start or now), "start_time_s": start or now}
         result = RunResult("composed", collected, **times, failure=failure, lost={} if role is None else {role: t})
     all_is_measured()
     return replace(result, collected=collected, start_time_s=result.start_time_s - begin)
-
-
-class _Limits:
-    """Time limits of the stages, and the failure of a run whose child ended in one."""
-
-    def __init__(self, place: ChildPlace, foreign: frozenset[str]) -> None:
-        self._place, self._foreign = place, foreign
-        self._settings, self.patience = Settings.read(), Patience()
-
-    def limit_s(self) -> float:
-        """Return the limit at the present place [s]."""
-        role, _, stage = self._place.now()
-        if role in self._foreign:
-            return self._settings.start_limit_s if stage is ChildStage.LOAD else self._settings.step_limit_s
-        return self.patience.start if stage is ChildStage.LOAD else self.patience.hard
-
-    def wait_text(self) -> str:
-        """Return a text for a child that stays at its present place."""
-        role, t, stage = self._place.now()
-        doing = {
-            ChildStage.LOAD: "start; a first run compiles, which takes a minute or more",
-            ChildStage.FINISH: "finish its files",
-        }
-        what = doing.get(stage, f"finish its step at {t / NS:.3f} s")
-        return f"waiting for {role or 'the process of all services'} to {what} ({self.limit_s():g} s at most)"
-
-    def failure(self, error: RunError) -> Failure:
-        """Return the failure of a run whose child ended with `error`."""
-        role, t, stage = self._place.now()
-        hangs = isinstance(error, ChildLost) and error.late
-        when = {ChildStage.LOAD: "at start", ChildStage.STEP: f"at {t / NS:.3f} s", ChildStage.FINISH: "at its end"}[stage]
-        where = " in its step" if role and stage is ChildStage.STEP else ""
-        text = f"{role or 'the process of all services'} lost {when}: {error}{where}"
-        if hangs and role in self._foreign:
-            text += f" ({variable('start_limit_s' if stage is ChildStage.LOAD else 'step_limit_s')})"
-        codes = {ChildStage.LOAD: FailureCode.NO_ANSWER if hangs else FailureCode.START_FAILED}
-        code = codes.get(stage, FailureCode.BLOCKED if hangs else FailureCode.ROLE_LOST)
-        return Failure(code, text, () if role is None else (role,))
 
 
 def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: ChildPlace, send: Send) -> RunResult:

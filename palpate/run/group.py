@@ -8,7 +8,6 @@ import json
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import NamedTuple
 
 from palpate.environment import given
 from palpate_bus.contract import contract
@@ -75,40 +74,28 @@ def _in_processes(workers: Sequence[str], number: int) -> Groups:
     return tuple(tuple(row[begin:end]) for begin, end in zip([0, *cuts], [*cuts, len(row)], strict=True))
 
 
-class GroupMember(NamedTuple):
-    """A service of a shared process."""
+def group_command(file: Path, words: Mapping[str, Sequence[str]], own: Mapping[str, Mapping[str, str]]) -> tuple[str, ...]:
+    """Write the file of a group, and return the command of its process. Raises OSError.
 
-    words: tuple[str, ...]
-    """Arguments after `python -m palpate.service ROLE`."""
-    environment: Mapping[str, str]
-    """Environment variables of this service alone."""
-
-
-def group_command(file: Path, hosted: Mapping[str, GroupMember]) -> tuple[str, ...]:
-    """Write the file of a group, and return the command of its process. Raises OSError."""
-    file.write_text(json.dumps({role: member._asdict() for role, member in hosted.items()}), encoding="utf-8")
+    `words`: by service, its arguments after `python -m palpate.service ROLE`; `own`: its variables.
+    """
+    file.write_text(json.dumps({role: (words[role], own[role]) for role in words}), encoding="utf-8")
     return ("python", "-m", "palpate.run.group", str(file))
 
 
-def group_members(file: Path) -> dict[str, GroupMember]:
-    """Return the services of a group from its file. Raises OSError."""
-    rows = json.loads(file.read_text(encoding="utf-8"))
-    return {role: GroupMember(tuple(row["words"]), row["environment"]) for role, row in rows.items()}
-
-
-def _hosted(role: str, member: GroupMember) -> Hosted:
+def _hosted(role: str, words: Sequence[str], environment: Mapping[str, str]) -> Hosted:
     def make() -> Service:
-        with given(member.environment):
-            return chosen(role, load_scenario, member.words)
+        with given(environment):
+            return chosen(role, load_scenario, words)
 
-    with given(member.environment):
+    with given(environment):
         return Hosted(role, BusOptions.from_settings(Settings.read()), make)
 
 
 def main(arguments: Sequence[str]) -> None:
     """Run the group to its end, and exit with status 0, or 3 if the run failed or was aborted."""
-    hosted = group_members(Path(arguments[0]))
-    host(lambda: [_hosted(role, member) for role, member in hosted.items()], "+".join(hosted))
+    hosted = json.loads(Path(arguments[0]).read_text(encoding="utf-8"))
+    host(lambda: [_hosted(role, *row) for role, row in hosted.items()], "+".join(hosted))
 
 
 if __name__ == "__main__":

@@ -19,7 +19,7 @@ from typing import IO, Any, Self
 
 from palpate.apart import ended
 from palpate.environment import FIXED, given
-from palpate.run.group import GroupMember, Groups, group_command
+from palpate.run.group import Groups, group_command
 from palpate.run.options import Record
 from palpate.service import command as service_command
 from palpate_bus.contract import contract
@@ -269,8 +269,8 @@ class LocalProcesses:
         environments = {process.role: self.environment(process) for process in processes}
         common = dict(set.intersection(*(set(environment.items()) for environment in environments.values())))
         own = {role: dict(environment.items() - common.items()) for role, environment in environments.items()}
-        members = {process.role: GroupMember(process.shared_words(), own[process.role]) for process in processes}
-        return group_command(self.folder / f"{processes[0].role}.json", members), common
+        words = {process.role: process.shared_words() for process in processes}
+        return group_command(self.folder / f"{processes[0].role}.json", words, own), common
 
     def _started(self, command: tuple[str, ...], environment: dict[str, str], path: Path) -> subprocess.Popen[bytes]:
         log = path.open("wb")

@@ -82,7 +82,7 @@ def in_one_process(scenario: Scenario, out: Path) -> Any:
         patch.setattr(composed, "create", create)
         with pytest.raises(StopError):
             write_scenario_files(scenario, out)
-            composed.run_here(scenario, out, OBSERVERS, composed.ChildPlace.shared(), lambda _: None)
+            composed.run_here(scenario, out, OBSERVERS, composed.ChildPlace(), lambda _: None)
     return handouts
 
 

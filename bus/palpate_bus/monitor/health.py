@@ -14,8 +14,8 @@ from typing import NamedTuple
 from palpate_bus.contract import Topic, contract
 from palpate_bus.contract.port_check import MessageViolation
 from palpate_bus.contract.port_check import ViolationKind as Kind
-from palpate_bus.messages import DiagnosticArray, DiagnosticStatus, KeyValue, codec
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages import DiagnosticStatus, KeyValue, codec
+from palpate_bus.messages.stamps import MS
 
 
 @dataclass(frozen=True)
@@ -118,11 +118,6 @@ def _level(row: TopicHealth, found: list[SeenViolation], now: float) -> tuple[in
 
 def _how_often(seen: SeenViolation) -> str:
     return "once" if seen.count == 1 else f"{seen.count} times"
-
-
-def diagnostics(health: Iterable[TopicHealth], active: Iterable[SeenViolation], t: int, now: float) -> codec.Message:
-    """Return the statuses as `diagnostic_msgs/DiagnosticArray` stamped `t` [ns]."""
-    return DiagnosticArray(header(t), topic_statuses(health, active, now))
 
 
 @dataclass(frozen=True)

@@ -131,11 +131,10 @@ class Monitor:
         """Note bytes on a topic that are not a message."""
         self._note(self.rules.topics[name], "unknown", Kind.GARBAGE, "rmw_zenoh's attachment of 33 bytes", why, now)
 
-    def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes | None, now: float) -> None:
+    def foreign(self, name: str, type_name: str, type_hash: str, gid: bytes, now: float) -> None:
         """Note a message on a topic's key with another type or hash."""
         topic = self.rules.topics[name]
-        sender = "unknown" if gid is None else self._sender(gid)
-        self._note(topic, sender, Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
+        self._note(topic, self._sender(gid), Kind.TYPE, _type(topic.type, topic.type_hash), _type(type_name, type_hash), now)
 
     def check(self, now: float, wall: int) -> list[Violation]:
         """Check rates and ages; return the violations that are new. `wall` is the wall time [ns]. Call it often."""
@@ -255,7 +254,7 @@ class LiveMonitor:
         self.offsets: dict[str, float] = {}
         """Smallest age [ms] of a message by topic; negative if the sender's clock is ahead of ours."""
         self._session, self._domain = session, domain
-        self._listeners: dict[str, _Listener] = {}
+        self._subscribers: dict[str, Any] = {}
         self.listen(rules.topics if topics is None else topics)
         report, control = "palpation_msgs/msg/ServiceReport", "palpation_msgs/msg/RunControl"
         self._reports: Any = session.declare_subscriber(
@@ -269,10 +268,11 @@ class LiveMonitor:
     def listen(self, topics: Iterable[str]) -> None:
         """Subscribe to `topics` and no others from now on."""
         chosen = set(topics)
-        for name in self._listeners.keys() - chosen:
-            self._listeners.pop(name).close()
-        for name in chosen - self._listeners.keys():
-            self._listeners[name] = _Listener(self._session, self.monitor.rules.topics[name], self._domain)
+        for name in self._subscribers.keys() - chosen:
+            self._subscribers.pop(name).undeclare()
+        for name in chosen - self._subscribers.keys():
+            key, latched = any_type_key(name, self._domain), self.monitor.rules.topics[name].latched
+            self._subscribers[name] = subscribe(self._session, key, zenoh.handlers.FifoChannel(ROOM), history=latched)
         self.monitor.listen(chosen, monotonic())
 
     def poll(self) -> list[Violation]:
@@ -282,20 +282,31 @@ class LiveMonitor:
         self.monitor.set_entities(self.graph.alive.values(), now)
         self._receive_control()
         self._receive_reports(now)
-        for listener in self._listeners.values():
-            for sent, sequence, gid, payload in listener.drain(self.monitor, now):
-                self.monitor.receive(listener.topic.name, sent, sequence, gid, payload, now)
-                age = (time_ns() - sent) / 1e6
-                self.offsets[listener.topic.name] = min(age, self.offsets.get(listener.topic.name, age))
+        for name, subscriber in self._subscribers.items():
+            for sample in list(_waiting(subscriber)):
+                self._receive(name, sample, now)
         return self.monitor.check(monotonic(), time_ns())
 
     def close(self) -> None:
         """Close the subscriptions."""
         self.graph.close()
-        for listener in self._listeners.values():
-            listener.close()
-        self._reports.undeclare()
-        self._control.undeclare()
+        for subscriber in (*self._subscribers.values(), self._reports, self._control):
+            subscriber.undeclare()
+
+    def _receive(self, name: str, sample: Any, now: float) -> None:
+        try:
+            sequence, sent, gid = unpack(sample.attachment.to_bytes())
+            key = parse_key(str(sample.key_expr))
+        except (WireError, AttributeError) as error:
+            self.monitor.garbage(name, "no attachment" if sample.attachment is None else str(error), now)
+            return
+        topic = self.monitor.rules.topics[name]
+        if (key.type, key.type_hash) != (topic.type, topic.type_hash):
+            self.monitor.foreign(name, key.type, key.type_hash, gid, now)
+            return
+        self.monitor.receive(name, sent, sequence, gid, sample.payload.to_bytes(), now)
+        age = (time_ns() - sent) / 1e6
+        self.offsets[name] = min(age, self.offsets.get(name, age))
 
     def _receive_control(self) -> None:
         for message in _decoded(self._control, self._decode_control):
@@ -308,46 +319,13 @@ class LiveMonitor:
                 self.reports[message.role] = message, now
 
 
+def _waiting(subscriber: Any) -> Iterator[Any]:
+    """Yield the samples that a subscriber has received."""
+    while (sample := subscriber.handler.try_recv()) is not None:
+        yield sample
+
+
 def _decoded(subscriber: Any, decode: Callable[[bytes], Any]) -> Iterator[Any]:
     """Yield the messages that a subscriber has received, without those that cannot be decoded."""
-    while (sample := subscriber.handler.try_recv()) is not None:
-        if (message := decoded(decode, sample.payload.to_bytes())) is not None:
-            yield message
-
-
-class _Listener:
-    """A subscription to one topic under any type and hash."""
-
-    def __init__(self, session: zenoh.Session, topic: Topic, domain: int) -> None:
-        self.topic = topic
-        key = any_type_key(topic.name, domain)
-        channel: Any = zenoh.handlers.FifoChannel(ROOM)
-        self._subscriber = subscribe(session, key, channel, history=topic.latched)
-        self._receive = self._subscriber.handler.try_recv
-        self._wanted = (topic.type, topic.type_hash)
-
-    def drain(self, monitor: Monitor, now: float) -> list[tuple[int, int, bytes, bytes]]:
-        """Return new messages of the contract's type: (source time [ns], sequence, GID, payload)."""
-        received = []
-        while (sample := self._receive()) is not None:
-            attachment = sample.attachment
-            try:
-                sequence, sent, gid = unpack(attachment.to_bytes())
-            except (WireError, AttributeError) as error:
-                why = "no attachment" if attachment is None else str(error)
-                monitor.garbage(self.topic.name, why, now)
-                continue
-            try:
-                key = parse_key(str(sample.key_expr))
-            except WireError as error:
-                monitor.garbage(self.topic.name, str(error), now)
-                continue
-            if (key.type, key.type_hash) != self._wanted:
-                monitor.foreign(self.topic.name, key.type, key.type_hash, gid, now)
-                continue
-            received.append((sent, sequence, gid, sample.payload.to_bytes()))
-        return received
-
-    def close(self) -> None:
-        """Close the subscriptions."""
-        self._subscriber.undeclare()
+    messages = (decoded(decode, sample.payload.to_bytes()) for sample in _waiting(subscriber))
+    return (message for message in messages if message is not None)

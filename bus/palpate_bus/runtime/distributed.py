@@ -7,7 +7,7 @@ grants simulated time, announces lost roles, and stops the run. A node never han
 """
 
 import logging
-from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from time import monotonic, perf_counter_ns
 from typing import Any
 
@@ -40,7 +40,7 @@ class LockstepNode(Node):
         self._seat = {seat.stepper: seat for seat in seats}
         self._inputs = {seat: RemoteInputs(seat.stepper, members[seat.role], roles) for seat in seats}
         self._advances = {
-            seat: Advances(seat.stepper, members[seat.role]) for seat in seats if any(awaited_elsewhere(rules, seat.role, roles))
+            seat: Advances(seat.stepper, members[seat.role]) for seat in seats if awaited_elsewhere(rules, seat.role, roles)
         }
         self._horizon = NEVER
         self._last = False
@@ -256,9 +256,7 @@ def event_topics(rules: Contract, role: str) -> tuple[str, ...]:
     return tuple(topic.name for topic in rules.outputs(role) if topic.event)
 
 
-def awaited_elsewhere(rules: Contract, role: str, local: Collection[str]) -> Iterator[str]:
-    """Yield the event topics of a role for which a role in another process waits."""
-    for name in event_topics(rules, role):
-        readers = rules.topics[name].readers
-        if any(edge.blocking and reader not in local for reader, edge in readers.items()):
-            yield name
+def awaited_elsewhere(rules: Contract, role: str, local: Collection[str]) -> bool:
+    """Return True if a role in another process waits for an event topic of the role."""
+    readers = [reader for name in event_topics(rules, role) for reader in rules.topics[name].readers.items()]
+    return any(edge.blocking and reader not in local for reader, edge in readers)

@@ -33,40 +33,14 @@ from palpate_bus.settings import Settings
 from palpate_bus.wire.transport import dropped_by
 
 BIN_NS = 20_000
-BINS = 5_000
-"""Bins cover 0 to 0.1 s; a longer latency counts in the last bin and in `worst`."""
+"""Width of a bin of ages [ns]."""
 
 
-class LatencyHistogram:
-    """Histogram of the latencies of one topic [ns], from sending to reception; its memory is constant."""
-
-    __slots__ = ("_bins", "total", "worst")
-
-    def __init__(self) -> None:
-        self._bins = [0] * BINS
-        self.total = self.worst = 0
-
-    @property
-    def count(self) -> int:
-        """Number of latencies."""
-        return sum(self._bins)
-
-    def add(self, latency: int) -> None:
-        """Count a latency [ns]. A negative one, from clocks of two machines, counts as zero."""
-        self._bins[min(max(latency, 0) // BIN_NS, BINS - 1)] += 1
-        self.total += latency
-        self.worst = max(self.worst, latency)
-
-    def quantile(self, fraction: float) -> int:
-        """Return the latency [ns] that this fraction of the messages does not exceed, to within a bin; 0 without messages."""
-        index = int(np.searchsorted(np.cumsum(self._bins), max(fraction * self.count, 1e-9)))
-        return min((index + 1) * BIN_NS, max(self.worst, 0))
-
-    def as_ms(self) -> dict[str, float]:
-        """Return mean, median, 99th percentile and largest latency [ms]."""
-        mean = self.total / max(self.count, 1)
-        figures = {"mean": mean, "p50": self.quantile(0.5), "p99": self.quantile(0.99), "max": self.worst}
-        return {name: round(value / 1e6, 3) for name, value in figures.items()}
+def age_ms(bins: Counter[int]) -> dict[str, float]:
+    """Return mean, median, 99th percentile and largest age of the messages of a topic [ms], given by their numbers per bin."""
+    ages = np.repeat(list(bins.keys()), list(bins.values())) * BIN_NS / 1e6
+    figures = {"mean": ages.mean(), "p50": np.quantile(ages, 0.5), "p99": np.quantile(ages, 0.99), "max": ages.max()}
+    return {name: round(float(value), 3) for name, value in figures.items()}
 
 
 log = logging.getLogger(__name__)
@@ -122,7 +96,7 @@ class WallClockNode(Node):
         }
         self._sequences = dict.fromkeys(self._data, 0)
         self._number = Counter(gaps=0, undecodable=0, refused=0, overruns=0, skips=0)
-        self._ages = {name: LatencyHistogram() for name in self._data}
+        self._ages: dict[str, Counter[int]] = {name: Counter() for name in self._data}
         self._end: int | None = None
         self._rate = Settings.read().rate or 1.0
         self._epoch = 0
@@ -238,7 +212,7 @@ class WallClockNode(Node):
                 if sample.sequence > last + 1 and not buffer.topic.open:
                     self._number["gaps"] += sample.sequence - last - 1
                 self._sequences[name] = sample.sequence
-                self._ages[name].add(now - sample.sent)
+                self._ages[name][max(now - sample.sent, 0) // BIN_NS] += 1  # clocks of two machines may give a negative age
                 try:
                     # decoded here, not in the service: invalid bytes must not end a driver whose arm is in contact
                     message = buffer.decode(sample.payload)
@@ -261,7 +235,7 @@ class WallClockNode(Node):
         seat.output.send(sent)
 
     def _counts(self, seat: Seat) -> dict[str, Any]:
-        ages = {name: ages.as_ms() for name, ages in self._ages.items() if ages.count}
+        ages = {name: age_ms(bins) for name, bins in self._ages.items() if bins}
         dropped = dropped_by(self._data.values())
         dropped["garbage"] += self._link.garbage
         return {"digests": {}, **dropped, **self._number, "age_ms": ages}

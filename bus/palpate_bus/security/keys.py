@@ -81,7 +81,11 @@ def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), day
                 continue
         place.mkdir(exist_ok=True, mode=0o700)
         key = ec.generate_private_key(ec.SECP256R1())
-        subject = _issue(name, key.public_key(), authority, signer, days, known)
+        uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if known else [])]
+        builder = x509.CertificateBuilder(authority.subject, _name(name), key.public_key())
+        limits = x509.BasicConstraints(ca=False, path_length=None), True
+        called = x509.SubjectAlternativeName([_host(host) for host in known or (name,)]), False
+        subject = _signed(builder, days, signer, limits, called, (x509.ExtendedKeyUsage(uses), False))
         _write_key(place / KEY, key)
         (place / CERTIFICATE).write_bytes(subject.public_bytes(serialization.Encoding.PEM))
         (place / CA).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
@@ -124,39 +128,22 @@ def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
         digital_signature=False, content_commitment=False, key_encipherment=False, data_encipherment=False, key_agreement=False,
         key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
     )  # fmt: skip
-    now = datetime.now(UTC)
-    made = (
-        x509.CertificateBuilder(name, name, key.public_key(), x509.random_serial_number())
-        .not_valid_before(now - _SKEW)
-        .not_valid_after(now + timedelta(days=365 * CA_YEARS))
-        .add_extension(x509.BasicConstraints(ca=True, path_length=0), critical=True)
-        .add_extension(usage, critical=True)
-        .sign(key, hashes.SHA256())
-    )
+    limits = x509.BasicConstraints(ca=True, path_length=0), True
+    made = _signed(x509.CertificateBuilder(name, name, key.public_key()), 365 * CA_YEARS, key, limits, (usage, True))
     _write_key(key_file, key)
     certificate.write_bytes(made.public_bytes(serialization.Encoding.PEM))
     return made, key
 
 
-def _issue(
-    name: str,
-    public: ec.EllipticCurvePublicKey,
-    authority: x509.Certificate,
-    signer: ec.EllipticCurvePrivateKey,
-    days: int,
-    hosts: Sequence[str],
+def _signed(
+    builder: x509.CertificateBuilder, days: int, signer: ec.EllipticCurvePrivateKey, *extensions: tuple[x509.ExtensionType, bool]
 ) -> x509.Certificate:
+    """Return a certificate that is valid for `days` from now on; `extensions`: each with whether it is critical."""
     now = datetime.now(UTC)
-    uses = [ExtendedKeyUsageOID.CLIENT_AUTH, *([ExtendedKeyUsageOID.SERVER_AUTH] if hosts else [])]
-    return (
-        x509.CertificateBuilder(authority.subject, _name(name), public, x509.random_serial_number())
-        .not_valid_before(now - _SKEW)
-        .not_valid_after(now + timedelta(days=days))
-        .add_extension(x509.BasicConstraints(ca=False, path_length=None), critical=True)
-        .add_extension(x509.SubjectAlternativeName([_host(host) for host in hosts or (name,)]), critical=False)
-        .add_extension(x509.ExtendedKeyUsage(uses), critical=False)
-        .sign(signer, hashes.SHA256())
-    )
+    builder = builder.serial_number(x509.random_serial_number()).not_valid_before(now - _SKEW)
+    for extension, critical in extensions:
+        builder = builder.add_extension(extension, critical)
+    return builder.not_valid_after(now + timedelta(days=days)).sign(signer, hashes.SHA256())
 
 
 def _name(common: str) -> x509.Name:

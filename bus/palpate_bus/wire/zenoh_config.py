@@ -323,9 +323,6 @@ def serve(
 
 def main(arguments: Sequence[str]) -> int:
     """Run a router on the given endpoints; return the exit status."""
-    if any(argument.startswith("-") for argument in arguments):
-        print("usage: python -m palpate_bus.wire.zenoh_config [ENDPOINT...], e.g. tcp/0.0.0.0:7447", file=sys.stderr)
-        return 0 if "--help" in arguments or "-h" in arguments else 2
     try:
         serve(arguments or (DEFAULT_ENDPOINT,), ready=lambda line: print(line, flush=True))
     except BusConfigError as error:
