@@ -196,7 +196,7 @@ def test_each_service_of_a_process_has_the_scenario_of_its_view(local: LocalProc
     assert local.bus["robot"] == local.bus["tissue"] != local.bus["planning"]
     assert local.bus["robot"].lowlatency
     assert "PALPATE_SCENARIO" not in environment
-    seen = {role: Path(row["environment"]["PALPATE_SCENARIO"]).name for role, row in rows.items()}
+    seen = {role: Path(environment["PALPATE_SCENARIO"]).name for role, (_, environment) in rows.items()}
     assert seen == {"robot": "plant.yaml", "tissue": "scenario.yaml", "control": "exam.yaml"}
 
 
