@@ -1,10 +1,12 @@
 """Delay margins of the contact of robot, tissue and controller: measured, and by linear theory."""
 
 from dataclasses import dataclass
+from pathlib import Path
 
 from matplotlib.figure import Figure
 
-from palpate_validation.check import COLOURS, QUIET, Check, PageSection, show
+from palpate.console import wide_console
+from palpate_validation.check import COLOURS, QUIET, Check, PageSection, table, write
 from research.contact_rig import CONTACT_PATH, CONTROL_PATH, EVENTS, Delays, Ringing, press
 from research.loop_theory import linearise
 
@@ -136,4 +138,6 @@ def draw(figure: Figure, found: Stability) -> None:
 
 
 if __name__ == "__main__":
-    show(section())
+    found = section()
+    write([found], Path("out/research"))
+    wide_console(150).print(table([found]), found.text)

@@ -90,7 +90,7 @@ class FlatPatch(Slide):
 
     def time_surface(self, *_: object) -> None:
         """Read the deformed surface."""
-        _ = self.body.deformed_vertices
+        _ = self.body.inward
 
 
 def flat_patch(vertices: int, half_width_m: float = 0.13) -> PhantomModel:

@@ -12,12 +12,11 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
 from math import isfinite
 from pathlib import Path
 from random import Random
 from time import monotonic, sleep
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import psutil
 
@@ -75,8 +74,7 @@ LATE: Final = frozenset(
 """Sources and causes of the signs of a machine that is too slow."""
 
 
-@dataclass(frozen=True)
-class CaseTuning:
+class CaseTuning(NamedTuple):
     """Durations of the faults."""
 
     partitions_s: tuple[int, ...] = (1, 5, 30)

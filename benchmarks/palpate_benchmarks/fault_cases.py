@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, fields
 from enum import StrEnum
 from io import StringIO
-from typing import Final
+from typing import Final, NamedTuple
 
 from pydantic import TypeAdapter
 
@@ -20,8 +20,7 @@ KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *SCARCE_KINDS, "partition", LIE)
 """Process and message kinds apply to one service; `kill`, `freeze` and the last four apply to whole runs."""
 
 
-@dataclass(frozen=True)
-class CampaignLimits:
+class CampaignLimits(NamedTuple):
     """Time of the fault, and limits that a case has to keep."""
 
     at_depth_s: float = 0.3
@@ -68,8 +67,7 @@ class LieVerdict(StrEnum):
     BAD = "bad"
 
 
-@dataclass(frozen=True)
-class FaultCase:
+class FaultCase(NamedTuple):
     """One fault."""
 
     kind: str

@@ -7,12 +7,11 @@ itself complete on less than its twin felt, and the liar was named, or did no ha
 """
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from pathlib import Path
 from random import Random
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from palpate.apart import guarded
 from palpate.environment import given
@@ -57,8 +56,7 @@ LIVE_KINDS: Final = ("zero", "stale")
 """Further kinds of the cases in wall-clock mode."""
 
 
-@dataclass(frozen=True)
-class LieTuning:
+class LieTuning(NamedTuple):
     """Times of a lie's case, and limits of its outcome."""
 
     least_share: float = 0.9
@@ -94,8 +92,7 @@ UNDETECTABLE: Final = (
 """Lies that no other input contradicts: topic or topic and field, kinds (empty: all), and the reason."""
 
 
-@dataclass(frozen=True)
-class Healthy:
+class Healthy(NamedTuple):
     """The twin: the same examination without a lie."""
 
     moments_s: dict[str, float]

@@ -15,7 +15,7 @@ from contextlib import nullcontext, suppress
 from dataclasses import dataclass, field, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import psutil
 from pydantic import TypeAdapter
@@ -55,8 +55,7 @@ PROCESSES: Final = "processes: "
 FILE: Final = "struck.pickle"
 
 
-@dataclass(frozen=True)
-class FaultTimes:
+class FaultTimes(NamedTuple):
     """Wall times around a fault [s]."""
 
     freeze_s: float = 10.0

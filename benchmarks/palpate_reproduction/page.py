@@ -3,10 +3,9 @@
 import json
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from jinja2 import Environment, PackageLoader, StrictUndefined
@@ -23,8 +22,7 @@ from palpate_reproduction.scene import Stage, deformation_mm, moments
 WATCHING = ("conductor", "dashboard", "recorder")
 
 
-@dataclass(frozen=True)
-class MeasuredWay:
+class MeasuredWay(NamedTuple):
     """One way to cover the region, measured."""
 
     name: str
@@ -143,7 +141,7 @@ def write_page(
     )
     page.parent.mkdir(parents=True, exist_ok=True)
     page.write_text(text, encoding="utf-8")
-    return {**facts, "ways": [vars(way) for way in ways], "run_hash": report.run_hash, "page": str(page)}
+    return {**facts, "ways": [way._asdict() for way in ways], "run_hash": report.run_hash, "page": str(page)}
 
 
 def _forces(evidence: Evidence) -> tuple[float, float, float]:

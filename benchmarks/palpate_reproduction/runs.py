@@ -6,10 +6,9 @@ import json
 import signal
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from time import sleep
-from typing import Final
+from typing import Final, NamedTuple
 
 from palpate.report.archive import completed
 from palpate_bus.runs.announcement import Run, live
@@ -24,8 +23,7 @@ STOP_S: Final = 30.0
 """Time for a run to end after SIGINT."""
 
 
-@dataclass(frozen=True)
-class ReproductionCase:
+class ReproductionCase(NamedTuple):
     """One way to cover the region."""
 
     pattern: str

@@ -1,7 +1,6 @@
 """Pictures of a recorded run at a given time: robot, table and deformed abdomen, drawn triangle by triangle, from far to near."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -66,8 +65,7 @@ def draw(axes: Axes, bodies: Sequence[Body], view: Viewpoint, aspect: float = 48
     axes.set(xlim=(-aspect * half, aspect * half), ylim=(-half, half), aspect="equal")
 
 
-@dataclass(frozen=True)
-class Moment:
+class Moment(NamedTuple):
     """Latest messages at a simulated time."""
 
     time_s: float

@@ -1,6 +1,6 @@
 """Validation of breathing: rate, shape and irregularity measured on the curve, and the mode over the body."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -13,8 +13,7 @@ from palpate_models.patient.schema import Phantom
 from palpate_validation.check import COLOURS, INK, Check, PageSection
 
 
-@dataclass(frozen=True)
-class BreathingSetup:
+class BreathingSetup(NamedTuple):
     """Sampling of the curves."""
 
     step_s: float = 0.01

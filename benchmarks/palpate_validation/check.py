@@ -11,7 +11,7 @@ import matplotlib as mpl
 from matplotlib.figure import Figure
 from rich.table import Table
 
-from palpate.console import number, wide_console
+from palpate.console import number
 
 Draw = Callable[[Figure], None]
 
@@ -127,9 +127,3 @@ def write(sections: Sequence[PageSection], out: Path) -> None:
 def _number(value: float) -> float | None:
     """Return a number for JSON: seven digits, null if not finite."""
     return float(f"{value:.7g}") if isfinite(value) else None
-
-
-def show(section: PageSection, out: Path = Path("out/research")) -> None:
-    """Print the checks of one section and write its files, for a study in `research`."""
-    write([section], out)
-    wide_console(150).print(table([section]), section.text)

@@ -8,8 +8,7 @@ figure is stiffer and less damped, as in DART; stiffness is chosen for the 1 mm,
     draw(figure, measure())
 """
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import dartpy as dart
 import numpy as np
@@ -26,8 +25,7 @@ HEAVY_KG = 1e6
 """Mass of the body that holds the flesh, so that it moves by less than a nanometre."""
 
 
-@dataclass(frozen=True)
-class Flesh:
+class Flesh(NamedTuple):
     """A box of DART's soft body with its top in z = 0; its point masses have no edges."""
 
     size_m: tuple[float, float, float]
@@ -47,8 +45,7 @@ class Flesh:
         return x * y * z - (x - 2) * (y - 2) * (z - 2)
 
 
-@dataclass(frozen=True)
-class DropSetup:
+class DropSetup(NamedTuple):
     """The dropped indenter."""
 
     mass_kg: float = 0.35
@@ -133,8 +130,7 @@ FLESH = Flesh((0.03, 0.03, 0.02), (13, 13, 3), k_v=560.0, damping=0.7, mass=1e-3
 """Soft body of DART in the figure, vertices 2.5 mm apart."""
 
 
-@dataclass(frozen=True)
-class Drop:
+class Drop(NamedTuple):
     """Motion of a dropped indenter; arrays of shape (n,)."""
 
     name: str

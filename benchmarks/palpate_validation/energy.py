@@ -1,7 +1,8 @@
 """Validation of passivity: no closed cycle of pressing, sliding and lifting extracts work from the tissue."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,8 +15,7 @@ from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import COLOURS, INK, Check, PageSection
 
 
-@dataclass(frozen=True)
-class CycleSetup:
+class CycleSetup(NamedTuple):
     """The random cycles."""
 
     radius_m: float = 0.015
@@ -28,8 +28,7 @@ class CycleSetup:
 SETUP = CycleSetup()
 
 
-@dataclass(frozen=True)
-class Cycle:
+class Cycle(NamedTuple):
     """Energies of one closed cycle [J]; arrays of shape (steps,)."""
 
     work: Array

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -20,8 +21,7 @@ RATIO: float = Guarding(centre_m=(0.0, 0.0)).ratio
 KINDS = ("relaxed", "voluntary", "involuntary")
 
 
-@dataclass(frozen=True)
-class GuardingSetup:
+class GuardingSetup(NamedTuple):
     """The strokes over a guarding wall."""
 
     radius_m: float = 0.015
@@ -43,8 +43,7 @@ BY_HAND = (0.25 + 0.75 * math.exp(-press.DEPTH_M / press.SPEED_MPS / FADING_S)) 
 """Contraction of voluntary guarding at the reading of the press: 20 mm/s cause a quarter of it, a hold at 10 mm none."""
 
 
-@dataclass(frozen=True)
-class GuardedTouch:
+class GuardedTouch(NamedTuple):
     """Forces of one wall on a path of the sphere; n instants."""
 
     time: Array

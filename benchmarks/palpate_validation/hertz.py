@@ -4,7 +4,7 @@ Surface tier: the range in which a Winkler-Pasternak wall behaves as a half-spac
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,8 +17,7 @@ from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 from palpate_validation.probing import static_curve
 
 
-@dataclass(frozen=True)
-class HertzSetup:
+class HertzSetup(NamedTuple):
     """The half-space and the range of the comparison."""
 
     young_pa: float = 1.0e4
@@ -57,8 +56,7 @@ def sneddon_force(depth: float, radius: float, young: float = HERTZ.young_pa, po
     return float(modulus * ((a**2 + radius**2) * np.arctanh(a / radius) - a * radius))
 
 
-@dataclass(frozen=True)
-class HertzCurves:
+class HertzCurves(NamedTuple):
     """Static forces of the surface tier and of Hertz, shapes (radii, depths)."""
 
     radii: tuple[float, ...]

@@ -6,7 +6,7 @@ The reference for mesh and lumps are axisymmetric finite elements of the tier's 
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,8 +22,7 @@ from palpate_validation.check import COLOURS, INK, Check, PageSection
 from palpate_validation.probing import ELASTIC, OFFSETS, hold
 
 
-@dataclass(frozen=True)
-class MeshSetup:
+class MeshSetup(NamedTuple):
     """The meshes and presses."""
 
     half_m: float = 0.08
@@ -108,8 +107,7 @@ def _solve(diagonal: Array, spring: Array, active: NDArray[np.bool_], hold: Arra
 DEPTHS_M = np.array((2, 3, 5, 7.5, 10, 15)) * 1e-3
 
 
-@dataclass(frozen=True)
-class MeshForces:
+class MeshForces(NamedTuple):
     """Static forces [N], shape (edges, radii, places, depths), and of the continuum, shape (radii, depths)."""
 
     force: Array

@@ -1,8 +1,9 @@
 """Validation with living people: the measurement of Remus et al. simulated on the flat surface tier."""
 
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,8 +18,7 @@ from palpate_tissue.backends.winkler.tissue import WinklerTissue
 from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 
 
-@dataclass(frozen=True)
-class IndentationSetup:
+class IndentationSetup(NamedTuple):
     """The simulated measurement."""
 
     half_m: float = 0.08
@@ -77,8 +77,7 @@ def at_depths(force: Array, zero_offset_m: float, depths: Array = COMPARED_M) ->
     return np.interp(depths + zero_offset_m, np.arange(len(force)) * PRESS.spacing_m, force)
 
 
-@dataclass(frozen=True)
-class PeopleBounds:
+class PeopleBounds(NamedTuple):
     """Bounds of the reproduction and depths of the loops."""
 
     within_percent: float = 5.0
@@ -100,8 +99,7 @@ def rms_percent(simulated: Array, measured: Array) -> float:
     return 100 * float(np.sqrt(np.mean((simulated / measured - 1) ** 2)))
 
 
-@dataclass(frozen=True)
-class Place:
+class Place(NamedTuple):
     """One position on one relaxed person: measured and simulated force at `COMPARED_M`."""
 
     region: str
@@ -120,8 +118,7 @@ class Place:
         return rms_percent(self.simulated, self.measured)
 
 
-@dataclass(frozen=True)
-class HysteresisLoop:
+class HysteresisLoop(NamedTuple):
     """Press and release of the median person's wall at one speed."""
 
     speed: float
@@ -140,8 +137,7 @@ class HysteresisLoop:
         return 100 * float(1 - back / pressed)
 
 
-@dataclass(frozen=True)
-class People:
+class People(NamedTuple):
     """All positions, the median person and the loops."""
 
     places: tuple[Place, ...]

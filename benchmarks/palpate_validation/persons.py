@@ -1,6 +1,6 @@
 """Three sampled persons: maps of the force of a press, and the shape of the body."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.colors import LogNorm
@@ -19,8 +19,7 @@ from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
 SEEDS = ((Build.SLIM, 4), (Build.MEDIAN, 2), (Build.OBESE, 3))
 
 
-@dataclass(frozen=True)
-class MapSetup:
+class MapSetup(NamedTuple):
     """Ranges of the drawn maps."""
 
     shown_n: tuple[float, float] = (0.7, 15.0)
@@ -32,8 +31,7 @@ class MapSetup:
 SETUP = MapSetup()
 
 
-@dataclass(frozen=True)
-class Person:
+class Person(NamedTuple):
     """A person and the force [N] on a sphere of 10 mm pressed 10 mm deep at each vertex, shape (n,)."""
 
     build: Build

@@ -1,7 +1,7 @@
 """Check of the sampler of persons: the statistics of their forces against those of the living people of Remus et al."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -19,8 +19,7 @@ from palpate_models.patient.tension import pressed_force
 from palpate_validation.check import COLOURS, INK, Check, PageSection
 
 
-@dataclass(frozen=True)
-class PopulationSetup:
+class PopulationSetup(NamedTuple):
     """The sampled population."""
 
     persons: int = 200

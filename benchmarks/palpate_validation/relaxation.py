@@ -1,6 +1,6 @@
 """Validation of relaxation: the Prony series estimated from the force of a held contact."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -14,8 +14,7 @@ from palpate_validation.check import COLOURS, INK, Check, PageSection
 from palpate_validation.probing import ELASTIC, STILL, hold
 
 
-@dataclass(frozen=True)
-class RelaxationSetup:
+class RelaxationSetup(NamedTuple):
     """The held contact."""
 
     half_m: float = 0.04

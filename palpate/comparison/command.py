@@ -32,7 +32,6 @@ def compare(
 
       palpate compare outcomes.csv                    real against simulated outcomes
     """
-    from dataclasses import asdict
     from json import dumps
 
     from rich.console import Console
@@ -45,7 +44,7 @@ def compare(
         pairs = read_outcomes(a)
         outcome = sim_to_real(*pairs)
         draw_outcomes(out / "compare.png", *pairs)
-        figures = asdict(outcome)
+        figures = outcome._asdict()
     else:
         first = comparing.read_palpated(a, mapping)
         second = comparing.read_palpated(b, mapping, first.depth_m)
@@ -53,7 +52,7 @@ def compare(
             say(text)
         compared = comparing.compare(first, second, register)
         comparing.draw(out / "compare.png", compared)
-        figures = asdict(compared.figures)
+        figures = compared.figures._asdict()
     write_text(out / "compare.json", dumps(figures, indent=2) + "\n")
     if as_json:
         print_json(figures)

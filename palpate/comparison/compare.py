@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib.axes import Axes
@@ -26,8 +26,7 @@ from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, apply, rigid
 
 
-@dataclass(frozen=True)
-class CompareTuning:
+class CompareTuning(NamedTuple):
     """Settings of the registration and the intervals."""
 
     surface_m: float = 0.001
@@ -91,8 +90,7 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
     )
 
 
-@dataclass(frozen=True)
-class MapAgreement:
+class MapAgreement(NamedTuple):
     """Figures of a comparison; ratios are of B over A."""
 
     places: int
@@ -119,8 +117,7 @@ class MapAgreement:
     """Overlap of the findings; null if neither has one."""
 
 
-@dataclass(frozen=True, eq=False)
-class Compared:
+class Compared(NamedTuple):
     """A comparison and its values at k places, for the figure."""
 
     figures: MapAgreement

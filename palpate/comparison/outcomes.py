@@ -7,8 +7,8 @@ SureSim (arXiv 2510.04354): theta = lambda mean(S of these) + mean(R - lambda S 
 (Angelopoulos, Duchi and Zrnic, PPI++, arXiv 2311.01453).
 """
 
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -22,8 +22,7 @@ COLUMNS = ("body", "real", "simulated")
 LEAST_PAIRS = 3
 
 
-@dataclass(frozen=True)
-class SimToReal:
+class SimToReal(NamedTuple):
     """Agreement of outcomes."""
 
     pairs: int

@@ -3,10 +3,9 @@
 import random
 import struct
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -22,8 +21,7 @@ from palpate_bus.wire.zenoh_config import BusConfigError, BusOptions
 from palpate_models.scenario.load import ScenarioError, dump_scenario, load_scenario, scenario_names
 
 
-@dataclass(frozen=True)
-class FuzzTarget:
+class FuzzTarget(NamedTuple):
     """A function under test and its valid inputs."""
 
     name: str

@@ -32,8 +32,7 @@ if TYPE_CHECKING:
     from palpate.fuzz.bus_readers import FuzzTarget
 
 
-@dataclass(frozen=True)
-class FuzzLimits:
+class FuzzLimits(NamedTuple):
     """Limits of an attempt."""
 
     slow_s: float = 1.0
@@ -52,8 +51,7 @@ _CHANGES: Final = frozenset(("os.mkdir", "os.rename", "os.link", "os.symlink", "
 _EDGES = (b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80", b"\1\0\0\0", b"\0\0\xf0\x7f")
 
 
-@dataclass(frozen=True)
-class FuzzPlan:
+class FuzzPlan(NamedTuple):
     """Extent of a campaign, for each target."""
 
     inputs: int

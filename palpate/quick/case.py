@@ -4,9 +4,8 @@ import gc
 import hashlib
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
 from time import perf_counter, process_time
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -107,8 +106,7 @@ RUNTIME: Final = "quick"
 _HASHED: Final = ("assessment/samples", "assessment/map", "assessment/findings")
 
 
-@dataclass(frozen=True)
-class QuickCase:
+class QuickCase(NamedTuple):
     """Result of a quick case, and the processor time of its parts [s]."""
 
     report: Report

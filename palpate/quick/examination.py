@@ -10,7 +10,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from math import sqrt
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -53,8 +53,7 @@ _NOWHERE: Final = np.zeros(3)
 _FOOT: Final = Foot(_NOWHERE, _NOWHERE, 0.0, _NOWHERE[:2])
 
 
-@dataclass(frozen=True, eq=False)
-class SkinPath:
+class SkinPath(NamedTuple):
     """A path on the perceived and on the true skin: g places, about _DENSE_M apart."""
 
     segment: Segment

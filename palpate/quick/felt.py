@@ -4,8 +4,8 @@ The force at a place follows from stiffness and stiffening of the wall there (`f
 of the indenter on a Winkler-Pasternak foundation. It takes half a second per person.
 """
 
-from dataclasses import dataclass, replace
-from typing import Final
+from dataclasses import replace
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
@@ -36,8 +36,7 @@ _TABLE: Final = np.linspace(0.0, 600.0, 25)
 """Stiffening [1/m] at which the force is computed; linear between."""
 
 
-@dataclass(frozen=True)
-class FeltPatient:
+class FeltPatient(NamedTuple):
     """Force of the standard press on a square grid about the umbilicus, the origin of A, with n x n places."""
 
     force: Array

@@ -1,9 +1,8 @@
 """Cuts readings into contacts: by force and noise over time, by number in a table of probes; finds where each one begins."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,8 +25,7 @@ _LOADED: Final = 0.95
 """Share of the greatest depth up to which a press loads."""
 
 
-@dataclass(frozen=True)
-class ContactOnset:
+class ContactOnset(NamedTuple):
     """Begin of a contact by its loading: F = stiffness (s - at - slope along)^power."""
 
     at: float
@@ -89,8 +87,7 @@ def power_of(loads: Sequence[Loaded], sigma: float) -> float:
     return POWERS[int(np.argmin(misfits))]
 
 
-@dataclass(frozen=True)
-class Cut:
+class Cut(NamedTuple):
     """The contacts of a recording over time."""
 
     touching: list[slice]

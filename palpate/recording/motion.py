@@ -6,7 +6,7 @@ the sensor's range or on the stiffness of the body.
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,8 +21,7 @@ _LEAST_M2: Final = 1e-15
 Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class FreeMotionTuning:
+class FreeMotionTuning(NamedTuple):
     """Windows and limits of the analysis."""
 
     block_s: float = 0.25

@@ -1,9 +1,9 @@
 """Files to a `Recording`: reads, cleans, aligns, tares, cuts, finds the skin, and says what was wrong."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from operator import attrgetter
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.ndimage import find_objects, label, median_filter
@@ -24,8 +24,7 @@ from palpate_models.numerics.frames import Array, apply, inverse, matrix
 from palpate_models.scenario.load import exam_input, load_scenario
 
 
-@dataclass(frozen=True)
-class ReadingLimits:
+class ReadingLimits(NamedTuple):
     """Limits of plausible readings and contacts."""
 
     frozen: int = 10

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from enum import StrEnum
 from functools import cached_property
 from math import sqrt
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 import numpy as np
 
@@ -73,8 +73,7 @@ class Palpated:
         return cls([], np.empty((0, 3)), np.empty((0, 3)), 1.5, 0)
 
 
-@dataclass(frozen=True)
-class Loading:
+class Loading(NamedTuple):
     """Presses of one body; k of them."""
 
     force: Array

@@ -1,8 +1,8 @@
 """Contacts of a recording over time: aligned, tared, cut, and measured from the skin where they begin."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import Enum, auto
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -94,8 +94,7 @@ class _Motion(Enum):
     """Part of a slide that pushes in and out, which is a press of its own."""
 
 
-@dataclass(frozen=True)
-class _Loading:
+class _Loading(NamedTuple):
     """The first part of a contact, whole cycles of a slide, or another stretch of one, along one normal."""
 
     normal: Array

@@ -14,11 +14,10 @@ from itertools import groupby, pairwise
 from operator import attrgetter
 from pathlib import Path
 from time import sleep, time
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from mcap.reader import make_reader
-from numpy.typing import NDArray
 
 from palpate.replay.golden import rerun, write_recording
 from palpate.truth.pressed import Pressed, Touched
@@ -59,8 +58,6 @@ _MAGIC: Final = b"\x89MCAP0\r\n"
 _STILL_S: Final = 3.0
 """A recording that has not grown for this long is complete: its recorder writes every simulated second."""
 
-Mask = NDArray[np.bool_]
-
 
 class EvidenceError(UserError):
     """A folder without a readable run. Names the file and what to do."""
@@ -70,8 +67,7 @@ class NothingRecordedError(EvidenceError):
     """An interrupted run of which nothing was recorded."""
 
 
-@dataclass(frozen=True)
-class Event:
+class Event(NamedTuple):
     """A message of the examination or a change of the driver, for the reader of a report."""
 
     time_s: float
@@ -247,8 +243,7 @@ def completed(folder: Path) -> dict[str, Any] | None:
     return None
 
 
-@dataclass(frozen=True)
-class InterruptedRun:
+class InterruptedRun(NamedTuple):
     """A run without results or with those of a failure."""
 
     folder: Path

@@ -19,7 +19,6 @@ from palpate_models.patient.motion import BodyMotion
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Scenario
 
-Mask = NDArray[np.bool_]
 xyz: Final = attrgetter("x", "y", "z")
 """Coordinates of a point or vector of a message."""
 

@@ -12,7 +12,7 @@ from matplotlib.cm import ScalarMappable
 from matplotlib.colors import LogNorm, Normalize
 from matplotlib.figure import Figure
 from matplotlib.patheffects import withStroke
-from matplotlib.ticker import FixedLocator, FuncFormatter, MaxNLocator, NullFormatter, NullLocator
+from matplotlib.ticker import MaxNLocator
 from matplotlib.tri import Triangulation
 
 from palpate.report import rows
@@ -134,12 +134,9 @@ class Drawing:
         for name, x, y in (("RUQ", 0, 1), ("LUQ", 1, 1), ("RLQ", 0, 0), ("LLQ", 1, 0)):
             if not ((high[0] > 0 if x else low[0] < 0) and (high[1] > 0 if y else low[1] < 0)):
                 continue  # it lies outside the view
-            text = axes.text(
-                0.03 + 0.94 * x, 0.03 + 0.94 * y, name, transform=axes.transAxes, color="white", fontsize=10, weight="bold"
-            )
-            text.set_horizontalalignment("right" if x else "left")
-            text.set_verticalalignment("top" if y else "bottom")
-            text.set_path_effects([withStroke(linewidth=2, foreground=INK)])
+            place: Any = {"transform": axes.transAxes, "ha": "right" if x else "left", "va": "top" if y else "bottom"}
+            look: Any = {"color": "white", "weight": "bold", "path_effects": [withStroke(linewidth=2, foreground=INK)]}
+            axes.text(0.03 + 0.94 * x, 0.03 + 0.94 * y, name, fontsize=10, **place, **look)
 
     def rounded(self, member: Array) -> Array:
         """Return membership averaged over neighbours, so that its half level is a smooth outline."""
@@ -182,13 +179,9 @@ class Drawing:
 
     def space(self, axes: Any, height: Array, layer: MapQuantity, label: str) -> None:
         """Draw the map as a surface in space: `height` above the xy plane, coloured by a quantity."""
-        z = height.copy()
-        surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), z, linewidth=0)
-        surface.set_cmap(layer.cmap)
-        surface.set_norm(layer.norm)
+        look = {"cmap": layer.cmap, "norm": layer.norm, "linewidth": 0, "edgecolor": "none", "antialiased": False}
+        surface = axes.plot_trisurf(Triangulation(self.xyz[:, 0], self.xyz[:, 1], self.triangles), height, **look)
         surface.set_array(layer.values[self.triangles].mean(axis=1))
-        surface.set_edgecolor("none")
-        surface.set_antialiased(False)
         axes.view_init(elev=30, azim=-62)
         axes.zaxis.set_major_locator(MaxNLocator(4))
         axes.set_xlabel("x [mm]", fontsize=_SMALL, labelpad=-2)
@@ -271,15 +264,11 @@ def colour_bar(image: ScalarMappable, axes: Axes, label: str) -> None:
     """Draw a colour bar next to `axes`, with round numbers on a logarithmic scale."""
     figure = axes.get_figure()
     assert figure is not None
-    bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02)
+    round_numbers: Any = {"ticks": _LOG_TICKS, "format": "%g"} if isinstance(image.norm, LogNorm) else {}
+    bar = figure.colorbar(image, ax=axes, fraction=0.046, pad=0.02, **round_numbers)
     bar.set_label(label, fontsize=_SMALL, color=INK)
-    if isinstance(image.norm, LogNorm):
-        low, high = image.get_clim()
-        ticks = [t for t in _LOG_TICKS if (low or 0.0) <= t <= (high or 0.0)]
-        bar.ax.yaxis.set_major_locator(FixedLocator(ticks))
-        bar.ax.yaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g}"))
-        bar.ax.yaxis.set_minor_locator(NullLocator())
-        bar.ax.yaxis.set_minor_formatter(NullFormatter())
+    if round_numbers:
+        bar.minorticks_off()
     bar.ax.tick_params(labelsize=_SMALL, colors=INK)
     bar.outline.set_visible(False)
 

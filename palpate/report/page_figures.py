@@ -2,8 +2,7 @@
 
 import base64
 import io
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from matplotlib import colormaps
@@ -36,8 +35,7 @@ _PHASE_TINTS: Final = {
 }
 
 
-@dataclass(frozen=True)
-class FigureTuning:
+class FigureTuning(NamedTuple):
     """Ranges and limits of the figures."""
 
     free_mm: float = -20.0

@@ -7,10 +7,10 @@ import tempfile
 from collections import deque
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -94,8 +94,7 @@ def _assess(run: archive.InterruptedRun) -> None:
             collected.findings = codec.decode(sent.payload, rules.topics[sent.topic].type)
 
 
-@dataclass(frozen=True)
-class Resumption:
+class Resumption(NamedTuple):
     """An examination to continue."""
 
     folder: Path

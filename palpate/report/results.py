@@ -3,9 +3,8 @@
 import csv
 import logging
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +31,7 @@ from palpate_planning.reasons import Loss
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class Known:
+class Known(NamedTuple):
     """Known parts of the truth of a run; None if unknown."""
 
     body: TrueBody | None

@@ -2,10 +2,11 @@
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from typing import Any, Final, Protocol
+from typing import Any, Final
 
 from pydantic import BaseModel, ConfigDict
 
+from palpate_bus.messages import Finding
 from palpate_bus.runtime.failure import FailureCode
 
 Point = tuple[float, ...]
@@ -260,22 +261,12 @@ OTHERS: Final = {
 """Causes of an area other than a lump, by the field of their probability."""
 
 
-class Probable(Protocol):
-    """A finding or a candidate, as a row or as a message."""
-
-    confidence: float
-    guarding: float
-    ridge: float
-    bone: float
-    soft: float
-
-
 def percent(probability: float) -> str:
     """Return a probability as text; no finding is certain."""
     return f"over {100 * _SURE:.0f} %" if probability > _SURE else f"{100 * probability:.0f} %"
 
 
-def confidence(found: Probable) -> str:
+def confidence(found: FindingRow | Finding) -> str:
     """Return the probability of a lump as text, with those of other causes that are not negligible."""
     others = [f"{percent(p)} {text}" for name, text in OTHERS.items() if (p := getattr(found, name)) >= _REPORTED]
     return percent(found.confidence) + (f" ({', '.join(others)})" if others else "")

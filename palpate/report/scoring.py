@@ -8,7 +8,7 @@ of the abdomen frame A; areas are on the skin.
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,8 +43,7 @@ class Map:
     """Index of the finding of each vertex, -1 if none."""
 
 
-@dataclass(frozen=True)
-class Truth:
+class Truth(NamedTuple):
     """Truth of a run, for its scores."""
 
     body: TrueBody

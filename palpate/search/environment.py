@@ -117,12 +117,6 @@ class SearchEnv(gymnasium.Env[Observation, NDArray[np.float32]]):
         """Number of layers, places along x and along y."""
         return LAYERS, *shape(self.posterior)
 
-    @property
-    def usual_depth(self) -> float:
-        """Nominal depth of a press, scaled as in an action."""
-        task = self._hand.task
-        return 2 * (task.depth - task.shallowest) / (task.deepest - task.shallowest) - 1
-
     def _entropy(self) -> float:
         """Return the entropy of the posterior over no lump, or one at each place [nat]."""
         p = np.append(self.posterior.by_place, self.posterior.none)

@@ -23,7 +23,7 @@ from operator import attrgetter
 from pathlib import Path
 from threading import Thread
 from time import monotonic, perf_counter, process_time, sleep
-from typing import Any, Final, Literal
+from typing import Any, Final, Literal, NamedTuple
 
 import psutil
 
@@ -161,8 +161,7 @@ def _end_with(parent: int) -> None:
     os._exit(1)
 
 
-@dataclass(frozen=True)
-class PoolTuning:
+class PoolTuning(NamedTuple):
     """Distribution of cases to workers."""
 
     connect_s: int = 30

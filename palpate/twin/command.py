@@ -28,7 +28,6 @@ def fit(
 
       palpate fit bag -m bag.yaml --elastic
     """
-    from dataclasses import asdict
     from json import dumps
 
     from palpate.console import print_json, say
@@ -44,7 +43,7 @@ def fit(
     message = collected(read).stiffness_map
     found = None if message is None else map_of(message)
     quality = write_twin(read, out, found, elastic, thickness_m)
-    figures = asdict(quality)
+    figures = quality._asdict()
     write_text(out / "twin.json", dumps(figures, indent=2) + "\n")
     if as_json:
         print_json(figures)

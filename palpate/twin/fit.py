@@ -10,10 +10,10 @@ the tissue under it is loaded.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from math import sqrt
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,8 +34,7 @@ from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W
 from palpate_tissue.backends.winkler.presses import Course, contracted, press_forces, prony_table
 
 
-@dataclass(frozen=True)
-class FitTuning:
+class FitTuning(NamedTuple):
     """Settings of the fit."""
 
     form_presses: int = 12
@@ -66,8 +65,7 @@ TUNING: Final = FitTuning()
 _ROUNDING_M = 1e-6
 
 
-@dataclass(frozen=True, eq=False)
-class FittedPress:
+class FittedPress(NamedTuple):
     """One press; n readings in the order of time, in A."""
 
     place: Array
@@ -155,8 +153,7 @@ def amplitude(measured: Array, expected: Array) -> float:
     return float(measured[there] @ expected[there]) / square if square > 0 else 0.0
 
 
-@dataclass(frozen=True, eq=False)
-class FittedWall:
+class FittedWall(NamedTuple):
     """A fitted wall; n presses."""
 
     grid: BodyGrid

@@ -1,8 +1,8 @@
 """The twin as a scenario: twin.yaml, the grid file twin.csv, and how well it reproduces the recording."""
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import yaml
@@ -27,8 +27,7 @@ from palpate_tissue.service import TissueService
 GRID: Final = "twin.csv"
 
 
-@dataclass(frozen=True)
-class TwinTuning:
+class TwinTuning(NamedTuple):
     """Presses of the elastic twin, and findings that become lumps."""
 
     presses: int = 20
@@ -46,8 +45,7 @@ class TwinTuning:
 TUNING: Final = TwinTuning()
 
 
-@dataclass(frozen=True)
-class Quality:
+class Quality(NamedTuple):
     """Simulated against recorded forces of a twin."""
 
     presses: int

@@ -79,7 +79,9 @@ class Presses(gymnasium.Env[NDArray[np.float32], int]):
         """Return a press of the usual depth at a place, or of the greatest."""
         depth, row, column = np.unravel_index(int(action), (2, *self._shape[1:]))
         share = 2.0 * np.array((row / (self._shape[1] - 1), column / (self._shape[2] - 1))) - 1.0
-        press = np.array((*share, self._env.usual_depth if depth == 0 else 1.0), dtype=np.float32)
+        task = self._env.task
+        usual = 2 * (task.depth - task.shallowest) / (task.deepest - task.shallowest) - 1
+        press = np.array((*share, usual if depth == 0 else 1.0), dtype=np.float32)
         observed, reward, over, cut, given = self._env.step(press)
         return observed["maps"], reward, over, cut, given
 

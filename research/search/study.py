@@ -16,7 +16,7 @@ from rich.progress import track
 
 from palpate.search.hand import PatientHand, SurrogateHand
 from palpate.search.trial import case, search
-from palpate_search.posterior import policies, policy
+from palpate_search.posterior import POLICY, policy
 
 HANDS: Final = {"surrogate": SurrogateHand, "patient": PatientHand}
 
@@ -54,7 +54,7 @@ def main(
     """Search the patients of some seeds by every policy. `python -m research.search.curves` compares what was done."""
     if hand not in HANDS:
         raise typer.BadParameter(f"--hand {hand}: want one of {', '.join(HANDS)}")
-    run(range(first_seed, first_seed + number * every, every), hand, names or policies(), out)
+    run(range(first_seed, first_seed + number * every, every), hand, names or POLICY.names(), out)
 
 
 if __name__ == "__main__":

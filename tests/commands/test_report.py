@@ -72,7 +72,7 @@ def test_a_complete_run(scenario: Scenario, tmp_path: Path) -> None:
 def test_depth_error_is_of_the_true_depth_in_steady_contact(scenario: Scenario, felt: Known) -> None:
     run = result(collected(depth_error=0.0007, measured_error=0.0002))
     contact = truth_of_run(scenario, run.collected).contact
-    report = assemble(scenario, run, replace(felt, contact=contact))
+    report = assemble(scenario, run, felt._replace(contact=contact))
     assert report.depth_rms_error_m == pytest.approx(0.0007)
     assert report.depth.measured_against_true_m == pytest.approx(0.0005)
     assert report.depth.true_against_setpoint_lump_m == pytest.approx(0.0007)

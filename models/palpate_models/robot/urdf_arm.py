@@ -4,6 +4,7 @@
 """
 
 import sys
+from collections import Counter
 from dataclasses import replace
 from difflib import get_close_matches
 from functools import cache
@@ -17,10 +18,10 @@ from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
 from palpate_errors import UserError
-from palpate_models.numerics.frames import Array
+from palpate_inputs import read_text
+from palpate_models.numerics.frames import Array, rigid
 from palpate_models.robot.chain import Arm, Capsule, Inertia
 from palpate_models.robot.fitting import as_point, enclosing_capsule, ready_posture
-from palpate_models.robot.urdf_tree import UrdfTree, linked
 from palpate_models.scenario.arm_file import ArmFile, arm_file, arm_path
 
 
@@ -93,15 +94,93 @@ _LIMITS: Final[tuple[tuple[str, str, float | None], ...]] = (
 """Limits of a joint: attribute in a URDF, field of `ArmFile`, value for a continuous joint."""
 
 
-class _Reader:
+class UrdfTree:
+    """A URDF file. Raises UserError if it is not one."""
+
+    def __init__(self, path: Path) -> None:
+        try:
+            text = read_text(path)
+            if "<!ENTITY" in text:
+                raise UserError(f"{path}: has XML entities, which may name other files: write their text")
+            root = ElementTree.fromstring(text)
+        except (OSError, ElementTree.ParseError) as error:
+            raise UserError(f"{path}: not a URDF: {error}") from error
+        if any("xacro" in element.tag for element in root.iter()):
+            raise UserError(f"{path}: not a URDF: has xacro elements; expand it with the tool xacro")
+        if root.tag != "robot":
+            raise UserError(f"{path}: not a URDF: its root element is {root.tag}, want robot")
+        self.links = {link.get("name", ""): link for link in root.findall("link")}
+        self.joints = root.findall("joint")
+        self.joint_of = {linked(joint, "child"): joint for joint in self.joints}
+        """Joint by the link that it carries."""
+        self.part = path.name
+        """Link or joint that is being read, for messages."""
+        named = {"link": root.findall("link"), "joint": self.joints}
+        twice = (
+            f"{kind} {name!r}: {count} of this name; each needs its own"
+            for kind, elements in named.items()
+            for name, count in Counter(element.get("name", "") for element in elements).items()
+            if count > 1 or not name
+        )
+        self.faults = [*twice, *self._loose()]
+        """Faults of the tree. With any, the rest of the file is not read."""
+
+    def _loose(self) -> list[str]:
+        """Return faults of joints whose links are not there, and of links with two joints or in none of the trees."""
+        found = []
+        for joint in self.joints:
+            for end in ("parent", "child"):
+                link = linked(joint, end)
+                if link not in self.links:
+                    found.append(f"joint {joint.get('name')}: no link {link!r} in the file, its {end}")
+            if self.joint_of[linked(joint, "child")] is not joint:
+                found.append(f"link {linked(joint, 'child')}: has two joints above it, one is {joint.get('name')}")
+        roots = [link for link in self.links if link not in self.joint_of]
+        if len(roots) > 1 and not found:
+            found.append(f"links {', '.join(roots)}: {len(roots)} roots, want one")
+        return found
+
+    def chain(self, flange: str) -> list[str]:
+        """Return the links from the root to the flange. Raises ValueError for a circle."""
+        chain = [flange]
+        while joint := self.joint_of.get(chain[-1]):
+            parent = linked(joint, "parent")
+            if parent in chain:
+                raise ValueError(f"link {parent}: its joints form a circle")
+            chain.append(parent)
+        chain = chain[::-1]
+        return chain[1:] if chain[0] == "world" and len(chain) > 2 else chain
+
+    def numbers(self, element: ElementTree.Element | None, attribute: str, default: str = "0 0 0") -> Array:
+        """Return as many numbers as the default has. Raises ValueError that names the part which is being read."""
+        text = default if element is None else element.get(attribute, default)
+        try:
+            found = np.array([float(part) for part in text.split()])
+        except ValueError:
+            found = np.zeros(0)
+        if len(found) != len(default.split()):
+            raise ValueError(f"{self.part}: {attribute} is {text!r}, want {len(default.split())} number(s)")
+        if not np.isfinite(found).all():
+            raise ValueError(f"{self.part}: {attribute} is not finite: {text}")
+        return found
+
+    def pose(self, element: ElementTree.Element | None) -> Array:
+        """Return the pose of an `origin`, shape (4, 4)."""
+        return rigid(Rotation.from_euler("xyz", self.numbers(element, "rpy")).as_matrix(), self.numbers(element, "xyz"))
+
+
+def linked(joint: ElementTree.Element, end: str) -> str:
+    """Return the name of a joint's `parent` or `child` link."""
+    element = joint.find(end)
+    return "" if element is None else element.get("link", "")
+
+
+class _Reader(UrdfTree):
     """Reads the chain from base to flange of one URDF and collects faults."""
 
     def __init__(self, given: ArmFile, path: Path) -> None:
+        super().__init__(path)
         self._given, self._path = given, path
-        self._tree = UrdfTree(path)
-        self._links, self._joint_of = self._tree.links, self._tree.joint_of
-        self._numbers, self._pose = self._tree.numbers, self._tree.pose
-        self.faults = list(self._tree.faults)
 
     def read(self, name: str) -> tuple[Arm | None, list[str]]:
         """Return the arm, None if it is unusable, and the faults."""
@@ -113,10 +192,10 @@ class _Reader:
             return None, [*self.faults, f"{self._path.name}: {error}"]
 
     def _arm(self, name: str) -> tuple[Arm | None, list[str]]:
-        if self._given.flange not in self._links:
-            near = get_close_matches(self._given.flange, self._links, 6, 0.4) or list(self._links)[-6:]
+        if self._given.flange not in self.links:
+            near = get_close_matches(self._given.flange, self.links, 6, 0.4) or list(self.links)[-6:]
             return None, [f"flange: no link {self._given.flange!r} in {self._path.name}; it has {', '.join(near)}"]
-        chain = self._tree.chain(self._given.flange)
+        chain = self.chain(self._given.flange)
         self._base = chain[0]
         poses, moving = self._placed(chain)
         n = len(moving)
@@ -173,29 +252,29 @@ class _Reader:
 
     def _axis(self, joint: ElementTree.Element) -> Array:
         """Return the unit axis of a joint."""
-        self._tree.part = f"joint {joint.get('name')}"
-        axis = self._numbers(joint.find("axis"), "xyz", "1 0 0")
+        self.part = f"joint {joint.get('name')}"
+        axis = self.numbers(joint.find("axis"), "xyz", "1 0 0")
         if not axis.any():
-            raise ValueError(f"{self._tree.part}: its axis is zero")
+            raise ValueError(f"{self.part}: its axis is zero")
         return axis / np.linalg.norm(axis)
 
     def _placed(self, chain: list[str]) -> tuple[list[Array], list[ElementTree.Element]]:
         """Return the pose of each link in the root at zero, and the joints that turn."""
         X, poses, moving = np.eye(4), [np.eye(4)], []
         for link in chain[1:]:
-            joint = self._joint_of[link]
-            self._tree.part = f"joint {joint.get('name')}"
-            X = X @ self._pose(joint.find("origin"))
+            joint = self.joint_of[link]
+            self.part = f"joint {joint.get('name')}"
+            X = X @ self.pose(joint.find("origin"))
             poses.append(X)
             kind = joint.get("type")
-            if np.linalg.norm(self._numbers(joint.find("origin"), "xyz")) > TUNING.largest_link_m:
-                self.faults.append(f"{self._tree.part}: its origin is farther than {TUNING.largest_link_m:g} m: want metres")
+            if np.linalg.norm(self.numbers(joint.find("origin"), "xyz")) > TUNING.largest_link_m:
+                self.faults.append(f"{self.part}: its origin is farther than {TUNING.largest_link_m:g} m: want metres")
             if joint.find("mimic") is not None:
-                self.faults.append(f"{self._tree.part}: mimics another joint; want joints that turn by themselves")
+                self.faults.append(f"{self.part}: mimics another joint; want joints that turn by themselves")
             if kind in ("revolute", "continuous"):
                 moving.append(joint)
             elif kind != "fixed":
-                raise ValueError(f"{self._tree.part}: is {kind}; want joints that turn")
+                raise ValueError(f"{self.part}: is {kind}; want joints that turn")
         return poses, moving
 
     def _limits(self, moving: list[ElementTree.Element]) -> Array:
@@ -203,7 +282,7 @@ class _Reader:
         table = np.zeros((4, len(moving)))
         for k, joint in enumerate(moving):
             limit, name = joint.find("limit"), joint.get("name")
-            self._tree.part = f"joint {name}"
+            self.part = f"joint {name}"
             for row, (attribute, field, endless) in enumerate(_LIMITS):
                 given = getattr(self._given, field)
                 if given is not None and k < len(given):
@@ -213,7 +292,7 @@ class _Reader:
                 elif limit is None or attribute not in limit.attrib:
                     self.faults.append(f"joint {name}: no limit {attribute!r}; give {field} in the YAML file")
                 else:
-                    table[row, k] = self._numbers(limit, attribute, "0")[0]
+                    table[row, k] = self.numbers(limit, attribute, "0")[0]
             lower, upper, velocity, torque = table[:, k]
             if not upper > lower:
                 self.faults.append(f"joint {name}: its range is {lower:g} to {upper:g} rad")
@@ -239,9 +318,9 @@ class _Reader:
         todo = list(chain[:-1])
         while todo:
             parent = todo.pop()
-            for child, joint in self._joint_of.items():
+            for child, joint in self.joint_of.items():
                 if child not in carrier and linked(joint, "parent") == parent and joint.get("type") == "fixed":
-                    poses[child] = poses[parent] @ self._pose(joint.find("origin"))
+                    poses[child] = poses[parent] @ self.pose(joint.find("origin"))
                     carrier[child] = carrier[parent]
                     groups[carrier[parent]].append((child, poses[child]))
                     todo.append(child)
@@ -251,18 +330,18 @@ class _Reader:
         """Return the inertia of links fixed to each other, about their common centre, in the axes of the flange at zero."""
         parts = []
         for link, X in group:
-            inertial = self._links[link].find("inertial")
+            inertial = self.links[link].find("inertial")
             if inertial is None:
                 continue
-            self._tree.part = f"link {link}"
-            mass = float(self._numbers(inertial.find("mass"), "value", "0")[0])
+            self.part = f"link {link}"
+            mass = float(self.numbers(inertial.find("mass"), "value", "0")[0])
             entries = inertial.find("inertia")
-            xx, yy, zz, xy, xz, yz = (float(self._numbers(entries, f"i{axes}", "0")[0]) for axes in _MOMENTS)
+            xx, yy, zz, xy, xz, yz = (float(self.numbers(entries, f"i{axes}", "0")[0]) for axes in _MOMENTS)
             tensor = np.array(((xx, xy, xz), (xy, yy, yz), (xz, yz, zz)))
             if mass == 0 and not tensor.any():
                 continue
             self._check_inertia(link, mass, tensor)
-            offset = self._pose(inertial.find("origin"))
+            offset = self.pose(inertial.find("origin"))
             if np.linalg.norm(offset[:3, 3]) > TUNING.largest_link_m:
                 self.faults.append(f"link {link}: its centre of mass is farther than {TUNING.largest_link_m:g} m: want metres")
             X_C = X @ offset
@@ -302,8 +381,8 @@ class _Reader:
         """Return a capsule about the collision geometry of each link of a group (visual where there is none)."""
         found = []
         for link, X in group:
-            shapes = self._links[link].findall("collision") or self._links[link].findall("visual")
-            self._tree.part = f"link {link}"
+            shapes = self.links[link].findall("collision") or self.links[link].findall("visual")
+            self.part = f"link {link}"
             clouds = [points for shape in shapes if len(points := self._points(link, X, shape))]
             if clouds:
                 found.append(enclosing_capsule((np.concatenate(clouds) - origin) @ R_BF))
@@ -311,7 +390,7 @@ class _Reader:
 
     def _points(self, link: str, X: Array, shape: ElementTree.Element) -> Array:
         """Return points of a shape's surface in the axes of the root, shape (n, 3)."""
-        X = X @ self._pose(shape.find("origin"))
+        X = X @ self.pose(shape.find("origin"))
         geometry = shape.find("geometry")
         kind = None if geometry is None or not len(geometry) else geometry[0]
         if kind is None:
@@ -319,10 +398,10 @@ class _Reader:
         if kind.tag == "mesh":
             return np.asarray(self._mesh(link, kind) @ X[:3, :3].T + X[:3, 3])
         if kind.tag == "box":
-            size = self._numbers(kind, "size")
+            size = self.numbers(kind, "size")
             points = np.array(np.meshgrid(*((-side / 2, side / 2) for side in size))).reshape(3, -1).T
         elif kind.tag in ("sphere", "cylinder"):
-            radius, half = size = np.append(self._numbers(kind, "radius", "0"), self._numbers(kind, "length", "0") / 2)
+            radius, half = size = np.append(self.numbers(kind, "radius", "0"), self.numbers(kind, "length", "0") / 2)
             size = size[: 1 if kind.tag == "sphere" else 2]
             turn = np.linspace(0, 2 * np.pi, 24, endpoint=False)
             ring = radius * np.column_stack((np.cos(turn), np.sin(turn), 0 * turn))
@@ -330,9 +409,9 @@ class _Reader:
             top = np.array((0.0, 0.0, half))
             points = np.concatenate((ring + top, ring - top, tips))
         else:
-            raise ValueError(f"{self._tree.part}: shape {kind.tag}; want mesh, box, sphere or cylinder")
+            raise ValueError(f"{self.part}: shape {kind.tag}; want mesh, box, sphere or cylinder")
         if not (size > 0).all():
-            raise ValueError(f"{self._tree.part}: size of its {kind.tag} is {size}, want more than 0")
+            raise ValueError(f"{self.part}: size of its {kind.tag} is {size}, want more than 0")
         return np.asarray(points @ X[:3, :3].T + X[:3, 3])
 
     def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:
@@ -342,7 +421,7 @@ class _Reader:
         if not path.is_file():
             self.faults.append(f"link {link}: mesh {name} is not there")
             return np.zeros((0, 3))
-        scale = self._numbers(mesh, "scale", "1 1 1")
+        scale = self.numbers(mesh, "scale", "1 1 1")
         try:
             vertices = np.array(_coal().MeshLoader().load(str(path), scale).vertices())
             hull = vertices[ConvexHull(vertices).vertices]

@@ -98,31 +98,27 @@ def touch_centres(targets: Array) -> Array:
     return centres
 
 
-def lines(exam: Exam, surface: Surface) -> Scan:
+def lines(exam: Exam, _: Surface) -> Scan:
     """Lines in alternating directions, every second one first. The tool lifts at their ends, for a touch and a tare per line.
 
     Pressed skin recovers slowly, and a touch next to it would be too deep: the lines in between are pressed a minute later.
     """
-    del surface
     along = _upward(exam)
     return Scan(_there_and_back(along[::2] + along[1::2]))
 
 
-def raster(exam: Exam, surface: Surface) -> Scan:
+def raster(exam: Exam, _: Surface) -> Scan:
     """All lines from the feet to the head; the tool lifts at their ends."""
-    del surface
     return Scan(_upward(exam))
 
 
-def snake(exam: Exam, surface: Surface) -> Scan:
+def snake(exam: Exam, _: Surface) -> Scan:
     """Lines in alternating directions, joined in contact by arcs."""
-    del surface
     return Scan(_there_and_back(_upward(exam)), joined=True)
 
 
-def search(exam: Exam, surface: Surface) -> Scan:
+def search(exam: Exam, _: Surface) -> Scan:
     """All targets that a search may request."""
-    del surface
     return Scan(_there_and_back(_upward(exam)))
 
 

@@ -1,7 +1,6 @@
 """Accuracy of findings: errors of position, size and stiffness (Bland and Altman), calibration of confidences, and effort."""
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -17,18 +16,18 @@ NORMAL: Final = 1.959964
 """Between -NORMAL and NORMAL lie 95 % of a standard normal variable."""
 
 
-@dataclass(frozen=True)
-class Sample:
+class Sample(NamedTuple):
     """Values of findings and the patient of each; shapes (m,)."""
 
     values: Array
     patient: NDArray[np.intp]
+    of: str = "findings"
 
     def mean(self, bootstrap: Bootstrap) -> Estimate:
         """Return the mean."""
         if not len(self.values):
-            return Estimate(value=None, n=0, of="findings")
-        return estimate(float(self.values.mean()), self.mean_replicates(bootstrap), len(self.values), "findings")
+            return Estimate(value=None, n=0, of=self.of)
+        return estimate(float(self.values.mean()), self.mean_replicates(bootstrap), len(self.values), self.of)
 
     def mean_replicates(self, bootstrap: Bootstrap) -> Array:
         """Return replicates of the mean, shape (folds,)."""
@@ -37,9 +36,9 @@ class Sample:
     def quantile(self, q: float, bootstrap: Bootstrap) -> Estimate:
         """Return the quantile `q`: the least value that is not below this share of the values."""
         if not len(self.values):
-            return Estimate(value=None, n=0, of="findings")
+            return Estimate(value=None, n=0, of=self.of)
         value = float(np.quantile(self.values, q, method="inverted_cdf"))
-        return estimate(value, bootstrap.quantile(self.values, self.patient, q), len(self.values), "findings")
+        return estimate(value, bootstrap.quantile(self.values, self.patient, q), len(self.values), self.of)
 
 
 class Agreement(Row):
@@ -127,6 +126,7 @@ def agreement(estimated: Array, true: Array, patient: NDArray[np.intp], bootstra
 
 MEASURED: Final = ("peak_force_n", "exam_time_s", "depth_rms_m")
 COVERED: Final = ("coverage_area", "coverage_lumps", "coverage_ratio")
+"""Shares on which a 90 % band includes the truth."""
 
 
 class Spread(Row):
@@ -142,22 +142,15 @@ class Spread(Row):
 def spread(variant: Variant, column: str, bootstrap: Bootstrap) -> Spread:
     """Return the spread of a column of the cases."""
     sample = of_cases(variant, column)
-    mean, median, p95 = (
-        each.model_copy(update={"of": "examinations"})
-        for each in (sample.mean(bootstrap), sample.quantile(0.5, bootstrap), sample.quantile(0.95, bootstrap))
-    )
-    return Spread(mean=mean, median=median, p95=p95, greatest=float(sample.values.max()) if len(sample.values) else None)
-
-
-def coverage(variant: Variant, column: str, bootstrap: Bootstrap) -> Estimate:
-    """Return the mean over examinations of the share on which a 90 % band includes the truth."""
-    return of_cases(variant, column).mean(bootstrap).model_copy(update={"of": "examinations"})
+    greatest = float(sample.values.max()) if len(sample.values) else None
+    median, p95 = (sample.quantile(q, bootstrap) for q in (0.5, 0.95))
+    return Spread(mean=sample.mean(bootstrap), median=median, p95=p95, greatest=greatest)
 
 
 def of_cases(variant: Variant, column: str) -> Sample:
     """Return a column of the completed cases, where it is known."""
     cases = variant.cases[~variant.cases["failed"]].dropna(subset=[column])
-    return Sample(cases[column].to_numpy(dtype=np.float64), cases["patient"].to_numpy(dtype=np.intp))
+    return Sample(cases[column].to_numpy(dtype=np.float64), cases["patient"].to_numpy(dtype=np.intp), "examinations")
 
 
 BINS: Final = 10

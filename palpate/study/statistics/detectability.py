@@ -5,8 +5,7 @@ Hill, Percept Psychophys 2001;63:1293). The lapse, lumps that are missed however
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -25,8 +24,7 @@ MADE: Final = ("contrast", "radius_m", "depth_m")
 LOGARITHMIC: Final = ("felt_contrast", "contrast")
 
 
-@dataclass(frozen=True)
-class DetectabilityTuning:
+class DetectabilityTuning(NamedTuple):
     """Settings of the fit."""
 
     greatest_lapse: float = 0.25

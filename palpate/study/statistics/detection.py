@@ -1,7 +1,7 @@
 """Detection: rates of findings and failures, ROC per patient, FROC over lumps, and rates by felt contrast."""
 
 from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -163,8 +163,7 @@ class Froc:
     high: Array
 
 
-@dataclass(frozen=True)
-class _Marks:
+class _Marks(NamedTuple):
     """Areas by decreasing confidence, shape (m,): at most one hit per lump, and false ones."""
 
     patient: NDArray[np.intp]

@@ -3,9 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from math import isfinite
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 from zlib import crc32
 
 import numpy as np
@@ -53,8 +52,7 @@ def wilson(successes: float, n: int, of: str) -> Estimate:
     return Estimate(value=successes / n, low=float(low), high=float(high), n=n, of=of, interval="Wilson")
 
 
-@dataclass(frozen=True)
-class Bootstrap:
+class Bootstrap(NamedTuple):
     """Resamplings of patients with replacement, within each population.
 
     All methods share them, and so are paired. A replicate of a statistic is the statistic with every patient counted as often

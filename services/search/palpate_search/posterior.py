@@ -323,11 +323,6 @@ Policy = Callable[[Posterior, Budget], tuple[Array, float]]
 POLICY: Final = PluginKind("policy", "search.policy", "next_press", "posterior, budget")
 
 
-def policies() -> tuple[str, ...]:
-    """Return the names of the installed policies."""
-    return POLICY.names()
-
-
 def policy(choice: str) -> Policy:
     """Return the policy of a name or file. Raises PluginError."""
     return POLICY.load(choice)

@@ -34,8 +34,7 @@ class PressTuning(NamedTuple):
 PRESSES: Final = PressTuning()
 
 
-@dataclass(frozen=True)
-class Press:
+class Press(NamedTuple):
     """One press as it was measured, in the abdomen frame."""
 
     x: float

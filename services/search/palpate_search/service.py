@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from typing import Any, ClassVar, Final, NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from palpate_assessment.shapes import Bump
 from palpate_bus.contract import contract
@@ -135,21 +136,19 @@ def next_press(chosen: Policy, posterior: Posterior, left: Budget) -> tuple[Arra
     asked: Any = chosen(posterior, left)
     try:
         place, depth = asked
-        return checked(np.asarray(place, dtype=float), float(depth), posterior.task)
+        return checked(place, float(depth), posterior.task)
     except (TypeError, ValueError) as error:
         raise PluginError(f"search.policy: returned {asked!r}, want (place, depth): (x, y) [m] and a number [m]") from error
 
 
-def checked(place: Array, depth: float, task: Task) -> tuple[Array, float]:
+def checked(place: ArrayLike, depth: float, task: Task) -> tuple[Array, float]:
     """Return the place [m] and depth [m] requested by a policy. Raises PluginError outside the allowed range."""
-    place = np.asarray(place, dtype=float)
-    if place.shape != (2,) or not np.all(
-        (place >= task.low - TUNING.rounded_m) & (place <= task.high + TUNING.rounded_m)
-    ):  # also rejects NaN
-        raise PluginError(f"search.policy: requested place {place} m; allowed: {task.low} to {task.high} m")
-    if not 0 < depth <= task.deepest + TUNING.rounded_m:
+    xy, rounded = np.asarray(place, dtype=float), TUNING.rounded_m
+    if xy.shape != (2,) or not np.all((xy >= task.low - rounded) & (xy <= task.high + rounded)):  # also rejects NaN
+        raise PluginError(f"search.policy: requested place {xy} m; allowed: {task.low} to {task.high} m")
+    if not 0 < depth <= task.deepest + rounded:
         raise PluginError(f"search.policy: requested depth {depth} m; allowed: above 0, at most {task.deepest} m")
-    return place, float(depth)
+    return xy, depth
 
 
 def outline(lump: Bump, posterior: Posterior) -> list[Array]:

@@ -27,11 +27,11 @@ from palpate_search.posterior import (
     FIELD,
     LEVEL_SD,
     LUMPS,
+    POLICY,
     STROKE_SHARE,
     SURFACE_SHARE,
     USUAL_N,
     Posterior,
-    policies,
     policy,
 )
 from palpate_search.presses import Budget, Press, Task
@@ -52,7 +52,7 @@ def presses(name: str, count: int, task: Task = TASK) -> list[tuple[float, float
     return [(p.x, p.y, p.depth) for p in posterior.presses]
 
 
-@pytest.mark.parametrize("name", policies())
+@pytest.mark.parametrize("name", POLICY.names())
 def test_a_policy_keeps_to_the_region_and_the_limits_and_repeats(name: str) -> None:
     found = np.array(presses(name, 12))
     assert np.all(found[:, :2] >= TASK.low - 1e-9)

@@ -83,11 +83,6 @@ class TissueBackend(ABC):
     def inward(self) -> Array:
         """Return the displacement of each vertex from rest along its inward normal [m], with breathing, shape (n,)."""
 
-    @property
-    def deformed_vertices(self) -> Array:
-        """Return the present surface [m], shape (n, 3)."""
-        return self.model.vertices - self.inward[:, None] * self.model.normals
-
     def guard(self, v_A: Array) -> None:
         """Advance `activation` by a period for a sphere of velocity `v_A` [m/s]. Each `step` ends with it."""
         if self._guarding.voluntary and self.touching:

@@ -12,7 +12,6 @@ local errors cancel in the difference; P M interpolates them to the vertices.
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Final, NamedTuple
 
@@ -245,8 +244,7 @@ def compliance(
     return Compliance(_Body(model, free, thickness, poisson, pitch_m).matrix(tuple(lesions)), free, young)
 
 
-@dataclass(frozen=True)
-class _Body:
+class _Body(NamedTuple):
     model: PhantomModel
     free: NDArray[np.intp]
     thickness: float
