@@ -19,16 +19,11 @@ from typing import TYPE_CHECKING, Any
 from palpate_plugins import needs
 
 if TYPE_CHECKING:
-    from palpate.interface.assessment import Assessment as Assessment
-    from palpate.interface.assessment import StiffnessMap as StiffnessMap
-    from palpate.interface.assessment import assess as assess
-    from palpate.interface.examination import Examination as Examination
-    from palpate.interface.examination import run as run
+    from palpate.interface.assessment import Assessment as Assessment, StiffnessMap as StiffnessMap, assess as assess
+    from palpate.interface.examination import Examination as Examination, run as run
     from palpate.interface.scenarios import scenario as scenario
-    from palpate.interface.studies import StudyResult as StudyResult
-    from palpate.interface.studies import study as study
-    from palpate.quick.patient import Patient as Patient
-    from palpate.quick.patient import Touch as Touch
+    from palpate.interface.studies import StudyResult as StudyResult, study as study
+    from palpate.quick.patient import Patient as Patient, Touch as Touch
     from palpate.recording.read import read_recording as read_recording
     from palpate.recording.recording import PalpationRecording as PalpationRecording
     from palpate_models.scenario.load import ScenarioError as ScenarioError

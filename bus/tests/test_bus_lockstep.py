@@ -3,8 +3,7 @@
 import random
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 from toy_services import TOYS, Control, Robot
 
 from palpate_bus.contract import Edge, contract

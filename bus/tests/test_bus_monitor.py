@@ -6,13 +6,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 from message_strategies import messages
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.port_check import Checker, leaves, numbers
-from palpate_bus.contract.port_check import ViolationKind as Kind
+from palpate_bus.contract.port_check import Checker, ViolationKind as Kind, leaves, numbers
 from palpate_bus.messages import (
     DiagnosticArray,
     DiagnosticStatus,

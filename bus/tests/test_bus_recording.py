@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import JointState, RunControl, ServiceReport, codec

@@ -8,8 +8,7 @@ from time import sleep, time_ns
 from typing import Any
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import OperatorRequest, codec

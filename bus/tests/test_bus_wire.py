@@ -6,8 +6,7 @@ from pathlib import Path
 
 import pytest
 import zenoh.ext as ze
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from palpate_bus.contract import contract
 from palpate_bus.wire import rmw as wire

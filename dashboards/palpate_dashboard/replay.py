@@ -14,8 +14,7 @@ from time import monotonic, sleep
 
 import zenoh
 from mcap.reader import make_reader
-from mcap.records import Channel, Schema
-from mcap.records import Message as McapMessage
+from mcap.records import Channel, Message as McapMessage, Schema
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import RunControl, codec

@@ -4,8 +4,7 @@ from collections.abc import Iterator
 from typing import Final
 
 from generate import one_line, table
-from palpate_models.scenario.errors import LEVEL, Errors
-from palpate_models.scenario.errors import table as levels
+from palpate_models.scenario.errors import LEVEL, Errors, table as levels
 
 _HEAD: Final = f"""# Errors of sensors, calibrations and arm
 

@@ -8,8 +8,7 @@ import pinocchio as pin
 import pytest
 import trimesh
 
-from palpate_models.robot import arm as robot_arm
-from palpate_models.robot import lbr
+from palpate_models.robot import arm as robot_arm, lbr
 from palpate_models.robot.arm import TOOL, link_names, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.kinematics import link_transforms, tool_pose

@@ -4,8 +4,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
+from hypothesis import given, strategies as st
 
 from palpate_models.patient.abdomen import parametric_surface
 from palpate_models.patient.field import at_skin, background_factor, gaussian_field, lesion_field

@@ -18,8 +18,7 @@ from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
 from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.monitor import LiveMonitor
-from palpate_bus.runs.announcement import live as live_runs
-from palpate_bus.runs.announcement import versions
+from palpate_bus.runs.announcement import live as live_runs, versions
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.security.access import public
 from palpate_bus.wire.liveliness import mismatches

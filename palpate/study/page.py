@@ -19,8 +19,7 @@ from palpate.study.statistics.accuracy import Agreement, FindingCalibration
 from palpate.study.statistics.analysis import MethodRow
 from palpate.study.statistics.comparison import QUANTITIES
 from palpate.study.statistics.detectability import FELT, LOGARITHMIC, MADE, Surface
-from palpate.study.statistics.detection import GRID as ROC_GRID
-from palpate.study.statistics.detection import RATES
+from palpate.study.statistics.detection import GRID as ROC_GRID, RATES
 from palpate.study.statistics.estimate import Estimate
 
 COLOURS: Final = ("#0f766e", "#c2410c", "#7c3aed", "#2563eb", "#be185d", "#854d0e")

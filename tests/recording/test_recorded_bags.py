@@ -22,12 +22,12 @@ from palpate_bus.messages import (
     PoseStamped,
     Quaternion,
     TFMessage,
+    Transform as TransformMessage,
     TransformStamped,
     Vector3,
     Wrench,
     WrenchStamped,
 )
-from palpate_bus.messages import Transform as TransformMessage
 from palpate_bus.messages.stamps import NS, header
 from palpate_bus.messages.typestore import store
 

@@ -12,8 +12,7 @@ from statistics import median
 from typing import NamedTuple
 
 from palpate_bus.contract import Topic, contract
-from palpate_bus.contract.port_check import MessageViolation
-from palpate_bus.contract.port_check import ViolationKind as Kind
+from palpate_bus.contract.port_check import MessageViolation, ViolationKind as Kind
 from palpate_bus.messages import DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import MS
 

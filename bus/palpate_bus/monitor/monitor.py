@@ -22,8 +22,7 @@ from typing import Any
 import zenoh
 
 from palpate_bus.contract import Contract, Topic
-from palpate_bus.contract.port_check import Checker
-from palpate_bus.contract.port_check import ViolationKind as Kind
+from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import RunControl, ServiceReport, codec
 from palpate_bus.messages.stamps import MS, UNIX_NS
 from palpate_bus.monitor.health import (

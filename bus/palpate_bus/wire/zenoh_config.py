@@ -50,8 +50,11 @@ from typing import Any
 
 import zenoh
 
-from palpate_bus.settings import BusConfigError as BusConfigError  # noqa: PLC0414  # others import it from here, too
-from palpate_bus.settings import Settings, variable
+from palpate_bus.settings import (
+    BusConfigError as BusConfigError,  # noqa: PLC0414  # others import it from here, too
+    Settings,
+    variable,
+)
 
 UNIX_PATH_MAX_BYTES = 107  # sun_path without its NUL on Linux
 

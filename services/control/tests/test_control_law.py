@@ -4,8 +4,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from control_plant import ROBOT, WORKING, reference, setpoint
-from hypothesis import given, settings
-from hypothesis import strategies as st
+from hypothesis import given, settings, strategies as st
 
 from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_control import impedance, safety

@@ -11,8 +11,7 @@ from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import lbr
 from palpate_models.robot.arm import TOOL
 from palpate_models.scenario.load import exam_input
-from palpate_models.scenario.schema import Exam as ExamSettings
-from palpate_models.scenario.schema import ExamInput, Robot, Scenario
+from palpate_models.scenario.schema import Exam as ExamSettings, ExamInput, Robot, Scenario
 from palpate_planning.contact import SensorReading
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.motion.kinematics import ArmKinematics

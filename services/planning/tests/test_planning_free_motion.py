@@ -10,8 +10,7 @@ from planning_fakes import BASE, PERIOD_S, known
 
 from palpate_bus.setpoint import Setpoint
 from palpate_models.robot.lbr import ARM, HOME
-from palpate_models.scenario.schema import Exam as ExamSettings
-from palpate_models.scenario.schema import Limits, Robot
+from palpate_models.scenario.schema import Exam as ExamSettings, Limits, Robot
 from palpate_planning.contact import ContactMeasurement
 from palpate_planning.free_motion import BackgroundTask, FreeMotion
 from palpate_planning.motion.kinematics import ArmKinematics
@@ -20,8 +19,7 @@ from palpate_planning.palpation import Palpation
 from palpate_planning.periods import MS
 from palpate_planning.reasons import Reason
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.stroke_motion import MOTION as STROKE_MOTION
-from palpate_planning.stroke_motion import StrokeMotion
+from palpate_planning.stroke_motion import MOTION as STROKE_MOTION, StrokeMotion
 from palpate_planning.strokes.path import PathPoint, SurfacePath
 from palpate_planning.strokes.plan import ExamPlanner
 from palpate_planning.strokes.segments import Segment

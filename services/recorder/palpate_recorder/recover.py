@@ -15,8 +15,7 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
-from mcap.records import Channel as ChannelRecord
-from mcap.records import Message, Schema
+from mcap.records import Channel as ChannelRecord, Message, Schema
 
 from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import Gap, RecordedMessage, RecordedType, Recording, complete_records, kept_every_ms, recorded_type

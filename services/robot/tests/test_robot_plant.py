@@ -6,8 +6,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from palpate_models.numerics.frames import GRAVITY
-from palpate_models.robot import arm as robot_arm
-from palpate_models.robot import lbr
+from palpate_models.robot import arm as robot_arm, lbr
 from palpate_models.robot.arm import TOOL, link_names, urdf
 from palpate_models.robot.lbr import ARM
 from palpate_models.scenario.schema import Robot

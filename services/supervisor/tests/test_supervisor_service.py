@@ -16,8 +16,7 @@ from palpate_models.robot import lbr
 from palpate_models.robot.arm import urdf
 from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Limits
-from palpate_supervisor import latch as latch_module
-from palpate_supervisor import service as service_module
+from palpate_supervisor import latch as latch_module, service as service_module
 from palpate_supervisor.latch import Latch
 from palpate_supervisor.senses import Measurement
 from palpate_supervisor.service import SupervisorService, create
