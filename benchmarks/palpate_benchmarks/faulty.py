@@ -29,8 +29,8 @@ import zenoh
 
 from palpate_benchmarks.liar import filled, stamped
 from palpate_bus.contract import Qos, Topic, contract
-from palpate_bus.contract.port_check import leaves, numbers
 from palpate_bus.messages import codec
+from palpate_bus.messages.fields import leaves, numbers
 from palpate_bus.messages.stamps import NS
 from palpate_bus.run import chosen, run_service
 from palpate_bus.wire.transport import Sender, Transport

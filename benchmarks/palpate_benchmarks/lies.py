@@ -24,8 +24,8 @@ from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, 
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_benchmarks.struck import SETTINGS, Watched, kept_rate
 from palpate_bus.contract import Edge, Topic, contract
-from palpate_bus.contract.port_check import leaves
 from palpate_bus.messages import ExamState
+from palpate_bus.messages.fields import leaves
 from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.composed import Composed, ServiceFailed
 from palpate_bus.runtime.failure import Failure, FailureCode

@@ -10,7 +10,7 @@ from hypothesis import given, settings, strategies as st
 from message_strategies import messages
 
 from palpate_bus.contract import contract
-from palpate_bus.contract.port_check import Checker, ViolationKind as Kind, leaves, numbers
+from palpate_bus.contract.port_check import Checker, ViolationKind as Kind
 from palpate_bus.messages import (
     DiagnosticArray,
     DiagnosticStatus,
@@ -22,6 +22,7 @@ from palpate_bus.messages import (
     WrenchStamped,
     codec,
 )  # fmt: skip
+from palpate_bus.messages.fields import leaves, numbers
 from palpate_bus.messages.stamps import MS, duration_message, header
 from palpate_bus.monitor.health import RECENT_S, Violation, topic_statuses
 from palpate_bus.monitor.monitor import Monitor

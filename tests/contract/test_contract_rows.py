@@ -9,8 +9,8 @@ import yaml
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract import Contract, Edge, Topic, Visibility, contract, parse
-from palpate_bus.contract.port_check import leaves
 from palpate_bus.messages import codec
+from palpate_bus.messages.fields import leaves
 from palpate_bus.messages.typestore import palpation_definitions
 
 RULES = contract()

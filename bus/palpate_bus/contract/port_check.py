@@ -11,7 +11,7 @@ plausible in a related unit (degrees for radians, millimetres for metres) is rep
 
 import sys
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from functools import cache
 from math import acos, hypot, inf
@@ -22,7 +22,8 @@ import numpy as np
 from rosbags.interfaces import Nodetype
 
 from palpate_bus.contract.rows import Topic
-from palpate_bus.messages.codec import CodecError, Message, message_type, store
+from palpate_bus.messages.codec import Message, message_type, store
+from palpate_bus.messages.fields import LeafField, leaves, numbers
 from palpate_bus.messages.stamps import nanoseconds
 from palpate_errors import RunError
 
@@ -124,66 +125,6 @@ def _too_fast(message: Message, before: Message, path: str, most: float) -> str:
     now, then = numbers(message, path), numbers(before, path)
     worst = int(np.argmax(np.abs(now - then))) if now.size else 0
     return "" if not now.size or abs(now[worst] - then[worst]) <= most else f"{now[worst]:g} after {then[worst]:g}"
-
-
-@dataclass(frozen=True)
-class LeafField:
-    """A field of a base type, at any depth of a message type."""
-
-    path: str
-    base: str
-    """Type of the field or of its items: `float64`, `string`."""
-    array: bool
-    """The field is an array."""
-    repeated: bool
-    """The path contains a sequence of messages."""
-    message: str = ""
-    """Type of the message that has the field."""
-
-
-def leaves(type_name: str, path: str = "") -> list[LeafField]:
-    """Return the fields of base type at and below `path` in a message type: `wrench.force` gives x, y and z.
-
-    Raises CodecError if the type has no such field.
-    """
-    message_type(type_name)
-    found = [leaf for leaf in _leaves(type_name) if not path or f"{leaf.path}.".startswith(f"{path}.")]
-    if path and not found:
-        raise CodecError(f"{type_name} has no field {path!r}: its fields are {sorted(leaf.path for leaf in _leaves(type_name))}")
-    return found
-
-
-def _leaves(type_name: str, path: str = "", repeated: bool = False) -> Iterator[LeafField]:
-    for name, described in store.get_msgdef(type_name).fields:
-        description: Any = described
-        array = False
-        while description[0] in (Nodetype.ARRAY, Nodetype.SEQUENCE):
-            description, array = description[1][0], True
-        here = f"{path}.{name}" if path else name
-        if description[0] == Nodetype.NAME:
-            yield from _leaves(description[1], here, repeated or array)
-        else:
-            yield LeafField(here, description[1][0], array, repeated, type_name)
-
-
-def numbers(message: Message, path: str) -> np.ndarray[Any, Any]:
-    """Return all numbers at and below a field of a message, shape (n,)."""
-    found: list[np.ndarray[Any, Any]] = []
-    _collect(message, path.split("."), found)
-    return np.concatenate(found) if found else np.zeros(0)
-
-
-def _collect(value: Any, path: list[str], found: list[np.ndarray[Any, Any]]) -> None:
-    if isinstance(value, list):
-        for item in value:
-            _collect(item, path, found)
-    elif path:
-        _collect(getattr(value, path[0]), path[1:], found)
-    elif is_dataclass(value):
-        for field in fields(value):
-            _collect(getattr(value, field.name), [], found)
-    elif not isinstance(value, str):
-        found.append(np.atleast_1d(np.asarray(value, dtype=float)))
 
 
 FEW = 32
