@@ -18,6 +18,7 @@ from mcap.records import Channel, Message as McapMessage, Schema
 
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import RunControl, codec
+from palpate_bus.messages.stamps import NS
 from palpate_bus.recordings import BROKEN, RecordingError, complete_records, recorded_type
 from palpate_bus.runs.announcement import Run, live
 from palpate_bus.runs.operator import OperatorKeys, order
@@ -32,8 +33,8 @@ from palpate_dashboard.sinks import Live
 from palpate_inputs import InputFile
 from palpate_models.scenario.load import load_scenario
 
-DISORDER = 2_000_000_000
-"""Greatest disorder of messages in a recording [ns]."""
+DISORDER_MAX_NS = 2_000_000_000
+"""A later message may be earlier than one before it by this [ns]."""
 
 
 def recording_of(folder: Path) -> tuple[Path, ...]:
@@ -58,16 +59,20 @@ def end_of(files: Sequence[Path]) -> int | None:
 def messages(files: Sequence[Path]) -> Iterator[tuple[int, str, bytes]]:
     """Yield time [ns], topic and payload of all complete messages on observed topics, ordered by time.
 
-    The last file may still be written or be truncated. Services send messages in chunks, so order is restored within `DISORDER`.
-    Raises OSError, RecordingError for a topic of another type than the contract's.
+    The last file may still be written or be truncated. Services send messages in chunks, so order is restored within
+    `DISORDER_MAX_NS`. Raises OSError, RecordingError for greater disorder or a topic of another type than the contract's.
     """
     topics = {f"/{topic.name}": topic for topic, _ in contract().inputs("dashboard")}
     waiting: list[tuple[int, int, str, bytes]] = []
+    past = 0
     for count, (name, record) in enumerate(_records(files, topics)):
+        if record.log_time < past:
+            late = f"{name} of {record.log_time / NS:.3f} s stands after {past / NS + DISORDER_MAX_NS / NS:.3f} s"
+            raise RecordingError(f"{files[0].parent}: {late} (want at most {DISORDER_MAX_NS / NS:g} s of disorder)")
         heappush(waiting, (record.log_time, count, name, record.data))
-        while waiting[0][0] < record.log_time - DISORDER:
-            time, _, topic, payload = heappop(waiting)
-            yield time, topic, payload
+        while waiting[0][0] < record.log_time - DISORDER_MAX_NS:
+            past, _, topic, payload = heappop(waiting)
+            yield past, topic, payload
     while waiting:
         time, _, topic, payload = heappop(waiting)
         yield time, topic, payload

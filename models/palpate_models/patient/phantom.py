@@ -126,15 +126,16 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
         tension=tension,
         lesion=lesion,
         fixed=fixed,
-        breathing=_breathing_profile(vertices, normals, half_length, fixed),
+        breathing=_breathing_profile(vertices, normals, fixed),
         young=young,
         voluntary=any(area.kind == "voluntary" for area in phantom.guarding),
     )
 
 
-def _breathing_profile(vertices: Array, normals: Array, half_length: float, fixed: NDArray[np.bool_]) -> Array:
+def _breathing_profile(vertices: Array, normals: Array, fixed: NDArray[np.bool_]) -> Array:
     """Share of the excursion, shape (n,): greatest about the umbilicus, none at the ends, the flanks and the back."""
-    along = np.cos(np.clip(vertices[:, 1] / half_length, -1, 1) * np.pi / 2) ** 2
+    y = vertices[:, 1]
+    along = np.cos(np.where(y > 0, y / y.max(), y / y.min()) * np.pi / 2) ** 2
     profile = along * np.clip(normals[:, 2], 0, 1) ** 2
     return np.where(fixed, 0.0, profile)
 

@@ -14,6 +14,7 @@ from palpate_models.numerics.frames import GRAVITY, Array
 from palpate_models.robot.arm import inertias
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
+from palpate_planning.periods import SECOND
 from palpate_planning.wall.surface import Foot
 from palpate_planning.wall.wall import Wall, WallEstimate
 
@@ -71,6 +72,8 @@ THRESHOLDS = ContactThresholds()
 class SensorReading(NamedTuple):
     """Sensor values averaged over one planning period, so that force and depth belong together."""
 
+    stamp: int
+    """Time at the end of the period [ns]."""
     q: Array
     """Joint positions [rad], shape (n,)."""
     wrench_S: Array
@@ -109,14 +112,14 @@ class ContactMeasurement(NamedTuple):
 class ContactSensing:
     """Computes the contact with the estimated wall from sensor readings."""
 
-    def __init__(self, kinematics: ArmKinematics, robot: Robot, wall: Wall, period_s: float) -> None:
-        """A reading comes every `period_s`."""
+    def __init__(self, kinematics: ArmKinematics, robot: Robot, wall: Wall) -> None:
         self.wall = wall
         self.compensation = ForceCompensation(sum(inertias(robot)[link].mass for link in ("ft_sensor", "indenter")))
-        self._kinematics, self._radius, self._period_s = kinematics, robot.indenter_radius_m, period_s
+        self._kinematics, self._radius = kinematics, robot.indenter_radius_m
         self._touching = False
-        self._velocity: Array | None = None
-        """Previous velocity of the sphere's centre [m/s], world axes, shape (3,)."""
+        self._before: tuple[int, Array] | None = None
+        """Stamp [ns] of the latest reading, and the velocity of the sphere's centre then [m/s], world axes, shape (3,)."""
+        self._acceleration = np.zeros(3)
 
     def sense(self, reading: SensorReading, t: int, joint_force: float = 0.0) -> ContactMeasurement:
         """Return the contact at the reading of time `t` [ns]; `joint_force`: force at the tool by the joints alone [N]."""
@@ -124,9 +127,10 @@ class ContactSensing:
         wall, foot = self.wall, self.wall.perceived.nearest(X_WI[:3, 3])
         place = wall.at(foot.xy_A, t)
         velocity = self._kinematics.jacobian(reading.q)[:3] @ reading.qd
-        acceleration = np.zeros(3) if self._velocity is None else (velocity - self._velocity) / self._period_s
-        self._velocity = velocity
-        force_W = self.compensation.contact_force_W(R_WS, reading.wrench_S, acceleration)
+        if self._before is not None and reading.stamp > self._before[0]:  # else the latest reading once more
+            self._acceleration = (velocity - self._before[1]) / ((reading.stamp - self._before[0]) / SECOND)
+        self._before = reading.stamp, velocity
+        force_W = self.compensation.contact_force_W(R_WS, reading.wrench_S, self._acceleration)
         force = float(force_W @ foot.n_W)
         self._touching = self.compensation.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         load, by_joints = float(np.linalg.norm(force_W)), joint_force - THRESHOLDS.joints_n

@@ -72,7 +72,7 @@ class ExaminationSequence:
         self._before = before
         self._kinematics = ArmKinematics(known.robot, known.limits)
         compile_ahead()
-        self._sense = ContactSensing(self._kinematics, known.robot, plane(np.array(known.X_WA)), step_s)
+        self._sense = ContactSensing(self._kinematics, known.robot, plane(np.array(known.X_WA)))
         self._planner = ExamPlanner(known, step_s)
         WORKER.submit(self._planner.prepare)
         arm = FreeMotion(self._kinematics, self._planner, lockstep=lockstep)

@@ -19,7 +19,7 @@ from palpate_bus.messages import (
 )
 from palpate_bus.messages.codec import Message
 from palpate_bus.messages.geometry import wrench
-from palpate_bus.messages.stamps import MS, header
+from palpate_bus.messages.stamps import MS, header, nanoseconds
 from palpate_bus.runtime.process import WORKER_NICENESS, lower_priority
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_bus.settings import Settings
@@ -79,7 +79,8 @@ class PlanningService(Service):
         """Advance one planning period: read the measurements, step the examination, write set-point and state."""
         status = inbox.latest("robot/status")
         if status is not None:
-            self._reading = SensorReading(status.position.copy(), wrench(status.wrench), status.velocity.copy())
+            stamp, force = nanoseconds(status.header.stamp), wrench(status.wrench)
+            self._reading = SensorReading(stamp, status.position.copy(), force, status.velocity.copy())
             self._commanded = self._commanded or status.mode == RobotStatus.MODE_ACTIVE
         requests = tuple(inbox.new("operator/request"))
         state = inbox.latest("supervisor/state")

@@ -153,7 +153,7 @@ class World:
         if self._answer_at is not None and self.t >= self._answer_at:
             answer, self._answer_at = self.answers.pop(0) if len(self.answers) > 1 else self.answers[0], None
         final = self.exam.status.phase is Phase.ASSESS
-        reading = SensorReading(self.q.copy(), wrench, qd)
+        reading = SensorReading(self.t, self.q.copy(), wrench, qd)
         motion = self._motion() if self.excursion is not None and self.t % (100 * MS) == 0 else None
         outcome = self.exam.step(
             Observation(self.t, reading, answer, motion, final, ArmStop(self.stop, self.soft, self.final), self.end, self.lost)

@@ -1,20 +1,24 @@
 """Tests of the waits: each says for what within some seconds, and ends within a bound that counts all of it."""
 
 from collections.abc import Callable
+from typing import Any, NamedTuple
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 from planning_fakes import BASE, FRAME, PERIOD_S, World, known
 
 from palpate_models.scenario.schema import ExamInput
-from palpate_planning import waits
+from palpate_planning import presses as requested, waits
 from palpate_planning.examination import ExaminationSequence
 from palpate_planning.free_motion import BackgroundTask
 from palpate_planning.periods import SECOND
+from palpate_planning.presses import RequestedPresses
 from palpate_planning.reasons import NO_CAUSE, Cause, Reason
 from palpate_planning.status import OVER, Observation, Phase
 from palpate_planning.stroke import StrokeStage
-from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_WALL, WAIT, StrokeWaits
+from palpate_planning.strokes.requests import PressRequest
+from palpate_planning.waits import FOR_ARM, FOR_BREATH, FOR_PLAN, FOR_WALL, WAIT, StrokeWaits
 
 SMALL = {"region_m": (0.025, 0.0125)}
 STILL_RAD = 1e-6
@@ -104,6 +108,35 @@ def test_a_search_without_requests_ends_the_strokes(limit_s: float) -> None:
     assert world.reasons[Reason.WAITS_FOR_REQUEST] - began < WAIT.reported_s + 0.1
     assert Reason.NO_REQUEST in world.reasons
     assert world.t / SECOND - began < limit_s + 15.0
+
+
+class _PlansFor(NamedTuple):
+    """A planner that hangs for as long as the tests run."""
+
+    begun: int
+    duration: int
+    work: Callable[[], object]
+    lockstep: bool = False
+
+    def due(self, t: int) -> bool:
+        return False
+
+    def late(self, t: int) -> bool:
+        return t - self.begun > WAIT.limit_s * SECOND
+
+
+def test_a_request_whose_plan_is_dropped_is_planned_again_and_one_that_hangs_ends_the_strokes(monkeypatch: Any) -> None:
+    monkeypatch.setattr(requested, "BackgroundTask", _PlansFor)
+    presses, palpation, planner = RequestedPresses(lockstep=False), Mock(waiting=True), Mock()
+    presses.receive(PressRequest(1, np.zeros(2), 0.01))
+    for t in range(3):
+        presses.step(t, planner, palpation, np.zeros(2))
+    presses.drop_plan()
+    presses.step(3, planner, palpation, np.zeros(2))
+    assert presses.done == 0, "nothing was pressed"
+    assert presses._planning is not None
+    presses.step(4 + round(WAIT.limit_s * SECOND), planner, palpation, np.zeros(2))
+    palpation.leave.assert_called_once_with(FOR_PLAN.end)
 
 
 def test_a_silent_perception_is_named_at_once() -> None:

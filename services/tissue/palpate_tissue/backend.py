@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from math import isfinite
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +13,12 @@ from palpate_models.patient.breathing import BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.wall import Activation
 from palpate_models.scenario import press
+
+
+def require_finite(motion: Array) -> None:
+    """Raise ValueError unless the sphere's motion is finite: rows position [m], velocity [m/s], angular velocity [rad/s]."""
+    if not isfinite(motion.sum()):
+        raise ValueError(f"tissue: position, velocity, angular velocity of the indenter are not finite: {motion.tolist()}")
 
 
 class TissueBackend(ABC):
@@ -33,7 +40,7 @@ class TissueBackend(ABC):
         """Advance by one period to time `t_s` [s] with the sphere's centre at `p_A` [m]; return the wrench on it.
 
         `v_A` [m/s] and `w_A` [rad/s] are the sphere's velocities, `radius` [m]. The result is the force [N] on the sphere and the
-        torque about its centre [N m], shapes (3,), averaged over the period. Raises ValueError for a position that is not finite.
+        torque about its centre [N m], shapes (3,), averaged over the period. Raises ValueError for a motion that is not finite.
         """
 
     @abstractmethod

@@ -127,7 +127,7 @@ class TissueService(Service):
         for at, place in self._path(t, nanoseconds(tool.header.stamp), p_A):
             F_A = self.backend.step(at / NS, place, v_A, float(tool.radius), w_A)
             self._t, self._p_A = at, place
-        if not self.backend.touching:
+        if not np.any(F_A):  # a zero without a sign
             return np.zeros(6)
         F_W: Array = np.array(F_A).dot(self._R_AW).ravel()  # each row times R_WA' = R_AW
         return F_W

@@ -13,6 +13,7 @@ from palpate_models.patient.breathing import Breathing, BreathingCurve
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.schema import Lesion, Phantom, Stiffness
 from palpate_models.patient.wall import stress
+from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import MOST_SUBSTEPS
 from palpate_tissue.backends.winkler.tissue import WinklerTissue, move_freely
 from palpate_tissue.contact import RIM, Push, Sphere, add_friction, skin
@@ -154,10 +155,23 @@ def test_the_far_side_is_not_touched():
     assert (model.normals[tissue.contacts, 2] > 0.5).all()
 
 
-def test_a_position_that_is_not_finite_is_refused():
-    tissue = WinklerTissue(flat_phantom(0.03), Stiffness())
+@pytest.mark.parametrize("row", range(3))
+@pytest.mark.parametrize("tissue", [WinklerTissue, ImplicitTissue])
+def test_a_motion_that_is_not_finite_is_refused(tissue, row):
+    motion = np.zeros((3, 3))
+    motion[row, 1] = np.nan
     with pytest.raises(ValueError, match="not finite"):
-        tissue.step(0, np.array((0.0, np.nan, 0.0)), STILL, 0.015)
+        tissue(flat_phantom(0.03), Stiffness(), BreathingCurve(Breathing(), 0), 1e-3).step(
+            0, motion[0], motion[1], 0.015, motion[2]
+        )
+
+
+def test_a_sphere_that_was_away_does_not_sweep_through_the_skin():
+    tissue = WinklerTissue(flat_phantom(0.04, edge_m=0.0025), Stiffness())
+    tissue.step(0.0, np.array((0.0, 0.0, 0.005)), STILL, 0.015)
+    tissue.idle(0.001)
+    force, _ = tissue.step(0.002, np.array((0.02, 0.0, 0.017)), STILL, 0.015)
+    assert tissue.substeps > 1 and not force.any()
 
 
 def test_fields_of_small_and_large_meshes_move_alike():

@@ -262,3 +262,12 @@ def test_the_latched_truth_and_all_before_the_motion_are_those_of_a_body_at_rest
         sent = [service.step(k * MS, inbox)["sim/contact_wrench"].wrench for service in (moving, resting)]
         assert sent[0] == sent[1]
     assert moving.finish()["moved_at_s"] == 0.02
+
+
+def test_the_mean_wrench_of_the_period_in_which_contact_ends_is_sent(monkeypatch):
+    """With several sub-steps the sphere may touch in the first of them only."""
+    service = create(scenario())
+    monkeypatch.setattr(service.backend, "step", lambda *motion: (np.array((0.0, 0.0, 2.9)), np.zeros(3)))
+    out = press(service, np.eye(4), ticks=1)
+    assert not service.backend.touching
+    assert np.linalg.norm(vector(out["sim/contact_wrench"].wrench.force)) == pytest.approx(2.9)

@@ -119,7 +119,7 @@ class ExamPlanner:
         if not pieces:
             reasons = "; ".join(sorted({cause.text for cause in skipped.values()})) or "there are none"
             raise NoPathError(f"no target is left of {len(xy)}: {reasons}")
-        start = segments.hover(pieces[0], 0)
+        start, _ = segments.hover(pieces[0], 0)
         assert start is not None, "strokes without a hover posture were dropped"
         missed = {i: cause for i, cause in skipped.items() if wanted is None or i in wanted}
         approach = self._motion(free, q_now, start)

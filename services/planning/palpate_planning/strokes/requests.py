@@ -53,7 +53,9 @@ class PressPlanner:
         """Return the path to the requested place and a press there, or at the nearest possible target; empty if there is none."""
         assert request.xy is not None
         apart = np.where(self._free, np.linalg.norm(self._targets - request.xy, axis=1), np.inf)
-        nearest = np.argsort(apart)[:_NEAREST]
+        nearest = np.argsort(apart)[: min(_NEAREST, np.count_nonzero(self._free))]
+        if not len(nearest):
+            return ()
         places = [(request.xy, int(nearest[0])), *((self._targets[target], int(target)) for target in nearest)]
         for place, target in places:
             stroke = Stroke(place[None], np.array([target]), np.zeros(1, dtype=np.int64))

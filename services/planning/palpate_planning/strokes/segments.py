@@ -98,8 +98,8 @@ class SegmentPlanner:
         self._kinematics, self._scene, self._surface = kinematics, scene, surface
         self._radius, self._depth = known.robot.indenter_radius_m, known.exam.depth_m
         self._postures, self._bend, self._free_motion = postures, bend, free_motion
-        self._strokes: dict[tuple[int, ...], tuple[SurfacePath, Infeasible]] = {}
-        self._hovers: dict[Place, Array | None] = {}
+        self._strokes: dict[tuple[bytes, bytes], tuple[SurfacePath, Infeasible]] = {}
+        self._hovers: dict[Place, tuple[Array | None, Cause]] = {}
         self._paths: dict[tuple[Place, Place], tuple[Segment | None, Cause]] = {}
         self._R_ref = np.eye(3)
 
@@ -118,8 +118,9 @@ class SegmentPlanner:
                 else:
                     layout.breaks.add(target)
             for end in (0, -1):
-                if self.hover(piece, end) is None:
-                    layout.dropped[int(piece.targets[end])] = REACH._replace(text=f"the posture above it is {REACH.text}")
+                posture, why = self.hover(piece, end)
+                if posture is None:
+                    layout.dropped[int(piece.targets[end])] = why._replace(text=f"posture above it: {why.text}")
             if k and not layout.infeasible:
                 segment, why = self._path_to_next(pieces[k - 1], piece)
                 if segment is None:
@@ -132,25 +133,29 @@ class SegmentPlanner:
     def press_after(self, before: Stroke, press: Stroke, depth: float) -> tuple[Segment, ...]:
         """Return a press to `depth` [m] and the path to it from the end of the previous stroke; empty if impossible."""
         path, infeasible = self._path_of(press, depth)
-        if infeasible or self.hover(press, 0) is None:
+        if infeasible or self.hover(press, 0)[0] is None:
             return ()
         transit, _ = self._path_to_next(before, press)
         return () if transit is None else (transit, Segment(path, contact=True, depth_m=depth))
 
-    def hover(self, piece: Stroke, end: int) -> Array | None:
-        """Return the posture above the first (0) or last (-1) target [rad], shape (n,); None if out of reach or in collision."""
+    def hover(self, piece: Stroke, end: int) -> tuple[Array | None, Cause]:
+        """Return the posture above the first (0) or last (-1) target [rad], shape (n,), or None and why there is none."""
         place = _place(piece, end)
         if place not in self._hovers:
             p, n = (a[0] for a in self._surface.at(piece.xy[[end]]))
             goal = rigid(least_twist(-n, self._R_ref), centre(p, n, self._radius, -SEGMENTS.hover_m))
             near = self._postures[piece.targets[end]]
             solution = self._kinematics.solve(goal, near)
-            good = solution.ok and self._scene.free(solution.q)
-            self._hovers[place] = solution.q if good else None
+            if not solution.ok:
+                self._hovers[place] = None, REACH
+            elif not self._scene.free(solution.q):
+                self._hovers[place] = None, collision(self._scene, solution.q)
+            else:
+                self._hovers[place] = solution.q, NO_CAUSE
         return self._hovers[place]
 
     def _stroke(self, piece: Stroke) -> tuple[SurfacePath, Infeasible]:
-        key = tuple(int(i) for i in piece.targets)
+        key = piece.targets.tobytes(), piece.xy.tobytes()
         if key not in self._strokes:
             self._strokes[key] = self._path_of(piece, self._depth)
         return self._strokes[key]
@@ -161,7 +166,7 @@ class SegmentPlanner:
         if key not in self._paths:
             xy, targets = transfer(before.xy[-1], after.xy[0]), np.array((before.targets[-1], after.targets[0]))
             path, infeasible = self._path_of(Stroke(xy, targets, np.array([0, len(xy) - 1])), -SEGMENTS.hover_m)
-            start, goal = self.hover(before, -1), self.hover(after, 0)
+            start, goal = self.hover(before, -1)[0], self.hover(after, 0)[0]
             if not infeasible:
                 self._paths[key] = (Segment(path, contact=False), NO_CAUSE)
             elif start is None or goal is None:

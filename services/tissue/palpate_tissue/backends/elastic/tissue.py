@@ -12,7 +12,6 @@ The coefficients are equal at all vertices, so a step is one small matrix M and 
 steps, and by S times the accumulated effect of the forces since then, which the same M propagates.
 """
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -22,7 +21,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backend import TissueBackend, require_finite
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W, Compliance
 from palpate_tissue.backends.elastic.patch import MUSCLE, ElasticPatch, SprungPatch, VertexSprings
 from palpate_tissue.contact import Sphere, VertexSearch, add_friction, skin
@@ -100,9 +99,9 @@ class ElasticTissue(TissueBackend):
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
         """See `TissueBackend`."""
-        p = p_A.tolist()
-        if not math.isfinite(sum(p)):
-            raise ValueError(f"tissue: the indenter's position is not finite: {p}")
+        motion = np.array((p_A, v_A, np.zeros(3) if w_A is None else w_A))
+        require_finite(motion)
+        p, velocity, spin = motion.tolist()
         self._excursion = self.excursion(t_s)
         patch = self._patch
         if patch is None or not patch.near.holds(p, radius):
@@ -115,7 +114,7 @@ class ElasticTissue(TissueBackend):
         wrench = np.zeros(6)
         if len(patch.vertex) and patch.step(w, self._advance, self._feed, self.activation):
             self.touching = self.disturbed = True
-            sphere = Sphere(tuple(p), tuple(v_A.tolist()), (0.0, 0.0, 0.0) if w_A is None else tuple(w_A.tolist()), radius)
+            sphere = Sphere(tuple(p), tuple(velocity), tuple(spin), radius)
             add_friction(self.friction, sphere, patch.push(), self.dt, wrench)
             self.guard(v_A)
         else:

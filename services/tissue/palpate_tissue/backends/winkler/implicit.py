@@ -9,7 +9,6 @@ Only the vertices near the sphere are stepped; the others follow every `far_s`, 
 its forces with those of the explicit steps.
 """
 
-import math
 from math import sqrt
 from typing import Final, NamedTuple
 
@@ -24,7 +23,7 @@ from palpate_models.patient import wall
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backend import TissueBackend, require_finite
 from palpate_tissue.backends.winkler.mechanics import stiffness_matrix
 from palpate_tissue.contact import RIM, Bristle, Near, Push, Sphere, VertexSearch, add_friction, skin
 
@@ -269,14 +268,12 @@ class ImplicitTissue(TissueBackend):
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
         """See `TissueBackend`; the wrench is that at the end of the step."""
-        p = p_A.tolist()
-        if not math.isfinite(sum(p)):
-            raise ValueError(f"tissue: the indenter's position is not finite: {p}")
+        motion, p = self._motion, p_A.tolist()
+        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
+        require_finite(motion)
         self._tick(t_s)
         if self._near is None or self._patch is None or not self._near.holds(p, radius):
             self._patch = self._gather(p, radius)
-        motion = self._motion
-        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
         touching, wrench = press(
             self._wall, self._patch, self.friction, motion, radius, self._excursion, self.activation, self.dt
         )

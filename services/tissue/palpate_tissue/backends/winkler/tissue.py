@@ -15,7 +15,7 @@ step is
 The README has the derivation. The FMU's C source has the same equations.
 """
 
-from math import isfinite, sqrt
+from math import sqrt
 from typing import NamedTuple
 
 import numpy as np
@@ -28,7 +28,7 @@ from palpate_models.patient import wall as wall_law
 from palpate_models.patient.breathing import STILL, BreathingCurve
 from palpate_models.patient.phantom import PhantomModel
 from palpate_models.patient.schema import Stiffness
-from palpate_tissue.backend import TissueBackend
+from palpate_tissue.backend import TissueBackend, require_finite
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
 from palpate_tissue.backends.winkler.mechanics import assemble
 from palpate_tissue.backends.winkler.presses import standard_presses
@@ -225,13 +225,11 @@ class WinklerTissue(TissueBackend):
 
     def step(self, t_s: float, p_A: Array, v_A: Array, radius: float, w_A: Array | None = None) -> tuple[Array, Array]:
         """See `TissueBackend`. The period has equal sub-steps, in which the sphere moves on a straight line."""
-        end = p_A.tolist()
-        if not isfinite(sum(end)):
-            raise ValueError(f"tissue: the indenter's position is not finite: {end}")
+        motion, end = self._motion, p_A.tolist()
+        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
+        require_finite(motion)
         start = self._previous_centre or end
         self._previous_centre = end
-        motion = self._motion
-        motion[0], motion[1], motion[2] = p_A, v_A, 0.0 if w_A is None else w_A
         wrench = np.zeros(6)
         if self.substeps == 1:
             self._substep(self.excursion(t_s), end, radius, wrench)
@@ -249,6 +247,7 @@ class WinklerTissue(TissueBackend):
 
     def idle(self, t_s: float) -> None:
         """See `TissueBackend`."""
+        self._previous_centre = None
         for k in range(1, self.substeps + 1):
             self._excursion = self.excursion(t_s - self.dt * (1 - k / self.substeps))
             self._advance(self._no_patch, 0.0, np.zeros(6))
