@@ -45,7 +45,8 @@ def check_command(  # noqa: PLR0913 - the options of a command
     from palpate_models.scenario.load import load_scenario
 
     if role not in SUITES:
-        raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}")
+        own = "; for a role of your own write a module with suite(rig) in palpate/check/suites"
+        raise NoBus(f"no suite for {role!r}; there is one for {', '.join(SUITES)}{own}")
     settings = RigSettings(
         load_scenario(scenario, [*STILL, *(given or ())]), 1e3 * slack, motion or role != "robot" or service is not None
     )

@@ -237,6 +237,8 @@ def print_scores(console: Console, report: Report) -> None:
         console.print(
             f"against the truth{clean_world_note(report)}: {scores_text(report.scores)}", highlight=False, soft_wrap=True
         )
+    elif report.truth is not None and not report.truth.felt and report.assessed:
+        console.print("not scored: a copy of this tissue cannot be pressed for the truth", highlight=False)
 
 
 def clean_world_note(report: Report) -> str:

@@ -25,9 +25,12 @@ NONE = "none"
 
 
 def workers(scenario: Scenario) -> tuple[str, ...]:
-    """Return the roles that a run of this scenario needs: with the search if it searches, without the tissue if that is real."""
+    """Return the roles that a run of this scenario needs: without the tissue if that is real, with the search if it searches, and
+    with other optional roles that have an implementation.
+    """
+    chosen = (role for role, row in _ROLES.items() if row.optional and role != "search" and choice(scenario, role) != "default")
     searching = ("search",) if scenario.exam.searched else ()
-    return (*(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE), *searching)
+    return (*(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE), *searching, *chosen)
 
 
 def kept(observers: Sequence[str]) -> Record:

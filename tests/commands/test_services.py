@@ -5,6 +5,7 @@ from pathlib import Path
 import pytest
 
 import palpate_plugins
+from palpate.run import roles
 from palpate.run.composed import load_services
 from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
 from palpate_bus.implementations import create, kind
@@ -99,6 +100,13 @@ def test_a_file_takes_the_place_of_ours(monkeypatch: pytest.MonkeyPatch) -> None
     assert scenario.services.assessment == str(EXAMPLE)
     (service,) = load_services(scenario, ("assessment",))
     assert type(service).__name__ == "Threshold"
+
+
+def test_a_run_has_an_optional_role_if_that_has_an_implementation(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(roles, "_ROLES", {**roles._ROLES, "thermometer": roles._ROLES["search"]})
+    without = load_scenario("clean")
+    with_it = load_scenario("clean", ["services.thermometer=mine.py"])
+    assert set(roles.workers(with_it)) - set(roles.workers(without)) == {"thermometer"}
 
 
 def test_a_file_may_import_modules_of_its_folder(tmp_path: Path) -> None:

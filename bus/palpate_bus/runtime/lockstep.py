@@ -363,7 +363,8 @@ class Stepper:
             self.blame.encode += perf_counter_ns() - begin
 
     def _missing(self, port: OutputPort, t: int) -> LockstepError:
-        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: it is due every {port.period} ns")
+        due = f"it is due every {port.period} ns; a topic that not every implementation sends is an `event` in contract.yaml"
+        return LockstepError(f"{self.role.name} sent no {port.topic.name} at {t} ns: {due}")
 
     def _items(self, outbox: Outbox) -> Iterable[tuple[str, Message | list[Message]]]:
         """Return the topics and messages of what the service returned. Raises LockstepError if that is not an outbox."""
