@@ -76,6 +76,21 @@ class ControllerTuning(NamedTuple):
 TUNING = ControllerTuning()
 
 
+class CartesianGains(NamedTuple):
+    """Gains of mode CARTESIAN."""
+
+    K: Array
+    """Stiffness along and about the axes of D, shape (6,)."""
+    B: Array
+    """Damping along and about the axes of D, shape (6,)."""
+    K_0: Array
+    """Stiffness of the null-space posture, shape (n,)."""
+    B_0: Array
+    """Damping of the null-space posture, shape (n,)."""
+    J_bar: Array
+    """Inverse of the Jacobian weighted by inertia and friction, shape (n, 6)."""
+
+
 class JointGains(NamedTuple):
     """Gains of mode JOINT, shape (n, n) each."""
 
@@ -94,8 +109,8 @@ class ImpedanceController:
         self._friction = np.stack((model.viscous_friction, model.coulomb_friction, model.velocity_limit))
         self._designed_for: Setpoint | None = None
         self._design_age = 0
-        self._cartesian_gains: Arrays = ()  # see `cartesian_gains`
-        self._joint_gains = JointGains(np.zeros(0), np.zeros(0))
+        self._cartesian_gains: CartesianGains  # designed in the first tick, as the joint gains
+        self._joint_gains: JointGains
 
     def reset(self) -> None:
         """Restart the rate limit from zero torque, after a pause without commands."""
@@ -119,7 +134,7 @@ class ImpedanceController:
             self._cartesian_gains = cartesian_gains(requested, R_WD, model.J_W, inertia, friction, self._dead_time)
         arm = (q, qd, model.p_WI, model.J_W, model.bias, model.gravity)
         R_DI = R_WD.T.dot(model.R_WI)
-        gains, torque = self._cartesian_gains, np.empty_like(q)
+        gains, torque = tuple(self._cartesian_gains), np.empty_like(q)
         cartesian_torque(arm, R_WD, x, pin.log3(R_DI), pin.Jlog3(R_DI), gains, self._friction, torque)
         return torque
 
@@ -162,7 +177,7 @@ def cartesian_torque(
         x: coordinates of the desired `ReferenceMotion`, shape (18 + 3 n,).
         phi: rotation vector of R_DI [rad], shape (3,).
         Jlog: derivative of `phi` with respect to a rotation in axes of I, shape (3, 3).
-        gains: as `cartesian_gains` returns them.
+        gains: `CartesianGains` as a plain tuple.
         friction: viscous [N m s/rad] and Coulomb [N m] friction and the velocity limit [rad/s], shape (3, n).
         torque: output [N m], shape (n,).
     """
@@ -204,7 +219,7 @@ def to_axes(R_AB: Array, x_B: Array) -> Array:
 
 
 @compiled
-def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> Arrays:
+def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Array, dead_time: float) -> CartesianGains:
     """Return the stiffness that is stable when sampled, the matching damping, and the null-space gains at a posture.
 
     Args:
@@ -214,9 +229,6 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
         M: joint-space inertia [kg m^2], shape (n, n).
         D: viscous joint friction [N m s/rad], shape (n,).
         dead_time: delay from measurement to torque [s].
-
-    Returns K and B for the six axes of D, shapes (6,), K_0 and B_0 for the null-space posture, shapes (n,), and the inverse of J
-    that these weigh, J_bar, shape (n, 6).
     """
     stiffness, damping_ratio, K_0 = requested
     turn = np.kron(np.eye(2), R_WD.T)  # twist or wrench from world axes to axes of D
@@ -232,7 +244,7 @@ def cartesian_gains(requested: Arrays, R_WD: Array, J_W: Array, M: Array, D: Arr
     B = 2 * damping_ratio * np.sqrt(K * mass)
     B_0 = 2 * LAW.joint_damping_ratio * np.sqrt(K_0 / np.diag(M_inverse))
     J_bar = W @ J.T @ slow_inertia @ turn
-    return K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar
+    return CartesianGains(K, np.maximum(B - friction, LAW.least_damping * B), K_0, B_0, J_bar)
 
 
 def joint_gains(stiffness: Array, M: Array, viscous_friction: Array, dead_time: float) -> JointGains:
