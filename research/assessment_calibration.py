@@ -33,7 +33,7 @@ from palpate.report.scoring import Truth
 from palpate.study.statistics.estimate import LEVEL, Estimate
 from palpate.truth.felt import PALPABLE
 from palpate_assessment.assess import weigh_all
-from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.detection import FEATURES, FELT, STRUCTURES, SURE, Candidate
 from palpate_assessment.findings import causes
 from palpate_assessment.observations import observe
@@ -233,7 +233,7 @@ def main(
     next_even = beyond + beyond % 2
     seeds = [*range(first_seed, beyond), *range(next_even, next_even + 2 * more_healthy, 2)]
     cases = [kept(seed, out) for seed in seeds]
-    calibration = learned()
+    calibration = load_calibration()
     if not check:
         calibration = fitted(cases, calibration)
         path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"

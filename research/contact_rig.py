@@ -8,7 +8,7 @@ long after that rings by itself.
 from collections import deque
 from collections.abc import Callable, Iterable, Mapping
 from copy import deepcopy
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from functools import cache
 from typing import Any
 
@@ -271,7 +271,7 @@ class _Script:
             return {TOPIC: joint_setpoint(t, self._at(-ABOVE_M), self.ready, still, still).message()}
         setpoint = cartesian_setpoint(t, self.R, self._at(self.depth(now))[:3, 3], self.ready)
         stiffness = CARTESIAN_STIFFNESS * (1, 1, self.stiffness / CARTESIAN_STIFFNESS[2], 1, 1, 1)
-        return {TOPIC: replace(setpoint, stiffness=stiffness).message()}
+        return {TOPIC: setpoint._replace(stiffness=stiffness).message()}
 
 
 def _smooth(t: float) -> float:

@@ -55,15 +55,15 @@ class Disturbance:
 
 
 def _deeper(sample: ForceSample, sign: float) -> ForceSample:
-    return replace(sample, depth=sample.depth + 0.001 * sign)
+    return sample._replace(depth=sample.depth + 0.001 * sign)
 
 
 def _harder(sample: ForceSample, sign: float) -> ForceSample:
-    return replace(sample, force=sample.force + 0.3 * sign)
+    return sample._replace(force=sample.force + 0.3 * sign)
 
 
 def _drifting(sample: ForceSample, sign: float) -> ForceSample:
-    return replace(sample, force=sample.force + 0.3 * sign * sample.time / 60)
+    return sample._replace(force=sample.force + 0.3 * sign * sample.time / 60)
 
 
 def _lengthened(length_m: float) -> Phantom:

@@ -27,7 +27,7 @@ from palpate.report.scoring import Truth
 from palpate.study.cases import Case, Request, cases_of
 from palpate.study.spec import load_study
 from palpate_assessment.assess import weigh_all
-from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.detection import Candidate
 from palpate_assessment.observations import observe
 from palpate_assessment.service import AssessmentService
@@ -76,7 +76,7 @@ def weigh(case: Case) -> list[Weighed]:
     gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service = AssessmentService(exam_input(scenario))
     assess(service, gathered)
-    calibration = learned()
+    calibration = load_calibration()
     observations = observe(service.samples, USUAL)
     judged = None if observations is None else weigh_all(observations)
     assert known is not None
@@ -143,7 +143,7 @@ def main(
     """Fit the probability of a tensed muscle, and write it to calibration.yaml."""
     out.mkdir(parents=True, exist_ok=True)
     rows = [row for case in cases() for row in kept(case, out)]
-    new: dict[str, Any] = learned().model_dump(mode="json") | {"guarding": np.round(fitted(rows), 2).tolist()}
+    new: dict[str, Any] = load_calibration().model_dump(mode="json") | {"guarding": np.round(fitted(rows), 2).tolist()}
     path = Path(palpate_assessment.__path__[0]) / "calibration.yaml"
     path.write_text(yaml.safe_dump(new, sort_keys=False, default_flow_style=None), "utf-8")
     evaluate(rows, Calibration.model_validate(new))

@@ -23,9 +23,9 @@ from statsmodels.stats.proportion import proportion_confint
 
 from palpate.quick.errors import loop_errors
 from palpate.quick.felt import HALF_M, PITCH_M, FeltPatient
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import detect
-from palpate_assessment.model import errors, fixed
+from palpate_assessment.model import errors, fixed_covariance
 from palpate_assessment.observations import Observations, observe
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
@@ -69,7 +69,7 @@ def patient(length: float, seed: int) -> tuple[FeltPatient, float]:
 def ideal(o: Observations, length: float) -> float:
     """Return the ideal observer's greatest |t| of a scan."""
     apart, lever = cdist(o.xy, o.xy, "sqeuclidean"), np.outer(o.per_metre, o.per_metre)
-    S = fixed(replace(o, depth_uncertainty=np.zeros(len(o.y))))
+    S = fixed_covariance(replace(o, depth_uncertainty=np.zeros(len(o.y))))
     S += NATURAL_SD**2 * np.exp(-0.5 * apart / length**2)
     S += ERRORS.field_m**2 * lever * np.exp(-0.5 * apart / FIELD_LENGTH_M**2)
     for sd, part in zip(
@@ -85,7 +85,7 @@ def ideal(o: Observations, length: float) -> float:
 
 def ours(o: Observations) -> float:
     """Return the assessment's greatest logit of a scan; -20 where it weighs nothing."""
-    calibration = learned()
+    calibration = load_calibration()
     _, candidates = detect(o)
     return float(calibration.logit(np.array([c.features for c in candidates])).max()) if candidates else -20.0
 

@@ -23,7 +23,7 @@ import palpate_assessment
 from palpate.quick.case import assess, examined
 from palpate.report.results import truth_of_run
 from palpate_assessment.assess import weigh_all
-from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.detection import SURE, Candidate
 from palpate_assessment.findings import Kind, causes, marked_share
 from palpate_assessment.observations import observe
@@ -252,7 +252,7 @@ def main(
     rows: dict[str, list[list[Evidence]]] = {}
     for name in only or (*PERSONS, *STRUCTURES):
         rows[name] = [kept(name, seed, out) for seed in range(10 * persons if name == "as drawn" else persons)]
-    calibration = learned()
+    calibration = load_calibration()
     if fit:
         every = [(row, SHARE if name in STRUCTURES else 1.0) for name in rows for person in rows[name] for row in person]
         calibration = fitted([row for row, _ in every], np.array([weight for _, weight in every]), calibration)

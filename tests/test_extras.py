@@ -100,7 +100,7 @@ OPTIONAL = {"zenoh_ros2_sdk"}
 ON_DEMAND = {
     "playwright": "dashboard",
     "palpate_fmu.reading.FmuError": "fmu",
-    "palpate_fmu.reading.opened_fmu": "fmu",
+    "palpate_fmu.reading.open_fmu": "fmu",
     "palpate_models.robot.urdf_arm.load_arm": "run",
     "palpate_models.robot.urdf_arm.read_arm": "run",
     "palpate_robot.backends.ros2_control.emulator.EmulatedPort": "run",

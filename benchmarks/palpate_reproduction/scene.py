@@ -122,7 +122,7 @@ class Stage:
 
     def abdomen(self, moment: Moment) -> Body:
         """Return the deformed abdomen, coloured by the estimated stiffness."""
-        skin = palette.packed(palette.SKIN)
+        skin = palette.pack(palette.SKIN)
         colors = np.full(len(self._rest), skin, dtype=np.uint32)
         known = moment.stiffness_map
         if known is not None and np.asarray(known.scanned).any():

@@ -47,15 +47,15 @@ BROKEN = (*_DAMAGED, EOFError, RuntimeError, ValueError, LookupError, OverflowEr
 _lz4 = stream_reader.lz4
 
 
-def _checked(size: int) -> None:
+def _check_size(size: int) -> None:
     if size > bounds().chunk_mb * MB:
         raise over("a chunk of the recording", f"{size / MB:.0f} MB decompressed", "chunk_mb")
 
 
-def _whole(frame: Any, data: bytes) -> bytes:
+def _decompress(frame: Any, data: bytes) -> bytes:
     """Return the content of a frame, by a decompressor that stops at a length."""
     content = bytes(frame.decompress(data, max_length=bounds().chunk_mb * MB + 1))
-    _checked(len(content))
+    _check_size(len(content))
     if not frame.eof:
         raise EOFError("a chunk that is not whole")
     return content
@@ -64,18 +64,18 @@ def _whole(frame: Any, data: bytes) -> bytes:
 def zstd(data: bytes, size: int) -> bytes:
     """Return the content of a zstd frame; `size`: as its chunk states it [bytes]. Raises InputError if it is too large."""
     stated = zstandard.get_frame_parameters(data).content_size
-    _checked(size if stated == zstandard.CONTENTSIZE_UNKNOWN else max(size, stated))
+    _check_size(size if stated == zstandard.CONTENTSIZE_UNKNOWN else max(size, stated))
     return bytes(zstandard.decompress(data, size))
 
 
 def lz4(data: bytes, _: int = 0) -> bytes:
     """Return the content of an lz4 frame. Raises InputError if it is too large."""
-    return _whole(_lz4.LZ4FrameDecompressor(), data)
+    return _decompress(_lz4.LZ4FrameDecompressor(), data)
 
 
 def bz2(data: bytes) -> bytes:
     """Return the content of a bzip2 file. Raises InputError if it is too large."""
-    return _whole(BZ2Decompressor(), data)
+    return _decompress(BZ2Decompressor(), data)
 
 
 # modules of compressions as mcap calls them
@@ -160,7 +160,7 @@ class Recording:
 
             def read(file: Path) -> Iterator[RecordedMessage]:
                 kind = NonSeekingReader if file in self.unindexed else make_reader
-                reader = kind(stack.enter_context(_opened(file)), validate_crcs=True)
+                reader = kind(stack.enter_context(_open(file)), validate_crcs=True)
                 for schema, channel, m in reader.iter_messages(topics=names, starting_at=begin, ending_at=end):
                     if schema is not None:
                         yield RecordedMessage(m.log_time, channel.topic.removeprefix("/"), m.data, m.sequence)
@@ -205,7 +205,7 @@ def _convert(path: Path) -> str:
 
 def _unreadable(file: Path, path: Path) -> RecordingError:
     """Return the error for a file that is not a complete MCAP file. `path`: its recording."""
-    with _opened(file) as stream:
+    with _open(file) as stream:
         head = stream.read(16)
     if not head:
         return RecordingError(f"{file}: is empty, so nothing was recorded")
@@ -227,7 +227,7 @@ def recorded_files(path: Path) -> tuple[Path, tuple[Path, ...]]:
     folder = path / RECORDING if (path / RECORDING).is_dir() else path
     metadata = folder / "metadata.yaml"
     if metadata.is_file():
-        return folder, _listed(metadata)
+        return folder, _list_files(metadata)
     found = sorted(folder.glob("*.mcap")) or sorted(folder.glob("*.db3"))
     if not found:
         raise RecordingError(f"{path}: no recording there; give a run's folder, a rosbag2 folder or an .mcap file")
@@ -236,7 +236,7 @@ def recorded_files(path: Path) -> tuple[Path, tuple[Path, ...]]:
     return folder, tuple(found)
 
 
-def _listed(metadata: Path) -> tuple[Path, ...]:
+def _list_files(metadata: Path) -> tuple[Path, ...]:
     """Return the files that rosbag2's description of a recording lists."""
     try:
         info = read_yaml(metadata, RecordingError)["rosbag2_bagfile_information"]
@@ -271,7 +271,7 @@ class _Contents:
 
 def _contents(file: Path) -> _Contents:
     """Return what a file has, by its summary, or read from beginning to end if that is missing or incomplete."""
-    with _opened(file) as stream:
+    with _open(file) as stream:
         reader = make_reader(stream)
         summary = reader.get_summary()
         scenario = next((a.data.decode() for a in reader.iter_attachments() if a.name == SCENARIO), None)
@@ -341,7 +341,7 @@ def kept_every_ms(channel: Channel) -> int:
     return int(text) if re.fullmatch(r"[0-9]{1,9}", text) else 0
 
 
-def _opened(path: Path) -> InputFile:
+def _open(path: Path) -> InputFile:
     """Open a file of a recording; a single record may be twice as large as a chunk."""
     return InputFile(path, RecordingError, 2 * bounds().chunk_mb * MB)
 
@@ -375,7 +375,7 @@ def complete_records(path: Path) -> Iterator[object]:
     Reading continues at the next chunk. If there is none and the file has no end, it is truncated, which is not a gap.
     Raises OSError.
     """
-    with _opened(path) as file, ExitStack() as stack:
+    with _open(path) as file, ExitStack() as stack:
         if not path.stat().st_size:
             return
         data = stack.enter_context(mmap(file.fileno(), 0, access=ACCESS_READ))
@@ -384,7 +384,7 @@ def complete_records(path: Path) -> Iterator[object]:
             try:
                 records, end = _records_at(data, at)
             except (*BROKEN, RecordingError):
-                end = next((m.start() for m in _CHUNK.finditer(data, at + 1) if _framed(data, m.start())), len(data))
+                end = next((m.start() for m in _CHUNK.finditer(data, at + 1) if _is_framed(data, m.start())), len(data))
                 if end == len(data) and data[-MAGIC_SIZE:] != MCAP0_MAGIC:
                     return
                 with suppress(*BROKEN, OSError, RecordingError):  # schemas and channels are repeated there
@@ -408,7 +408,7 @@ def _records_at(data: mmap, at: int) -> tuple[list[McapRecord], int]:
     stream = ReadDataStream(BytesIO(data[begin:end]))
     match kind:
         case Opcode.CHUNK:
-            if not _framed(data, at):
+            if not _is_framed(data, at):
                 raise ValueError("a chunk of another length than it states")
             return breakup_chunk(Chunk.read(stream), validate_crc=True), end
         case Opcode.SCHEMA:
@@ -421,7 +421,7 @@ def _records_at(data: mmap, at: int) -> tuple[list[McapRecord], int]:
             return [], end
 
 
-def _framed(data: mmap, at: int) -> bool:
+def _is_framed(data: mmap, at: int) -> bool:
     """Return True if the lengths of a chunk at byte `at` agree."""
     with suppress(*BROKEN):
         _, length = _FRAME.unpack_from(data, at)

@@ -12,8 +12,7 @@ import os
 import signal
 import sys
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -34,8 +33,7 @@ from palpate_errors import ExitStatus, UserError
 from palpate_inputs import PrintableFormatter
 
 
-@dataclass(frozen=True)
-class Hosted:
+class Hosted(NamedTuple):
     """A service of a process: its role, how it joins the bus, and its factory."""
 
     role: str
@@ -64,7 +62,7 @@ def in_background(role: Role, runtime: str) -> bool:
     return role.observer or (runtime == "lockstep" and role.period > MS)
 
 
-def chosen(role: str, load: Callable[[str], Any], words: Sequence[str] = ()) -> Service:
+def choose_service(role: str, load: Callable[[str], Any], words: Sequence[str] = ()) -> Service:
     """Return the service of `role` that the first word names, or else the scenario that `load` reads.
 
     Raises BusConfigError, PluginError.

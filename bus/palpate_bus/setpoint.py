@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 from palpate_bus.contract import contract
 from palpate_bus.messages import ImpedanceSetpoint
@@ -20,8 +20,7 @@ class ControlMode(IntEnum):
     JOINT = 1
 
 
-@dataclass(frozen=True, slots=True)
-class Setpoint:
+class Setpoint(NamedTuple):
     """Desired motion of the arm at one time. Control extrapolates it with `V_WD` and `qd`.
 
     D is the desired frame of the indenter, W is world. The contract's row of `planning/setpoint` limits the values.

@@ -11,7 +11,6 @@ import os
 import types
 import typing
 from collections.abc import Mapping
-from dataclasses import fields
 from pathlib import Path
 from typing import Any, Literal, Self
 
@@ -116,7 +115,7 @@ class Settings(BaseModel):
     bounds: str = Field(
         default="",
         description="Bounds of files and texts from outside, such as `text_kb=1024,chunk_mb=128`, separated by commas: "
-        + ", ".join(f"`{field.name}` ({field.default})" for field in fields(Bounds))
+        + ", ".join(f"`{name}` ({value})" for name, value in Bounds._field_defaults.items())
         + ".",
     )
     log: Literal["DEBUG", "INFO", "WARNING", "ERROR", "CRITICAL"] = "INFO"
@@ -153,13 +152,13 @@ class Settings(BaseModel):
         Raises BusConfigError that names each invalid variable, its value and what is allowed.
         """
         given = os.environ if environ is None else environ
-        return cls._checked({name: given[variable(name)] for name in cls.model_fields if given.get(variable(name))})
+        return cls._check({name: given[variable(name)] for name in cls.model_fields if given.get(variable(name))})
 
     def replaced(self, **changes: Any) -> Self:
         """Return a copy with some fields changed. Raises BusConfigError."""
         if unknown := changes.keys() - type(self).model_fields.keys():
             raise BusConfigError(f"there is no setting {', '.join(sorted(unknown))}")
-        return self._checked(dict(self) | changes)
+        return self._check(dict(self) | changes)
 
     def required(self, name: str, why: str) -> Any:
         """Return the value of a setting that this process needs. Raises BusConfigError, with `why`, if it is not set."""
@@ -173,7 +172,7 @@ class Settings(BaseModel):
         return {variable(name): text(value) for name, value in self}
 
     @classmethod
-    def _checked(cls, values: Mapping[str, Any]) -> Self:
+    def _check(cls, values: Mapping[str, Any]) -> Self:
         try:
             return cls.model_validate(values)
         except ValidationError as error:

@@ -9,11 +9,10 @@ import os
 import re
 import stat
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
 from functools import cache
 from pathlib import Path, PurePosixPath
 from reprlib import Repr
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 from xml.parsers import expat
 from zipfile import ZipFile
 
@@ -38,8 +37,7 @@ class InputError(UserError):
     """A file or text from outside that is not read. Names it, what was found and what is allowed."""
 
 
-@dataclass(frozen=True)
-class Bounds:
+class Bounds(NamedTuple):
     """Largest inputs. PALPATE_BOUNDS changes them, such as `unpacked_mb=4096,chunk_mb=128`."""
 
     text_kb: int = 512
@@ -65,10 +63,9 @@ class Bounds:
     def parse(cls, text: str) -> Bounds:
         """Return the bounds with changes such as `text_kb=1024,depth=80`. Raises ValueError that names what is allowed."""
         pairs = [[word.strip() for word in part.split("=")] for part in text.split(",") if part.strip()]
-        known = {field.name for field in fields(cls)}
         for pair in pairs:
-            if len(pair) != 2 or pair[0] not in known or not re.fullmatch(r"[1-9][0-9]{0,11}", pair[1]):
-                raise ValueError(f"{'='.join(pair)!r} is not NAME=NUMBER with NAME one of {', '.join(sorted(known))}")
+            if len(pair) != 2 or pair[0] not in cls._fields or not re.fullmatch(r"[1-9][0-9]{0,11}", pair[1]):
+                raise ValueError(f"{'='.join(pair)!r} is not NAME=NUMBER with NAME one of {', '.join(sorted(cls._fields))}")
         return cls(**{name: int(number) for name, number in pairs})
 
 
@@ -221,7 +218,7 @@ def parse_yaml(text: str, name: str, error: type[UserError] = InputError) -> Any
 _TextT = TypeVar("_TextT", str, bytes)
 
 
-def checked_xml(content: _TextT, name: object, error: type[UserError] = InputError) -> _TextT:
+def check_xml(content: _TextT, name: object, error: type[UserError] = InputError) -> _TextT:
     """Return XML that is well formed, not too deep, and without a document type, whose entities may name files."""
     parser, depth = expat.ParserCreate(), 0
 
@@ -249,7 +246,7 @@ def checked_xml(content: _TextT, name: object, error: type[UserError] = InputErr
 _ArchiveT = TypeVar("_ArchiveT", bound=ZipFile)
 
 
-def checked_archive(archive: _ArchiveT, name: object, error: type[UserError] = InputError) -> _ArchiveT:
+def check_archive(archive: _ArchiveT, name: object, error: type[UserError] = InputError) -> _ArchiveT:
     """Return an archive whose files are few and small enough, and all regular and inside the folder that it is unpacked to."""
     infos = archive.infolist()
     if len(infos) > bounds().entries:
@@ -271,7 +268,7 @@ def read_arrays(file: Path | bytes, name: object, error: type[UserError] = Input
 
     try:
         with io.BytesIO(file) if isinstance(file, bytes) else InputFile(file, error) as stream:
-            checked_archive(ZipFile(stream), name, error)
+            check_archive(ZipFile(stream), name, error)
             stream.seek(0)
             with np.load(stream, allow_pickle=False) as stored:
                 return {key: stored[key] for key in stored.files}

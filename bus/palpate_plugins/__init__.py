@@ -7,7 +7,6 @@ import ast
 import re
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cache
 from importlib import import_module, metadata
@@ -15,7 +14,7 @@ from importlib.metadata import EntryPoint, EntryPoints, PackageNotFoundError, en
 from importlib.util import find_spec, module_from_spec, spec_from_file_location
 from pathlib import Path
 from traceback import extract_tb
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate_errors import UserError
 from palpate_inputs import read_text
@@ -40,8 +39,7 @@ def _entry_points(group: str, _: tuple[str, ...]) -> EntryPoints:
     return entry_points(group=group)
 
 
-@dataclass(frozen=True)
-class PluginKind:
+class PluginKind(NamedTuple):
     """The functions that one field of the scenario may name. All methods raise PluginError."""
 
     kind: str

@@ -10,7 +10,7 @@ import pytest
 import zenoh
 
 from palpate_bus.contract import contract
-from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, watched
+from palpate_bus.security.access import OPERATOR, ROUTER, VIEWER, WATCHER, access_control, list_watched
 from palpate_bus.security.keys import HOSTS, KeysError, certificates, init, members, read
 from palpate_bus.wire.liveliness import ADMIN_SPACE, GraphWatch, NodeTokens
 from palpate_bus.wire.rmw import message_key, topic_key
@@ -194,11 +194,11 @@ def test_every_row_has_its_rules() -> None:
     for topic in RULES.topics.values():
         key = topic_key(topic, 7)
         for role in RULES.roles:
-            receives = role in topic.readers or (role == WATCHER and topic.name in watched(RULES))
+            receives = role in topic.readers or (role == WATCHER and topic.name in list_watched(RULES))
             assert may(role, "ingress", "put", key) is (role == topic.producer), (role, topic.name)
             assert may(role, "egress", "put", key) is receives, (role, topic.name)
             assert may(role, "ingress", "declare_subscriber", key) is receives, (role, topic.name)
-        assert topic.visibility != "sim" or topic.name not in watched(RULES)
+        assert topic.visibility != "sim" or topic.name not in list_watched(RULES)
         assert may(VIEWER, "egress", "put", key) is (topic.visibility == "public"), topic.name
         assert not may(VIEWER, "ingress", "put", key)
     assert ROUTER not in policy

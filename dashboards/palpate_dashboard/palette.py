@@ -52,7 +52,7 @@ def _opaque(channels: Iterable[NDArray[np.floating[Any]]]) -> NDArray[np.uint32]
     return np.asarray((red << 24) | (green << 16) | (blue << 8) | 255, dtype=np.uint32)
 
 
-def packed(color: Rgba) -> int:
+def pack(color: Rgba) -> int:
     """Return a colour as 0xRRGGBBAA."""
     r, g, b, a = color
     return (r << 24) | (g << 16) | (b << 8) | a

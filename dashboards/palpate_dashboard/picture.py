@@ -8,10 +8,9 @@ import io
 import shutil
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from itertools import groupby, takewhile
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,8 +28,7 @@ ARGUMENTS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore
 """WebGL without a graphics card."""
 
 
-@dataclass(frozen=True)
-class Screenshots:
+class Screenshots(NamedTuple):
     """When a page in a browser is drawn, and its picture."""
 
     timeout_s: int = 400
@@ -86,7 +84,7 @@ def screenshot(page: Page) -> Pixels:
 
 
 @contextmanager
-def _shown(folder: Path, port: int, size: tuple[int, int]) -> Iterator[tuple[DashboardService, Callable[[], Page]]]:
+def _show(folder: Path, port: int, size: tuple[int, int]) -> Iterator[tuple[DashboardService, Callable[[], Page]]]:
     """Yield the empty dashboard of a recorded run and a function that opens its page. Raises NoPicture and OSError."""
     if not recording_of(folder):
         raise NoPicture(f"{folder}: no recording there; give the folder of a recorded run")
@@ -101,12 +99,12 @@ def take(folder: Path, target: Path, at_s: float, port: int, size: tuple[int, in
 
     Raises NoPicture, also when the run was not recorded, and OSError.
     """
-    with _shown(folder, port, size) as (service, open_page):
+    with _show(folder, port, size) as (service, open_page):
         report(f"drawing {folder} up to {at_s:g} s")
         draw(takewhile(lambda item: item[0] <= at_s * 1e9, messages(recording_of(folder))), service)
         service.flush()
         report("waiting for the browser to draw it")
-        image = _settled(open_page())
+        image = _wait_settled(open_page())
     target.parent.mkdir(parents=True, exist_ok=True)
     _small(image).save(target, optimize=True)
 
@@ -117,7 +115,7 @@ def film(folder: Path, target: Path, port: int, size: tuple[int, int], report: C
     Raises NoPicture, also when the run was not recorded, and OSError.
     """
     frames: list[Image.Image] = []
-    with _shown(folder, port, size) as (service, open_page):
+    with _show(folder, port, size) as (service, open_page):
         recording = recording_of(folder)
         step = max(time for time, *_ in messages(recording)) // FRAMES + 1
         page = None
@@ -125,7 +123,7 @@ def film(folder: Path, target: Path, port: int, size: tuple[int, int], report: C
             draw(part, service)
             service.flush()
             page = page or open_page()
-            frames.append(Image.fromarray(_settled(page)).resize(FILM_PX, Image.Resampling.LANCZOS))
+            frames.append(Image.fromarray(_wait_settled(page)).resize(FILM_PX, Image.Resampling.LANCZOS))
             report(f"frame {number + 1} of {FRAMES}")
     target.parent.mkdir(parents=True, exist_ok=True)
     palette = frames[-1].quantize(FILM_COLOURS)  # one palette for all frames: unchanged pixels compress to nothing
@@ -139,7 +137,7 @@ def _small(image: Pixels) -> Image.Image:
     return Image.fromarray(image).quantize(SCREENSHOTS.colours, Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE)
 
 
-def _settled(page: Page) -> Pixels:
+def _wait_settled(page: Page) -> Pixels:
     before = screenshot(page)
     for _ in range(int(SCREENSHOTS.timeout_s / SCREENSHOTS.interval_s)):
         image = screenshot(page)

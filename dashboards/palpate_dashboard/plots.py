@@ -5,9 +5,8 @@ is minus force [N], as image axes point down, both times `PLOT.stretch`.
 """
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import cycle, islice
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -18,8 +17,7 @@ from palpate_dashboard.sinks import Canvas, scalars
 from palpate_dashboard.text import LEVELS, Health
 
 
-@dataclass(frozen=True)
-class PlotTuning:
+class PlotTuning(NamedTuple):
     """Scale and detail of the plots."""
 
     stretch: float = 10.0

@@ -4,9 +4,8 @@ Messages in, rerun entities out.
 """
 
 from collections.abc import Iterable
-from dataclasses import dataclass
 from functools import cache
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -24,8 +23,7 @@ from palpate_models.robot.visual import visual_meshes
 from palpate_models.scenario.schema import Camera, Robot
 
 
-@dataclass(frozen=True)
-class SceneTuning:
+class SceneTuning(NamedTuple):
     """Scale and detail of the scene."""
 
     metres_per_newton: float = 0.03
@@ -109,7 +107,7 @@ class SceneView:
         vertices = triples(message.vertices)
         if self._triangles is None:
             self._triangles, self._rest = triples(message.triangles), vertices
-            skin = np.full(len(vertices), palette.packed(palette.SKIN), dtype=np.uint32)
+            skin = np.full(len(vertices), palette.pack(palette.SKIN), dtype=np.uint32)
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(triangle_indices=self._triangles))
             self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=skin), t)
             self._canvas.recording.flush()  # a live viewer must receive the triangles before the vertices
@@ -127,7 +125,7 @@ class SceneView:
         if self._carry is None or self._map_vertices is None or not np.array_equal(vertices, self._map_vertices):
             self._map_vertices = vertices
             self._carry = Carry(vertices, self._rest, SCENE.carry_m)
-        skin = palette.packed(palette.SKIN)
+        skin = palette.pack(palette.SKIN)
         colors = self._carry(np.where(scanned, palette.stiffness_colors(ratio), skin), skin)
         self._canvas.log("world/abdomen", rr.Mesh3D.from_fields(vertex_colors=colors.astype(np.uint32)), t)
 
@@ -286,7 +284,7 @@ class MapView:
             mesh = rr.Mesh3D.from_fields(vertex_positions=flat, triangle_indices=triangles)
             for layer in LAYERS:
                 self._canvas.log(f"map/{layer}/surface", mesh, t)
-        unknown = palette.packed((70, 72, 78, 255))
+        unknown = palette.pack((70, 72, 78, 255))
         for layer, colors in (("mean", palette.stiffness_colors(ratio)), ("band", palette.spread_colors(spread))):
             mesh = rr.Mesh3D.from_fields(vertex_colors=np.where(scanned, colors, unknown).astype(np.uint32))
             self._canvas.log(f"map/{layer}/surface", mesh, t)

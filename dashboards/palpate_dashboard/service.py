@@ -4,10 +4,9 @@ It sends nothing, so it cannot change a run. Late messages are skipped.
 """
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,8 +34,7 @@ from palpate_models.scenario.schema import Scenario
 FILE: Final = "recording.rrd"
 
 
-@dataclass(frozen=True)
-class ViewPeriods:
+class ViewPeriods(NamedTuple):
     """Periods of what is drawn [ns], simulated."""
 
     mesh_ns: int = 100 * MS

@@ -7,9 +7,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
 from uuid import uuid4
 
@@ -26,8 +25,7 @@ MEMORY_LIMIT = "512MiB"
 """Buffer for viewers that join late; the oldest data is dropped first, static data never."""
 
 
-@dataclass(frozen=True)
-class Live:
+class Live(NamedTuple):
     """Live view of a run.
 
     `serve:PORT` hosts the recording for viewers of this machine, in the browser at PORT + 1; with `serve:0.0.0.0:PORT` every

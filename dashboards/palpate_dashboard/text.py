@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -69,8 +68,7 @@ def status(scenario: str, phase: str, exam: ExamState, robot: str, real_time_fac
     ))  # fmt: skip
 
 
-@dataclass(frozen=True)
-class Health:
+class Health(NamedTuple):
     """One entry of `diagnostics`: a service, or a topic as checked by the contract monitor."""
 
     name: str

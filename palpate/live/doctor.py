@@ -3,7 +3,7 @@
 import os
 import platform
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
 from time import monotonic, sleep
@@ -72,8 +72,8 @@ class Diagnosis:
 
     def as_json(self) -> dict[str, Any]:
         """Return the output of `--json`."""
-        topics = [{**asdict(row), "topic": row.topic.name} for row in self.topics]
-        violations = [{**asdict(violation), "count": count} for violation, count in self.violations]
+        topics = [{**row._asdict(), "topic": row.topic.name} for row in self.topics]
+        violations = [{**violation._asdict(), "count": count} for violation, count in self.violations]
         findings = [finding._asdict() for finding in self.findings]
         return {"healthy": self.healthy, "findings": findings, "topics": topics, "violations": violations}
 
@@ -234,7 +234,7 @@ def _watch(live: LiveMonitor, as_json: bool) -> NoReturn:
             for violation in live.poll():
                 after_s = monotonic() - began
                 if as_json:
-                    print_line({"after_s": round(after_s, 3), **asdict(violation)})
+                    print_line({"after_s": round(after_s, 3), **violation._asdict()})
                 else:
                     line = Text.assemble((f"{after_s:8.2f} s", "dim"), "  ", (str(violation), "red"))
                     wide_console().print(line, soft_wrap=True)

@@ -18,7 +18,7 @@ from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.recording.timed import contacts_over_time
 from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import columns_of, points, xyz
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_models.numerics.frames import Array, apply, inverse, matrix
 from palpate_models.scenario.load import exam_input, load_scenario
@@ -272,7 +272,7 @@ def own_recording(folder: Path) -> PalpationRecording:
         normals=normals,
         X_WA=inverse(X_AW),
         abdomen=True,
-        exponent=learned().exponent,
+        exponent=load_calibration().exponent,
     )
 
 

@@ -22,7 +22,7 @@ from palpate_bus.messages.stamps import NS, nanoseconds
 from palpate_bus.messages.typestore import store
 from palpate_bus.recordings import recorded_files
 from palpate_errors import UserError
-from palpate_inputs import KB, MB, InputFile, bounds, checked_xml, over, read_bytes, read_text
+from palpate_inputs import KB, MB, InputFile, bounds, check_xml, over, read_bytes, read_text
 from palpate_models.numerics.frames import Array
 from palpate_plugins import needs
 
@@ -292,7 +292,7 @@ def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -
 
     try:
         text = read_text(source.urdf, ReadingError, bounds().text_kb * KB)
-        model = pinocchio.buildModelFromXML(checked_xml(text, source.urdf))
+        model = pinocchio.buildModelFromXML(check_xml(text, source.urdf))
     except ValueError as error:
         raise ReadingError(f"{source.urdf}: is not a URDF: {error}") from None
     data, frame = model.createData(), model.getFrameId(source.frame)

@@ -156,17 +156,20 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     except Exception as error:  # the report needs what was measured
         now, (role, t, _) = perf_counter(), place.now()
         failure = place.failure(error) if isinstance(error, RunError) else failure_of(error, t)
-        times: dict[str, Any] = {"sim_time_s": t / NS, "wall_time_s": now - (start or now), "start_time_s": start or now}
-        result = RunResult("composed", collected, **times, failure=failure, lost={} if role is None else {role: t})
+        result = RunResult(
+            "composed",
+            collected,
+            sim_time_s=t / NS,
+            wall_time_s=now - (start or now),
+            failure=failure,
+            lost={} if role is None else {role: t},
+        )
     all_is_measured()
-    return replace(result, collected=collected, start_time_s=result.start_time_s - begin)
+    return replace(result, collected=collected, start_time_s=(start or perf_counter()) - begin)
 
 
 def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: ChildPlace, send: Send) -> RunResult:
-    """Run all services in this process. What is collected goes to `send`, as `News`, and not into the result.
-
-    The result's `start_time_s` is the time of the first tick by `perf_counter`.
-    """
+    """Run all services in this process. What is collected and the start go to `send`, as `News`, and not into the result."""
     collector = Collector(tree=FrameTree(exam_input(scenario)))
     news = CollectedNews(collector.collected)
     with given({"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}):  # only observers: the name may reveal the patient
@@ -199,7 +202,7 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
         with rare_collections():
             last = run.run(end, SIM_LIMIT)
     except ServiceFailed as error:
-        failure = replace(error.failure, text=f"{error.role} lost at {error.t / NS:.3f} s: {error.failure}")
+        failure = error.failure._replace(text=f"{error.role} lost at {error.t / NS:.3f} s: {error.failure}")
         lost = {error.role: error.t}
         last = error.t
     except (Exception, KeyboardInterrupt, SystemExit) as error:  # the report still needs what was measured
@@ -222,7 +225,6 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
         digests=run.digests(),
         sim_time_s=last / NS,
         wall_time_s=wall,
-        start_time_s=start,
         blame={role: stepper.blame.per_step_us() for role, stepper in run.steppers.items()},
         counters={role: {"facts": dict(fact)} for role, fact in facts.items()},
         failure=failure or gave_up(collector.collected),

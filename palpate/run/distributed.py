@@ -73,7 +73,7 @@ def run_distributed(
         start_s, step_s = Settings.read().start_limit_s, Settings.read().step_limit_s
         patience = Patience(foreign=foreign_roles(scenario), foreign_start=start_s, foreign_step=step_s)
         if absent.roles:
-            patience = replace(patience, absent=absent.roles, join=absent.wait_s)
+            patience = patience._replace(absent=absent.roles, join=absent.wait_s)
             absent.call(out, places)
         try:
             tree = FrameTree(exam_input(scenario))

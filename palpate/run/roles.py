@@ -119,10 +119,10 @@ def _check_fmu(scenario: Scenario) -> None:
         if given and not Path(given).is_file():
             raise PluginError(f"{scenario.name}: tissue.{field} = {given!r}: there is no such file")
     if given := scenario.tissue.fmu:
-        from palpate_fmu.reading import FmuError, opened_fmu  # noqa: PLC0415 - images of other roles lack its libraries
+        from palpate_fmu.reading import FmuError, open_fmu  # noqa: PLC0415 - images of other roles lack its libraries
 
         try:
-            with opened_fmu(Path(given)):
+            with open_fmu(Path(given)):
                 pass
         except FmuError as error:
             raise PluginError(f"{scenario.name}: tissue.fmu = {given!r}: {error}") from error

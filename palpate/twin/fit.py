@@ -31,7 +31,7 @@ from palpate_models.patient.phantom import PhantomModel, build_phantom, flat_pha
 from palpate_models.patient.schema import Phantom, Stiffness
 from palpate_perception.surface import fit as fit_surface
 from palpate_tissue.backends.elastic.compliance import YOUNG_OVER_K_W
-from palpate_tissue.backends.winkler.presses import Course, contracted, press_forces, prony_table
+from palpate_tissue.backends.winkler.presses import Course, contract, press_forces, prony_table
 
 
 class FitTuning(NamedTuple):
@@ -139,7 +139,7 @@ def simulated(
     """
     prony = prony_table(stiffness)
     courses = [
-        Course(radius, press.time, depth, contracted(model.voluntary, press.time, depth), prony)
+        Course(radius, press.time, depth, contract(model.voluntary, press.time, depth), prony)
         for press in presses
         for depth in (press.depth + deeper,)
     ]

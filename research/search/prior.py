@@ -14,7 +14,7 @@ from scipy.optimize import minimize
 
 from palpate.search.hand import SurrogateHand
 from palpate.search.trial import case, search
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import natural
 from palpate_assessment.standard import LENGTHS, USUAL
 from palpate_models.numerics.frames import Array
@@ -37,7 +37,7 @@ def felt(seed: int, presses: int) -> tuple[Array, Array, Array]:
     patient = case(seed)
     posterior = Posterior(SurrogateHand(patient.scenario, felt=patient.felt).task)
     search(SurrogateHand(patient.scenario, felt=patient.felt), policy("random"), presses, posterior)
-    made, exponent = posterior.presses, learned().exponent
+    made, exponent = posterior.presses, load_calibration().exponent
     xy = np.array([one.xy for one in made])
     depth, force, unsure = np.array([(one.depth, max(one.force, 0.1), one.depth_uncertainty) for one in made]).T
     error = exponent / depth * unsure

@@ -130,9 +130,9 @@ def test_a_fault_of_the_assessment_shows_after_the_scan(tmp_path: Path) -> None:
 def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> None:
     case = FaultWatch(StruckRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
     for t, phase in ((6.0, ExamState.PHASE_INDENT), (7.0, ExamState.PHASE_SCAN), (7.4, ExamState.PHASE_SCAN)):
-        case.on_progress(replace(in_phase(phase), t=round(t * NS)))
+        case.on_progress(in_phase(phase)._replace(t=round(t * NS)))
     assert not capsys.readouterr().out
-    case.on_progress(replace(in_phase(ExamState.PHASE_SCAN), t=round(7.5 * NS)))
+    case.on_progress(in_phase(ExamState.PHASE_SCAN)._replace(t=round(7.5 * NS)))
     assert capsys.readouterr().out == "the fault is due at 7.5\n"
 
 

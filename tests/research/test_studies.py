@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.special import expit
 
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import FEATURES
 from palpate_validation.people import PRESS, at_depths
 from research import assessment_calibration, guarding_calibration, people_fit
@@ -30,7 +30,7 @@ def population(number: int, seed: int) -> list[WeighedPatient]:
 
 
 def test_probabilities_that_are_fitted_are_true_of_other_patients() -> None:
-    calibration, others = assessment_calibration.fitted(population(3000, 0), learned()), population(3000, 1)
+    calibration, others = assessment_calibration.fitted(population(3000, 0), load_calibration()), population(3000, 1)
     features = np.array([row for case in others for row in case.features])
     real = np.array([r for case in others for r in case.real])
     logits = calibration.logit(features)
@@ -41,7 +41,7 @@ def test_probabilities_that_are_fitted_are_true_of_other_patients() -> None:
 
 
 def test_the_operating_point_keeps_the_rate_of_false_findings() -> None:
-    calibration = assessment_calibration.fitted(population(3000, 0), learned())
+    calibration = assessment_calibration.fitted(population(3000, 0), load_calibration())
     healthy = [case for case in population(3000, 1) if case.contrast == 1.0]
     for wanted in (0.02, 0.1):
         threshold = calibration.threshold(wanted)

@@ -16,7 +16,7 @@ from enum import StrEnum
 from functools import cache
 from math import acos, hypot, inf
 from operator import attrgetter
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -48,8 +48,7 @@ class ViolationKind(StrEnum):
     FROZEN = "frozen"
 
 
-@dataclass(frozen=True)
-class MessageViolation:
+class MessageViolation(NamedTuple):
     """A violation by one message of its topic's row."""
 
     kind: ViolationKind

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from rosbags.interfaces import Nodetype
 
-from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS, fitted
+from palpate_bus.messages.struct_codecs import ENCAPSULATION, STRUCT_CODECS, fit
 from palpate_bus.messages.typestore import CodecError, array_dtype, definition, message_type, store, type_hash
 
 __all__ = ["CodecError", "Message", "decode", "decoder", "definition", "encode", "encoder", "message_type", "store", "type_hash"]
@@ -126,7 +126,7 @@ def _with_fitted_arrays(message: Message, name: str, path: str = "") -> Message:
     changed: dict[str, Any] = {}
     for field, dtype, length in _array_fields(name):
         value = getattr(message, field)
-        array = fitted(value, dtype, length, path + field)
+        array = fit(value, dtype, length, path + field)
         if array is not value:
             changed[field] = array
     for field, nested, repeated in _fields_with_arrays(name):

@@ -1,8 +1,8 @@
 """The fields of a message type, and the numbers in a message, by their path: `wrench.force.x`."""
 
 from collections.abc import Iterator
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any
+from dataclasses import fields, is_dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 from rosbags.interfaces import Nodetype
@@ -10,8 +10,7 @@ from rosbags.interfaces import Nodetype
 from palpate_bus.messages.codec import CodecError, Message, message_type, store
 
 
-@dataclass(frozen=True)
-class LeafField:
+class LeafField(NamedTuple):
     """A field of a base type, at any depth of a message type."""
 
     path: str

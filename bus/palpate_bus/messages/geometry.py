@@ -3,7 +3,7 @@
 Rotations are matrices in arrays and unit quaternions in messages.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from math import sqrt
 from typing import Any, Final, NamedTuple
 
@@ -22,7 +22,9 @@ from palpate_bus.messages import (
     RegionOfInterest,
     SurfaceMesh,
     TFMessage,
+    ToolState,
     Transform,
+    TransformStamped,
     Twist,
     Vector3,
     Wrench,
@@ -125,6 +127,22 @@ def twist_message(V: Array) -> Twist:
 def wrench_message(F: Array) -> Wrench:
     """Return the `Wrench` of an array, force [N] then torque [N m], shape (6,)."""
     return Wrench(Vector3(*F[:3].tolist()), Vector3(*F[3:].tolist()))
+
+
+def tool_message(header: Header, motion: Sequence[float], radius: float) -> ToolState:
+    """Return the `ToolState` of an indenter with a radius [m] in world.
+
+    `motion`: position [m], orientation x, y, z, w, and velocities [m/s, rad/s] of its centre.
+    """
+    px, py, pz, x, y, z, w, vx, vy, vz, wx, wy, wz = motion
+    pose = Pose(Point(px, py, pz), Quaternion(x, y, z, w))
+    return ToolState(header, pose, Twist(Vector3(vx, vy, vz), Vector3(wx, wy, wz)), radius)
+
+
+def frames_message(header: Header, names: Sequence[str], poses: Array) -> TFMessage:
+    """Return the `TFMessage` of frames by name: position [m], orientation x, y, z, w, shape (n, 7)."""
+    transforms = [Transform(Vector3(*pose[:3]), Quaternion(*pose[3:])) for pose in poses.tolist()]
+    return TFMessage([TransformStamped(header, *pair) for pair in zip(names, transforms, strict=True)])
 
 
 def vector(message: Point | Vector3) -> Array:

@@ -118,7 +118,7 @@ def _joints(count: int, gap: int) -> Struct:
     return Struct(f"<I{gap}x{8 * count}sI4x{8 * count}sI4x{8 * count}s")
 
 
-def fitted(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDArray[Any]:
+def fit(value: Any, dtype: np.dtype[Any], length: int | None, field: str) -> NDArray[Any]:
     """Return `value` as a contiguous array of `dtype`, shape (length,), or of any length if that is None.
 
     Raises ValueError that names the field for another shape, or for an unsafe conversion (text, complex numbers, fractions for an
@@ -171,7 +171,7 @@ def encode_joint_torque_command(message: JointTorqueCommand) -> bytes:
     """Convert `palpation_msgs/JointTorqueCommand`."""
     data = pack_header(message.header, 4)
     for field in ("torque", "position"):
-        values = fitted(getattr(message, field), _FLOAT64, None, field)
+        values = fit(getattr(message, field), _FLOAT64, None, field)
         data += _numbers(values.size, len(data)).pack(values.size, values.tobytes())
     valid_for = message.valid_for
     return data + _DURATION.pack(valid_for.sec, valid_for.nanosec) + _pack_texts((message.problem, message.culprit))
@@ -200,9 +200,9 @@ def decode_joint_torque_command(data: bytes) -> tuple[JointTorqueCommand, int]:
 def encode_joint_state(message: JointState) -> bytes:
     """Convert `sensor_msgs/JointState`."""
     data = pack_header(message.header, 4) + _pack_names(tuple(message.name))
-    position = fitted(message.position, _FLOAT64, None, "position")
-    velocity = fitted(message.velocity, _FLOAT64, None, "velocity")
-    effort = fitted(message.effort, _FLOAT64, None, "effort")
+    position = fit(message.position, _FLOAT64, None, "position")
+    velocity = fit(message.velocity, _FLOAT64, None, "velocity")
+    effort = fit(message.effort, _FLOAT64, None, "effort")
     n = position.size
     if n == velocity.size == effort.size > 0:
         joints = _joints(n, padding(len(data) + LENGTH.size, 8))

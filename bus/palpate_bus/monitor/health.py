@@ -17,8 +17,7 @@ from palpate_bus.messages import DiagnosticStatus, KeyValue, codec
 from palpate_bus.messages.stamps import MS
 
 
-@dataclass(frozen=True)
-class Violation:
+class Violation(NamedTuple):
     """One violation of the contract."""
 
     topic: str
@@ -43,8 +42,7 @@ class SeenViolation:
     count: int = 1
 
 
-@dataclass(frozen=True)
-class TopicHealth:
+class TopicHealth(NamedTuple):
     """State of a topic as of the last check while it was subscribed to."""
 
     topic: Topic
@@ -119,8 +117,7 @@ def _how_often(seen: SeenViolation) -> str:
     return "once" if seen.count == 1 else f"{seen.count} times"
 
 
-@dataclass(frozen=True)
-class StreamTuning:
+class StreamTuning(NamedTuple):
     """Tolerances of rate, silence and age."""
 
     window_s: float = 0.7

@@ -15,7 +15,6 @@ Samples wait in channels until `poll`, which the owner calls often. Each produce
 """
 
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import replace
 from time import monotonic, time_ns
 from typing import Any
 
@@ -38,7 +37,7 @@ from palpate_bus.monitor.health import (
 )  # fmt: skip
 from palpate_bus.wire.liveliness import Entity, EntityKind, GraphWatch
 from palpate_bus.wire.rmw import WireError, any_type_key, message_key, parse_key, unpack
-from palpate_bus.wire.transport import decoded, subscribe
+from palpate_bus.wire.transport import subscribe, try_decode
 
 
 class Monitor:
@@ -165,7 +164,7 @@ class Monitor:
         kept = self._kept.get(topic.name)
         if kept is not None and seconds < TUNING.grace_s:  # as of its last subscription, with its present senders
             senders = sorted(self._publishers.get(topic.name, set()))
-            return replace(kept, senders=tuple(senders), violations=self._violations(topic))
+            return kept._replace(senders=tuple(senders), violations=self._violations(topic))
         messages, size = sum(p.messages for p in passed), sum(p.bytes for p in passed)
         own = [p.messages * 1e9 / p.stamps for p in passed if p.stamps]
         senders = sorted({stream.sender for stream in streams} | self._publishers.get(topic.name, set()))
@@ -308,12 +307,12 @@ class LiveMonitor:
         self.offsets[name] = min(age, self.offsets.get(name, age))
 
     def _receive_control(self) -> None:
-        for message in _decoded(self._control, self._decode_control):
+        for message in _decode(self._control, self._decode_control):
             if message.command == RunControl.GRANT and message.tick >= UNIX_NS:  # the common start of a wall-clock run
                 self.monitor.rate = self.monitor.rate or 1.0
 
     def _receive_reports(self, now: float) -> None:
-        for message in _decoded(self._reports, self._decode_report):
+        for message in _decode(self._reports, self._decode_report):
             if message.state in (ServiceReport.READY, ServiceReport.PROGRESS, ServiceReport.FINISHED, ServiceReport.FAILED):
                 self.reports[message.role] = message, now
 
@@ -324,7 +323,7 @@ def _waiting(subscriber: Any) -> Iterator[Any]:
         yield sample
 
 
-def _decoded(subscriber: Any, decode: Callable[[bytes], Any]) -> Iterator[Any]:
+def _decode(subscriber: Any, decode: Callable[[bytes], Any]) -> Iterator[Any]:
     """Yield the messages that a subscriber has received, without those that cannot be decoded."""
-    messages = (decoded(decode, sample.payload.to_bytes()) for sample in _waiting(subscriber))
+    messages = (try_decode(decode, sample.payload.to_bytes()) for sample in _waiting(subscriber))
     return (message for message in messages if message is not None)

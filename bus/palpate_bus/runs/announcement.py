@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import asdict, dataclass, field, fields
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
+from typing import NamedTuple
 
 from palpate_bus.runs.run_folder import remove_leftovers
 from palpate_bus.security.access import OPERATOR
@@ -138,8 +139,7 @@ class NoBus(UserError):
     """No bus to join, or several. Names what was searched and what to do."""
 
 
-@dataclass(frozen=True)
-class BusTarget:
+class BusTarget(NamedTuple):
     """A bus to join."""
 
     options: BusOptions

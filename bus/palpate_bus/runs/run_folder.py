@@ -79,7 +79,7 @@ class RunFolder:
 
 def remove_leftovers() -> list[Path]:
     """Remove folders and shared memory of this user's ended runs; return their paths."""
-    removed = [path for path in SHARED_MEMORY.glob("*.zenoh") if _removed(path)]
+    removed = [path for path in SHARED_MEMORY.glob("*.zenoh") if _remove(path)]
     for path in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
         with suppress(OSError):  # another user's, just removed, or locked
             if path.stat().st_uid != os.getuid():
@@ -91,7 +91,7 @@ def remove_leftovers() -> list[Path]:
     return removed
 
 
-def _removed(segment: Path) -> bool:
+def _remove(segment: Path) -> bool:
     """Remove an unlocked segment; return True if it was removed."""
     with suppress(OSError):  # another user's, just removed, or locked
         about = segment.stat()

@@ -7,9 +7,8 @@ lifts the arm; in lockstep they leave at once, since no time passes without gran
 
 import json
 import logging
-from dataclasses import dataclass
 from time import monotonic
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from palpate_bus.contract import Contract
 from palpate_bus.messages import RunControl, ServiceReport, codec
@@ -27,8 +26,7 @@ CONTROL_TYPE: Final = "palpation_msgs/msg/RunControl"
 REPORT_TYPE: Final = "palpation_msgs/msg/ServiceReport"
 
 
-@dataclass(frozen=True)
-class LinkTimes:
+class LinkTimes(NamedTuple):
     """Times of the link to the conductor."""
 
     poll_s: float = 0.05

@@ -5,10 +5,9 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
 from enum import StrEnum
 from traceback import walk_tb
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate_bus.contract.port_check import Checker, RefusedMessage
 from palpate_bus.messages.codec import CodecError, Message
@@ -54,8 +53,7 @@ class FailureCode(StrEnum):
     """An unexpected error in the conductor."""
 
 
-@dataclass(frozen=True)
-class Failure:
+class Failure(NamedTuple):
     """Failure of a run. Programs use `code`, `roles` and `topics`; `text` is for people."""
 
     code: FailureCode
@@ -70,7 +68,7 @@ class Failure:
 
     def with_note(self, note: str) -> Failure:
         """Return the same failure with `note` appended to its text."""
-        return replace(self, text=f"{self.text}; {note}")
+        return self._replace(text=f"{self.text}; {note}")
 
     @classmethod
     def of(cls, error: BaseException, role: str, buffers: Iterable[InputBuffer]) -> Failure:

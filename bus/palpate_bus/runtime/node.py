@@ -3,7 +3,6 @@
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
 from typing import Any
 
 from palpate_bus.messages import RunControl, ServiceReport
@@ -97,7 +96,7 @@ class Node(ABC):
             culprit = self._acting
             failure = Failure.of(error, culprit.role, culprit.stepper.buffers.values())
             if len(self._seats) > 1:
-                failure = replace(failure, text=f"{culprit.role}: {failure.text}")
+                failure = failure._replace(text=f"{culprit.role}: {failure.text}")
             for seat in self._seats:
                 seat.fail(failure)
             raise

@@ -8,9 +8,8 @@ nothing is lost, but the run may be slower.
 import logging
 from collections import Counter
 from contextlib import suppress
-from dataclasses import dataclass
 from time import monotonic, sleep
-from typing import Any, Protocol, runtime_checkable
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import zenoh
 
@@ -30,8 +29,7 @@ from palpate_bus.wire.transport import subscribe
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ObserverLimits:
+class ObserverLimits(NamedTuple):
     """Times and queue lengths of an observer."""
 
     idle_s: float = 0.005

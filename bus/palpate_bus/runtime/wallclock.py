@@ -12,9 +12,8 @@ On a slow machine the common clock may run slower than the wall clock (PALPATE_R
 import logging
 from collections import Counter
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from time import monotonic_ns, perf_counter_ns, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -46,8 +45,7 @@ def age_ms(bins: Counter[int]) -> dict[str, float]:
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class WallClockTimes:
+class WallClockTimes(NamedTuple):
     """Times of a service in wall-clock mode."""
 
     catch_up_ns: int = 200 * MS

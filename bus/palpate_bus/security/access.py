@@ -96,7 +96,7 @@ def access_control(rules: Contract, by: str = "cert_common_names") -> dict[str, 
     return {"enabled": True, "default_permission": "deny", **members}
 
 
-def watched(rules: Contract) -> list[str]:
+def list_watched(rules: Contract) -> list[str]:
     """Return the topics that the monitor of a run may receive, in the contract's order."""
     shown = {*public(rules), *(topic.name for topic, _ in rules.inputs(WATCHER))}
     return [name for name in rules.topics if name in shown]

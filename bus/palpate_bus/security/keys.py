@@ -11,9 +11,9 @@ import ipaddress
 import os
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from datetime import UTC, datetime, timedelta
 from pathlib import Path
+from typing import NamedTuple
 
 from cryptography import x509
 from cryptography.hazmat.primitives import hashes, serialization
@@ -39,8 +39,7 @@ class KeysError(UserError):
     """Keys that cannot be created or read. Names the file and what to do."""
 
 
-@dataclass(frozen=True)
-class Certificate:
+class Certificate(NamedTuple):
     """Contents of a certificate."""
 
     name: str
@@ -85,7 +84,7 @@ def init(folder: Path, names: Sequence[str] = (), hosts: Sequence[str] = (), day
         builder = x509.CertificateBuilder(authority.subject, _name(name), key.public_key())
         limits = x509.BasicConstraints(ca=False, path_length=None), True
         called = x509.SubjectAlternativeName([_host(host) for host in known or (name,)]), False
-        subject = _signed(builder, days, signer, limits, called, (x509.ExtendedKeyUsage(uses), False))
+        subject = _sign(builder, days, signer, limits, called, (x509.ExtendedKeyUsage(uses), False))
         _write_key(place / KEY, key)
         (place / CERTIFICATE).write_bytes(subject.public_bytes(serialization.Encoding.PEM))
         (place / CA).write_bytes(authority.public_bytes(serialization.Encoding.PEM))
@@ -129,13 +128,13 @@ def _authority(folder: Path) -> tuple[x509.Certificate, ec.EllipticCurvePrivateK
         key_cert_sign=True, crl_sign=True, encipher_only=False, decipher_only=False,
     )  # fmt: skip
     limits = x509.BasicConstraints(ca=True, path_length=0), True
-    made = _signed(x509.CertificateBuilder(name, name, key.public_key()), 365 * CA_YEARS, key, limits, (usage, True))
+    made = _sign(x509.CertificateBuilder(name, name, key.public_key()), 365 * CA_YEARS, key, limits, (usage, True))
     _write_key(key_file, key)
     certificate.write_bytes(made.public_bytes(serialization.Encoding.PEM))
     return made, key
 
 
-def _signed(
+def _sign(
     builder: x509.CertificateBuilder, days: int, signer: ec.EllipticCurvePrivateKey, *extensions: tuple[x509.ExtensionType, bool]
 ) -> x509.Certificate:
     """Return a certificate that is valid for `days` from now on; `extensions`: each with whether it is critical."""

@@ -12,11 +12,10 @@ and `qos.cpp`; the numbers of the policies are those of ros2/rmw, `rmw/types.h`.
 """
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
 from enum import StrEnum
 from itertools import count, product
 from queue import Empty, SimpleQueue
-from typing import Any
+from typing import Any, NamedTuple
 
 import xxhash
 import zenoh
@@ -40,8 +39,7 @@ class EntityKind(StrEnum):
     CLIENT = "SC"
 
 
-@dataclass(frozen=True, slots=True)
-class Endpoint:
+class Endpoint(NamedTuple):
     """Declaration of a publisher, subscription, service or client. `type` is the ROS name."""
 
     topic: str
@@ -50,8 +48,7 @@ class Endpoint:
     qos: str
 
 
-@dataclass(frozen=True, slots=True)
-class Entity:
+class Entity(NamedTuple):
     """An entity of the ROS graph, as in its token."""
 
     domain: int

@@ -28,11 +28,11 @@ import os
 import re
 import secrets
 import struct
-from dataclasses import dataclass
 from functools import lru_cache
 from hashlib import blake2s
 from hmac import compare_digest
 from pathlib import Path
+from typing import NamedTuple
 
 from palpate_bus.contract import Topic
 from palpate_bus.messages.codec import type_hash
@@ -103,8 +103,7 @@ class WireError(UserError):
     """A key, token or attachment is not one of rmw_zenoh."""
 
 
-@dataclass(frozen=True, slots=True)
-class TopicKey:
+class TopicKey(NamedTuple):
     """The parts of a topic's key expression. `type` is the ROS name, e.g. `sensor_msgs/msg/JointState`."""
 
     domain: int

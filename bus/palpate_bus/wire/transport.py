@@ -113,7 +113,7 @@ class TagCheck:
         """Return True if a message needs no tag or has a valid one; `sent` is its source time [ns]."""
         if self._decode is None:
             return self._tagger.holds(attachment, payload)
-        message = decoded(self._decode, payload)
+        message = try_decode(self._decode, payload)
         if message is None or not any(getattr(message, field) in values for field, values in self._values.items()):
             return True
         if sent <= self._newest or not self._tagger.holds(attachment, payload):
@@ -198,7 +198,7 @@ class Subscription:
             self.hello_received = self.hello_received or sequence == HELLO
             return None
         # some clients of rmw_zenoh number their messages from 0
-        if sequence == HELLO if self._decode is None else decoded(self._decode, payload) is None:
+        if sequence == HELLO if self._decode is None else try_decode(self._decode, payload) is None:
             self.garbage += 1
             return None
         return ReceivedSample(sequence, sent, payload)
@@ -273,7 +273,7 @@ class Transport:
         return None if tagger is None else TagCheck(tagger, contract().topics.get(parse_key(key).topic))
 
 
-def decoded(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
+def try_decode(decode: Callable[[bytes], Any], payload: bytes) -> Any | None:
     """Return the message, or None if it cannot be decoded, so that a foreign sender cannot end a service."""
     try:
         return decode(payload)

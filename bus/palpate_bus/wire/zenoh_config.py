@@ -278,7 +278,7 @@ def session(options: BusOptions | None = None, access: Mapping[str, Any] | None 
 
 
 @contextmanager
-def stopped_by_signals() -> Iterator[threading.Event]:
+def catch_signals() -> Iterator[threading.Event]:
     """Yield an event that SIGINT and SIGTERM set, for the main thread; in the end the handlers are as before."""
     stop = threading.Event()
     before = {number: signal.signal(number, lambda *_: stop.set()) for number in (signal.SIGINT, signal.SIGTERM)}
@@ -318,7 +318,7 @@ def serve(
 
     Raises BusConfigError if it cannot listen there.
     """
-    with stopped_by_signals() as stop, session(BusOptions(mode="router", listen=tuple(listen), tls=tls), access) as router:
+    with catch_signals() as stop, session(BusOptions(mode="router", listen=tuple(listen), tls=tls), access) as router:
         ready(f"router {router.zid()} listens on {', '.join(listen)}")
         while not stop.wait(1.0):  # in slices, so that signals are handled on every platform
             pass

@@ -26,7 +26,7 @@ from typing import Any, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from palpate_fmu.reading import FmuError, FmuVariable, binary_folders, listed, read_description, read_scalars, read_variables
+from palpate_fmu.reading import FmuError, FmuVariable, binary_folders, list_names, read_description, read_scalars, read_variables
 
 _TYPES: dict[str, tuple[str, str | None, type[np.generic]]] = {
     "Float64": ("Float64", None, np.float64),
@@ -258,7 +258,7 @@ class FmuInstance:
         """Return a variable, or an element of an array that the FMU has as scalars. Raises FmuError if there is none."""
         found = self.variables.get(name) or self._scalars.get(name)
         if found is None:
-            raise FmuError(f"{self.path.name} has no variable {name!r}; it has {listed(self.variables)}")
+            raise FmuError(f"{self.path.name} has no variable {name!r}; it has {list_names(self.variables)}")
         return found
 
     def port(self, names: Sequence[str]) -> Port:

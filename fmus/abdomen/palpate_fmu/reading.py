@@ -14,7 +14,7 @@ from typing import Any, NamedTuple
 from xml.etree import ElementTree as ET
 
 from palpate_errors import UserError
-from palpate_inputs import MB, InputFile, bounds, brief, checked_archive, checked_xml, over
+from palpate_inputs import MB, InputFile, bounds, brief, check_archive, check_xml, over
 
 DESCRIPTION = "modelDescription.xml"
 _VERSION = re.compile(r"2\.0|3\.\d+")
@@ -54,9 +54,9 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
     """Return FMPy's model description and the validator's findings. Raises FmuError if it is not an FMU, or of FMI 1.0."""
     import fmpy  # noqa: PLC0415  (slow to import)
 
-    with opened_fmu(path) as archive:
+    with open_fmu(path) as archive:
         try:
-            root = ET.fromstring(_checked_xml(archive))
+            root = ET.fromstring(_read_xml(archive))
         except FmuError as error:
             raise FmuError(f"{path}: {error}") from error
         except Exception as error:  # a damaged archive raises many kinds
@@ -90,14 +90,14 @@ def read_description(path: Path) -> tuple[Any, tuple[str, ...]]:
 
 
 @contextmanager
-def opened_fmu(path: Path) -> Iterator[zipfile.ZipFile]:
+def open_fmu(path: Path) -> Iterator[zipfile.ZipFile]:
     """Open an FMU whose files are within the bounds and may be unpacked. Raises FmuError."""
     if not path.is_file():
         raise FmuError(f"{path}: no such file")
     with ExitStack() as stack:
         try:
             file = stack.enter_context(InputFile(path, FmuError, bounds().document_mb * MB))
-            archive = checked_archive(stack.enter_context(zipfile.ZipFile(file)), path, FmuError)
+            archive = check_archive(stack.enter_context(zipfile.ZipFile(file)), path, FmuError)
             if DESCRIPTION not in archive.namelist():
                 raise FmuError(f"{path}: not an FMU: it has no {DESCRIPTION}")
         except FmuError:
@@ -107,11 +107,11 @@ def opened_fmu(path: Path) -> Iterator[zipfile.ZipFile]:
         yield archive
 
 
-def _checked_xml(archive: zipfile.ZipFile) -> bytes:
+def _read_xml(archive: zipfile.ZipFile) -> bytes:
     """Return the model description. Raises FmuError if it is too large."""
     if archive.getinfo(DESCRIPTION).file_size > bounds().document_mb * MB:
         raise over(DESCRIPTION, f"{archive.getinfo(DESCRIPTION).file_size / MB:.0f} MB", "document_mb", FmuError)
-    return checked_xml(archive.read(DESCRIPTION), f"its {DESCRIPTION}", FmuError)
+    return check_xml(archive.read(DESCRIPTION), f"its {DESCRIPTION}", FmuError)
 
 
 def _simplify(root: ET.Element) -> None:
@@ -139,7 +139,7 @@ def _simplify(root: ET.Element) -> None:
 
 def binary_folders(path: Path) -> tuple[str, ...]:
     """Return the platforms for which an FMU has binaries, as its folders name them."""
-    with opened_fmu(path) as archive:
+    with open_fmu(path) as archive:
         parts = [name.split("/") for name in archive.namelist()]
     return tuple(sorted({part[1] for part in parts if part[0] == "binaries" and len(part) > 2 and part[-1]}))
 
@@ -194,7 +194,7 @@ def read_scalars(description: Any) -> dict[str, FmuVariable]:
     return found
 
 
-def listed(variables: Mapping[str, Any]) -> str:
+def list_names(variables: Mapping[str, Any]) -> str:
     """Return the names of variables as text, of at most `_NAMED`."""
     names = list(variables)
     rest = f" and {len(names) - _NAMED} more" if len(names) > _NAMED else ""

@@ -1,8 +1,8 @@
 """Samples to map and findings: the whole of the assessment, arrays in, arrays out."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,8 +32,7 @@ class UnassessedReason(IntEnum):
     YIELDED = 3
 
 
-@dataclass(frozen=True)
-class AssessedMap:
+class AssessedMap(NamedTuple):
     """The stiffness map on a grid's nodes, and the findings."""
 
     grid: MapGrid
@@ -92,7 +91,7 @@ def weigh_all(o: Observations) -> tuple[Regression, list[Candidate], NDArray[np.
     if len(telling) < USABLE.fewest:
         return None
     regression, candidates = detect(o.part(telling))
-    wrong = contradicted(regression)
+    wrong = find_contradicted(regression)
     if 0 < wrong.mean() < _MOST_CONTRADICTED:
         reasons[telling[wrong]] = UnassessedReason.CONTRADICTED
         regression, candidates = detect(o.part(telling[~wrong]))
@@ -104,7 +103,7 @@ SURPRISE = 1e-5
 examinations where the model holds."""
 
 
-def contradicted(regression: Regression) -> NDArray[np.bool_]:
+def find_contradicted(regression: Regression) -> NDArray[np.bool_]:
     """Return the mask of samples in a piece of a stroke that the others contradict, shape (m,): a posterior predictive check.
 
     With the covariance K of all observations and P = K^-1, the piece k held out has the residual e = (P_kk)^-1 (P y)_k with
@@ -131,7 +130,7 @@ def pieces(o: Observations) -> list[NDArray[np.intp]]:
     return [np.flatnonzero(group.ravel() == g) for g in range(int(group.max()) + 1)]
 
 
-def growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
+def assess_growing(samples: Sequence[ForceSample], grid: MapGrid, reach: float) -> AssessedMap | None:
     """Return the cheap variant for a growing map: with usual amplitudes, and without findings."""
     o = observe(samples, USUAL)
     if o is None:

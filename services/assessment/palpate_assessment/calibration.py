@@ -64,6 +64,6 @@ class Calibration(BaseModel):
 
 
 @cache
-def learned() -> Calibration:
+def load_calibration() -> Calibration:
     """Return the calibration of this version."""
     return Calibration.model_validate(yaml.safe_load(files(__package__).joinpath("calibration.yaml").read_text("utf-8")))

@@ -7,7 +7,7 @@ f' S^-1 y / (f' S^-1 f + fade_sd^-2).
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import partial
 from itertools import pairwise
 from typing import NamedTuple
@@ -23,8 +23,7 @@ from palpate_assessment.standard import ABDOMEN, LENGTHS
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class Muscle:
+class Muscle(NamedTuple):
     """A muscle that is tensed [assumption]."""
 
     radius_m: float = 0.06
@@ -38,8 +37,7 @@ class Muscle:
     """Part of the samples that is taken for the relaxed wall."""
 
 
-@dataclass(frozen=True)
-class ShapeSearch:
+class ShapeSearch(NamedTuple):
     """Search for lumps."""
 
     tries: int = 120
@@ -131,15 +129,14 @@ MOST_GAIN = 10.0
 """Bound of the evidence of one shape against another: shapes are ideal."""
 
 
-@dataclass(frozen=True)
-class Candidate:
+class Candidate(NamedTuple):
     """A lump that is weighed."""
 
     bump: Bump
     log_contrast: float
     """E, by generalised least squares; negative where it is softer than its surroundings."""
     t: float
-    """E over its standard deviation, as far as more than one stroke says it (`agreed`)."""
+    """E over its standard deviation, as far as more than one stroke says it (`limit_strength`)."""
     signs: Signs
     """Signs of a tensed muscle around it."""
     disc: Bump
@@ -180,7 +177,7 @@ class Candidate:
         return float(np.clip((contrast - np.log(FELT)) * abs(self.t) / max(contrast, 1e-9), -SURE, SURE))
 
 
-def matched(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:
+def match_bumps(regression: Regression, bumps: Sequence[Bump]) -> tuple[Array, Array]:
     """Log-contrast e and strength t of bumps under a regression that does not have them, shape (k,) each."""
     seen = regression.whiten(np.array([bump(regression.observations.xy) for bump in bumps]).T)
     power = np.maximum((seen**2).sum(axis=0), 1e-9)
@@ -192,24 +189,24 @@ def detect(o: Observations) -> tuple[Regression, list[Candidate]]:
     steps = [Regression(o, (), amplitudes(o, ()))]
     shapes: list[tuple[Bump, Bump | None]] = []
     while len(steps) <= SEARCH.most_with_bone and _open_wall(steps[-1]) < SEARCH.most:
-        last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmasked(steps[-1]))
-        found = [strongest(last), *([] if o.standard.anatomy else [strongest_ridge(last)])]
+        last = steps[-1] if o.standard.anatomy else replace(steps[-1], log_amplitudes=unmask(steps[-1]))
+        found = [find_disc(last), *([] if o.standard.anatomy else [find_ridge(last)])]
         bumps = [bump for bump, strength in found if bump is not None and strength >= SEARCH.weakest_t]
         if o.standard.anatomy and bumps:
             shapes.append((bumps[0], ridge_instead(last, bumps[0])))
-            bumps = [preferred(last, *shapes[-1])]
+            bumps = [prefer(last, *shapes[-1])]
         lumps = [(*last.lumps, bump) for bump in bumps]
         more = [Regression(o, some, amplitudes(o, some, last.log_amplitudes)) for some in lumps]
         if not more:
             break
-        best = more[0] if o.standard.anatomy else max(more, key=partial(gained, steps[-1]))
-        if o.standard.anatomy is None and gained(steps[-1], best) < SEARCH.least_gain:
+        best = more[0] if o.standard.anatomy else max(more, key=partial(measure_gain, steps[-1]))
+        if o.standard.anatomy is None and measure_gain(steps[-1], best) < SEARCH.least_gain:
             break
         steps.append(best)
     both = shapes or [(lump, None) for lump in steps[-1].lumps]
     weighed = [weigh(steps[-1], lump, *shape) for lump, shape in zip(steps[-1].lumps, both, strict=False)]
     if o.standard.anatomy is None:
-        weighed = [replace(c, evidence=gained(*both)) for c, both in zip(weighed, pairwise(steps), strict=True)]
+        weighed = [c._replace(evidence=measure_gain(*both)) for c, both in zip(weighed, pairwise(steps), strict=True)]
     return steps[-1], weighed
 
 
@@ -219,7 +216,7 @@ def _open_wall(regression: Regression) -> int:
     return len(centres) if anatomy is None else int((anatomy.bone(centres) < SEARCH.bone).sum())
 
 
-def unmasked(regression: Regression) -> Array:
+def unmask(regression: Regression) -> Array:
     """Return log-amplitudes of a regression, those of natural variation at most their medians: a lump that is not in it yet
     counts as natural variation, and would hide itself.
     """
@@ -231,15 +228,14 @@ def unmasked(regression: Regression) -> Array:
 def weigh(regression: Regression, lump: Bump, disc: Bump, instead: Bump | None) -> Candidate:
     """Return a lump of a regression, tested under the regression without it, with the disc and the ridge that it may be."""
     without = replace(regression, lumps=tuple(other for other in regression.lumps if other is not lump))
-    (log_contrast,), (t,) = matched(without, [lump])
+    (log_contrast,), (t,) = match_bumps(without, [lump])
     o, at = regression.observations, np.array([[disc.x, disc.y]])
-    candidate = Candidate(lump, float(log_contrast), agreed(without, lump, float(t)), signs(regression, disc), disc)
+    candidate = Candidate(lump, float(log_contrast), limit_strength(without, lump, float(t)), signs(regression, disc), disc)
     if o.standard.anatomy is None:
         return candidate
     felt = o.exponent > 0
     steep = o.exponent[felt & (disc.distance(o.xy) < disc.radius + SEARCH.border_m)]
-    return replace(
-        candidate,
+    return candidate._replace(
         ridge=instead,
         ridge_gain=ridge_gain(without, disc, instead),
         inside_m=float(-(at @ o.hull.equations[:, :2].T + o.hull.equations[:, 2]).max()),
@@ -251,31 +247,31 @@ def ridge_gain(regression: Regression, disc: Bump, instead: Bump | None) -> floa
     """Return the gain of the log evidence of a ridge over a disc under a regression without them, within MOST_GAIN."""
     if instead is None:
         return -MOST_GAIN
-    _, (t, other) = matched(regression, [disc, instead])
+    _, (t, other) = match_bumps(regression, [disc, instead])
     return float(np.clip(0.5 * (other**2 - t**2), -MOST_GAIN, MOST_GAIN))
 
 
-def preferred(regression: Regression, disc: Bump, instead: Bump | None) -> Bump:
+def prefer(regression: Regression, disc: Bump, instead: Bump | None) -> Bump:
     """Return the shape that joins the model."""
     return instead if instead and ridge_gain(regression, disc, instead) > SEARCH.preferred else disc
 
 
 def ridge_instead(regression: Regression, disc: Bump) -> Bump | None:
     """Return the strongest ridge that may be there instead of a disc, under a regression without it."""
-    (stiffer,) = np.sign(matched(regression, [disc])[0])
+    (stiffer,) = np.sign(match_bumps(regression, [disc])[0])
     centres = np.array([(disc.x + x, disc.y + y) for x in SEARCH.rival_offsets_m for y in SEARCH.rival_offsets_m])
     return _best_ridge(regression, centres, SEARCH.rival_tries, stiffer)[0]
 
 
-def gained(before: Regression, after: Regression) -> float:
+def measure_gain(before: Regression, after: Regression) -> float:
     """Return the log Bayes factor of the last lump, of the ideal shape or free to differ from it, against those before alone.
 
-    Each has its own amplitudes. What one stroke alone says is not believed (`agreed`). The lump may be at as many places as its
-    area fits into the region, of as many sizes as are tried, and a ridge in as many directions.
+    Each has its own amplitudes. What one stroke alone says is not believed (`limit_strength`). The lump may be at as many places
+    as its area fits into the region, of as many sizes as are tried, and a ridge in as many directions.
     """
     lump, without = after.lumps[-1], replace(after, lumps=before.lumps)
-    (log_contrast,), (t,) = matched(without, [lump])
-    believed = 0.5 * agreed(without, lump, float(t)) ** 2
+    (log_contrast,), (t,) = match_bumps(without, [lump])
+    believed = 0.5 * limit_strength(without, lump, float(t)) ** 2
     gain = 1.0 + (PRIOR.lump_sd * float(t) / float(log_contrast)) ** 2
     ideal = without.log_evidence - before.log_evidence + believed * (1.0 - 1.0 / gain) - 0.5 * np.log(gain)
     free = min(after.log_evidence - before.log_evidence, believed)
@@ -284,7 +280,7 @@ def gained(before: Regression, after: Regression) -> float:
     return float(np.logaddexp(ideal, free) - np.log(2.0 * places))
 
 
-def agreed(regression: Regression, lump: Bump, t: float) -> float:
+def limit_strength(regression: Regression, lump: Bump, t: float) -> float:
     """The strength `t` of a lump, at most `alike` times what is left of it without the stroke that says it most.
 
     A hiccup, or a breath that was followed too late, is a few millimetres for a second: three centimetres of one stroke. Such
@@ -311,17 +307,17 @@ def agreed(regression: Regression, lump: Bump, t: float) -> float:
     return float(np.sign(t)) * min(abs(t), SEARCH.alike * max(left, 0.0))
 
 
-def strongest(regression: Regression) -> tuple[Bump | None, float]:
+def find_disc(regression: Regression) -> tuple[Bump | None, float]:
     """Return the disc that stands out most from what the regression explains, and how much (|t|)."""
     lengths = regression.observations.standard.lengths
     bumps = [Bump(x, y, radius, lengths.edge_m) for x, y in _centres(regression).tolist() for radius in lengths.radii_m]
     return _best(regression, bumps, lambda p: Bump(p[0], p[1], *np.exp(p[2:])))
 
 
-def strongest_ridge(regression: Regression) -> tuple[Bump | None, float]:
+def find_ridge(regression: Regression) -> tuple[Bump | None, float]:
     """Return the ridge that stands out most from what the regression explains, and how much (t)."""
     band, t = _best_ridge(regression, _centres(regression))
-    return (band, t) if band is None else _grown(regression, band, t)
+    return (band, t) if band is None else _grow(regression, band, t)
 
 
 def _best_ridge(
@@ -351,7 +347,7 @@ def _best(
     `shape`: the bump of its parameters: points [m], and the logarithms of radius and edge. `sign`: of the contrast of ridges; 0:
     those which are stiffer than their surroundings, as vessels, scars and tendons are.
     """
-    bumps = [bump for bump in bumps if _possible(regression, bump)]
+    bumps = [bump for bump in bumps if _is_possible(regression, bump)]
     if not bumps:
         return None, 0.0
     xy, lengths = regression.observations.xy, regression.observations.standard.lengths
@@ -359,7 +355,7 @@ def _best(
 
     def loss(p: Array) -> float:
         bump = shape(p)
-        return -float(_strengths(regression, [bump], sign)[0]) if _possible(regression, bump) else 0.0
+        return -float(_strengths(regression, [bump], sign)[0]) if _is_possible(regression, bump) else 0.0
 
     anatomy = regression.observations.standard.anatomy is not None
     narrowest = np.log((lengths.radii_m[0] * (1.0 if anatomy and not bumps[0].path else SEARCH.narrowest), lengths.edge_m))
@@ -392,11 +388,11 @@ def _best(
 
 def _strengths(regression: Regression, bumps: Sequence[Bump], sign: float = 0.0) -> Array:
     """Return |t| of discs, and t of ridges times the sign of their contrast, that of stiffer ones if 0; shape (k,)."""
-    _, t = matched(regression, bumps)
+    _, t = match_bumps(regression, bumps)
     return np.where([bool(bump.path) for bump in bumps], t * (sign or 1.0), np.abs(t))
 
 
-def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
+def _grow(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
     """Return a ridge, longer at its ends by pieces in any forward direction while the evidence grows, and its |t|."""
     step = regression.observations.standard.lengths.radii_m[SEARCH.usual]
     turns = [np.array(((np.cos(a), -np.sin(a)), (np.sin(a), np.cos(a)))) for a in SEARCH.turns]
@@ -407,14 +403,14 @@ def _grown(regression: Regression, band: Bump, t: float) -> tuple[Bump, float]:
             corners = np.array(band.path)[::forward]
             along = (corners[-1] - corners[-2]) / np.linalg.norm(corners[-1] - corners[-2])
             longer = [ridge(np.vstack((corners, corners[-1] + step * turn @ along)), band.radius, band.edge) for turn in turns]
-            longer = [one for one in longer if _possible(regression, one)]
+            longer = [one for one in longer if _is_possible(regression, one)]
             found = _strengths(regression, longer) if longer else np.zeros(1)
             if 0.5 * found.max() ** 2 > 0.5 * t**2 + SEARCH.gain:
                 band, t, grows = longer[int(np.argmax(found))], float(found.max()), True
     return band, t
 
 
-def _possible(regression: Regression, bump: Bump) -> bool:
+def _is_possible(regression: Regression, bump: Bump) -> bool:
     """Return True if a bump does not overlap those found before, and, without an anatomy, is not outside the samples."""
     o = regression.observations
     if (places := o.standard.places) is not None and not (

@@ -1,8 +1,8 @@
 """From candidates to findings: how probable each is, where it ends, and how it feels against its surroundings."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from enum import IntEnum
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,8 +27,7 @@ OUTLINE_FRACTION = 0.5
 """The outline is where the log-contrast is this part of its peak."""
 
 
-@dataclass(frozen=True)
-class StatedPrior:
+class StatedPrior(NamedTuple):
     """Assumptions about a body of which nothing is known."""
 
     structures: float = 0.5
@@ -50,8 +49,7 @@ class Kind(IntEnum):
     SOFT_DEFECT = 4
 
 
-@dataclass(frozen=True)
-class Area:
+class Area(NamedTuple):
     """An area that is stiffer or softer than its surroundings, in the abdomen frame."""
 
     nodes: Mask
@@ -102,7 +100,7 @@ def areas(
     if not candidates:
         return []
     if regression.observations.standard.anatomy is None:
-        logits = np.array([stated(c) for c in candidates])
+        logits = np.array([stated_logit(c) for c in candidates])
         kinds = np.column_stack((expit(logits), np.zeros((len(logits), len(Kind) - 1))))
     else:
         features, signs = np.array([c.features for c in candidates]), np.array([c.signs for c in candidates])
@@ -118,7 +116,7 @@ def areas(
     return sorted(found, key=lambda area: -area.logit)
 
 
-def stated(candidate: Candidate) -> float:
+def stated_logit(candidate: Candidate) -> float:
     """Return the logit that a candidate is a structure under the stated prior."""
     contrast = abs(candidate.log_contrast)
     sd = max(contrast / max(abs(candidate.t), 1e-9), 1e-9)

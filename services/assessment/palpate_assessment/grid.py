@@ -1,6 +1,6 @@
 """The map's mesh: a regular grid over the examined region in the xy plane of A, lifted to the perceived surface."""
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.polynomial.polynomial import polyvander
@@ -15,8 +15,7 @@ _POWER_X, _POWER_Y = np.array([(i, j) for i in range(_DEGREE + 1) for j in range
 """Exponents of its terms."""
 
 
-@dataclass(frozen=True)
-class MapGrid:
+class MapGrid(NamedTuple):
     """A regular grid of nodes on the perceived surface, row by row: node j * nx + i is at (x[i], y[j])."""
 
     x: Array

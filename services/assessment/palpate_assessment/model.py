@@ -10,6 +10,7 @@ as the mode of their posterior under log-normal priors (Rasmussen and Williams 2
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.linalg import cho_solve, cholesky, solve_triangular
@@ -22,8 +23,7 @@ from palpate_assessment.standard import PressStandard
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class Prior:
+class Prior(NamedTuple):
     """Prior of the field in logarithms, and how its amplitudes are fitted."""
 
     natural_sd: float = 0.08
@@ -107,7 +107,7 @@ def errors(o: Observations) -> list[Array]:
     ]
 
 
-def fixed(o: Observations) -> Array:
+def fixed_covariance(o: Observations) -> Array:
     """Return the covariance of level, exponent, surface and sensor, which a scan cannot estimate; shape (m, m)."""
     e = o.standard.errors
     lever = np.outer(o.per_metre, o.per_metre)
@@ -141,7 +141,7 @@ def amplitudes(o: Observations, lumps: Sequence[Bump], start: Array | None = Non
     most = PRIOR.fitted_presses if o.standard.anatomy is None else PRIOR.fitted
     few = o.part(slice(None, None, -(-len(o.y) // most)))
     parts = np.array(natural(few.xy, few.xy, o.standard) + errors(few))
-    rest = fixed(few) + sum(lump_covariance(lump, few.xy, few.xy, o.standard) for lump in lumps)
+    rest = fixed_covariance(few) + sum(lump_covariance(lump, few.xy, few.xy, o.standard) for lump in lumps)
     middle, spread = _medians(o)
     y = few.y - np.median(o.y)
 
@@ -191,7 +191,7 @@ class Regression:
     def triangle(self) -> Array:
         """Lower Cholesky factor of the observations' covariance, shape (m, m)."""
         o = self.observations
-        covariance = fixed(o)
+        covariance = fixed_covariance(o)
         for log_amplitude, part in zip(self.log_amplitudes, natural(o.xy, o.xy, o.standard) + errors(o), strict=True):
             covariance += np.exp(2 * log_amplitude) * part
         for lump in self.lumps:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +16,7 @@ from palpate_assessment.standard import PressStandard
 from palpate_models.numerics.frames import Array
 
 
-@dataclass(frozen=True)
-class Usable:
+class Usable(NamedTuple):
     """Samples that are used."""
 
     depth: float = 0.2
@@ -99,7 +99,7 @@ def _slides(sample: ForceSample) -> bool:
     return float(np.linalg.norm(sample.velocity)) > USABLE.slide_mps
 
 
-def firm(samples: Sequence[ForceSample], standard: PressStandard) -> list[ForceSample]:
+def keep_firm(samples: Sequence[ForceSample], standard: PressStandard) -> list[ForceSample]:
     """Return the samples that are deep and strong enough, those next to held presses included."""
     shallowest, weakest = USABLE.depth * standard.depth_m, USABLE.force * standard.force_n
     return [s for s in samples if s.depth >= shallowest and s.force >= weakest]
@@ -110,7 +110,7 @@ def distance_to_samples(places: Array, samples: Sequence[ForceSample], standard:
 
     What lies between a held press and its slide is interpolated, and counts as felt.
     """
-    return np.asarray(cKDTree(np.array([s.position[:2] for s in firm(samples, standard)])).query(places)[0])
+    return np.asarray(cKDTree(np.array([s.position[:2] for s in keep_firm(samples, standard)])).query(places)[0])
 
 
 def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observations | None:
@@ -118,7 +118,7 @@ def observe(samples: Sequence[ForceSample], standard: PressStandard) -> Observat
     pressed = {} if standard.anatomy is None else {s.stroke: s.position for s in samples if not _slides(s)}
     good = [
         s
-        for s in firm(samples, standard)
+        for s in keep_firm(samples, standard)
         if not (
             s.stroke in pressed
             and _slides(s)

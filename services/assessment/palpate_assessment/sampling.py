@@ -2,8 +2,8 @@
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import dataclass, fields, replace
 from math import sqrt
+from typing import NamedTuple
 
 import numpy as np
 
@@ -18,8 +18,7 @@ _FEWEST = 3
 """States that make a sample."""
 
 
-@dataclass(frozen=True)
-class HeldPress:
+class HeldPress(NamedTuple):
     """A press that is held before a slide begins: the standard press, felt itself."""
 
     states: int = 200
@@ -40,8 +39,7 @@ class HeldPress:
 PRESS = HeldPress()
 
 
-@dataclass(frozen=True)
-class ContactState:
+class ContactState(NamedTuple):
     """Measurement of the examination at one instant, in the abdomen frame A."""
 
     time: float
@@ -66,8 +64,7 @@ class ContactState:
     """Displacement by which set-point and depth followed the breathing skin [m]."""
 
 
-@dataclass(frozen=True)
-class ForceSample:
+class ForceSample(NamedTuple):
     """One measurement of force at depth, averaged over a few millimetres of travel, in A."""
 
     time: float
@@ -147,7 +144,7 @@ class Sampler:
         if sample is None or len(fall) < _FEWEST:
             return sample
         log_depth, log_force = np.log(fall.T)
-        return replace(sample, exponent=float(np.polyfit(log_depth, log_force, 1)[0]))
+        return sample._replace(exponent=float(np.polyfit(log_depth, log_force, 1)[0]))
 
     def _average(self) -> ForceSample | None:
         """Return the sample of the present block, and begin the next one."""
@@ -185,13 +182,11 @@ class Sampler:
 
 def columns(samples: Sequence[ForceSample], before: float) -> FeltSoFar:
     """Samples as a checkpoint keeps them, with times before `before` [s], at which their examination ended."""
-    names = [field.name for field in fields(ForceSample)]
-    felt = {name: np.array([getattr(sample, name) for sample in samples]) for name in names}
+    felt = {name: np.array([getattr(sample, name) for sample in samples]) for name in ForceSample._fields}
     return FeltSoFar(**(felt | {"time": felt["time"] - before}))
 
 
 def samples_of(felt: FeltSoFar) -> list[ForceSample]:
     """Return the samples of a checkpoint."""
-    names = [field.name for field in fields(ForceSample)]
-    plain = ((values if values.ndim > 1 else values.tolist()) for values in (getattr(felt, name) for name in names))
-    return [ForceSample(**dict(zip(names, row, strict=True))) for row in zip(*plain, strict=True)]
+    plain = ((values if values.ndim > 1 else values.tolist()) for values in (getattr(felt, name) for name in ForceSample._fields))
+    return [ForceSample(*row) for row in zip(*plain, strict=True)]

@@ -10,7 +10,6 @@ is the depth d' corrected accordingly.
 
 from collections import deque
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -100,4 +99,4 @@ class SeenBreath:
         time, depth, followed = np.array([(state.time, state.depth, state.followed) for state in states]).T
         share = self._shares(np.array([state.position for state in states]))
         depths = depth_seen(time, depth, followed, share, (np.array(self._exposed), np.array(self._displacement)))
-        return [replace(state, depth=float(d)) for state, d in zip(states, depths, strict=True)]
+        return [state._replace(depth=float(d)) for state, d in zip(states, depths, strict=True)]

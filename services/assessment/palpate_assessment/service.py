@@ -2,12 +2,11 @@
 
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 
-from palpate_assessment.assess import AssessedMap, assess, growing
+from palpate_assessment.assess import AssessedMap, assess, assess_growing
 from palpate_assessment.findings import Area
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ContactState, ForceSample, Sampler, samples_of
@@ -30,8 +29,7 @@ from palpate_models.section import quadrant
 FRAME = contract().topics["assessment/map"].frame or ""
 
 
-@dataclass(frozen=True)
-class MapTuning:
+class MapTuning(NamedTuple):
     """Grids of the maps, and when a map of the growing samples is made."""
 
     pitch_m: float = 0.005
@@ -202,7 +200,7 @@ class AssessmentService(Service):
         self._last_map, self._mapped = t, len(self.samples)
         every = -(-len(self.samples) // MAP.growing_samples)
         chosen = self.samples[::every]
-        result = growing(chosen, self._coarse, self._reach)
+        result = assess_growing(chosen, self._coarse, self._reach)
         return {} if result is None else {"assessment/map": map_message(t, result, self._exam.depth_m)}
 
     def _finish(self, t: int) -> Outbox:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from itertools import pairwise
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial.distance import cdist
@@ -21,8 +21,7 @@ def smooth(a: Array, b: Array, length: float | Array) -> Array:
     return np.asarray(np.exp(-0.5 * cdist(a / length, b / length, "sqeuclidean")))
 
 
-@dataclass(frozen=True)
-class Bump:
+class Bump(NamedTuple):
     """The shape in which a lump is felt: 1 inside, 0 outside, with a soft edge. A ridge is a band about its path."""
 
     x: float
@@ -75,10 +74,10 @@ class Bump:
     def apart(self, other: Bump) -> float:
         """Return the distance between two bumps over the sum of their radii."""
         points = np.array(other.path or ((other.x, other.y),))
-        return float(self.distance(_filled(points)).min()) / (self.radius + other.radius)
+        return float(self.distance(_fill(points)).min()) / (self.radius + other.radius)
 
 
-def _filled(corners: Array) -> Array:
+def _fill(corners: Array) -> Array:
     """Return points along a path, shape (k, 2)."""
     if len(corners) < 2:
         return corners
@@ -88,5 +87,5 @@ def _filled(corners: Array) -> Array:
 
 def ridge(corners: Array, radius: float, edge: float) -> Bump:
     """Return the ridge about a path, shape (k, 2) [m]."""
-    x, y = _filled(corners).mean(axis=0)
+    x, y = _fill(corners).mean(axis=0)
     return Bump(float(x), float(y), radius, edge, tuple((float(a), float(b)) for a, b in corners))

@@ -7,7 +7,6 @@ images of the wall. With z(x) the height of that skin, and z' the height from wh
 """
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator
@@ -41,6 +40,6 @@ class KnownSkin:
         columns = ([sample.time for sample in samples], [s.position for s in samples], [s.normal for s in samples])
         deeper, sigma = self.deeper(*map(np.array, columns))
         return [
-            sample if np.isnan(by) else replace(sample, depth=sample.depth + float(by), depth_uncertainty=float(s))
+            sample if np.isnan(by) else sample._replace(depth=sample.depth + float(by), depth_uncertainty=float(s))
             for sample, by, s in zip(samples, deeper, sigma, strict=True)
         ]

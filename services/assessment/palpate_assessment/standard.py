@@ -5,23 +5,22 @@ with it. Forces scale with the force of the press.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from functools import cached_property
 from math import sqrt
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from scipy.special import expit
 
-from palpate_assessment.calibration import Calibration, learned
+from palpate_assessment.calibration import Calibration, load_calibration
 from palpate_assessment.places import SampledPlaces, places_of
 from palpate_assessment.sampling import ForceSample
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 
 
-@dataclass(frozen=True)
-class AnatomyPrior:
+class AnatomyPrior(NamedTuple):
     """Prior of ribs, iliac crests and muscles of an abdomen, in A."""
 
     arch_m: float = 0.17
@@ -47,8 +46,7 @@ class AnatomyPrior:
         return np.asarray(np.maximum(ribs, spine))
 
 
-@dataclass(frozen=True)
-class Lengths:
+class Lengths(NamedTuple):
     """Lengths [m] for the footprint of the abdomen's standard press."""
 
     fields_m: tuple[float, ...] = (0.012, 0.022, 0.045, 0.09, 0.18)
@@ -139,7 +137,7 @@ class PressStandard:
     """None for a body of which nothing is known: long shapes are tried too, and probabilities are of a stated prior."""
     places: SampledPlaces | None = None
     """Sampled places; None with an anatomy."""
-    calibration: Calibration = field(default_factory=learned)
+    calibration: Calibration = field(default_factory=load_calibration)
     """Exponent and conversion of the tissue."""
     errors: ErrorPrior = ErrorPrior()
 
@@ -156,9 +154,8 @@ class PressStandard:
             "held": 0.0,
             "lead_s": 0.0,
         }
-        return cls(
-            radius_m, depth_m, force_n, None, places_of(samples), learned().model_copy(update=tissue), ONSET_REFERENCED_ERRORS
-        )
+        calibration = load_calibration().model_copy(update=tissue)
+        return cls(radius_m, depth_m, force_n, None, places_of(samples), calibration, ONSET_REFERENCED_ERRORS)
 
     @property
     def footprint_m(self) -> float:
@@ -175,10 +172,10 @@ class PressStandard:
     def lengths(self) -> Lengths:
         """Lengths for this footprint."""
         scale = self.footprint_m / _USUAL_FOOTPRINT_M
-        return Lengths(**{f.name: _scaled(getattr(LENGTHS, f.name), scale) for f in fields(Lengths)})
+        return Lengths(*(_scale(length, scale) for length in LENGTHS))
 
 
-def _scaled(length: Any, scale: float) -> Any:
+def _scale(length: Any, scale: float) -> Any:
     """Return a length, or each of several, times a scale."""
     return tuple(one * scale for one in length) if isinstance(length, tuple) else length * scale
 

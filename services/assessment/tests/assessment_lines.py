@@ -4,7 +4,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.grid import MapGrid, map_grid
 from palpate_assessment.sampling import ForceSample
 
@@ -51,7 +51,7 @@ def lines(
     what breathing leaves, `conversion` the log of slide over press less the usual one, `exponent` that of the descents.
     """
     rng = np.random.Generator(np.random.PCG64(seed))
-    calibration = learned()
+    calibration = load_calibration()
     along = np.arange(-REGION / 2, REGION / 2 + 1e-9, ALONG)
     samples = []
     for stroke, y in enumerate(np.arange(-REGION / 2, REGION / 2 + 1e-9, SPACING)):

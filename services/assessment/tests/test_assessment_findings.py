@@ -1,14 +1,13 @@
 """Map and findings of known bellies, and signs of a muscle around a lump."""
 
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
 import pytest
 from assessment_lines import LEVEL, flat_grid, level, lines, lump, natural
 
-from palpate_assessment.assess import AssessedMap, assess, growing
-from palpate_assessment.calibration import learned
+from palpate_assessment.assess import AssessedMap, assess, assess_growing
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import Candidate, Signs, signs
 from palpate_assessment.findings import Kind, causes, marked_share
 from palpate_assessment.model import Regression, amplitudes
@@ -86,7 +85,7 @@ def test_a_lower_rate_of_false_findings_reports_less() -> None:
 def test_a_stroke_piece_that_the_others_contradict_is_not_assessed() -> None:
     def spoiled(sample: ForceSample) -> ForceSample:
         wrong = abs(sample.position[0]) < 0.012 and abs(sample.position[1] - 0.005) < 0.001
-        return replace(sample, force=sample.force * 3.0) if wrong else sample
+        return sample._replace(force=sample.force * 3.0) if wrong else sample
 
     result = examine([spoiled(sample) for sample in lines(level)])
     x, y = result.grid.nodes[:, :2].T
@@ -97,7 +96,7 @@ def test_a_stroke_piece_that_the_others_contradict_is_not_assessed() -> None:
 
 
 def test_a_place_where_the_force_limit_was_met_far_above_the_depth_is_not_assessed() -> None:
-    samples = [replace(s, force=15.0, depth=0.004, force_limited=True) if s.position[0] > 0.05 else s for s in lines(level)]
+    samples = [s._replace(force=15.0, depth=0.004, force_limited=True) if s.position[0] > 0.05 else s for s in lines(level)]
     result = examine(samples)
     x, y = result.grid.nodes[:, :2].T
     assert (result.unassessed[(x > 0.057) & (x < 0.07) & (np.abs(y) < 0.06)] == StiffnessMap.YIELDED).all()
@@ -105,11 +104,11 @@ def test_a_place_where_the_force_limit_was_met_far_above_the_depth_is_not_assess
 
 
 def test_a_lump_whose_middle_yields_to_the_force_limit_is_one_finding() -> None:
-    limit, calibration = 8.0, learned()
+    limit, calibration = 8.0, load_calibration()
 
     def yielding(sample: ForceSample) -> ForceSample:
         depth = sample.depth * min(1.0, (limit / sample.force) ** (1 / calibration.exponent))
-        return replace(sample, force=min(sample.force, limit), depth=depth, force_limited=sample.force > limit)
+        return sample._replace(force=min(sample.force, limit), depth=depth, force_limited=sample.force > limit)
 
     samples = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.025, 4.0))
     (area,), (unlimited,) = (examine(felt).findings for felt in ([yielding(s) for s in samples], samples))
@@ -131,12 +130,12 @@ def test_the_map_says_what_was_not_reached() -> None:
 def test_too_few_samples_are_no_map() -> None:
     few = lines(level)[:5]
     assert assess(few, flat_grid(), REACH, FALSE_FINDINGS) is None
-    assert growing(few, flat_grid(), REACH) is None
+    assert assess_growing(few, flat_grid(), REACH) is None
 
 
 def test_a_growing_map_says_what_the_final_one_does() -> None:
     samples = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.0), 0.025, 3.0))
-    grown = growing(samples[::2], flat_grid(0.008), REACH)
+    grown = assess_growing(samples[::2], flat_grid(0.008), REACH)
     assert grown is not None
     inside = np.linalg.norm(grown.grid.nodes[:, :2], axis=1) < 0.01
     assert np.median(grown.apparent[inside]) == pytest.approx(3.0 * np.exp(LEVEL), rel=0.1)
@@ -158,7 +157,7 @@ def seen(samples: list[ForceSample]) -> Signs:
 def letting_go(samples: list[ForceSample]) -> list[ForceSample]:
     """Samples over a muscle that is twice as stiff at the touch and lets go within three seconds."""
     tension = MUSCLE(np.array([s.position[:2] for s in samples])) * np.exp(-np.array([s.time_in_contact for s in samples]) / 3.0)
-    return [replace(s, force=s.force * 2.0**a) for s, a in zip(samples, tension, strict=True)]
+    return [s._replace(force=s.force * 2.0**a) for s, a in zip(samples, tension, strict=True)]
 
 
 def test_the_wall_rises_about_a_muscle_and_not_about_a_lump() -> None:
@@ -177,14 +176,14 @@ def test_a_muscle_that_lets_go_is_seen_to_fade() -> None:
 def test_lump_muscle_and_neither_compete() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     stiff, soft = (Candidate(bump, e, 6.0, Signs(0.8, 0.2), bump, inside_m=0.05) for e in (0.5, -0.5))
-    alone = replace(stiff, signs=Signs(0.0, -0.1))
+    alone = stiff._replace(signs=Signs(0.0, -0.1))
     features, muscles = (np.array(rows) for rows in zip(*((c.features, c.signs) for c in (stiff, soft, alone)), strict=True))
     evidence = np.array([c.structures() for c in (stiff, soft, alone)])
-    logits, kinds = causes(learned(), features, muscles, evidence)
+    logits, kinds = causes(load_calibration(), features, muscles, evidence)
     guarding = kinds[:, Kind.MUSCLE]
     assert guarding[0] > 0.1 > guarding[2]
     assert guarding[1] == kinds[1, Kind.BONE] == kinds[0, Kind.SOFT_DEFECT] == 0
-    rare, kinds_if_rare = causes(learned(), features, muscles, evidence, shift=-3.0)
+    rare, kinds_if_rare = causes(load_calibration(), features, muscles, evidence, shift=-3.0)
     assert rare == pytest.approx(logits)
     assert (kinds_if_rare[:, Kind.LUMP] < kinds[:, Kind.LUMP]).all()
 

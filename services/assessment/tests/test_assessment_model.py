@@ -1,13 +1,11 @@
 """The regression: amplitudes that data of known amplitudes have, the check of its predictions, and the standard press."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from assessment_lines import LEVEL, level, lines, lump, natural
 
-from palpate_assessment.assess import AssessedMap, assess, contradicted
-from palpate_assessment.detection import agreed, matched, strongest
+from palpate_assessment.assess import AssessedMap, assess, find_contradicted
+from palpate_assessment.detection import find_disc, limit_strength, match_bumps
 from palpate_assessment.grid import map_grid
 from palpate_assessment.model import Regression, amplitudes, usual_amplitudes
 from palpate_assessment.observations import Observations, observe
@@ -46,7 +44,7 @@ def test_the_field_is_followed_and_its_uncertainty_grows_beyond_the_samples() ->
 def test_the_matched_filter_reads_a_bump_without_bias() -> None:
     bump = Bump(0.0, 0.0, 0.02)
     o = observations(lines(lambda xy: LEVEL + 0.4 * bump(xy), noise=0.002))
-    (log_contrast,), (t,) = matched(Regression(o, (), usual_amplitudes(o)), [bump])
+    (log_contrast,), (t,) = match_bumps(Regression(o, (), usual_amplitudes(o)), [bump])
     assert log_contrast == pytest.approx(0.4, abs=0.05)
     assert t > 3
 
@@ -55,7 +53,7 @@ def test_the_matched_filter_reads_a_bump_without_bias() -> None:
 def test_the_edge_with_which_a_lump_is_felt_is_found(edge: float) -> None:
     lump = Bump(0.005, -0.01, 0.02, edge)
     o = observations(lines(lambda xy: LEVEL + 0.8 * lump(xy), noise=0.01))
-    found, t = strongest(Regression(o, (), usual_amplitudes(o)))
+    found, t = find_disc(Regression(o, (), usual_amplitudes(o)))
     assert found is not None
     assert found.edge == pytest.approx(edge, rel=0.2)
     assert found.radius == pytest.approx(lump.radius, rel=0.15)
@@ -66,15 +64,15 @@ def test_what_one_stroke_alone_says_is_not_believed() -> None:
     """A hiccup of a second lifts the force along three centimetres of one stroke, a lump that of all strokes over it."""
     bump = Bump(0.0, 0.005, 0.015)
     hiccup = [
-        replace(s, force=1.3 * s.force) if s.stroke == 6 and abs(s.position[0]) < 0.015 else s for s in lines(level, noise=0.005)
+        s._replace(force=1.3 * s.force) if s.stroke == 6 and abs(s.position[0]) < 0.015 else s for s in lines(level, noise=0.005)
     ]
     lumpy = lines(lambda xy: LEVEL + lump(xy, (0.0, 0.005), 0.015, 1.3), noise=0.005)
     strengths = []
     for samples in (hiccup, lumpy):
         o = observations(samples)
         regression = Regression(o, (), usual_amplitudes(o))
-        (t,) = matched(regression, [bump])[1]
-        strengths.append((float(t), agreed(regression, bump, float(t))))
+        (t,) = match_bumps(regression, [bump])[1]
+        strengths.append((float(t), limit_strength(regression, bump, float(t))))
     assert strengths[0][1] < 0.5 * strengths[0][0]
     assert strengths[1][1] == pytest.approx(strengths[1][0], rel=0.15)
 
@@ -94,7 +92,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
     wall = natural(1, 0.1)
     steady = lines(lambda xy: LEVEL + wall(xy))
     found = []
-    for samples in (steady, [replace(s, force=s.force + float(zeros[s.stroke])) for s in steady]):
+    for samples in (steady, [s._replace(force=s.force + float(zeros[s.stroke])) for s in steady]):
         o = observations(samples)
         regression = Regression(o, (), amplitudes(o, ()))
         found.append((np.exp(regression.log_amplitudes[-2]), regression.field(np.zeros((1, 2)))[1][0]))
@@ -105,7 +103,7 @@ def test_strokes_determine_the_zero_of_the_force_and_the_level_becomes_uncertain
 
 def test_a_model_that_holds_is_not_contradicted() -> None:
     o = observations(lines(level))
-    assert not contradicted(Regression(o, (), usual_amplitudes(o))).any()
+    assert not find_contradicted(Regression(o, (), usual_amplitudes(o))).any()
 
 
 RADIUS, DEPTH, FORCE = 0.006, 0.002, 1.0

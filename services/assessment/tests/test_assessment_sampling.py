@@ -1,7 +1,5 @@
 """Samples from states: averages, the map's grid, depth from the final skin and from measured breathing."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -203,7 +201,7 @@ def test_depth_counts_from_where_the_skin_was_after_all() -> None:
 def test_samples_before_the_scan_or_off_the_surface_are_unchanged() -> None:
     skin = skin_of(wall(), correction(9), X_AW)
     assert skin is not None
-    before, other = felt(9.0, 0.0), replace(felt(12.0, 0.0), position=np.array((0.3, 0.0, 0.2)))
+    before, other = felt(9.0, 0.0), felt(12.0, 0.0)._replace(position=np.array((0.3, 0.0, 0.2)))
     assert skin.again([before, other]) == [before, other]
 
 

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Iterable
-from dataclasses import dataclass
 from math import isfinite
 from typing import Any, Final, NamedTuple
 
@@ -41,8 +40,7 @@ class Frame(NamedTuple):
     pinhole: Pinhole
 
 
-@dataclass(frozen=True)
-class CameraInput:
+class CameraInput(NamedTuple):
     """A camera's pair of topics, and what its messages must agree with."""
 
     image: str

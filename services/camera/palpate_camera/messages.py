@@ -6,8 +6,7 @@ coordinates, as in ROS, so the principal point of a w x h image is ((w - 1)/2, (
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,8 +18,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Camera
 
 
-@dataclass(frozen=True, slots=True)
-class Pinhole:
+class Pinhole(NamedTuple):
     """Intrinsics in pixels, without distortion."""
 
     width: int
@@ -62,18 +60,18 @@ def small_spacing(width: int) -> int:
     return max(round(width / SMALL_WIDTH_PX), 1)
 
 
-def whole(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
+def whole_image(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
     """Return the messages by topic of a whole image at `t` [ns]; `depth` [m], shape (height, width), NaN where invalid."""
     return {IMAGE: depth_message(header(t, FRAME), depth), INFO: camera_info_message(t, pinhole)}
 
 
 def small(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """Return the messages by topic of a small image, as `whole`; `pinhole` is that of the small image."""
+    """Return the messages by topic of a small image, as `whole_image`; `pinhole` is that of the small image."""
     return {SMALL_IMAGE: depth_message(header(t, FRAME), depth), SMALL_INFO: camera_info_message(t, pinhole)}
 
 
 def small_of(t: int, depth: NDArray[np.float32], pinhole: Pinhole) -> dict[str, Message]:
-    """Return the messages by topic of the small image of a whole one; arguments as of `whole`."""
+    """Return the messages by topic of the small image of a whole one; arguments as of `whole_image`."""
     k = small_spacing(pinhole.width)
     return small(t, depth[k // 2 :: k, k // 2 :: k], pinhole.every(k))
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Container, Mapping, Set
-from dataclasses import dataclass
 from time import perf_counter, sleep
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -32,8 +31,7 @@ from palpate_inputs import InputError, parse_json
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ConductorTuning:
+class ConductorTuning(NamedTuple):
     """Periods and time limits of the conductor's loop."""
 
     poll_s: float = 0.02

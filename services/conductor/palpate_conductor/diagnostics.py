@@ -6,10 +6,9 @@ from their liveliness tokens. `palpate doctor` receives everything at once.
 """
 
 from collections.abc import Callable, Container, Mapping, Sequence
-from dataclasses import dataclass
 from itertools import cycle
 from time import monotonic
-from typing import Any
+from typing import Any, NamedTuple
 
 import zenoh
 
@@ -18,12 +17,11 @@ from palpate_bus.messages import DiagnosticStatus, KeyValue
 from palpate_bus.messages.stamps import NS
 from palpate_bus.monitor.health import RECENT_S, SeenViolation, topic_statuses
 from palpate_bus.monitor.monitor import LiveMonitor
-from palpate_bus.security.access import WATCHER, watched
+from palpate_bus.security.access import WATCHER, list_watched
 from palpate_conductor.watchdog import RoleProgress
 
 
-@dataclass(frozen=True)
-class ContractWatchTuning:
+class ContractWatchTuning(NamedTuple):
     """When the contract's topics are received."""
 
     poll_s: float = 0.2
@@ -41,7 +39,7 @@ class ContractWatch:
     """Watches the bus of a run, whose wall-clock `rate` is None in lockstep. Call `poll` often."""
 
     def __init__(self, session: zenoh.Session, rules: Contract, domain: int, rate: float | None = None) -> None:
-        topics = [rules.topics[name] for name in watched(rules)]
+        topics = [rules.topics[name] for name in list_watched(rules)]
         received = [topic for topic in topics if topic.producer != WATCHER or topic.open]  # without its own
         fast = [topic.name for topic in received if topic.periodic and topic.period_ms < TUNING.fast_ms]
         self._slow = [topic.name for topic in received if topic.name not in fast]

@@ -6,9 +6,8 @@ while paused. In wall-clock mode only the common start and the end are granted.
 """
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from time import monotonic, time_ns
-from typing import Final
+from typing import Final, NamedTuple
 
 from palpate_bus.messages.stamps import MS, NS
 from palpate_bus.runs.operator import TIME_REQUESTS
@@ -18,8 +17,7 @@ from palpate_conductor.outcome import RunFailed, Timing
 from palpate_errors import UserError
 
 
-@dataclass(frozen=True)
-class GrantTuning:
+class GrantTuning(NamedTuple):
     """Limits of the granted time."""
 
     window_ns: int = 500 * MS

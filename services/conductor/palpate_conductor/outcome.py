@@ -3,7 +3,7 @@
 import logging
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.stamps import NS
@@ -17,8 +17,7 @@ SIM_LIMIT = 3600 * NS
 """Simulated time [ns] after which a run is ended in any case."""
 
 
-@dataclass(frozen=True)
-class Timing:
+class Timing(NamedTuple):
     """Progress of time in a run; by default in lockstep, as fast as possible."""
 
     wallclock: bool = False
@@ -43,8 +42,7 @@ class Timing:
         return "wallclock" if self.wallclock else "lockstep"
 
 
-@dataclass(frozen=True)
-class Patience:
+class Patience(NamedTuple):
     """Time limits of the conductor [s], wall clock."""
 
     start: float = 300.0
@@ -108,8 +106,7 @@ class RunResult:
         return self.interrupted and self.collected.exam is None
 
 
-@dataclass(frozen=True)
-class RunProgress:
+class RunProgress(NamedTuple):
     """The state of a run for its user."""
 
     t: int

@@ -9,7 +9,7 @@ from contextlib import suppress
 from dataclasses import dataclass, field
 from threading import Event, Thread
 from time import monotonic, sleep
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import psutil
 
@@ -22,8 +22,7 @@ from palpate_bus.runtime.process import Activity, is_running, pid_space
 from palpate_conductor.outcome import Patience
 
 
-@dataclass(frozen=True)
-class WatchdogTuning:
+class WatchdogTuning(NamedTuple):
     """Times after which silence means something."""
 
     hung_s: float = 2.0

@@ -1,6 +1,5 @@
 """Admittance control: the static law, the tare, and the limits of what it commands."""
 
-from dataclasses import replace
 from math import acos
 
 import numpy as np
@@ -108,7 +107,7 @@ def test_beside_a_path_through_a_singular_wrist_the_tool_tilts_and_stays_in_plac
         x = ms / 2000
         planned, rate = start + travel * x * x * (3 - 2 * x), travel * 3 * x * (1 - x)
         asked = setpoint(model, planned, qd=rate)
-        asked = replace(asked, p_WD=asked.p_WD + aside, V_WD=model.J_W @ rate)
+        asked = asked._replace(p_WD=asked.p_WD + aside, V_WD=model.J_W @ rate)
         before = q
         q = law.command(q, rate, reference(asked))
         fastest = max(fastest, float(np.abs(q - before).max()) * 1e3)

@@ -190,7 +190,7 @@ def downsample(p: Array, x: Array, y: Array) -> tuple[Array, NDArray[np.bool_]]:
     return nodes, seen.ravel()
 
 
-def supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
+def find_supported(p: Array, xy: Array, spacing: float) -> NDArray[np.bool_]:
     """Step 4: return the mask of targets whose cell has a point, shape (m,).
 
     `p`: points in A [m], shape (n, 3); `xy`: targets in A [m], shape (m, 2); cells are squares of the side `spacing` [m].

@@ -9,7 +9,6 @@ pixels show the drift alone,
 and its part slower than `DRIFT.tau_s` is subtracted from all depths.
 """
 
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -24,7 +23,7 @@ from palpate_models.scenario.schema import Exam, Robot
 from palpate_perception import cloud, wall
 from palpate_perception.cloud import Image, Intrinsics, RegionBox
 from palpate_perception.tracker import NOTHING, Followed, Tracker, WallAverage, shift_between
-from palpate_perception.wall import WALL_FIT, WallNotVisibleError, WallPixels, steady
+from palpate_perception.wall import WALL_FIT, WallNotVisibleError, WallPixels, find_steady
 
 
 class MaskMargins(NamedTuple):
@@ -120,7 +119,7 @@ class CameraDrift:
 
     def __init__(self, frames: Array, camera: Intrinsics, t_s: float) -> None:
         """Start with an observation that ended at `t_s` [s]: depth [m], shape (frames, height, width), NaN where unknown."""
-        pixel, depth, noise = steady(frames)
+        pixel, depth, noise = find_steady(frames)
         r_W = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel] @ camera.X_WC[:3, :3].T
         height = camera.X_WC[2, 3] + depth * r_W[:, 2]
         table = np.abs(height - TABLE.top_m) < DRIFT.table_distance_m
@@ -243,7 +242,7 @@ class Follower:
             self._look(t_s, depth, camera, q)
             followed = self._follow(t_s, depth, q)
         self.counts[followed.state.name.lower()] += 1
-        return replace(followed, shift=followed.shift + np.append(self.shift, 0.0))
+        return followed._replace(shift=followed.shift + np.append(self.shift, 0.0))
 
     @property
     def average(self) -> WallAverage | None:

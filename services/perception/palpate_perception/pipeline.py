@@ -122,7 +122,7 @@ class Pipeline:
         points = cloud.main_sheet(points, depth, self._region.holds(apply(self._X_AW, points.p_W)))
         p_A = apply(self._X_AW, points.p_W)
 
-        seen = visibility.seen(p_A, self._exam)
+        seen = visibility.find_seen(p_A, self._exam)
         coverage = float(np.mean(seen))
 
         def failed(reason: ViewReason, message: str) -> Perceived:
@@ -145,7 +145,7 @@ class Pipeline:
         field = surface.fit(p_A, points.sigma, self._box.low[:2], self._box.high[:2])
         scan = scan_of(self._exam, lambda xy: _in_A(field, xy + shift))
         nodes = scan.targets + shift  # step 5: the pattern gives places and their order
-        known = cloud.supported(p_A, nodes, self._exam.spacing_m)  # step 4: of those places, the ones with data
+        known = cloud.find_supported(p_A, nodes, self._exam.spacing_m)  # step 4: of those places, the ones with data
         p_W, n_W = self._on(field, nodes)
         targets = Targets(p_W, n_W, scan.line_of_target.astype(np.uint32))
 
@@ -180,7 +180,7 @@ class Pipeline:
         x = stations(cx + shift[0], width + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         y = stations(cy + shift[1], height + 2 * PIPELINE.mesh_margin_m, PIPELINE.mesh_step_m)
         nodes, known = cloud.downsample(p_A, x, y)
-        keep = _grown(known.reshape(len(x), len(y)), 2).ravel()
+        keep = _grow(known.reshape(len(x), len(y)), 2).ravel()
         index = np.arange(len(nodes)).reshape(len(x), len(y))
         a, b, c, d = (i.ravel() for i in (index[:-1, :-1], index[1:, :-1], index[1:, 1:], index[:-1, 1:]))
         triangles = np.concatenate((np.stack((a, b, c), axis=1), np.stack((a, c, d), axis=1)))
@@ -206,7 +206,7 @@ def _remarks(guessed: int, nodes: int, motion: float) -> str:
     return "; ".join(remarks)
 
 
-def _grown(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
+def _grow(mask: NDArray[np.bool_], cells: int) -> NDArray[np.bool_]:
     """Return a mask of the grid, dilated by `cells` in each direction."""
     for _ in range(cells):
         padded = np.pad(mask, 1)

@@ -29,7 +29,6 @@ over all images in which the arm does not hide it. These displacements are fitte
 the surface.
 """
 
-from dataclasses import dataclass
 from enum import Enum, auto
 from typing import Final, NamedTuple
 
@@ -196,8 +195,7 @@ class State(Enum):
     LOST = auto()
 
 
-@dataclass(frozen=True, slots=True)
-class Followed:
+class Followed(NamedTuple):
     """Result of one image."""
 
     state: State

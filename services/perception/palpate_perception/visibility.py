@@ -35,7 +35,7 @@ def cells(exam: Exam) -> tuple[Array, tuple[int, int]]:
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 2), (counts[0], counts[1])
 
 
-def seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
+def find_seen(p_A: Array, exam: Exam) -> NDArray[np.bool_]:
     """Return the mask of cells with a point of the cloud, shape (nx * ny,)."""
     _, (nx, ny) = cells(exam)
     low = np.array(exam.centre_m) - np.array(exam.region_m) / 2

@@ -109,7 +109,7 @@ def to_small(x: Array, axis: int, K: Array, K_small: Array) -> Array:
     return np.asarray((x - K[axis, 2]) / K[axis, axis] * K_small[axis, axis] + K_small[axis, 2])
 
 
-def watched(exam: Exam) -> RegionBox:
+def tracked_area(exam: Exam) -> RegionBox:
     """Return the tracked area, in A."""
     return RegionBox.of(exam, max(WALL_FIT.margin_m, WALL_FIT.half_m - min(exam.region_m) / 2), CROP.height_m)
 
@@ -127,11 +127,11 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
 
     Returns the wall and its displacement [m] in each frame, shape (frames,). Raises WallNotVisibleError.
     """
-    pixel, mean, sigma = steady(frames)
+    pixel, mean, sigma = find_steady(frames)
     X_AC = inverse(X_WA) @ camera.X_WC
     r_C = cloud.deproject(np.ones(camera.shape), camera.K).reshape(-1, 3)[pixel]
     p_A = apply(X_AC, mean[:, np.newaxis] * r_C)
-    box = watched(exam)
+    box = tracked_area(exam)
     keep = box.holds(p_A) & (apply(X_WA, p_A)[:, 2] > TABLE.top_m + CROP.table_clearance_m)
     keep[keep] &= sigma[keep] < WALL_FIT.edge_noise * np.median(sigma[keep]) if keep.any() else False
     _check_count(keep, "show the wall")
@@ -143,7 +143,7 @@ def learn(frames: Array, camera: Intrinsics, X_WA: Array, exam: Exam) -> tuple[W
     pixel, gain = pixel[keep], 1 / slope[keep]
     mean, sigma, p_A, n_A = mean[keep], sigma[keep], p_A[keep], n_A[keep]
 
-    outward = (without_gaps(frames.reshape(len(frames), -1)[:, pixel]) - mean) / gain
+    outward = (fill_gaps(frames.reshape(len(frames), -1)[:, pixel]) - mean) / gain
     mode = _mode(outward, np.abs(gain) / sigma, p_A, exam)
     lifts = mode(p_A)
     weight = lifts * (gain / sigma) ** 2
@@ -163,19 +163,19 @@ def _check_count(keep: NDArray[np.bool_], what: str) -> None:
         raise WallNotVisibleError(f"{count} pixels of the small image {what}, want {WALL_FIT.least_pixels}")
 
 
-def steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
+def find_steady(frames: Array) -> tuple[NDArray[np.intp], Array, Array]:
     """Return the mostly valid pixels (flat), their mean depth and the noise of a frame [m], shape (n,) each."""
     flat = frames.reshape(len(frames), -1)
     pixel = np.flatnonzero(np.isfinite(flat).mean(axis=0) > WALL_FIT.valid_share)
     seen = flat[:, pixel]
-    step = np.diff(without_gaps(seen), axis=0)
+    step = np.diff(fill_gaps(seen), axis=0)
     between = np.isfinite(seen[1:]) & np.isfinite(seen[:-1])  # steps at the edges of gaps are not noise
     noise = np.sqrt(np.sum(np.where(between, step, 0.0) ** 2, axis=0) / np.maximum(between.sum(axis=0), 1) / 2)
     sigma = np.where(between.any(axis=0) & (len(frames) > 2), noise, WALL_FIT.unknown_noise_m)
     return pixel, np.nanmean(seen, axis=0), np.maximum(sigma, 1e-4)
 
 
-def without_gaps(seen: Array) -> Array:
+def fill_gaps(seen: Array) -> Array:
     """Return depths of pixels, shape (frames, n), with gaps (NaN) interpolated over the frames.
 
     Holes of real cameras flicker, and the wall continues to move in a gap.

@@ -79,7 +79,7 @@ def test_down_sampling_gives_one_node_a_cell_and_says_which_have_no_points() -> 
     assert nodes.shape == (15, 2)
     np.testing.assert_allclose(nodes[:3], [(-0.1, -0.05), (-0.1, 0.0), (-0.1, 0.05)])
     np.testing.assert_allclose(nodes[~known], [(0.05, 0.0)], atol=1e-12)
-    assert (cloud.supported(p[~hole], nodes, 0.05) == known).all()
+    assert (cloud.find_supported(p[~hole], nodes, 0.05) == known).all()
 
 
 LOW, HIGH = (-0.13, -0.13), (0.13, 0.13)

@@ -12,7 +12,7 @@ from palpate_models.scenario.load import exam_input, load_scenario
 from palpate_models.scenario.schema import Robot
 from palpate_perception.breath_filter import BreathFilter
 from palpate_perception.follower import ArmMask
-from palpate_perception.wall import steady, without_gaps
+from palpate_perception.wall import fill_gaps, find_steady
 from research.following import READY, Patient, Run, run
 
 
@@ -157,8 +157,8 @@ def test_pixels_whose_holes_flicker_show_the_whole_breath_and_no_less_noise() ->
     breath = 0.004 * np.sin(np.arange(80) * 2 * np.pi / 40)
     frames = 1.0 + breath[:, None] + rng.normal(0.0, 0.002, (80, 200))
     frames[rng.random(frames.shape) < 0.2] = np.nan
-    filled = without_gaps(frames)
+    filled = fill_gaps(frames)
     assert np.isfinite(filled).all()
     assert np.ptp(filled.mean(axis=1)) > 0.95 * np.ptp(breath)
-    _, _, sigma = steady(frames.reshape(80, 10, 20))
+    _, _, sigma = find_steady(frames.reshape(80, 10, 20))
     assert abs(np.median(sigma) - 0.002) < 0.0002

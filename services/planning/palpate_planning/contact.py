@@ -94,15 +94,15 @@ class ContactMeasurement(NamedTuple):
     foot: Foot
     """The point of the perceived surface under the indenter."""
     wall: WallEstimate
-    """Height of the skin above it; its standard deviation is that of the depth."""
+    """Height of the wall above it; its standard deviation is that of the depth."""
     depth: float
-    """Radius less the signed distance of the sphere's centre from the present unpressed skin [m]; negative: gap."""
+    """Radius less the signed distance of the sphere's centre from the present unpressed wall [m]; negative: gap."""
     force: float
     """Normal force [N], positive when the tissue is pressed."""
     load: float
     """Magnitude of the whole force, normal and lateral [N]: the larger of F/T sensor and joints, less the joints' error."""
-    skin: tuple[Array, Array]
-    """Point of the skin under the indenter and its outward normal, in the frame of the first view (`Wall.skin`)."""
+    wall_point: tuple[Array, Array]
+    """Point of the wall under the indenter and its outward normal, in the frame of the first view (`Wall.point`)."""
     touching: bool
     """True in contact by the F/T sensor; False before the first tare, when the sensor's bias would look like contact."""
     joints_only: bool = False
@@ -135,7 +135,7 @@ class ContactSensing:
         self._touching = self.compensation.tared and force > (THRESHOLDS.off_n if self._touching else THRESHOLDS.on_n)
         load, by_joints = float(np.linalg.norm(force_W)), joint_force - THRESHOLDS.joints_n
         depth = self._radius - foot.distance + place.correction + place.displacement
-        skin, joints_only = wall.skin(foot, place.correction), by_joints > 0.0 and not self._touching
+        point, joints_only = wall.point(foot, place.correction), by_joints > 0.0 and not self._touching
         return ContactMeasurement(
-            reading.q, X_WI, R_WS, foot, place, depth, force, max(load, by_joints), skin, self._touching, joints_only
+            reading.q, X_WI, R_WS, foot, place, depth, force, max(load, by_joints), point, self._touching, joints_only
         )

@@ -18,7 +18,7 @@ from palpate_planning.motion.timing import RestartRamp
 from palpate_planning.palpation import REPLANNED, Palpation, PalpationStep
 from palpate_planning.periods import MS, SECOND
 from palpate_planning.presses import RequestedPresses
-from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, counted
+from palpate_planning.reasons import FAULTS, MOVED, NO_CAUSE, Cause, Reason, count_causes
 from palpate_planning.setpoints import joint_setpoint
 from palpate_planning.status import OVER, PALPATING, PHASE_OF, ExamStep, Observation, Phase
 from palpate_planning.stops import ExamCourse, Stops
@@ -269,7 +269,7 @@ class ExaminationSequence:
             out.path, course.palpation = plan.poses(self._known.robot.indenter_radius_m, self._known.exam.depth_m), None
             course.arm.start(plan.approach)
             self.status.targets_skipped = len(self.skipped)
-            course.enter(Phase.APPROACH, now.t, counted(plan.skipped.values()) or "approaching the first target")
+            course.enter(Phase.APPROACH, now.t, count_causes(plan.skipped.values()) or "approaching the first target")
         elif self._planning.late(now.t):
             self._planning = None
             self._give_up(now, out, FOR_PLAN.end)
@@ -370,7 +370,7 @@ class ExaminationSequence:
         """End the examination at `t` [ns]: complete, incomplete, or failed because faults have cost too many targets."""
         count, skipped, unplanned = self.status.target_count, self.skipped, self._remainder.unplanned
         lost = Counter(cause for cause in skipped.values() if cause.loss in FAULTS)
-        missing = [f"{len(skipped)} of {count} targets not felt: {counted(skipped.values())}"] if skipped else []
+        missing = [f"{len(skipped)} of {count} targets not felt: {count_causes(skipped.values())}"] if skipped else []
         missing += [f"the rest was left: {unplanned}"] if unplanned else []
         text = "; ".join(("examination incomplete", *missing)) if missing else "examination complete"
         if lost.total() > EXAM.lost_fraction_max * count:

@@ -2,7 +2,6 @@
 
 from collections import deque
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -25,7 +24,7 @@ class WallTuning(NamedTuple):
     """Times and limits for a wall that cannot be tracked or touched."""
 
     calm_s: float = 1.0
-    """After a cough or a deep breath the skin is left alone until the wall has been tracked for this time."""
+    """After a cough or a deep breath the wall is left alone until it has been tracked for this time."""
     hidden_timeout_s: float = 5.0
     """The arm leaves if it hides the wall for this time; a deep breath or a cough, which also hides it, is shorter."""
     contact_lost_s: float = 0.3
@@ -64,7 +63,7 @@ class SurgeTuning(NamedTuple):
     least_nps: float = 60.0
     """Twice the rate in the fastest descent into a stiff wall."""
     ahead_s: float = 0.1
-    """The arm retreats if the force would pass its working limit within this time: a cough lifts the skin for as long."""
+    """The arm retreats if the force would pass its working limit within this time: a cough lifts the wall for as long."""
 
 
 WALL: Final = WallTuning()
@@ -150,7 +149,7 @@ class Displacement:
         """Return the set-point, displaced by the remaining gap."""
         V_WD = setpoint.V_WD.copy()
         V_WD[:3] += self._direction * self._length.velocity
-        return replace(setpoint, p_WD=setpoint.p_WD + self._direction * self._length.position, V_WD=V_WD)
+        return setpoint._replace(p_WD=setpoint.p_WD + self._direction * self._length.position, V_WD=V_WD)
 
     def shrink(self) -> bool:
         """Return to the path for one period; True once there."""
@@ -219,7 +218,7 @@ class Recovery:
         self.resume_at, self._repeats = None, 0
 
     def _skip(self, segment: Segment, visits: Bools, cause: Cause) -> None:
-        """Skip targets, unless the skin is only touched there: they are pressed later."""
+        """Skip targets, unless the wall is only touched there: they are pressed later."""
         if not segment.touch:
             self.skipped |= dict.fromkeys((int(i) for i in segment.path.targets[visits]), cause)
 
@@ -247,7 +246,7 @@ class Recovery:
         return float(np.linalg.norm(gap - (gap @ point.n) * point.n))
 
     def return_to_path(self, contact: ContactMeasurement) -> None:
-        """Return to the path for one period: only clear of the skin, and not while the arm waits or gives up."""
+        """Return to the path for one period: only clear of the wall, and not while the arm waits or gives up."""
         if self.displacement is None:
             return
         if self.failed or self.paused or contact.depth > -RECOVERY.clear_height_m:

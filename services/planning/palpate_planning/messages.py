@@ -20,7 +20,7 @@ COINCIDENT_M = 1e-4
 
 def state_message(t: int, status: ExamStatus, contact: ContactMeasurement | None) -> Message:
     """Return `palpation_msgs/ExamState`; without a contact (before the first reading of the robot) nothing is measured."""
-    p, n = (np.zeros(3), np.array((0.0, 0.0, 1.0))) if contact is None else contact.skin
+    p, n = (np.zeros(3), np.array((0.0, 0.0, 1.0))) if contact is None else contact.wall_point
     fields = {name: value for name, value in vars(status).items() if name not in ("phase", "cause")}
     return ExamState(
         header=header(t, "world"),

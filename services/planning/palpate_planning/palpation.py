@@ -2,8 +2,8 @@
 
 | what happens | arm | targets ahead |
 |---|---|---|
-| the last segment ends, and no `more` may follow | stays above the skin | none |
-| no request in time (`early_end`) | stays above the skin | none |
+| the last segment ends, and no `more` may follow | stays above the wall | none |
+| no request in time (`early_end`) | stays above the wall | none |
 | `leave`: patient moved, wall hidden, elbow too straight, first place without tissue, long wait | lifts and ends | `ahead` |
 | `abandon`, last allowed soft stop or place without tissue (`failed`) | lifts and ends; at once in free motion | `remaining` |
 | `pause` | lifts and waits for `resume` | examined from there |
@@ -158,7 +158,7 @@ class Palpation:
         self._segments += segments
 
     def abandon(self, cause: Cause) -> None:
-        """Lift off and end. A free motion ends at once: it has no skin to lift off from, and the arm may be off its path."""
+        """Lift off and end. A free motion ends at once: it has no wall to lift off from, and the arm may be off its path."""
         self.recovery.give_up(cause)
         if self._motion.segment.free is not None:
             self._continue_with(_done())
@@ -186,7 +186,7 @@ class Palpation:
     def resume(self, t: int, contact: ContactMeasurement) -> None:
         """Continue at `t` [ns] after a pause, from where the arm is: the tissue has pushed it while the driver held it.
 
-        It lifts first and returns laterally above the skin, since the arm must not be drawn through tissue.
+        It lifts first and returns laterally above the wall, since the arm must not be drawn through tissue.
         """
         self.recovery.paused = False
         if self._motion.segment.free is not None:
@@ -203,34 +203,55 @@ class Palpation:
         self._continue_with(self._remaining())
 
     def step(self, t: int, contact: ContactMeasurement, rate: float = 1.0) -> PalpationStep:
-        """Advance one planning period, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`."""
-        motion, descent = self._motion, self.descent
-        descent.taring, descent.touched = False, None
+        """Advance one planning period, at `t` [ns], given the measured contact; `rate` as in `RestartRamp`.
+
+        Each part needs those before it: an interruption replaces the stages, the stages set the target of the motion, the depth
+        is regulated towards it, and the report shows the result.
+        """
+        self._correct(contact)
+        self._check_interruptions(t, contact)
+        self._resume_stages(t, contact, rate)
+        self._regulate(contact)
+        return self._report(t, contact, rate)
+
+    def _correct(self, contact: ContactMeasurement) -> None:
+        """Return towards the path, and refit the latest touch unless samples are taken."""
         self.recovery.return_to_path(contact)
         if self.stage not in (StrokeStage.SLIDE, StrokeStage.HOLD):
-            descent.revise()
+            self.descent.revise()
+
+    def _check_interruptions(self, t: int, contact: ContactMeasurement) -> None:
+        """Replace the stages where something interrupts them; each check sees what those before it have begun."""
         self._check_force(contact)
         self._check_elbow(contact)
         self._check_wall(t, contact)
         self._check_waits()
+
+    def _resume_stages(self, t: int, contact: ContactMeasurement, rate: float) -> None:
+        """Resume the stages for one period, in which they may tare the sensor or find the touch."""
+        descent, recovery = self.descent, self.recovery
+        descent.taring, descent.touched = False, None
         self.stage = self._stages.send(
             StrokeInput(
                 t,
                 contact,
                 open=self._watch.open,
                 calm=self._watch.calm,
-                aligned=self.recovery.displacement is None,
-                paused=self.recovery.paused,
-                ending=self.recovery.ending,
+                aligned=recovery.displacement is None,
+                paused=recovery.paused,
+                ending=recovery.ending,
                 rate=rate,
             )
         )
-        if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and motion.segment.touch):
-            self.waits.reach(self._number, motion.along.position, at_depth=not motion.segment.touch)
+        only_touched = self._motion.segment.touch
+        if self.stage in (StrokeStage.SLIDE, StrokeStage.HOLD) or (descent.touched and only_touched):
+            self.waits.reach(self._number, self._motion.along.position, at_depth=not only_touched)
+
+    def _regulate(self, contact: ContactMeasurement) -> None:
+        """Regulate the depth towards the target of the stage."""
         in_contact = contact.touching and self.stage is not StrokeStage.LIFT
         pushing = self.stage in PUSHING and not (self.recovery.paused or self.recovery.ending)
-        motion.regulate(contact, in_contact=in_contact, pushing=pushing)
-        return self._report(t, contact, rate)
+        self._motion.regulate(contact, in_contact=in_contact, pushing=pushing)
 
     # --- the sequence -------------------------------------------------------------------------------------------------
 
@@ -255,7 +276,7 @@ class Palpation:
         yield from self._remaining()
 
     def _wait(self) -> Stages[bool]:
-        """Wait above the skin; return True if a further segment follows."""
+        """Wait above the wall; return True if a further segment follows."""
         while True:
             now = yield StrokeStage.WAIT
             self._motion.depth.step(-SEGMENTS.hover_m, STROKE.lift_mps)
@@ -284,7 +305,7 @@ class Palpation:
             self.recovery.give_up(cause._replace(text=text))
 
     def _lift(self) -> Stages[None]:
-        """Lift off; take the stroke up again where it was interrupted, else move above the skin to the end of its path."""
+        """Lift off; take the stroke up again where it was interrupted, else move above the wall to the end of its path."""
         motion, recovery = self._motion, self.recovery
         while True:
             yield from lift(motion, self._height)
@@ -395,7 +416,7 @@ class Palpation:
         return FOR_BREATH if stage in (StrokeStage.SLIDE, StrokeStage.HOLD) and not open_gate else None
 
     def _rise(self) -> None:
-        """Lift from low above the skin to where a sudden motion of the wall does not reach."""
+        """Lift from low above the wall to where its sudden motion does not reach."""
         if self.stage is StrokeStage.REST and self._motion.joined:
             self.recovery.resume_at = self._motion.along.position
             self._interrupt()

@@ -97,7 +97,7 @@ NO_CAUSE: Final = Cause()
 MOVED: Final = Cause(Reason.PATIENT_MOVED, "the patient has moved")
 
 
-def counted(causes: Iterable[Cause]) -> str:
+def count_causes(causes: Iterable[Cause]) -> str:
     """Return how many targets have each cause, as text."""
     counts = Counter(cause.text for cause in causes)
     return "; ".join(f"{count} targets skipped: {text}" for text, count in sorted(counts.items()))

@@ -1,6 +1,5 @@
 """The two kinds of set-point of planning, with the stiffness of each."""
 
-from dataclasses import replace
 from typing import Final
 
 import numpy as np
@@ -9,7 +8,7 @@ from palpate_bus.setpoint import ControlMode, Setpoint
 from palpate_models.numerics.frames import Array
 
 
-def _fixed(values: list[float]) -> Array:
+def _freeze(values: list[float]) -> Array:
     array = np.array(values)
     array.setflags(write=False)
     return array
@@ -17,14 +16,14 @@ def _fixed(values: list[float]) -> Array:
 
 NORMAL_STIFFNESS: Final = 5000.0
 """K_z [N/m] along the tool: the depth error is 0.4 to 1.5 mm even before regulation."""
-CARTESIAN_STIFFNESS: Final = _fixed([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
+CARTESIAN_STIFFNESS: Final = _freeze([3000.0, 3000.0, NORMAL_STIFFNESS, 250.0, 250.0, 100.0])
 """[N/m, N m/rad] in axes of the indenter: stiff along the tool, softer across it, softest in spin."""
-DAMPING_RATIO: Final = _fixed([0.8] * 6)
+DAMPING_RATIO: Final = _freeze([0.8] * 6)
 POSTURE_STIFFNESS: Final = 20.0
 """Null space in contact [N m/rad]; the controller caps its torque at 5 N m."""
-_NO_TWIST: Final = _fixed([0.0] * 6)
-_NO_WRENCH: Final = _fixed([0.0] * 6)
-_NO_JOINTS: Final = _fixed([])
+_NO_TWIST: Final = _freeze([0.0] * 6)
+_NO_WRENCH: Final = _freeze([0.0] * 6)
+_NO_JOINTS: Final = _freeze([])
 AT_REST: Final = Setpoint(
     stamp=0,
     mode=ControlMode.JOINT,
@@ -46,7 +45,7 @@ def joint_setpoint(t: int, X_WI: Array, q: Array, qd: Array, stiffness: Array) -
 
     X_WI, shape (4, 4): desired pose of the indenter, at `q`; drivers that take Cartesian set-points follow it.
     """
-    return replace(AT_REST, stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
+    return AT_REST._replace(stamp=t, R_WD=X_WI[:3, :3], p_WD=X_WI[:3, 3], q=q, qd=qd, joint_stiffness=stiffness)
 
 
 def cartesian_setpoint(
@@ -57,4 +56,4 @@ def cartesian_setpoint(
     Shapes and units as in `Setpoint`.
     """
     motion = {"R_WD": R_WD, "p_WD": p_WD, "V_WD": V_WD, "F_W": F_W, "q": q, "qd": np.zeros_like(q) if qd is None else qd}
-    return replace(AT_REST, stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=np.full_like(q, POSTURE_STIFFNESS), **motion)
+    return AT_REST._replace(stamp=t, mode=ControlMode.CARTESIAN, joint_stiffness=np.full_like(q, POSTURE_STIFFNESS), **motion)

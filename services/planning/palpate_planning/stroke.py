@@ -1,4 +1,4 @@
-"""One stroke: rest and tare above the skin, descend to the touch, indent, settle, slide or hold, lift.
+"""One stroke: rest and tare above the wall, descend to the touch, indent, settle, slide or hold, lift.
 
 `press`, `lift` and `travel` are generators. Each resumption is one planning period: it receives a `StrokeInput`, moves the
 indenter (`StrokeMotion`) and yields the stage of the stroke. The planning service and the quick tier drive the same generators.
@@ -37,13 +37,13 @@ class StrokeTuning(NamedTuple):
 
 
 class TouchTuning(NamedTuple):
-    """Times of taring, speeds and range of the search for the skin."""
+    """Times of taring, speeds and range of the search for the wall."""
 
     descend_mps: float = 0.08
     probe_mps: float = 0.014
-    """Speed at which the skin is sought: force rises by about 3 N/s."""
+    """Speed at which the wall is sought: force rises by about 3 N/s."""
     sigmas: float = 3.0
-    """The skin is sought within this many standard deviations of its estimate."""
+    """The wall is sought within this many standard deviations of its estimate."""
     blind_m: float = 0.020
     """Maximum search depth below the estimated wall: three SD of camera and arm together (6.5 mm with typical
     errors, 1,000 tuning seeds)."""
@@ -93,7 +93,7 @@ class StrokeInput(NamedTuple):
     aligned: bool = True
     """True if the arm is on its path: it was not pushed aside."""
     paused: bool = False
-    """True if the arm has to wait above the skin."""
+    """True if the arm has to wait above the wall."""
     ending: bool = False
     """True if no stroke follows: the arm lifts, whatever the wall does."""
     rate: float = 1.0
@@ -118,12 +118,12 @@ class Duration:
 
 
 def clearance(sigma: float) -> float:
-    """Return the height [m] at which skin that is known within `sigma` [m] is not touched, and from which it is sought."""
+    """Return the height [m] at which a wall that is known within `sigma` [m] is not touched, and from which it is sought."""
     return min(max(STROKE.hop_height_m, TOUCH.sigmas * sigma + TOUCH.margin_m), SEGMENTS.hover_m)
 
 
 def press(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
-    """Press along the segment; return why the skin was not pressed, if it was not."""
+    """Press along the segment; return why the wall was not pressed, if it was not."""
     yield from _rest(motion, descent)
     cause = yield from _descend(motion, descent)
     if cause or motion.segment.touch:
@@ -137,7 +137,7 @@ def press(motion: StrokeMotion, descent: Descent) -> Stages[Cause]:
 
 
 def _rest(motion: StrokeMotion, descent: Descent) -> Stages[None]:
-    """Rest above the skin, in free air, until the sensor is tared."""
+    """Rest above the wall, in free air, until the sensor is tared."""
     descent.start()
     height, rested = 0.0, False
     while not rested:
@@ -206,7 +206,7 @@ def lift(motion: StrokeMotion, height: Callable[[int], float]) -> Stages[None]:
 
 
 def travel(motion: StrokeMotion, goal: float) -> Stages[None]:
-    """Follow the path above the skin to path length `goal` [m]."""
+    """Follow the path above the wall to path length `goal` [m]."""
     arrived = False
     while not arrived:
         now = yield StrokeStage.TRANSFER
@@ -241,10 +241,10 @@ def is_limited(stage: StrokeStage, motion: StrokeMotion) -> bool:
 
 
 class Descent:
-    """Takes one stroke after another down to the skin; the touch corrects the wall, and depth is counted from there."""
+    """Takes one stroke after another down to the wall; the touch corrects its estimate, and depth is counted from there."""
 
     def __init__(self, motion: StrokeMotion, depth: float, strokes: int = 0) -> None:
-        """Args: `depth` [m] below the skin at which force is measured at the latest; `strokes`: descents made before."""
+        """Args: `depth` [m] below the wall at which force is measured at the latest; `strokes`: descents made before."""
         self._motion, self._depth = motion, depth
         self.stroke = strokes
         """Number of the present or latest descent, from 1 on."""
@@ -264,7 +264,7 @@ class Descent:
         """Cause of a failed search, if any."""
 
     def rest(self, height: float) -> bool:
-        """Rest `height` [m] above the skin; return True once the sensor is tared."""
+        """Rest `height` [m] above the wall; return True once the sensor is tared."""
         rested_s = self._rested.update(self._motion.depth.step(-height, STROKE.lift_mps))
         over = rested_s >= TOUCH.rest_s + TOUCH.tare_s
         self.taring = not over and rested_s >= TOUCH.rest_s
@@ -272,7 +272,7 @@ class Descent:
         return over
 
     def probe(self, now: StrokeInput) -> bool:
-        """Descend fast to the uncertainty of the wall, from there at probe speed; return True once the skin is touched.
+        """Descend fast to the uncertainty of the wall, from there at probe speed; return True once the wall is touched.
 
         What is known of the wall bounds the descent, whatever the force is.
         """

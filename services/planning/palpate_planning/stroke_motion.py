@@ -140,7 +140,7 @@ class StrokeMotion:
         return self._radius + self.wall.outward(self.point.p, t)
 
     def free_height(self, t: int) -> float:
-        """Return the height [m] above the skin at `t` [ns] for free motions, which keep clear of the perceived surface, too."""
+        """Return the height [m] above the wall at `t` [ns] for free motions, which keep clear of the perceived surface, too."""
         return SEGMENTS.hover_m + max(0.0, -self.wall.outward(self.point.p, t))
 
     @property
@@ -156,7 +156,7 @@ class StrokeMotion:
     def bend_needed(self, q: Array) -> float:
         """Return the bend [rad] that a plan needs for the elbow not to become too straight, at measured joint positions q [rad].
 
-        The square of the bend falls in proportion to the arm's reach. Where the skin is deeper or more lateral than perceived,
+        The square of the bend falls in proportion to the arm's reach. Where the wall is deeper or more lateral than perceived,
         the elbow bends less than planned, and will do so by as much on the rest of the plan.
         """
         lost = self._arm.bend(self.point.q) ** 2 - self._arm.bend(q) ** 2
@@ -216,7 +216,7 @@ class StrokeMotion:
     def regulate(self, contact: ContactMeasurement, *, in_contact: bool, pushing: bool) -> None:
         """Regulate the measured depth towards the target depth.
 
-        `in_contact` enables the integral of the error, `pushing` the feed-forward of force: above the skin the tool does not
+        `in_contact` enables the integral of the error, `pushing` the feed-forward of force: above the wall the tool does not
         push back.
         """
         if self.segment.free is not None:  # the stroke after it begins where the arm is then

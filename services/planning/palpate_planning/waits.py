@@ -86,7 +86,7 @@ class StrokeWaits:
         """The present wait, once it has lasted for `reported_s`."""
 
     def reach(self, segment: int, position: float, *, at_depth: bool) -> None:
-        """A stroke touches the skin or slides; it makes progress if it was not as far before."""
+        """A stroke touches the wall or slides; it makes progress if it was not as far before."""
         self.pressed = self.pressed or at_depth
         if segment > self._segment or position >= self._position + WAIT.progress_m:
             self._segment, self._position = segment, position

@@ -187,7 +187,7 @@ def test_after_patient_motion_a_new_scan_continues_the_examination() -> None:
     assert status.stroke > strokes
     assert not status.patient_moved
     foot = world.exam._course.contact.foot
-    place = world.exam._sense.wall.perceived.xy(world.exam._course.contact.skin[0])
+    place = world.exam._sense.wall.perceived.xy(world.exam._course.contact.wall_point[0])
     assert place == pytest.approx(foot.xy_A - (0.008, -0.003), abs=5e-4)
     world.run()
     assert status.phase is Phase.DONE

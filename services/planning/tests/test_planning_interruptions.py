@@ -1,7 +1,5 @@
 """Tests of stops, pushes and unexpected motion of the wall: the examination waits, resumes or ends."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from planning_fakes import World, known
@@ -266,7 +264,7 @@ def test_an_arm_that_was_moved_off_a_free_motion_is_not_drawn_back_to_it() -> No
     palpation = world.exam._course.palpation
     assert palpation is not None
     posture = JointTrajectory(np.tile(world.q, (50, 1)), np.zeros((50, 7)))
-    palpation._motion.segment = replace(palpation._motion.segment, free=posture)
+    palpation._motion.segment = palpation._motion.segment._replace(free=posture)
     for _ in range(5):
         world.step()
     world.stop = Cause(Reason.ROBOT_HOLD, "")

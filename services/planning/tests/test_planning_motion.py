@@ -13,7 +13,7 @@ from palpate_models.scenario.schema import Limits, Robot
 from palpate_planning.motion.kinematics import KINEMATIC_LIMITS, ArmKinematics
 from palpate_planning.motion.planner import NoPathError, plan
 from palpate_planning.motion.scene import CollisionScene
-from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, rounded
+from palpate_planning.motion.timing import JerkLimitedAxis, SpeedLimit, joint_trajectory, round_corners
 from palpate_planning.strokes.path import centre, least_twist
 from palpate_planning.strokes.plan import ExamPlanner, look_postures
 from palpate_planning.strokes.segments import REACH, STRETCHED
@@ -102,7 +102,7 @@ def test_ends_in_collision_are_named() -> None:
 @pytest.mark.parametrize("points", [(np.array(lbr.HOME), above(0.05, 0.05, 0.03)), AROUND])
 def test_timing_keeps_all_limits(points: tuple[np.ndarray, np.ndarray]) -> None:
     path = plan(SCENE, *points, BOUNDS, 1)
-    trajectory = joint_trajectory(KINEMATICS, rounded(path, 0.1), LIMITS, PERIOD_S)
+    trajectory = joint_trajectory(KINEMATICS, round_corners(path, 0.1), LIMITS, PERIOD_S)
     assert trajectory.q[0] == pytest.approx(points[0], abs=1e-3)
     assert trajectory.q[-1] == pytest.approx(points[1], abs=1e-9)
     speed = np.abs(np.diff(trajectory.q, axis=0)) / PERIOD_S

@@ -7,7 +7,7 @@ message encoding `cdr`, schema encoding `ros2msg`; see MCAP's well-known profile
 from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import yaml
 from mcap.writer import CompressionType, Writer
@@ -16,8 +16,7 @@ from palpate_bus.messages.stamps import MS
 from palpate_bus.settings import KEPT_EVERY
 
 
-@dataclass(frozen=True)
-class BagSizes:
+class BagSizes(NamedTuple):
     """Sizes of chunks and files."""
 
     chunk_bytes: int = 4 * 1024 * 1024
@@ -34,8 +33,7 @@ _INFINITE = {"sec": 9223372036, "nsec": 854775807}
 """RMW_DURATION_INFINITE, as rosbag2 writes it."""
 
 
-@dataclass(frozen=True)
-class Channel:
+class Channel(NamedTuple):
     """Description of a topic in the file."""
 
     topic: str

@@ -101,8 +101,8 @@ class Driver:
         self._before: Array | None = None
         """Values of the last checked command; None if no command was accepted since the driver was IDLE."""
         still = np.zeros(arm.joints)  # compiles the functions of a tick
-        _within(still, still, arm.lower_rad, arm.upper_rad, arm.velocity_radps)
-        _acceptable(still, still, still, arm.torque_nm, TUNING.torque_rate_nm_per_ms)
+        _is_within(still, still, arm.lower_rad, arm.upper_rad, arm.velocity_radps)
+        _is_acceptable(still, still, still, arm.torque_nm, TUNING.torque_rate_nm_per_ms)
 
     @property
     def held(self) -> bool:
@@ -170,7 +170,7 @@ class Driver:
 
     def _check_joints(self, t: int, q: Array, v: Array) -> None:
         arm = self._arm
-        if _within(q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps):
+        if _is_within(q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps):
             return
         for joint, q_i, v_i, low, high, fastest in zip(
             arm.joint_names, q, v, arm.lower_rad, arm.upper_rad, arm.velocity_radps, strict=True
@@ -223,7 +223,7 @@ class Driver:
         first, limit = self._before is None, self._arm.torque_nm
         before = self._still if self._before is None else self._before
         change = TUNING.first_torque_nm if first else TUNING.torque_rate_nm_per_ms * interval_ms
-        if _acceptable(wanted, gravity, before, limit, change):
+        if _is_acceptable(wanted, gravity, before, limit, change):
             return None
         over, far = ~(np.abs(wanted + gravity) <= limit), ~(np.abs(wanted - before) <= change)  # also for NaN
         k = int(np.argmax(over | far))
@@ -259,12 +259,12 @@ class Driver:
 
 
 @compiled
-def _within(q: Array, v: Array, lower: Array, upper: Array, velocity_limit: Array) -> bool:
+def _is_within(q: Array, v: Array, lower: Array, upper: Array, velocity_limit: Array) -> bool:
     """Return True if positions and velocities, shapes (n,), are within their limits and not NaN."""
     return bool(np.all(q >= lower) and np.all(q <= upper) and np.all(np.abs(v) <= velocity_limit))
 
 
 @compiled
-def _acceptable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
+def _is_acceptable(torque: Array, gravity: Array, before: Array, limit: Array, change: float) -> bool:
     """Return True if a command (n,) plus gravity is within its limit and within `change` of the previous one [N m]."""
     return bool(np.all(np.abs(torque + gravity) <= limit) and np.all(np.abs(torque - before) <= change))

@@ -30,7 +30,7 @@ compiled function costs 0.1 us."""
 
 
 @compiled
-def _turned(a: Vector, axis: Vector, angle: float) -> Vector:
+def _turn(a: Vector, axis: Vector, angle: float) -> Vector:
     """Return `a` rotated by exp([axis] angle) with Rodrigues' formula; `axis` is of unit length."""
     c, s = cos(angle), sin(angle)
     return add(add(scale(c, a), scale(s, cross(axis, a))), scale((1.0 - c) * dot(axis, a), axis))
@@ -44,14 +44,14 @@ def _in_world(links: Array, i: int, a: Vector) -> Vector:
 
 
 @compiled
-def _placed(chain: Array, q: Array) -> Array:
+def _place(chain: Array, q: Array) -> Array:
     """Return the links of a chain in world at joint positions `q`, shape (n + 1, 19)."""
     links = chain.copy()
     for i in range(1, len(links)):
         axis = _in_world(links, i - 1, row(chain, i, _AXIS))
         origin = add(row(links, i - 1, _ORIGIN), _in_world(links, i - 1, row(chain, i, _ORIGIN)))
         x, y, z = row(links, i - 1, _X), row(links, i - 1, _Y), row(links, i - 1, _Z)
-        links[i, :_AXIS] = _turned(x, axis, q[i - 1]) + _turned(y, axis, q[i - 1]) + _turned(z, axis, q[i - 1]) + origin
+        links[i, :_AXIS] = _turn(x, axis, q[i - 1]) + _turn(y, axis, q[i - 1]) + _turn(z, axis, q[i - 1]) + origin
         links[i, _AXIS:_MASS] = axis + add(origin, _in_world(links, i, row(chain, i, _CENTRE)))
     return links
 
@@ -77,7 +77,7 @@ def _quaternion(links: Array, i: int) -> tuple[float, float, float, float]:
 @compiled
 def _state(chain: Array, mounts: Array, q: Array, v: Array) -> Array:
     """Return `Kinematics.state`. From the last joint to the first, the mass behind a joint grows by a link."""
-    links, n = _placed(chain, q), len(q)
+    links, n = _place(chain, q), len(q)
     p_WI = add(row(links, n, _ORIGIN), _in_world(links, n, row(mounts, 2, 0)))
     state = np.empty(13 + n)
     velocity = angular_velocity = moment = (0.0, 0.0, 0.0)
@@ -96,7 +96,7 @@ def _state(chain: Array, mounts: Array, q: Array, v: Array) -> Array:
 @compiled
 def _links(chain: Array, mounts: Array, q: Array) -> Array:
     """Return `Kinematics.links`. Flange, sensor and indenter are at `mounts` (3, 3) in the last link [m]."""
-    links, n = _placed(chain, q), len(q)
+    links, n = _place(chain, q), len(q)
     poses = np.empty((n + 4, 7))
     for i in range(n + 1):
         poses[i] = row(links, i, _ORIGIN) + _quaternion(links, i)

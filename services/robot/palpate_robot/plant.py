@@ -17,7 +17,7 @@ STICK_RADPS: Final = 1e-3
 """Speed below which friction is viscous: a joint loaded below its Coulomb friction creeps slower than this (assumed)."""
 
 
-def nominal(robot: Robot) -> DrawnArm:
+def nominal_arm(robot: Robot) -> DrawnArm:
     """Return an arm without errors."""
     return draw_arm(ArmErrors(), np.random.Generator(np.random.PCG64(0)), arm_of(robot).joints)
 

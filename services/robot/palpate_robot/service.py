@@ -9,7 +9,7 @@ import numpy as np
 from palpate_bus.contract import contract
 from palpate_bus.messages import Header, JointState, RobotStatus, String, Time, Vector3, Wrench, WrenchStamped
 from palpate_bus.messages.codec import Message
-from palpate_bus.messages.geometry import wrench_message
+from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
 from palpate_bus.messages.stamps import NS
 from palpate_bus.service import Inbox, Outbox, Service
 from palpate_models.numerics.frames import GRAVITY, Array
@@ -18,7 +18,6 @@ from palpate_models.scenario.arm_file import CommandLevel
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.driver import Driver, DriverMode, HoldCause
-from palpate_robot.messages import link_poses, tool_state
 from palpate_robot.plant import DT, PlantFactory
 from palpate_robot.position_loop import PositionLoop
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
@@ -85,14 +84,14 @@ class RobotService(Service):
         stamp = Time(t // NS, t % NS)
         yield {"joint_states": self._joint_state(stamp)}
         motion = self._plant.tool_motion().tolist()
-        yield {"sim/tool_state": tool_state(Header(stamp, "world"), motion, self._robot.indenter_radius_m)}
+        yield {"sim/tool_state": tool_message(Header(stamp, "world"), motion, self._robot.indenter_radius_m)}
         x, y, z, w = motion[3:7]
         up_S = (2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y))
         outbox: dict[str, Message] = {"ft/wrench": self._wrench(stamp, up_S)}
         if not t % _STATUS_PERIOD:
             outbox["robot/status"] = self._status(stamp)
         if not t % _LINKS_PERIOD:
-            outbox["sim/link_poses"] = link_poses(Header(stamp, "world"), self._links, self._plant.link_poses())
+            outbox["sim/link_poses"] = frames_message(Header(stamp, "world"), self._links, self._plant.link_poses())
         yield outbox
 
     def finish(self) -> Mapping[str, Any]:

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from scipy.linalg import solve_triangular
 from scipy.special import erfc, logsumexp
 
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import lump_covariance, natural
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import ABDOMEN, USUAL
@@ -200,7 +200,7 @@ class Posterior:
 
     def add(self, felt: Press) -> None:
         """Update the posterior with a press."""
-        calibration = learned()
+        calibration = load_calibration()
         depth, force = max(felt.depth, PRESSES.least_measured_m), max(felt.force, 0.1)
         log_depth, error = float(np.log(depth / press.DEPTH_M)), calibration.exponent / depth * felt.depth_uncertainty
         y = float(np.log(force)) - calibration.exponent * log_depth - np.log(USUAL_N)

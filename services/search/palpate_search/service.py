@@ -136,12 +136,12 @@ def next_press(chosen: Policy, posterior: Posterior, left: Budget) -> tuple[Arra
     asked: Any = chosen(posterior, left)
     try:
         place, depth = asked
-        return checked(place, float(depth), posterior.task)
+        return check_request(place, float(depth), posterior.task)
     except (TypeError, ValueError) as error:
         raise PluginError(f"search.policy: returned {asked!r}, want (place, depth): (x, y) [m] and a number [m]") from error
 
 
-def checked(place: ArrayLike, depth: float, task: Task) -> tuple[Array, float]:
+def check_request(place: ArrayLike, depth: float, task: Task) -> tuple[Array, float]:
     """Return the place [m] and depth [m] requested by a policy. Raises PluginError outside the allowed range."""
     xy, rounded = np.asarray(place, dtype=float), TUNING.rounded_m
     if xy.shape != (2,) or not np.all((xy >= task.low - rounded) & (xy <= task.high + rounded)):  # also rejects NaN

@@ -11,7 +11,7 @@ from scipy.stats import multivariate_normal
 
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import natural
 from palpate_assessment.shapes import Bump
 from palpate_assessment.standard import USUAL
@@ -21,7 +21,7 @@ from palpate_models.scenario.schema import Exam, Scenario, Search, SearchBudget
 from palpate_plugins import PluginError
 from palpate_search.policies.fixed import latin_hypercube, raster
 from palpate_search.policies.informed import information
-from palpate_search.policies.learned import convolved, ppo
+from palpate_search.policies.learned import convolve, ppo
 from palpate_search.posterior import (
     CONTRAST,
     FIELD,
@@ -35,7 +35,7 @@ from palpate_search.posterior import (
     policy,
 )
 from palpate_search.presses import Budget, Press, Task
-from palpate_search.service import TUNING, checked, create, next_press
+from palpate_search.service import TUNING, check_request, create, next_press
 
 DECIDED = (0.05, 0.0)
 """Next place of the learned policy after four presses."""
@@ -81,7 +81,7 @@ def test_the_learned_policy_is_a_convolution_with_zeros_beyond_the_edge() -> Non
     rng = np.random.default_rng(3)
     layers, kernel, bias = rng.normal(size=(2, 6, 5)), rng.normal(size=(3, 2, 3, 3)), rng.normal(size=3)
     expected = [sum(correlate(a, k, mode="constant") for a, k in zip(layers, one, strict=True)) for one in kernel]
-    np.testing.assert_allclose(convolved(layers, kernel, bias), np.array(expected) + bias[:, None, None])
+    np.testing.assert_allclose(convolve(layers, kernel, bias), np.array(expected) + bias[:, None, None])
 
 
 def test_the_learned_policy_decides_as_its_weights_do() -> None:
@@ -145,7 +145,7 @@ def test_sequential_updates_are_bayes_rule_of_all_presses_at_once() -> None:
     posterior = given(presses)
     xy = np.array([p.xy for p in presses])
     depth, force = (np.array([getattr(p, name) for p in presses]) for name in ("depth", "force"))
-    calibration = learned()
+    calibration = load_calibration()
     y = np.log(force) - calibration.exponent * np.log(depth / DEPTH_M) - np.log(USUAL_N)
     lever, away = calibration.exponent / depth, np.log(depth / DEPTH_M)
     parts = natural(xy, xy, USUAL)
@@ -280,7 +280,7 @@ SQUARE = Task((0.0, 0.0), (0.1, 0.1))
 )
 def test_what_the_arm_must_not_press_is_refused(place: tuple[float, ...], depth: float, named: str) -> None:
     with pytest.raises(PluginError, match=named):
-        checked(np.array(place), depth, SQUARE)
+        check_request(np.array(place), depth, SQUARE)
 
 
 @pytest.mark.parametrize("returned", [None, 5, (1,), ((0.0, 0.0), "deep"), (("a", "b"), 0.01)])

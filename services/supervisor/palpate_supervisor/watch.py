@@ -1,7 +1,6 @@
 """Compares measurements with the scenario's limits. Numbers in, breaches out."""
 
 from collections import deque
-from dataclasses import dataclass
 from enum import IntEnum
 from typing import NamedTuple
 
@@ -74,8 +73,7 @@ class DriverHold(IntEnum):
     STOP_REQUESTED = 8
 
 
-@dataclass(frozen=True, slots=True)
-class Breach:
+class Breach(NamedTuple):
     """A limit that is violated now. `cause` is the code to act on; `reason` is text for people."""
 
     level: Level

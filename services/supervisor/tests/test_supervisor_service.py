@@ -1,7 +1,6 @@
 """Limits that the supervisor watches, its latch, and the service."""
 
 from collections.abc import Iterable
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -254,14 +253,14 @@ def test_a_force_that_goes_on_rising_is_not_waited_for() -> None:
     [
         (SOFT, True),
         (EMERGENCY, True),
-        (replace(DRIVER, hold=RobotStatus.CAUSE_COMMAND_EXPIRED), True),
-        (replace(DRIVER, hold=RobotStatus.CAUSE_VELOCITY_LIMIT), False),
+        (DRIVER._replace(hold=RobotStatus.CAUSE_COMMAND_EXPIRED), True),
+        (DRIVER._replace(hold=RobotStatus.CAUSE_VELOCITY_LIMIT), False),
         (DEPTH, False),
         (Breach(Level.SOFT_STOP, StopCause.OPERATOR, "soft stop by the operator"), False),
     ],
 )
 def test_only_a_harmless_cause_that_is_over_is_released_alone_and_not_often(breach: Breach, alone: bool) -> None:
-    latch, over, held = Latch(), latch_module.TUNING.over_ns, replace(DRIVER, hold=RobotStatus.CAUSE_STOP_REQUESTED)
+    latch, over, held = Latch(), latch_module.TUNING.over_ns, DRIVER._replace(hold=RobotStatus.CAUSE_STOP_REQUESTED)
     later = [] if breach.level is Level.SOFT_STOP else [breach if breach.cause is StopCause.DRIVER else held]
     t = 0
     for _ in range(latch_module.TUNING.own_releases_max if alone else 1):
@@ -291,7 +290,7 @@ def test_what_only_motion_can_mend_is_passed_over_until_it_is_mended() -> None:
 
 
 def test_what_is_passed_over_is_not_when_it_grows_worse() -> None:
-    latch = latch_after([DEPTH], [DEPTH, RELEASE], [replace(DEPTH, level=Level.EMERGENCY)])
+    latch = latch_after([DEPTH], [DEPTH, RELEASE], [DEPTH._replace(level=Level.EMERGENCY)])
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.DEPTH)
 
 
@@ -320,7 +319,7 @@ def test_a_driver_has_a_limited_time_to_receive_its_release() -> None:
 
 def test_a_released_tool_that_goes_further_out_is_stopped_again() -> None:
     outside = Breach(Level.EMERGENCY, StopCause.WORKSPACE, "tool at y = 0.12 m", beyond_m=0.02)
-    near, far = (replace(outside, beyond_m=0.02 + share * latch_module.TUNING.further_m) for share in (0.9, 1.1))
+    near, far = (outside._replace(beyond_m=0.02 + share * latch_module.TUNING.further_m) for share in (0.9, 1.1))
     assert latch_after([outside], [outside, RELEASE], [near]).level is Level.OK
     latch = latch_after([outside], [outside, RELEASE], [near], [far])
     assert (latch.level, latch.cause) == (Level.EMERGENCY, StopCause.WORKSPACE)

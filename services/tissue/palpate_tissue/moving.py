@@ -24,7 +24,7 @@ from palpate_models.scenario.schema import Scenario
 TOOL = "sim/tool_state"
 
 
-def carried(tissue: Service, scenario: Scenario) -> Service:
+def carry(tissue: Service, scenario: Scenario) -> Service:
     """Return the tissue on the moving body of a scenario; the tissue itself if the body never moves."""
     motion = BodyMotion(scenario.phantom.motion, scenario.seed)
     return MovingBody(tissue, motion, matrix(true_pose(scenario))) if motion.moves else tissue
@@ -94,7 +94,7 @@ class MovingBody(Service):
 
     def _surface(self, message: Any) -> Message:
         R, p = self._X_WV[:3, :3], self._X_WV[:3, 3]
-        return replace(message, vertices=_transformed(message.vertices, R, p), normals=_transformed(message.normals, R))
+        return replace(message, vertices=_transform(message.vertices, R, p), normals=_transform(message.normals, R))
 
     def _indentation(self, message: Any) -> Message:
         p_W = self._X_WV[:3, :3] @ vector(message.surface_point) + self._X_WV[:3, 3]
@@ -126,6 +126,6 @@ class _ConvertedInbox:
         return self._inbox.lost(role)
 
 
-def _transformed(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
+def _transform(values: NDArray[np.float32], R: Array, p: Array | float = 0.0) -> NDArray[np.float32]:
     """Return n points or vectors, concatenated, shape (3 n,), rotated by R and translated by p [m]."""
     return np.asarray(values.reshape(-1, 3) @ R.T + p, dtype=np.float32).ravel()

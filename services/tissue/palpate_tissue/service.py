@@ -26,7 +26,7 @@ from palpate_models.scenario.schema import Scenario
 from palpate_models.section import Pose
 from palpate_plugins import PluginError
 from palpate_tissue.backend import TissueBackend
-from palpate_tissue.moving import carried
+from palpate_tissue.moving import carry
 from palpate_tissue.surface import SkinSurface
 
 _log = logging.getLogger("palpate.tissue")
@@ -200,4 +200,4 @@ def simulated(
         backend, facts = make(model, breathing, contract().roles[TissueService.role].period / NS)
     except UserError as error:
         raise PluginError(f"services.tissue = {scenario.services.tissue}: {error}") from error
-    return carried(service(backend, model, true_pose(scenario), facts), scenario)
+    return carry(service(backend, model, true_pose(scenario), facts), scenario)

@@ -18,7 +18,7 @@ from palpate_tissue.backend import TissueBackend
 from palpate_tissue.backends.elastic.compliance import compliance
 from palpate_tissue.backends.elastic.tissue import ElasticTissue
 from palpate_tissue.backends.winkler.implicit import ImplicitTissue
-from palpate_tissue.backends.winkler.presses import ENDS_S, contracted
+from palpate_tissue.backends.winkler.presses import ENDS_S, contract
 from palpate_tissue.backends.winkler.tissue import WinklerTissue
 
 LESION = Lesion(centre_m=(0.01, 0.0), radii_m=(0.02, 0.015), contrast=4.0)
@@ -64,12 +64,12 @@ def test_the_fast_way_is_the_slow_one(make: type[TissueBackend]) -> None:
 def test_a_press_lets_voluntary_guarding_fade_by_a_quarter_and_involuntary_stays() -> None:
     """The expected value is written by hand: 20 mm/s provoke a quarter of the contraction, a hold at 10 mm provokes nothing."""
     ends = np.array(ENDS_S)
-    level = contracted(True, ends, depths(ends))
+    level = contract(True, ends, depths(ends))
     at_depth = 0.25 + 0.75 * math.exp(-0.5 / FADING_S)
     assert level[ends == 0.5] == pytest.approx(at_depth)
     assert level[-1] == pytest.approx(at_depth * math.exp(-0.45 / FADING_S))
     assert level[-1] == pytest.approx(0.76, abs=0.005)
-    assert contracted(False, ends, depths(ends)).tolist() == [1.0] * len(ends)
+    assert contract(False, ends, depths(ends)).tolist() == [1.0] * len(ends)
 
 
 def test_a_press_does_not_ask_what_was_touched_before() -> None:

@@ -50,7 +50,7 @@ class ReplayedCamera(Service):
                                      f"{IMAGE}, {INFO}, {POSE}")  # fmt: skip
         self._transforms = StaticTransforms()
         try:
-            for pose in _decoded(recorded[POSE], rules.topics[POSE].type):  # each sender of a system publishes its own
+            for pose in _decode(recorded[POSE], rules.topics[POSE].type):  # each sender of a system publishes its own
                 self._transforms.add(pose.message.transforms)
             first = decode(recorded[IMAGE][0].payload, rules.topics[IMAGE].type)
             frame = first.header.frame_id.lstrip("/")
@@ -79,7 +79,7 @@ class ReplayedCamera(Service):
         outbox = self._next_small(t)
         self._ticks += 1
         if self._wanted:
-            outbox |= messages.whole(t, *self.frames[self._shown % len(self.frames)])
+            outbox |= messages.whole_image(t, *self.frames[self._shown % len(self.frames)])
             self._wanted -= 1
             self._shown += 1
         return outbox
@@ -112,7 +112,7 @@ class _Logged(NamedTuple):
         return nanoseconds(self.message.header.stamp)
 
 
-def _decoded(recorded: Sequence[RecordedMessage], kind: str) -> Iterator[_Logged]:
+def _decode(recorded: Sequence[RecordedMessage], kind: str) -> Iterator[_Logged]:
     """Decode messages of the type `kind`; of equal payloads only one is kept. Raises CodecError."""
     once = {message.payload: message for message in recorded}
     return (_Logged(message.stamp, decode(message.payload, kind)) for message in once.values())
@@ -135,7 +135,7 @@ def _pairs(images: Sequence[_Logged], infos: Sequence[_Logged]) -> Iterator[tupl
 def _frames(recorded: Mapping[str, list[RecordedMessage]], image: str, info: str, frame: str) -> list[Frame]:
     """Return the images of a pair of topics with their intrinsics; none if one topic is empty. Raises CameraError, CodecError."""
     types = contract().topics
-    images, infos = (list(_decoded(recorded[topic], types[topic].type)) for topic in (image, info))
+    images, infos = (list(_decode(recorded[topic], types[topic].type)) for topic in (image, info))
     source = CameraInput(
         image=image,
         info=info,

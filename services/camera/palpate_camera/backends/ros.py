@@ -127,7 +127,7 @@ class RosCameraService(Service):
         if self._wanted and not triggers and exposed >= self._asked:
             self._wanted -= 1
             self._facts["frames"] += 1
-            outbox |= messages.whole(exposed, depth, pinhole)
+            outbox |= messages.whole_image(exposed, depth, pinhole)
         return outbox
 
     def _exposed(self, t: int, stamp: int) -> int:

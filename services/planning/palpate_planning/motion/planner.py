@@ -15,7 +15,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.scenario.schema import Limits
 from palpate_planning.motion.kinematics import ArmKinematics
 from palpate_planning.motion.scene import COLLISION, CollisionScene
-from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, rounded
+from palpate_planning.motion.timing import JointTrajectory, joint_trajectory, round_corners
 
 
 class PlannerTuning(NamedTuple):
@@ -55,7 +55,7 @@ def timed_motion(
     """Return a collision-free motion from q0 to q1 within all limits, sampled every `period_s`. Raises NoPathError."""
     points = plan(scene, q0, q1, (kinematics.lower, kinematics.upper), seed)
     for blend in TUNING.blends_rad:
-        smooth = rounded(points, blend)
+        smooth = round_corners(points, blend)
         if len(points) == 2 or all(scene.motion_free(a, b) for a, b in pairwise(smooth)):
             return joint_trajectory(kinematics, smooth, limits, period_s)
     raise NoPathError(f"corners of the motion to {np.round(q1, 3).tolist()} cannot be rounded without collision")

@@ -137,7 +137,7 @@ class JointTrajectory:
         return np.asarray(q[0] + part * (q[1] - q[0])), np.asarray(qd[0] + part * (qd[1] - qd[0]))
 
 
-def rounded(points: Array, blend: float) -> Array:
+def round_corners(points: Array, blend: float) -> Array:
     """Return a joint-space polyline, shape (k, n), with corners replaced by sampled parabolas, shape (m, 7).
 
     At most `blend` [rad] is cut off each side of a corner, and never more than 45 % of an edge. A parabola is in the triangle of

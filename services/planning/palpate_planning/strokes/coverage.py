@@ -43,7 +43,7 @@ class Stroke(NamedTuple):
     visits: Ints
     """Sample at which each of them is reached, shape (m,)."""
     touch: bool = False
-    """True if the skin is only touched, not pressed."""
+    """True if the wall is only touched, not pressed."""
 
 
 def line_through(points: Array) -> tuple[Array, Ints]:

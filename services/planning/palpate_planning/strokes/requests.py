@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -18,8 +17,7 @@ _NEAREST: Final = 4
 """Number of targets tried where the place itself cannot be pressed."""
 
 
-@dataclass(frozen=True, slots=True)
-class PressRequest:
+class PressRequest(NamedTuple):
     """A request of the search."""
 
     number: int
@@ -31,7 +29,7 @@ class PressRequest:
 
     def moved(self, shift_A: Array) -> PressRequest:
         """Return the same place of a body that has moved by `shift_A` [m], shape (2,), since the first view."""
-        return self if self.xy is None else replace(self, xy=self.xy + shift_A)
+        return self if self.xy is None else self._replace(xy=self.xy + shift_A)
 
 
 class PressPlanner:

@@ -39,8 +39,7 @@ Infeasible = list[tuple[int, Cause]]
 """Samples of a path that the arm cannot take, with the cause."""
 
 
-@dataclass(frozen=True, slots=True)
-class Segment:
+class Segment(NamedTuple):
     """One stroke, or the path from one stroke to the next."""
 
     path: SurfacePath
@@ -48,7 +47,7 @@ class Segment:
     contact: bool
     """True for a stroke; False for a path above the surface between strokes."""
     touch: bool = False
-    """True if the skin is only touched, not pressed."""
+    """True if the wall is only touched, not pressed."""
     depth_m: float | None = None
     """Depth of a press [m]; None: the examination's depth."""
     free: JointTrajectory | None = None

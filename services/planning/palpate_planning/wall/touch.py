@@ -1,13 +1,13 @@
-"""Depth of the skin from the onset of force in a slow descent.
+"""Depth of the wall from the onset of force in a slow descent.
 
 While the indenter descends at constant speed, the normal force over depth d is
 
     F = b + a max(d - d0, 0)^1.3.
 
 b, a and d0 are fitted together (Levenberg and Marquardt, `scipy.optimize.curve_fit`): b is the remaining sensor bias, d0 the
-depth of the skin. At 14 mm/s, positions on persons and lumps (tuning seeds 0 to 7) follow the law up to 1 N with exponents of 1.2
+depth of the wall. At 14 mm/s, positions on persons and lumps (tuning seeds 0 to 7) follow the law up to 1 N with exponents of 1.2
 to 1.5, and 1.8 over a guarded muscle. There the error of d0 is -0.02 +- 0.15 mm, and 0.2 mm more where the indenter meets the
-skin between mesh points (computed).
+wall between mesh points (computed).
 """
 
 import math
@@ -47,8 +47,8 @@ _SINCE_BEGUN = 1 - (TUNING.begun_n / FELT_N) ** (1 / TUNING.exponent)
 """Fraction of the distance from d0 to FELT_N that remains at `begun_n`, by the law."""
 
 
-class SkinDepth(NamedTuple):
-    """Measured depth of the skin."""
+class WallDepth(NamedTuple):
+    """Measured depth of the wall."""
 
     depth: float
     """d0 [m], in the depth used during the descent."""
@@ -68,7 +68,7 @@ class Onset:
         self._rows.append((depth, force))
         self._moving.append((t, displacement))
 
-    def touch(self) -> SkinDepth:
+    def touch(self) -> WallDepth:
         """Return the touch found in the samples."""
         return find_touch(np.array(self._rows))
 
@@ -77,20 +77,20 @@ class Onset:
         """Times of the samples [ns], shape (n,)."""
         return np.array([t for t, _ in self._moving])
 
-    def touch_again(self, displacement: Array) -> SkinDepth:
+    def touch_again(self, displacement: Array) -> WallDepth:
         """Return the touch for a different wall displacement [m], shape (n,)."""
         rows = np.array(self._rows)
         rows[:, 0] += displacement - np.array([lifted for _, lifted in self._moving])
         return find_touch(rows)
 
 
-def find_touch(rows: Array) -> SkinDepth:
+def find_touch(rows: Array) -> WallDepth:
     """Return the touch in rows of depth [m] and force [N], shape (n, 2), the last of which is deepest with the largest force."""
     quiet = np.flatnonzero(rows[:, 1] < TUNING.begun_n)
     begun = float(rows[quiet[-1] if len(quiet) else 0, 0])
     rows = rows[rows[:, 0] > rows[-1, 0] - max(TUNING.window_m, (rows[-1, 0] - begun) / _SINCE_BEGUN + TUNING.air_m)]
     depth, force = rows.T
-    guess = SkinDepth(begun, TUNING.unfitted_sd_m)
+    guess = WallDepth(begun, TUNING.unfitted_sd_m)
     if len(rows) < TUNING.samples_min:
         return guess
     scale = (force[-1] - force[0]) / max(depth[-1] - begun, 1e-4) ** TUNING.exponent
@@ -101,7 +101,7 @@ def find_touch(rows: Array) -> SkinDepth:
     variance = float(covariance[2, 2])
     if not (slope > 0 and depth[0] < d0 < depth[-1] and variance < TUNING.unfitted_sd_m**2):
         return guess
-    return SkinDepth(
+    return WallDepth(
         float(d0), math.hypot(max(TUNING.model_sd_m, TUNING.model_sd_fraction * (depth[-1] - d0)), math.sqrt(variance))
     )
 

@@ -34,7 +34,7 @@ from palpate_models.numerics.frames import Array
 from palpate_planning.periods import SECOND
 from palpate_planning.wall.breath import Breath
 from palpate_planning.wall.surface import Foot, PerceivedSurface
-from palpate_planning.wall.touch import Onset, SkinDepth
+from palpate_planning.wall.touch import Onset, WallDepth
 
 ROUGHNESSES = 2.0 ** np.arange(-5, 2)
 """Candidate values of a."""
@@ -63,7 +63,7 @@ PRIOR = CorrectionPrior()
 
 
 class HeightMeasurement(NamedTuple):
-    """Height of the skin measured by a touch."""
+    """Height of the wall measured by a touch."""
 
     xy_A: Array
     """Position in A [m], shape (2,)."""
@@ -172,13 +172,13 @@ def _covariance(a: Array, b: Array, roughness: float) -> Array:
 
 
 class PublishedTouch(NamedTuple):
-    """One touch of the skin, as published on `exam/touches`."""
+    """One touch of the wall, as published on `exam/touches`."""
 
     p_W: Array
     """Point of the perceived surface [m], shape (3,)."""
     stroke: int
     height: float
-    """Measured height of the skin above the perceived surface at the end of expiration [m]."""
+    """Measured height of the wall above the perceived surface at the end of expiration [m]."""
     sigma: float
     """SD of `height` [m]."""
     expected: float
@@ -199,7 +199,7 @@ class WallEstimate(NamedTuple):
 
 
 class Wall:
-    """Estimated position of the skin and its uncertainty."""
+    """Estimated position of the wall and its uncertainty."""
 
     def __init__(self, perceived: PerceivedSurface, breath: Breath) -> None:
         """Start without correction."""
@@ -217,7 +217,7 @@ class Wall:
         self.correction.blur()
 
     def corrected(self, vertices_W: Array, averaged: Array | None) -> tuple[Array, Array]:
-        """Return the height of the skin above vertices of the perceived surface and its SD [m], shapes (n,).
+        """Return the height of the wall above vertices of the perceived surface and its SD [m], shapes (n,).
 
         Uses all touches, and the height of the mean of all images above these vertices [m] if `averaged` is given.
         """
@@ -227,8 +227,8 @@ class Wall:
         height, sigma = self.correction.averaged(NearestNDInterpolator(xy, averaged)).over(xy)
         return averaged + height, sigma
 
-    def skin(self, foot: Foot, correction: float) -> tuple[Array, Array]:
-        """Return the skin point `correction` [m] above `foot` and its outward normal, shapes (3,).
+    def point(self, foot: Foot, correction: float) -> tuple[Array, Array]:
+        """Return the wall point `correction` [m] above `foot` and its outward normal, shapes (3,).
 
         Both refer to the body's position at the first scan, at the end of expiration, so that all samples share one frame.
         """
@@ -253,7 +253,7 @@ class Wall:
             correction, share * self.breath.displacement(t), math.hypot(sigma, share * self.breath.uncertainty(t))
         )
 
-    def touched(self, foot: Foot, touch: SkinDepth, stroke: int, t: int) -> tuple[PublishedTouch, float]:
+    def touched(self, foot: Foot, touch: WallDepth, stroke: int, t: int) -> tuple[PublishedTouch, float]:
         """Update the correction by a touch under `foot` at `t` [ns]; return the touch and the change in wall height [m]."""
         before, before_sigma = self.correction.at(foot.xy_A)
         moved = self.perceived.breathing(foot.xy_A) * self.breath.uncertainty(t)

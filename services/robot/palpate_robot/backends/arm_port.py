@@ -1,7 +1,6 @@
 """Connections between a driver and the ROS side of its arm."""
 
-from abc import ABC, abstractmethod
-from typing import Any, Final
+from typing import Any, Final, Protocol
 
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -17,18 +16,15 @@ TOOL_TOPIC: Final = "emulator/tool_state"
 LINKS_TOPIC: Final = "emulator/link_poses"
 
 
-class ArmPort(ABC):
+class ArmPort(Protocol):
     """The driver's connection to the arm."""
 
-    @abstractmethod
     def states(self) -> list[Any]:
         """Return the arm's states since the last call, oldest first."""
 
-    @abstractmethod
     def wrenches(self) -> list[Any]:
         """Return WrenchStamped messages of the F/T sensor since the last call, oldest first."""
 
-    @abstractmethod
     def command(self, q: Array, values: Array) -> None:
         """Send a command, at measured joint positions `q` [rad]; `values`, shape (n,), are torques [N m] or positions [rad]."""
 
@@ -36,15 +32,13 @@ class ArmPort(ABC):
         """Return the GIDs of other senders of commands since the last call, oldest first."""
         return []
 
-    @abstractmethod
     def contact(self, wrench: Any) -> None:
         """Emulated: sends the tissue's wrench on the indenter."""
 
-    @abstractmethod
     def physics(self) -> tuple[Any | None, Any | None]:
         """Emulated: return new ToolState and link poses."""
 
-    def close(self) -> None:  # noqa: B027 - a port in this process has nothing to disconnect
+    def close(self) -> None:
         """Disconnect from the ROS side."""
 
 

@@ -13,18 +13,17 @@ from typing import Any, Final
 import numpy as np
 
 from palpate_bus.messages import WrenchStamped
-from palpate_bus.messages.geometry import wrench_message
+from palpate_bus.messages.geometry import frames_message, tool_message, wrench_message
 from palpate_bus.messages.stamps import header
 from palpate_bus.settings import Settings
 from palpate_bus.wire.ros_node import RosNode
-from palpate_bus.wire.zenoh_config import stopped_by_signals
+from palpate_bus.wire.zenoh_config import catch_signals
 from palpate_models.numerics.frames import Array
 from palpate_models.robot.arm import arm_of, link_names
 from palpate_models.scenario.errors import draw_errors
 from palpate_models.scenario.schema import PlantInput
 from palpate_robot.backends.arm_port import CONTACT_TOPIC, LINKS, LINKS_TOPIC, TOOL_STATE, TOOL_TOPIC, WRENCH
 from palpate_robot.backends.dart.plant import DartPlant
-from palpate_robot.messages import link_poses, tool_state
 from palpate_robot.sensors import FtSensor, JointSensor, TorqueSensors
 
 BRAKE_NMS: Final = 2000.0
@@ -91,11 +90,11 @@ class EmulatedArm:
 
     def tool(self, now: int) -> Any:
         """Return the exact palpation_msgs/ToolState."""
-        return tool_state(header(now, "world"), self._plant.tool_motion().tolist(), self._radius)
+        return tool_message(header(now, "world"), self._plant.tool_motion().tolist(), self._radius)
 
     def links(self, now: int) -> Any:
         """Return the exact tf2_msgs/TFMessage of all links in world."""
-        return link_poses(header(now, "world"), self._links, self._plant.link_poses())
+        return frames_message(header(now, "world"), self._links, self._plant.link_poses())
 
 
 class Metronome:
@@ -136,7 +135,7 @@ def serve(arm: EmulatedArm, node: RosNode, cycle: Callable[[int], None]) -> None
     gc.freeze()  # avoids garbage collections of 0.1 s
     metronome = Metronome(arm.period_ms * 1_000_000, monotonic_ns(), time_ns(), Settings.read().rate or 1.0)
     contact_at = cycles = 0
-    with stopped_by_signals() as stop, closing(node):
+    with catch_signals() as stop, closing(node):
         while not stop.is_set():
             sleep(metronome.wait(monotonic_ns()) / 1e9)
             now = monotonic_ns()

@@ -16,7 +16,7 @@ import numpy as np
 
 from palpate_bus.contract import contract
 from palpate_bus.wire.ros_node import RosNode
-from palpate_bus.wire.zenoh_config import stopped_by_signals
+from palpate_bus.wire.zenoh_config import catch_signals
 from palpate_models.numerics.frames import Array
 from palpate_robot.backends.hardware import STATE_AGE_NS, MeasuredArm
 
@@ -70,7 +70,7 @@ def watch(
     logging.basicConfig(level="INFO", format="%(asctime)s watchdog %(levelname)s %(message)s", stream=sys.stderr)
     states, commands, publisher = node.subscription(*state), node.subscription(*command), node.publisher(*command)
     reported = False
-    with stopped_by_signals() as stop, closing(node):
+    with catch_signals() as stop, closing(node):
         while not stop.is_set():
             now = monotonic_ns()
             for received in states.take():

@@ -12,7 +12,7 @@ from scipy.stats import norm
 from sklearn.gaussian_process import GaussianProcessRegressor
 from sklearn.gaussian_process.kernels import RBF, WhiteKernel
 
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_models.numerics.frames import Array
 from palpate_models.scenario import press
 from palpate_search.posterior import Posterior
@@ -48,7 +48,7 @@ Acquisition = Callable[[Array, Array, Array], Array]
 
 def _fit(posterior: Posterior) -> tuple[Array, Array, Array]:
     """Return mean and SD of the process at the places, and the standardised measurements."""
-    exponent = learned().exponent
+    exponent = load_calibration().exponent
     xy = np.array([felt.xy for felt in posterior.presses])
     force = np.array([max(felt.force, 0.1) for felt in posterior.presses])
     depth = np.array([max(felt.depth, PRESSES.least_measured_m) for felt in posterior.presses])

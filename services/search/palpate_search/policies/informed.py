@@ -13,7 +13,7 @@ from typing import Final, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate_assessment.calibration import learned
+from palpate_assessment.calibration import load_calibration
 from palpate_assessment.standard import USUAL
 from palpate_models.numerics.compiled import compiled
 from palpate_models.numerics.frames import Array
@@ -110,7 +110,7 @@ DEEPER: Final = DeeperTuning()
 
 def next_press(posterior: Posterior, budget: Budget) -> tuple[Array, float]:
     """Return the place and depth with the greatest expected information per second, including travel."""
-    task, calibration = posterior.task, learned()
+    task, calibration = posterior.task, load_calibration()
     mean, variance = posterior.field()
     contrast, contrast_variance = posterior.contrast()
     unexplained, probability = posterior.unexplained(), posterior.probability

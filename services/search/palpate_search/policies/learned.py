@@ -24,7 +24,7 @@ def _weights() -> tuple[tuple[Array, Array], ...]:
         return tuple((saved[f"kernel{k}"], saved[f"bias{k}"]) for k in range(len(saved.files) // 2))
 
 
-def convolved(layers: Array, kernel: Array, bias: Array) -> Array:
+def convolve(layers: Array, kernel: Array, bias: Array) -> Array:
     """Return a zero-padded convolution: (in, nx, ny) to (out, nx, ny)."""
     width = kernel.shape[-1] // 2
     padded = np.pad(layers, ((0, 0), (width, width), (width, width)))
@@ -37,8 +37,8 @@ def scores(posterior: Posterior) -> Array:
     layers = maps(posterior)
     *hidden, last = _weights()
     for kernel, bias in hidden:
-        layers = np.tanh(convolved(layers, kernel, bias))
-    return convolved(layers, *last).reshape(2, -1)
+        layers = np.tanh(convolve(layers, kernel, bias))
+    return convolve(layers, *last).reshape(2, -1)
 
 
 def ppo(posterior: Posterior, budget: Budget) -> tuple[Array, float]:

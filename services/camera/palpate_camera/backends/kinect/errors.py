@@ -37,7 +37,7 @@ class DepthBias:
         self._drawn, self._given, self._rng = drawn, given, rng
         shape = pinhole.height, pinhole.width
         self._constant = (drawn.offset_m + field(drawn, shape)).astype(np.float32)
-        self.lost: Mask = lost(drawn.lost, shape)
+        self.lost: Mask = find_lost(drawn.lost, shape)
         """Pixels that never have a depth, shape (height, width)."""
         self._rows, self._columns = (_hats(size, given.wander_px) for size in shape)
         self._nodes = rng.standard_normal((self._rows.shape[1], self._columns.shape[1]))
@@ -68,7 +68,7 @@ def field(drawn: DrawnCamera, shape: tuple[int, int]) -> Array:
     return np.asarray(drawn.given.field_m * waves / np.abs(waves).max())
 
 
-def lost(patches: Array, shape: tuple[int, int]) -> Mask:
+def find_lost(patches: Array, shape: tuple[int, int]) -> Mask:
     """Return the mask of pixels in one of the patches without depth (`DrawnCamera.lost`)."""
     v, u = np.indices(shape)
     mask = np.zeros(shape, bool)

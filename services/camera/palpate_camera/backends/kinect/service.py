@@ -70,7 +70,7 @@ class CameraService(Service):
         if self._frames_left:
             self._frames_left -= 1
             self._frames_taken += 1
-            outbox |= messages.whole(t, self._whole.take(on_s, skin, robot, self._bias), self._pinhole)
+            outbox |= messages.whole_image(t, self._whole.take(on_s, skin, robot, self._bias), self._pinhole)
         return outbox
 
     def finish(self) -> Mapping[str, Any]:

@@ -43,13 +43,14 @@ from palpate_robot.backends.lbr.port import (
     TORQUE_COMMAND,
     ClientCommandMode,
     ConnectionQuality,
-    FriControlMode,
     LBRState,
     SafetyState,
     SessionState,
 )
 
 PERIODS_MS: Final = range(1, 101)
+JOINT_IMPEDANCE: Final = 2
+"""JOINT_IMP_CONTROL_MODE of KUKA::FRI::EControlMode."""
 
 
 class SessionTuning(NamedTuple):
@@ -200,7 +201,7 @@ class Emulator(EmulatedArm):
             drive_state=1,
             client_command_mode=int(ClientCommandMode.TORQUE),
             overlay_type=1,
-            control_mode=int(FriControlMode.JOINT_IMP_CONTROL_MODE),
+            control_mode=JOINT_IMPEDANCE,
             time_stamp_sec=now // 1_000_000_000,
             time_stamp_nano_sec=now % 1_000_000_000,
             measured_joint_position=self.measured,

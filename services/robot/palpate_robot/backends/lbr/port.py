@@ -83,15 +83,6 @@ class ClientCommandMode(IntEnum):
     TORQUE = 3
 
 
-class FriControlMode(IntEnum):
-    """KUKA::FRI::EControlMode."""
-
-    POSITION_CONTROL_MODE = 0
-    CART_IMP_CONTROL_MODE = 1
-    JOINT_IMP_CONTROL_MODE = 2
-    NO_CONTROL = 3
-
-
 class ZenohPort(ZenohArmPort):
     """Connection to the stack."""
 

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate_bus.messages import JointState, Vector3, Wrench, WrenchStamped, codec
+from palpate_bus.messages import JointState, codec
 from palpate_bus.messages.stamps import MS, NS, header
 from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
@@ -53,7 +53,7 @@ class Ros2Emulator(EmulatedArm):
         self._order = [arm.joint_names.index(name) for name in self._names]
         self._model = GravityModel(known.robot)
         self._loop = PositionLoop(arm, self._joints.q) if self.rules.commands is CommandLevel.POSITION else None
-        self._events = sorted(map(_timed, (*known.robot.driver.events, *events)))
+        self._events = sorted(map(_split_time, (*known.robot.driver.events, *events)))
         self._begun: int | None = None
 
     def cycle(self, now: int) -> None:
@@ -83,13 +83,12 @@ class Ros2Emulator(EmulatedArm):
         values = self.measured, self.measured_v, self.read_torques()
         return JointState(header(now), self._names, *(array[self._order] for array in values))
 
-    def wrench(self, now: int) -> Any:
-        """Return the F/T reading with sign and weight as the stack has them."""
-        reading = self.read_wrench()
+    def read_wrench(self) -> Array:
+        """Return a reading of the F/T sensor with sign and weight as the stack has them, shape (6,)."""
+        reading = super().read_wrench()
         if not self.profile.ft_weight:
             reading = reading - tool_load(self._mass_kg, self._model.at(self.measured).up_S)
-        fx, fy, fz, mx, my, mz = (self.profile.ft_sign * reading).tolist()
-        return WrenchStamped(header(now, "ft_sensor"), Wrench(Vector3(fx, fy, fz), Vector3(mx, my, mz)))
+        return self.profile.ft_sign * reading
 
     def status(self) -> StackStatus:
         """Return the status that the stack reports."""
@@ -134,8 +133,11 @@ class EmulatedPort(Ros2Port):
         """See `Ros2Port.status`."""
         return self.emulator.status()
 
+    def close(self) -> None:
+        """See `ArmPort.close`: there is nothing to disconnect."""
 
-def _timed(text: str) -> tuple[float, str]:
+
+def _split_time(text: str) -> tuple[float, str]:
     time, _, event = text.partition(" ")
     try:
         return float(time), event

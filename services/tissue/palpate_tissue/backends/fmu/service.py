@@ -25,7 +25,7 @@ from palpate_models.scenario.load import true_pose
 from palpate_models.scenario.schema import Scenario
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.wiring import Wiring
-from palpate_tissue.moving import carried
+from palpate_tissue.moving import carry
 
 _log = logging.getLogger("palpate.tissue")
 
@@ -153,7 +153,7 @@ def create(scenario: Scenario) -> Service:
         raise
     except UserError as error:
         raise MapError(f"services.tissue = fmu: {error}") from error
-    return carried(service, scenario)
+    return carry(service, scenario)
 
 
 def hosted(fmu_file: Path, table: FmuMap | None, scenario: Scenario) -> FmuService:

@@ -76,7 +76,7 @@ def standard_presses(
     """Return the result of `TissueBackend.press` at `places` [m] with `normals`, shapes (k, 3), for a sphere of `radius` [m]."""
     ends = np.array(ENDS_S)
     depths = press.depths(ends)
-    course = Course(radius, ends, depths, contracted(model.voluntary, ends, depths), prony_table(stiffness))
+    course = Course(radius, ends, depths, contract(model.voluntary, ends, depths), prony_table(stiffness))
     forces = np.array(press_forces(model, stiffness, places, normals, [course] * len(places))).reshape(-1, len(ends))
     limited = forces.max(axis=1, initial=0.0) >= press.LIMIT_N
     return np.where(limited, press.LIMIT_N, forces[:, -1]), limited
@@ -107,7 +107,7 @@ def press_forces(
     return forces
 
 
-def contracted(voluntary: bool, ends: Array, depths: Array) -> Array:
+def contract(voluntary: bool, ends: Array, depths: Array) -> Array:
     """Return the contraction of guarding muscle at the `ends` [s] of steps with `depths` [m], shapes (n,).
 
     At rest it is fully contracted; the press sustains it or lets it fade (`palpate_models.patient.wall`).
@@ -151,7 +151,7 @@ def press_once(wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], at: Array
         for _ in range(SWEEPS.most):
             if sweep(wall, part, room, activation, stride) < SWEEPS.close_m:
                 break
-        forces[step] = held(wall, skin, part, room, activation, h, p, normal)
+        forces[step] = hold_force(wall, skin, part, room, activation, h, p, normal)
         for k in range(len(part)):
             i = part[k]
             for b in range(len(prony)):
@@ -174,7 +174,7 @@ def floor(X: Vector, n: Vector, p: Vector, radius: float, normal: Vector) -> flo
 
 
 @compiled
-def held(
+def hold_force(
     wall: ImplicitWall, skin: Skin, part: NDArray[np.intp], room: Array, activation: float, h: float, p: Vector, normal: Vector
 ) -> float:
     """Return the force along `normal` [N] on a sphere at p from all vertices that it holds, as in `tissue.hold`."""
