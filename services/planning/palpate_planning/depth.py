@@ -1,12 +1,12 @@
 """Depth regulation on soft and stiff tissue, within a limit of force.
 
-Depth d is measured: radius minus the signed distance of the sphere's centre (forward kinematics) from the perceived rest
-surface. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F - F_ff)/K_z. So
+Depth d is measured: radius minus the signed distance of the sphere's centre (forward kinematics) from the estimated wall
+at rest. The robot is an impedance K_z: commanded depth d_c yields d = d_c - (F - F_ff)/K_z. So
 
     F_ff = a LP(F)                          feed-forward of the measured force, a < 1: positive feedback of gain below one
     d_c  = d_r + k_i integral(d_r - d) - g  a slow integral for what is left: friction, model error
     d_r  -> min(target, d (F_max/F_p)^(1/1.45))   the depth at which the force would be F_max (F ~ d^1.45)
-    g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard surface, a wrong exponent
+    g'   = w (F_p - F_max)/K_z, g >= 0      guard that needs no tissue model: a hard wall, a wrong exponent
 
 with F the normal force, L the magnitude of the whole force (a hard edge pushes laterally, too), and F_p = L + tau dL/dt the
 magnitude expected when the command takes effect.
@@ -23,7 +23,7 @@ class DepthTuning(NamedTuple):
     force_fraction: float = 0.83
     """Fraction of the working force limit at which depth yields: force rises until the arm has yielded."""
     feed_forward: float = 0.9
-    """a, below one so that the force cannot build up by itself even on a rigid surface."""
+    """a, below one so that the force cannot build up by itself even on a rigid wall."""
     force_lag_s: float = 0.02
     """Low-pass of the measured force."""
     rate_lag_s: float = 0.03
@@ -41,7 +41,7 @@ class DepthTuning(NamedTuple):
     yield_lag_s: float = 0.03
     """Smoothing of d_r."""
     yield_mps: float = 0.08
-    """Fastest d_r towards the surface."""
+    """Fastest d_r towards the wall."""
     return_mps: float = 0.02
     """Fastest d_r back into the tissue after yielding."""
     model_depth_m: float = 0.003
@@ -85,7 +85,7 @@ class DepthRegulator:
         self.reset(0.0)
 
     def reset(self, depth: float) -> None:
-        """Start at rest at a commanded depth [m], negative above the surface."""
+        """Start at rest at a commanded depth [m], negative above the wall."""
         self._force = self._load = self._raw_load = self._slope = 0.0
         self._integral = self._guard = self._yield = 0.0
         self._command = depth

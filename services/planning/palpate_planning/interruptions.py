@@ -168,7 +168,7 @@ class Recovery:
         self._soft_stops = 0
         self._spoiled_at, self._repeats = 0.0, 0
         self.paused = False
-        """True if the arm has to wait above the surface."""
+        """True if the arm has to wait above the wall."""
         self.resume_at: float | None = None
         """Path length [m] at which the stroke is taken up again after the lift; None: the next segment follows."""
         self.displacement: Displacement | None = None

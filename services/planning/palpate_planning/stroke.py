@@ -22,7 +22,7 @@ class StrokeTuning(NamedTuple):
     """Tolerances, times and heights of a stroke."""
 
     hop_height_m: float = 0.010
-    """Least height between strokes; it is `SEGMENTS.hover_m` on free motions and where the surface is uncertain."""
+    """Least height between strokes; it is `SEGMENTS.hover_m` on free motions and where the wall is uncertain."""
     lift_mps: float = 0.12
     settled_error_m: float = 0.0005
     """An indentation has settled when its depth error stays below this for `settled_s`, or after `settle_timeout_s`."""

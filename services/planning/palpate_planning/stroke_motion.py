@@ -1,4 +1,4 @@
-"""Motion of the commanded indenter in a stroke: position along the path, depth below the surface, feed-forward force."""
+"""Motion of the commanded indenter in a stroke: position along the path, depth below the wall, feed-forward force."""
 
 from typing import Final, NamedTuple
 
@@ -53,7 +53,7 @@ def stroke_setpoint(t: int, point: PathPoint, rate: float, distance: float, sink
         t: time [ns].
         point: present point of the path.
         rate: speed along the path ds/dt [m/s].
-        distance: of the sphere's centre from the surface along the outward normal [m].
+        distance: of the sphere's centre from the perceived surface along the outward normal [m].
         sinking: rate at which `distance` decreases [m/s].
         push: feed-forward force into the tissue [N].
     """
@@ -76,7 +76,7 @@ class StrokeMotion:
         self._regulator = DepthRegulator(period_s, NORMAL_STIFFNESS, limits.force_working_n, limits.depth_m)
         self.regulation = Regulation(-SEGMENTS.hover_m, 0.0, -SEGMENTS.hover_m, 0.0, False, 0.0)
         self.depth = self._depth_axis(-SEGMENTS.hover_m)
-        """Target depth [m], negative above the surface."""
+        """Target depth [m], negative above the wall."""
         self._posture: Array | None = None
         """Posture of the last set-point [rad], shape (n,)."""
         self.joined = False
@@ -190,7 +190,7 @@ class StrokeMotion:
         return self.along.step(self.segment.path.length, speed)
 
     def travel(self, goal: float) -> bool:
-        """Follow the path above the surface to path length `goal` [m]; return True once there."""
+        """Follow the path above the wall to path length `goal` [m]; return True once there."""
         return self.along.step(goal, max(self._speed_limit.at(self.along.position), MOTION.creep_mps))
 
     def brake(self) -> None:

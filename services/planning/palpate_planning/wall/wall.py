@@ -17,7 +17,7 @@ for some seconds and is shared with the next touch. From n touches (Rasmussen an
     S_ij = s_i^2 [i = j] + b_i b_j exp(-|t_i - t_j| / PRIOR.persistence_s).
 
 The roughness a of the error is estimated: of a few values the one with the highest posterior probability (their eq. 2.30).
-Without camera error a becomes small, and the surface is known to within the error of a touch.
+Without camera error a becomes small, and the wall is known to within the error of a touch.
 """
 
 from __future__ import annotations
