@@ -1,9 +1,13 @@
 """The check of every message at a port, generated from the topic's row of the contract.
 
 A message is checked by itself (type, frame, ranges, finite numbers, unit quaternions) and against those before it at the
-same port (order and age of stamps, rates of change, values that repeat). The runtimes hold one `PortCheck` per port, where a
-service sends and where messages of other processes are received. In lockstep a refused message ends the run. In wall-clock mode
-it is dropped and reported, so its readers act as on silence. No service needs a check of its own.
+same port (order and age of stamps, rates of change, values that repeat). The runtimes hold one `PortCheck` per port: where a
+service sends, and where it receives (in lockstep when the service first reads the message; unread ones are not checked). In
+lockstep a refused message ends the run. In wall-clock mode it is dropped and reported, so readers act as on silence. No service
+needs a check of its own.
+
+Each rule is written twice: `_Source` generates the fast test; `Checker` and `broken_past` run after it has refused a message, to
+name the violation.
 
 `Checker` names what is wrong with a message by itself; `violations` does the same as text. A value that is out of range but
 plausible in a related unit (degrees for radians, millimetres for metres) is reported as a unit error.
@@ -244,7 +248,7 @@ def _out_of_range(path: str, values: np.ndarray[Any, Any], least: float, most: f
 
 @cache
 def conforms(row: str, sends: bool, alone: bool = False) -> Callable[[Message, PastMessages, int], bool]:
-    """Return a function that is True for a message that conforms to its topic, a row as JSON, and enters it into the past.
+    """Return a function that is True for a message that conforms to its topic, a row as JSON, and keeps it for comparison.
 
     `alone`: without the past.
     """

@@ -70,7 +70,7 @@ def decoder(name: str) -> Callable[[bytes | memoryview], Message]:
 
 @cache
 def passer(name: str) -> Callable[[Message], Message | None]:
-    """Return a function that gives the message which decoding an encoded one would give, or None if it has to be decoded.
+    """Return a function that returns a message equal to a decoded one, or None if it has to be decoded.
 
     Arrays and lists are copied, since their owner may write to them later. Arrays are read-only, as decoded ones are.
     """

@@ -35,7 +35,7 @@ Array = NDArray[np.float64]
 DEPTH_ENCODINGS: Final = {"32FC1": ("f4", 1.0), "16UC1": ("u2", 1e-3), "mono16": ("u2", 1e-3)}
 """Depth encodings of ROS (REP 118): pixel type and unit [m]. Pixels without a measurement are NaN, 0 or 65535 mm."""
 NO_DEPTH_M: Final = 65.5
-"""Depths from here on [m] are not measurements: 65535 mm, also after its conversion to metres, and infinity."""
+"""Depths from this one on [m] are not measurements: 65535 mm, and infinity."""
 
 
 class MeshArrays(NamedTuple):

@@ -223,7 +223,7 @@ class RemoteInputs:
     def _settle(self, producer: str, sample: ReceivedSample) -> None:
         last = self._closed[producer]
         if sample.sequence != last + 1:
-            raise LockstepError(f"palpate/advance/{producer}: message {sample.sequence} came after {last}")
+            raise LockstepError(f"palpate/advance/{producer}: expected message {last + 1}, received {sample.sequence}")
         self._closed[producer] = sample.sequence
         advance = _decode(sample.payload)
         for name, sequence in zip(self._event_topics[producer], advance.sequences, strict=True):

@@ -77,7 +77,7 @@ class ForgedSenderError(LockstepError):
 class Packet:
     """A message as bytes with its stamp [ns] and sequence number; decoded at first access unless the message is known.
 
-    `checked` is True if the message was held against the contract.
+    `checked` is True if the message was checked against the contract.
     """
 
     __slots__ = ("checked", "message", "payload", "sequence", "stamp")

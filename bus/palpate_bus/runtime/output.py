@@ -72,11 +72,13 @@ def unpack_chunk(payload: bytes) -> tuple[int, Iterator[ChunkMessage]]:
         column.tolist() for column in (chunk.topic, chunk.stamp, chunk.sequence, chunk.length)
     ]
     if len(set(map(len, columns))) != 1:
-        raise codec.CodecError(f"{CHUNK_TYPE}: columns of {', '.join(str(len(column)) for column in columns)} messages")
+        raise codec.CodecError(f"{CHUNK_TYPE}: columns differ in length: {', '.join(str(len(column)) for column in columns)}")
     if sum(lengths) != len(data):
-        raise codec.CodecError(f"{CHUNK_TYPE}: messages of {sum(lengths)} bytes in {len(data)} bytes")
+        raise codec.CodecError(f"{CHUNK_TYPE}: lengths sum to {sum(lengths)} bytes, the data have {len(data)}")
     if min(stamps, default=0) < 0 or max(topics, default=-1) >= len(chunk.topics):
-        raise codec.CodecError(f"{CHUNK_TYPE}: a message of {min(stamps)} ns, or of topic {max(topics)} of {len(chunk.topics)}")
+        raise codec.CodecError(
+            f"{CHUNK_TYPE}: stamp {min(stamps)} ns below 0, or topic {max(topics)} of only {len(chunk.topics)}"
+        )
     ends = list(accumulate(lengths, initial=0))
     payloads = (data[begin:end] for begin, end in pairwise(ends))
     names = (chunk.topics[topic] for topic in topics)

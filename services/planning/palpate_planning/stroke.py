@@ -118,7 +118,10 @@ class Duration:
 
 
 def clearance(sigma: float) -> float:
-    """Return the height [m] at which a wall that is known within `sigma` [m] is not touched, and from which it is sought."""
+    """Return the height [m] from which skin that is known within `sigma` [m] is sought, where it is not touched yet.
+
+    At most `hover_m`, the height of the planned paths.
+    """
     return min(max(STROKE.hop_height_m, TOUCH.sigmas * sigma + TOUCH.margin_m), SEGMENTS.hover_m)
 
 

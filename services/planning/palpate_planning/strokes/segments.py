@@ -56,7 +56,7 @@ class Segment(NamedTuple):
 
 @dataclass(slots=True)
 class Layout:
-    """All strokes and paths between them, and what prevents them."""
+    """All strokes and paths between them, and what prevents them. `segments` are complete only if it is feasible."""
 
     segments: list[Segment] = field(default_factory=list)
     breaks: set[int] = field(default_factory=set)

@@ -175,7 +175,9 @@ class Wiring:
 
     def _topic(self, name: str, allowed: set[str], what: str) -> Topic:
         if name not in allowed:
-            raise MapError(f"{name}: the role {self._table.role} does not {what} this topic; it may {', '.join(sorted(allowed))}")
+            raise MapError(
+                f"{name}: the role {self._table.role} does not {what} this topic; it can {what} {', '.join(sorted(allowed))}"
+            )
         return self._rules.topics[name]
 
     def _variable(self, name: str, where: str) -> FmuVariable:
@@ -199,7 +201,9 @@ class Wiring:
         for key, entry in entries.items():
             where, variable = f"{name}.{entry.field} -> {key}", chosen[key]
             if not (variable.causality == "input" or (variable.causality == "parameter" and variable.variability == "tunable")):
-                raise MapError(f"{where}: only inputs and tunable parameters can be set, this is {variable.causality}")
+                raise MapError(
+                    f"{where}: it is a {variable.variability} {variable.causality}; want an input or a tunable parameter"
+                )
             change = self._change(entry, topic, entry.field, variable, where, into_fmu=True)
             moves.append((ports[key][key], entry.field, change))
         return InputTopic(topic, tuple(dict.fromkeys(ports.values())), tuple(moves))
@@ -223,7 +227,7 @@ class Wiring:
                     raise MapError(f"{where}: the scenario gives only {', '.join(self._scenario) or 'nothing'}")
                 value = self._turn(entry, topic, where, into_fmu=False)(self._scenario[entry.scenario])
                 if size(topic.type, path) not in (None, np.size(value)):
-                    raise MapError(f"{where}: {np.size(value)} values do not fit")
+                    raise MapError(f"{where}: {np.size(value)} values; the field has {size(topic.type, path)}")
             constants.append((paths[path], value))
         return OutputTopic(self._fmu.path.name, topic, tuple(dict.fromkeys(ports.values())), tuple(moves), tuple(constants))
 
@@ -231,7 +235,7 @@ class Wiring:
         """Return the change of frame and unit of a field's values on the way into the FMU, or back."""
         room = size(topic.type, path)
         if room is not None and room != variable.size:
-            raise MapError(f"{where}: {room} values of {topic.type} against {variable.size} of the FMU")
+            raise MapError(f"{where}: the field has {room} values, the FMU variable {variable.name} has {variable.size}")
         turn, scale = self._turn(entry, topic, where, into_fmu), self._scale(entry, topic, path, variable, where, into_fmu)
         first, second = (turn, scale) if into_fmu else (scale, turn)
         return lambda values: second(first(values))
@@ -243,7 +247,7 @@ class Wiring:
         ours, theirs = self._table.frame, topic.frame
         for frame, owner in ((ours, "the map"), (theirs, f"the contract for {topic.name}")):
             if frame not in self._frames:
-                raise MapError(f"{where}: the frame of {owner} is {frame}; known are {', '.join(self._frames)}")
+                raise MapError(f"{where}: unknown frame {frame} of {owner}; want one of {', '.join(self._frames)}")
         if ours == theirs:
             return _same
         X = inverse(self._frames[str(ours)]) @ self._frames[str(theirs)]

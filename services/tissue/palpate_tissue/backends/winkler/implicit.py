@@ -5,8 +5,9 @@ The equations of `tissue.py` by backward Euler,
     C (u - u0) / h + K (u - sum_k y_k) + k_w A (sigma(u) + tension a max(u, 0)) = f,    f >= 0,  u >= w,  f (u - w) = 0
 
 are solved by projected successive over-relaxation, vertex by vertex, with the springs linearised at the present displacement.
-Only the vertices near the sphere are stepped; the others follow every `far_s`, or when the sphere comes near. The README compares
-its forces with those of the explicit steps.
+Only the vertices near the sphere are stepped; those that were near it before follow every `far_s`, or when it returns. Vertices
+that it never came near stay at rest: displacements are up to 0.05 mm too small, forces by 0.1 %. The README of the service
+compares forces with those of the explicit steps.
 """
 
 from math import sqrt
