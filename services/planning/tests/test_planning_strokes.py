@@ -1,17 +1,24 @@
 """Strokes of a scan: coverage, poses of the indenter, set-points along a path."""
 
+from unittest.mock import Mock
+
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings, strategies as st
+from planning_fakes import known
 from scipy.spatial.transform import Rotation
 
 from palpate_bus.setpoint import ControlMode
 from palpate_models.scenario.patterns import LIMITS
 from palpate_models.scenario.schema import Mode
 from palpate_planning.interruptions import Displacement
+from palpate_planning.motion.kinematics import IkSolution
+from palpate_planning.motion.planner import NoPathError
+from palpate_planning.reasons import Cause
 from palpate_planning.stroke_motion import stroke_setpoint
-from palpate_planning.strokes.coverage import TUNING, strokes, touches
+from palpate_planning.strokes.coverage import TUNING, Stroke, strokes, touches
 from palpate_planning.strokes.path import SurfacePath, centre, frame, frames_along, least_twist
+from palpate_planning.strokes.segments import REACH, STRETCHED, SegmentPlanner
 from palpate_planning.wall.surface import PerceivedSurface
 
 SPACING = 0.0125
@@ -180,3 +187,19 @@ def test_the_target_is_the_one_reached_last() -> None:
     _, middle, end = path.visits
     reached = [path.target(s) for s in (-1.0, 0.0, middle - 1e-9, middle, end - 1e-9, end, end + 1.0)]
     assert reached == [7, 7, 7, 3, 3, 5, 5]
+
+
+@pytest.mark.parametrize(("fault", "reason"), [("reach", REACH), ("stretched", STRETCHED), ("collision", None)])
+def test_a_target_that_the_arm_cannot_take_is_dropped_with_the_cause(fault: str, reason: Cause | None) -> None:
+    """The arm fails on the far side of a flat patch, where two of three targets are."""
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 21), np.linspace(-0.1, 0.1, 21))
+    surface = PerceivedSurface.from_mesh(np.column_stack((x.ravel(), y.ravel(), np.zeros(x.size))), None, np.eye(4))
+    fails = Mock(side_effect=lambda X_WI, near: IkSolution(X_WI[:, 3], fault != "reach" or X_WI[0, 3] < 0.01))
+    kinematics = Mock(solve=fails, stretched=lambda q, bend: fault == "stretched" and q[0] >= 0.01)
+    kinematics.pose.return_value = np.eye(4)
+    scene = Mock(free=lambda q: fault != "collision" or q[0] < 0.01, collisions=lambda q: ["elbow"])
+    planner = SegmentPlanner(kinematics, scene, surface, np.zeros((3, 4)), known(), 0.1, Mock(side_effect=NoPathError("none")))
+    xy = np.column_stack((np.linspace(0.0, 0.02, 11), np.zeros(11)))
+    dropped = planner.layout([Stroke(xy, np.arange(3), np.array([0, 5, 10]))]).dropped
+    assert set(dropped) == {1, 2}
+    assert dropped[1] == reason if reason else "elbow" in dropped[1].text
