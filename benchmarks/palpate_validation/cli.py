@@ -16,8 +16,7 @@ if TYPE_CHECKING:
     from palpate_validation.check import PageSection
 
 SECTIONS = (
-    "hertz", "elastic", "mesh", "people", "population", "persons", "buried", "guarding", "relaxation", "energy", "breathing",
-    "drop",
+    "hertz", "elastic", "mesh", "people", "population", "buried", "guarding", "relaxation", "energy", "breathing", "drop",
 )  # fmt: skip
 """Sections in the order of the report."""
 MODULES = {"elastic": "hertz", "mesh": "meshes"}

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 from palpate_errors import ExitStatus
 from palpate_models.patient.remus2024 import relaxed_people
 from palpate_tissue.backends.elastic.slab import FlatSlab
-from palpate_validation import buried, drop, energy, guarding, hertz, meshes, people, persons, population, relaxation
+from palpate_validation import buried, drop, energy, guarding, hertz, meshes, people, population, relaxation
 from palpate_validation.check import Check, PageSection, failures, write
 from palpate_validation.meshes import lump, static_force, uniform
 from palpate_validation.population import DEPTHS_M, sample_of
@@ -33,7 +33,6 @@ SECTIONS: dict[str, Callable[[], PageSection]] = {
     "some living people": lambda: people.section(people.measure(relaxed_people()[::6])),
     "random cycles": lambda: energy.section(energy.measure(8)),
     "population": population.section,
-    "bone": persons.section,
     "buried lumps against finite elements": buried.section,
 }
 SLOW_SECTIONS = {

@@ -6,8 +6,9 @@ from scipy.special import expit
 
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.detection import FEATURES
+from palpate_models.patient.schema import Build
 from palpate_validation.people import PRESS, at_depths
-from research import assessment_calibration, guarding_calibration, people_fit
+from research import assessment_calibration, guarding_calibration, people_fit, persons
 from research.assessment_calibration import WeighedPatient, reported, slope
 from research.guarding_calibration import TrueCause, Weighed
 
@@ -81,3 +82,8 @@ def test_people_are_fitted_by_the_wall_that_made_the_force() -> None:
     np.testing.assert_allclose(wall, (2e5, 0.015, 90.0), rtol=1e-3)
     assert offset == pytest.approx(0.0005, rel=1e-3)
     assert rms < 1e-3
+
+
+@pytest.mark.parametrize(("build", "seed"), persons.SEEDS)
+def test_the_wall_over_bone_is_felt_as_stiff(build: Build, seed: int) -> None:
+    assert persons.sample(build, seed).over_bone >= 3.0

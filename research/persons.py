@@ -1,5 +1,6 @@
-"""Three sampled persons: maps of the force of a press, and the shape of the body."""
+"""Three sampled persons: `python -m research.persons` draws maps of the force of a press, and the shape of the body."""
 
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -14,7 +15,7 @@ from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.person import drawn
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Build, Phantom
-from palpate_validation.check import COLOURS, INK, QUIET, Check, PageSection
+from palpate_validation.check import COLOURS, INK, QUIET, write_figure
 
 SEEDS = ((Build.SLIM, 4), (Build.MEDIAN, 2), (Build.OBESE, 3))
 
@@ -50,30 +51,18 @@ class Person(NamedTuple):
         """Return the mask of vertices that face forward, shape (n,)."""
         return np.asarray(self.model.normals[:, 2] > 0.3)
 
+    @property
+    def over_bone(self) -> float:
+        """Return the median force over bone, relative to that over the belly."""
+        belly = self.front & (self.bone < 0.01) & (np.abs(self.model.vertices[:, :2]) < SETUP.region_m).all(axis=1)
+        return float(np.median(self.force[self.front & (self.bone > 0.9)]) / np.median(self.force[belly]))
 
-def _person(build: Build, seed: int) -> Person:
+
+def sample(build: Build, seed: int) -> Person:
+    """Return the person of a seed."""
     phantom = drawn(Phantom(kind="person", build=build), seed)
     model = build_phantom(phantom, seed)
     return Person(build, phantom, model, force_at_10_mm(model, phantom.stiffness))
-
-
-def section() -> PageSection:
-    """Return the persons with their bounds."""
-    found = tuple(_person(build, seed) for build, seed in SEEDS)
-    checks = []
-    for person in found:
-        belly = person.front & (person.bone < 0.01) & (np.abs(person.model.vertices[:, :2]) < SETUP.region_m).all(axis=1)
-        over_bone = float(np.median(person.force[person.front & (person.bone > 0.9)]) / np.median(person.force[belly]))
-        checks.append(Check(f"{person.build}: ratio of the force over bone to that over the belly", over_bone, "times", low=3.0))
-        checks.append(Check(f"{person.build}: median force over the belly", float(np.median(person.force[belly])), "N"))
-    text = (
-        "Three persons of `phantom.kind: person`, one of each build. Above, the force on a sphere of 10 mm pressed 10 mm "
-        "deep, from the local stiffness and stiffening; white lines mark the edge of "
-        "ribs and iliac crests under the wall, the dashed square is the default examined region. Below, the crown "
-        "line from pelvis "
-        "to ribs, and the middle section."
-    )
-    return PageSection("persons", "Three persons", text, tuple(checks), lambda f: draw(f, found), (7.0, 4.6))
 
 
 def draw(figure: Figure, found: tuple[Person, ...]) -> None:
@@ -105,3 +94,13 @@ def draw(figure: Figure, found: tuple[Person, ...]) -> None:
     figure.colorbar(
         image, ax=axes[0], label="force at 10 mm [N]", extend="max", shrink=0.9, ticks=SETUP.ticks_n, format="%g"
     ).minorticks_off()
+
+
+def main() -> None:
+    """Write the figure of docs/reality.md."""
+    found = tuple(sample(build, seed) for build, seed in SEEDS)
+    write_figure(lambda figure: draw(figure, found), Path("docs/validation/persons.png"), (7.0, 4.6))
+
+
+if __name__ == "__main__":
+    main()
