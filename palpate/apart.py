@@ -45,7 +45,7 @@ class ChildLost(RunError):
         self.late = late
 
 
-def ended(code: int) -> str:
+def describe_end(code: int) -> str:
     """Return how a process ended, from its exit status or minus its signal."""
     if code >= 0:
         return f"left with status {code}"
@@ -92,7 +92,7 @@ def run_apart(
     return result
 
 
-def guarded(
+def run_guarded(
     part: str, work: Callable[[], T], limit_s: float, error: type[Exception] = RunError, place: Callable[[], object] = tuple
 ) -> T:
     """Return what `work` returns in a child process. Raises `error` that names the part if that exits, crashes or hangs.
@@ -165,7 +165,7 @@ class _Child:
                 os.kill(self.pid, signal.SIGKILL)
             self._ended(0)
         if self._answer is None:
-            raise ChildLost(ended(self._code or 0))
+            raise ChildLost(describe_end(self._code or 0))
         kind, value = self._answer
         if kind == "raised":
             raise value

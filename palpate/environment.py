@@ -18,7 +18,7 @@ if platform.machine() in KERNELS:
 
 
 @contextmanager
-def given(variables: Mapping[str, str]) -> Iterator[None]:
+def set_environment(variables: Mapping[str, str]) -> Iterator[None]:
     """Temporarily sets environment variables."""
     before = dict(os.environ)
     os.environ.update(variables)

@@ -11,7 +11,7 @@ import typer
 from rich.table import Table
 from rich.text import Text
 
-from palpate.apart import guarded
+from palpate.apart import run_guarded
 from palpate.console import CaseDisplay, SteadyConsole, refuse, wide_console
 from palpate.run.options import Settings
 
@@ -139,7 +139,7 @@ def simulate(
         return probing, () if probing else run_and_plot(file, out)
 
     try:
-        probing, names = guarded(str(file), perform, math.inf)
+        probing, names = run_guarded(str(file), perform, math.inf)
     except FmuError as error:
         refuse(f"{error} (this machine is {native()})")
     if probing is None:

@@ -44,7 +44,7 @@ def perceive(
 
     own = bag / "exam.yaml"
     chosen = load_scenario(scenario or (str(own) if own.is_file() else "clean"), settings or ())
-    seen = perceived(ReplayedCamera(open_recording(bag), whole=False), chosen)
+    seen = perceive_recording(ReplayedCamera(open_recording(bag), whole=False), chosen)
     figures = write(out, seen, chosen)
     if as_json:
         print_json(figures)
@@ -53,7 +53,7 @@ def perceive(
         print(f"written to {out}: surface.ply, surface.png")
 
 
-def perceived(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
+def perceive_recording(camera: ReplayedCamera, scenario: Scenario) -> Perceived:
     """Return the result of perception from all images of a recording. Raises RunError if there is no surface."""
     import numpy as np
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -39,19 +38,19 @@ def plan(
 
       palpate plan person --seed 3 --set exam.spacing_m=0.02 -o plan.png
     """
-    from palpate.apart import guarded
-    from palpate.run.inputs import usable
+    from palpate.apart import run_guarded
+    from palpate.run.inputs import check_usable
     from palpate_models.patient.phantom import build_phantom
     from palpate_planning.motion.planner import NoPathError
 
     if out.suffix.lower() != ".png":
         refuse(f"--out {out}: want the name of a .png file")
-    chosen = usable(scenario, settings, seed)
+    chosen = check_usable(scenario, settings, seed)
     try:
         with SteadyConsole(stderr=True).status("planning: about ten seconds"):
             phantom = build_phantom(chosen.phantom, chosen.seed)
             check_tissue(chosen, phantom)
-            planned = guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
+            planned = run_guarded(f"exam.pattern = {chosen.exam.pattern!r}", lambda: prospect(chosen, phantom), math.inf)
             draw(out, chosen, phantom, planned)
     except NoPathError as error:
         refuse(error)
@@ -62,8 +61,7 @@ def plan(
     console.print(f"drawn in {out}", highlight=False, soft_wrap=True)
 
 
-@dataclass(frozen=True)
-class Prospect:
+class Prospect(NamedTuple):
     """A planned examination."""
 
     scan: Scan

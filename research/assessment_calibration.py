@@ -27,7 +27,7 @@ from statsmodels.api import Logit
 from statsmodels.stats.proportion import proportion_confint
 
 import palpate_assessment
-from palpate.quick.case import assess, examined
+from palpate.quick.case import assess, examine_quickly
 from palpate.report.results import truth_of_run
 from palpate.report.scoring import Truth
 from palpate.study.statistics.estimate import LEVEL, Estimate
@@ -89,7 +89,7 @@ def scenario(seed: int) -> Scenario:
 def weigh(seed: int) -> WeighedPatient:
     """One patient, examined and weighed."""
     patient = scenario(seed)
-    gathered = examined(patient)
+    gathered = examine_quickly(patient)
     known = truth_of_run(patient, gathered).felt
     gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service = AssessmentService(exam_input(patient))

@@ -21,7 +21,7 @@ from scipy.optimize import minimize
 from sklearn.metrics import roc_auc_score
 
 import palpate_assessment
-from palpate.quick.case import assess, examined
+from palpate.quick.case import assess, examine_quickly
 from palpate.report.results import truth_of_run
 from palpate.report.scoring import Truth
 from palpate.study.cases import Case, Request, cases_of
@@ -71,7 +71,7 @@ def cases() -> list[Case]:
 def weigh(case: Case) -> list[Weighed]:
     """The candidates of one patient's examination, and what they truly are."""
     scenario = Scenario.model_validate(case.scenario)
-    gathered = examined(scenario)
+    gathered = examine_quickly(scenario)
     known = truth_of_run(scenario, gathered).felt
     gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service = AssessmentService(exam_input(scenario))

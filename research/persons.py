@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.quick.felt import force_at_10_mm
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.abdomen import bone_share
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Build, Phantom
 from palpate_validation.check import COLOURS, INK, QUIET, write_figure
@@ -60,7 +60,7 @@ class Person(NamedTuple):
 
 def sample(build: Build, seed: int) -> Person:
     """Return the person of a seed."""
-    phantom = drawn(Phantom(kind="person", build=build), seed)
+    phantom = draw_person(Phantom(kind="person", build=build), seed)
     model = build_phantom(phantom, seed)
     return Person(build, phantom, model, force_at_10_mm(model, phantom.stiffness))
 

@@ -20,7 +20,7 @@ from pydantic import TypeAdapter
 from scipy.optimize import minimize
 
 import palpate_assessment
-from palpate.quick.case import assess, examined
+from palpate.quick.case import assess, examine_quickly
 from palpate.report.results import truth_of_run
 from palpate_assessment.assess import weigh_all
 from palpate_assessment.calibration import Calibration, load_calibration
@@ -31,7 +31,7 @@ from palpate_assessment.service import AssessmentService
 from palpate_assessment.shapes import ridge
 from palpate_assessment.standard import USUAL
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Phantom, Structure, StructureKind
 from palpate_models.scenario.load import exam_input
 from palpate_models.scenario.schema import Marked, Scenario
@@ -150,14 +150,14 @@ def variant(name: str, seed: int) -> Scenario:
     """Return the scenario of a variant's person; those with a structure have no lump."""
     made = scenario(seed) if name in PERSONS else scenario(2 * seed)
     change = PERSONS[name] if name in PERSONS else STRUCTURES[name][0]
-    person = change(drawn(made.phantom, made.seed), np.random.default_rng(8000 + seed))
+    person = change(draw_person(made.phantom, made.seed), np.random.default_rng(8000 + seed))
     return made.model_copy(update={"phantom": person})
 
 
 def evidence(name: str, seed: int) -> list[Evidence]:
     """Return the candidates of a variant's person."""
     patient = variant(name, seed)
-    gathered = examined(patient)
+    gathered = examine_quickly(patient)
     known = truth_of_run(patient, gathered).felt if name in PERSONS else None
     gathered.exam_states = gathered.exam_states[:-1]  # the last asks for findings
     service = AssessmentService(exam_input(patient))

@@ -18,7 +18,7 @@ import numpy as np
 from scipy import stats
 
 from palpate.environment import FIXED
-from palpate_benchmarks.struck import SETTINGS
+from palpate_benchmarks.injection import SETTINGS
 from palpate_bus.settings import variable
 
 PAIRS: Final = 6

@@ -17,7 +17,7 @@ from palpate.check.perform import check_here
 from palpate.check.rig import RigSettings
 from palpate.run import composed
 from palpate.run.inputs import scan_safely
-from palpate.run.roles import checked
+from palpate.run.roles import check_choices
 from palpate_bus.runtime.failure import FailureCode
 from palpate_conductor.outcome import Patience, RunProgress, RunResult
 from palpate_errors import RunError
@@ -181,7 +181,7 @@ def test_a_file_that_is_loaded_before_the_run_is_named(
         if function == "scan":
             scan_safely(scenario.exam, lambda xy: (xy, xy))
         else:
-            checked(scenario)
+            check_choices(scenario)
 
 
 def test_a_check_of_a_service_that_exits_does_not_pass(tmp_path: Path) -> None:

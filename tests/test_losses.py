@@ -13,7 +13,8 @@ import pytest
 from examination import assert_held_and_no_harder, kill_in_contact
 
 from palpate.report.evidence import peak_force
-from palpate_benchmarks.struck import CONDUCTOR, TIMES, Blow, Struck, StruckRun, calm_rate, strike
+from palpate_benchmarks.campaign import CASES
+from palpate_benchmarks.injection import CONDUCTOR, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.codec import decode
@@ -66,35 +67,37 @@ def kill(processes: Mapping[str, psutil.Process]) -> None:
 
 def freeze(processes: Mapping[str, psutil.Process]) -> None:
     processes[CONDUCTOR].suspend()
-    time.sleep(TIMES.freeze_s)
+    time.sleep(CASES.freeze_s)
     processes[CONDUCTOR].resume()
 
 
-def recorded(struck: Struck, topic: str) -> list[tuple[int, Any]]:
+def recorded(ended: FaultResult, topic: str) -> list[tuple[int, Any]]:
     """Return the recorded messages of a topic: (stamp [ns], message)."""
     row = contract().topics[topic]
-    return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(struck.folder).messages([topic])]
+    return [(m.stamp, decode(m.payload, row.type)) for m in open_recording(ended.folder).messages([topic])]
 
 
-def forces_of(struck: Struck) -> list[tuple[int, float]]:
+def forces_of(ended: FaultResult) -> list[tuple[int, float]]:
     """Return simulated times [ns] and the peak true force [N] since the previous one."""
-    return [(stamp, peak_force(message)) for stamp, message in recorded(struck, "truth/indentation")]
+    return [(stamp, peak_force(message)) for stamp, message in recorded(ended, "truth/indentation")]
 
 
-def strike_conductor(folder: Path, runtime: str, blow: Blow) -> Struck:
+def inject_in_conductor(folder: Path, runtime: str, inject: Injector) -> FaultResult:
     """Retry, because on a busy machine a wall-clock run may be stopped before contact."""
     for attempt in range(ATTEMPTS):
         wallclock = runtime == "wallclock"
-        struck = strike(StruckRun(folder / str(attempt), wallclock, calm_rate() if wallclock else 1.0), blow)
-        if struck is not None:
-            assert not struck.staying
-            return struck
+        ended = inject_fault(
+            FaultRun(folder / str(attempt), wallclock, sustained_rate(reserve=True) if wallclock else 1.0), inject
+        )
+        if ended is not None:
+            assert not ended.hung
+            return ended
     raise AssertionError(f"never at depth in {ATTEMPTS} attempts: see {folder}")
 
 
-def assert_lifted(struck: Struck) -> None:
+def assert_lifted(ended: FaultResult) -> None:
     """Planning lifted the arm clear of the patient before the services left, and the force did not rise."""
-    states, forces = recorded(struck, "exam/state"), forces_of(struck)
+    states, forces = recorded(ended, "exam/state"), forces_of(ended)
     reported = next(stamp for stamp, state in states if state.reason == ExamState.REASON_SERVICE_LOST)
     before = max(force for stamp, force in forces if stamp <= reported)
     after = max(force for stamp, force in forces if stamp > reported)
@@ -106,25 +109,25 @@ def assert_lifted(struck: Struck) -> None:
     print(f"before {before:.2f} N, after {after:.2f} N")
 
 
-@pytest.mark.parametrize("blow", [kill, freeze])
-def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(blow: Blow, tmp_path: Path) -> None:
-    struck = strike_conductor(tmp_path, "wallclock", blow)
-    assert_lifted(struck)
-    if blow is freeze:
-        assert struck.watched is not None and struck.watched.result.failure is not None
-        assert struck.watched.result.failure.code == FailureCode.CONDUCTOR_LOST
-        assert "stood still for" in struck.watched.result.failure.text
+@pytest.mark.parametrize("inject", [kill, freeze])
+def test_in_wall_clock_mode_the_arm_is_lifted_and_the_services_leave(inject: Injector, tmp_path: Path) -> None:
+    ended = inject_in_conductor(tmp_path, "wallclock", inject)
+    assert_lifted(ended)
+    if inject is freeze:
+        assert ended.log is not None and ended.log.result.failure is not None
+        assert ended.log.result.failure.code == FailureCode.CONDUCTOR_LOST
+        assert "stood still for" in ended.log.result.failure.text
 
 
-@pytest.mark.parametrize("blow", [kill, freeze])
-def test_in_lockstep_the_measured_data_are_recovered(blow: Blow, tmp_path: Path) -> None:
-    struck = strike_conductor(tmp_path, "lockstep", blow)
-    *before, last = forces_of(struck)
+@pytest.mark.parametrize("inject", [kill, freeze])
+def test_in_lockstep_the_measured_data_are_recovered(inject: Injector, tmp_path: Path) -> None:
+    ended = inject_in_conductor(tmp_path, "lockstep", inject)
+    *before, last = forces_of(ended)
     assert last[1] <= max(force for _, force in before) + MORE_N
-    command = [str(Path(sys.executable).with_name("palpate")), "report", str(struck.folder), "--recover", "--json"]
+    command = [str(Path(sys.executable).with_name("palpate")), "report", str(ended.folder), "--recover", "--json"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=300, check=False)
     assert done.returncode == 0, done.stderr
-    report = json.loads((struck.folder / "report.json").read_text(encoding="utf-8"))
+    report = json.loads((ended.folder / "report.json").read_text(encoding="utf-8"))
     assert report["run_hash"] is None
     assert report["runtime"] == "recovered"
     assert abs(report["sim_time_s"] - last[0] / 1e9) < 0.2

@@ -20,7 +20,7 @@ from typer.testing import CliRunner
 
 from palpate.commands import COMMANDS, app_for
 from palpate.report.evidence import sample_columns
-from palpate.run.roles import checked, settings_of
+from palpate.run.roles import check_choices, settings_of
 from palpate.study.statistics.reading import read_tables
 from palpate_bus.contract import contract
 from palpate_bus.contract.port_check import violations
@@ -189,7 +189,7 @@ def test_every_command_is_valid(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
         settings = [value for flag, value in pairwise(words) if flag == "--set"]
         settings += settings_of([value for flag, value in pairwise(words) if flag == "--service"])
         name = words[0] if words and not words[0].startswith("--") else "clean"
-        checked(load_scenario(name, settings))
+        check_choices(load_scenario(name, settings))
 
 
 def test_the_mesh_is_an_abdomen(tmp_path: Path) -> None:

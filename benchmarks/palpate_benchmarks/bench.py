@@ -32,10 +32,10 @@ def bench(
 ) -> None:
     """Measure the speed of whole runs; print tables and write bench.json."""
     from palpate.report.files import fingerprint, write_text
-    from palpate.run.inputs import usable
+    from palpate.run.inputs import check_usable
 
     screen, console = Console(stderr=True), wide_console(160)
-    cases = run_cases(usable(scenario, settings))
+    cases = run_cases(check_usable(scenario, settings))
     figures: dict[str, Any] = {"platform": fingerprint(), "runs": {}}
     try:
         with CaseDisplay(screen, quiet or not screen.is_terminal, "benchmarks") as display:

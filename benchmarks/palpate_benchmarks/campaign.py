@@ -22,12 +22,12 @@ import psutil
 
 from palpate.report.archive import EvidenceError
 from palpate.report.evidence import peak_force
-from palpate.report.recovery import recovered
+from palpate.report.recovery import recover_run
 from palpate.run.group import one_per_process
 from palpate.run.roles import WORKERS
 from palpate_benchmarks.fault_cases import MESSAGE_KINDS, PROCESS_KINDS, SCARCE_KINDS, CaseOutcome, FaultCase, FaultFinding
 from palpate_benchmarks.faulty import InjectedFault, command
-from palpate_benchmarks.struck import CONDUCTOR, ROLES, TIMES, Blow, Struck, StruckRun, Watched, calm_rate, kept_rate, strike
+from palpate_benchmarks.injection import CONDUCTOR, ROLES, FaultLog, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, RobotStatus, SupervisorState
 from palpate_bus.messages.stamps import NS, nanoseconds
@@ -79,6 +79,8 @@ class CaseTuning(NamedTuple):
 
     partitions_s: tuple[int, ...] = (1, 5, 30)
     starved_s: tuple[int, ...] = (1, 5)
+    freeze_s: float = 10.0
+    """Duration of a freeze that includes the conductor."""
     spinning_per_core: int = 8
     """Busy processes per core while the machine is starved."""
     at_depth_s: tuple[float, float] = (0.05, 0.6)
@@ -91,12 +93,12 @@ CASES: Final = CaseTuning()
 def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
     """Yield the listed cases of these modes and kinds; `only` restricts them to those that hit one of these roles and topics."""
     for mode in modes:
-        for kind, where in _listed():
+        for kind, where in _list_faults():
             if kind in kinds and (not only or set(where.split(",")[0].split(TOGETHER)) & set(only)):
                 yield FaultCase(kind, where, mode == "wallclock")
 
 
-def _listed() -> Iterator[tuple[str, str]]:
+def _list_faults() -> Iterator[tuple[str, str]]:
     """Yield kind and place of every fault; those of whole runs first."""
     yield from ((kind, where) for kind in ENDING for where in FIXED)
     yield from (("memory", role) for role in ROLES)
@@ -108,7 +110,7 @@ def _listed() -> Iterator[tuple[str, str]]:
     yield from ((kind, topic) for kind in MESSAGE_KINDS for topic in topics)
 
 
-def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
+def draw_cases(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
     """Yield `count` random cases: one to three roles are killed or frozen at a random time in contact."""
     draw = Random(seed)
     for _ in range(count):
@@ -121,29 +123,29 @@ def run_case(case: FaultCase, folder: Path) -> FaultFinding:
     """Run one case; its logs stay in a subfolder of `folder`."""
     finding = FaultFinding(case.kind, case.where, case.mode, at_s=case.at_s)
     begin = monotonic()
-    run, blow = prepared(case, (folder / case.name).resolve(), kept_rate() if case.wallclock else 1.0)
+    run, inject = prepare(case, (folder / case.name).resolve(), sustained_rate() if case.wallclock else 1.0)
     with _network(case) as name:
-        struck = strike(run, blow, name)
-        if struck is None and case.wallclock:
-            struck = strike(prepared(case, run.folder, calm_rate())[0], blow, name)
+        ended = inject_fault(run, inject, name)
+        if ended is None and case.wallclock:
+            ended = inject_fault(prepare(case, run.folder, sustained_rate(reserve=True))[0], inject, name)
     finding.wall_s = round(monotonic() - begin, 1)
-    if struck is None:
+    if ended is None:
         finding.ended = "the fault was not injected: the indenter did not reach the depth"
     else:
-        judge(finding, struck, _culprits(case))
+        judge(finding, ended, _culprits(case))
     return finding
 
 
-def prepared(case: FaultCase, folder: Path, rate: float) -> tuple[StruckRun, Blow]:
+def prepare(case: FaultCase, folder: Path, rate: float) -> tuple[FaultRun, Injector]:
     """Return the run of a case and the function that injects its fault."""
     if case.kind in MESSAGE_KINDS or (case.kind in PROCESS_KINDS and case.where in WORKERS):
         return _of_one_service(case, folder, rate)
     roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
-    run = StruckRun(folder, case.wallclock, rate, one_per_process(roles), at_s=case.at_s, secure=case.kind == PARTITION)
-    return run, _blow(case)
+    run = FaultRun(folder, case.wallclock, rate, one_per_process(roles), at_s=case.at_s, secure=case.kind == PARTITION)
+    return run, _injector(case)
 
 
-def _of_one_service(case: FaultCase, folder: Path, rate: float) -> tuple[StruckRun, Blow]:
+def _of_one_service(case: FaultCase, folder: Path, rate: float) -> tuple[FaultRun, Injector]:
     target = contract().topics[case.where].producer if case.kind in MESSAGE_KINDS else case.where
     groups, early, phase = one_per_process(WORKERS), target != AFTER_SCAN, ExamState.PHASE_SCAN
     faulty: tuple[str, ...] = ()
@@ -157,7 +159,7 @@ def _of_one_service(case: FaultCase, folder: Path, rate: float) -> tuple[StruckR
         if not case.wallclock:  # in lockstep messages do not depend on the placement of the other services
             groups = (target,), tuple(role for role in WORKERS if role != target)
     number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(case.kind, signal.SIGUSR1)
-    run = StruckRun(folder, case.wallclock, rate, groups, phase, case.at_s, faulty, early)
+    run = FaultRun(folder, case.wallclock, rate, groups, phase, case.at_s, faulty, early)
     return run, lambda processes: processes[target].send_signal(number)
 
 
@@ -168,7 +170,7 @@ def _culprits(case: FaultCase) -> list[str]:
     return [MACHINE, FailureCode.BLOCKED] if case.kind == "starve" else case.where.split(TOGETHER)
 
 
-def _blow(case: FaultCase) -> Blow:
+def _injector(case: FaultCase) -> Injector:
     """Return the function that injects the fault of a case of a whole run."""
     if case.kind == "starve":
         return lambda _: starve(_seconds(case))
@@ -181,12 +183,12 @@ def _blow(case: FaultCase) -> Blow:
 
 
 def _signal(case: FaultCase, processes: Mapping[str, psutil.Process]) -> None:
-    """Kill or freeze the roles of a case; roles frozen together with the conductor resume after `TIMES.freeze_s`."""
+    """Kill or freeze the roles of a case; roles frozen together with the conductor resume after `CASES.freeze_s`."""
     roles = case.where.split(TOGETHER)
     for role in roles:
         processes[role].send_signal(signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP)
     if case.kind == "freeze" and CONDUCTOR in roles:  # otherwise the conductor ends the frozen processes
-        sleep(TIMES.freeze_s)
+        sleep(CASES.freeze_s)
         for role in roles:
             if processes[role].is_running():
                 processes[role].send_signal(signal.SIGCONT)
@@ -240,33 +242,33 @@ def _part(seconds: float) -> None:
     _ip("-n", NETWORK, "link", "set", "lo", "up")
 
 
-def judge(finding: FaultFinding, struck: Struck, culprits: Sequence[str]) -> None:
+def judge(finding: FaultFinding, ended: FaultResult, culprits: Sequence[str]) -> None:
     """Enter outcome, signs, forces and reaction into the finding of a case."""
-    finding.injected_s = struck.struck_s
-    finding.hung = struck.status is None or bool(struck.staying)
-    watched = struck.watched
-    if watched is None:
-        watched = Watched(_recovered(finding, struck.folder))
-    result = watched.result
-    if watched.outcome is not None:
-        finding.outcome = watched.outcome
+    finding.injected_s = ended.injected_s
+    finding.hung = ended.status is None or bool(ended.hung)
+    log = ended.log
+    if log is None:
+        log = FaultLog(_recover(finding, ended.folder))
+    result = log.result
+    if log.outcome is not None:
+        finding.outcome = log.outcome
     elif result.failure is not None:
         finding.outcome = CaseOutcome.ENDED
     else:
         finding.outcome = CaseOutcome.CONTINUED_WITHOUT if finding.kind in ENDING else CaseOutcome.COMPLETED
     finding.ended = "complete" if result.failure is None else result.failure.text
-    enter(finding, watched, culprits, struck.struck_s * NS)
+    enter(finding, log, culprits, ended.injected_s * NS)
     if CONDUCTOR in culprits:
-        finding.sign = _conductor_lost(struck.folder)
+        finding.sign = _conductor_lost(ended.folder)
         finding.named = finding.named or bool(finding.sign)
     remove_leftovers()
-    finding.left_behind = str(struck.own) if struck.own.exists() else ""
+    finding.left_behind = str(ended.sockets) if ended.sockets.exists() else ""
 
 
-def _recovered(finding: FaultFinding, folder: Path) -> RunResult:
+def _recover(finding: FaultFinding, folder: Path) -> RunResult:
     """Return the result of a run whose conductor was killed, from its recording."""
     try:
-        _, result = recovered(folder)
+        _, result = recover_run(folder)
     except EvidenceError as error:
         result = RunResult("", Collected(), failure=Failure(FailureCode.UNFINISHED, str(error)))
     finding.kept = bool(result.collected.exam_states)
@@ -283,23 +285,23 @@ def _conductor_lost(folder: Path) -> str:
     return ""
 
 
-def enter(finding: FaultFinding, watched: Watched, culprits: Iterable[str], at: float) -> None:
+def enter(finding: FaultFinding, log: FaultLog, culprits: Iterable[str], at: float) -> None:
     """Enter signs, forces, reaction and blame of a run with a fault at `at` [ns], whose outcome is known."""
-    result, collected = watched.result, watched.result.collected
+    result, collected = log.result, log.result.collected
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
     forces = [(t, force) for t, force in forces if isfinite(force)]  # the fault may be NaN in this message
     finding.peak_force_before_n = round(max((force for t, force in forces if t < at), default=0.0), 2)
     after = [force for t, force in forces if t >= at]
     finding.peak_force_n = round(max(after), 2) if after else None
-    finding.detected_ms = watched.detected_ms
-    if watched.signs:
-        finding.sign = str(watched.signs[0])
+    finding.detected_ms = log.detected_ms
+    if log.signs:
+        finding.sign = str(log.signs[0])
     elif result.failure is not None and not finding.outcome.unharmed:
         finding.sign = str(result.failure)
-    blamed: set[Any] = {*result.lost, *(sign.culprit for sign in watched.signs), *(s.culprit for s in collected.exam_states)}
+    blamed: set[Any] = {*result.lost, *(sign.culprit for sign in log.signs), *(s.culprit for s in collected.exam_states)}
     if result.failure is not None:
         blamed |= {result.failure.code, *result.failure.roles, *result.failure.topics}
-    if any((sign.source, sign.code) in LATE for sign in watched.signs):
+    if any((sign.source, sign.code) in LATE for sign in log.signs):
         blamed.add(MACHINE)
     finding.named = not _with_producers(blamed).isdisjoint(_with_producers(culprits))
     finding.reaction = _reaction(collected, finding.outcome)

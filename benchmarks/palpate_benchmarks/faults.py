@@ -36,7 +36,7 @@ def faults(
     """
     from palpate.study.folder import code_digest
     from palpate_benchmarks import lies
-    from palpate_benchmarks.campaign import cases, drawn, run_case
+    from palpate_benchmarks.campaign import cases, draw_cases, run_case
 
     console = SteadyConsole(stderr=True, width=wide_console(200).width)
     modes, kinds = mode or MODES, kind or [name for name in KINDS if name != LIE]
@@ -47,9 +47,9 @@ def faults(
     found = _load(out)
     todo = list(cases(modes, kinds, only or ()))
     if LIE in kinds:
-        todo += [*lies.cases(modes, only or ()), *lies.drawn(random, seed, modes)]
+        todo += [*lies.cases(modes, only or ()), *lies.draw_lies(random, seed, modes)]
     else:
-        todo += drawn(random, seed, modes)
+        todo += draw_cases(random, seed, modes)
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
     code = code_digest()[:8]

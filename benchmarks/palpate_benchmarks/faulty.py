@@ -20,14 +20,13 @@ messages, 0 for all. `palpate faults` starts its processes in this way.
 import signal
 import sys
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from time import sleep
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import zenoh
 
-from palpate_benchmarks.liar import filled, stamped
+from palpate_benchmarks.liar import fill, shift_stamp
 from palpate_bus.contract import Qos, Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.fields import leaves, numbers
@@ -40,8 +39,7 @@ PAST_S: Final = 3600
 JUMP_NS: Final = 3600 * NS
 
 
-@dataclass(frozen=True)
-class InjectedFault:
+class InjectedFault(NamedTuple):
     """Fault in the messages of one topic."""
 
     topic: str
@@ -123,13 +121,13 @@ def _nan(payload: bytes, topic: Topic) -> bytes:
     message = codec.decode(payload, topic.type)
     for leaf in leaves(topic.type):
         if leaf.base.startswith("float"):
-            message = filled(message, leaf.path, np.full_like(numbers(message, leaf.path), np.nan))
+            message = fill(message, leaf.path, np.full_like(numbers(message, leaf.path), np.nan))
     return codec.encode(message, topic.type)
 
 
 def _stamp(payload: bytes, topic: Topic) -> bytes:
     message = codec.decode(payload, topic.type)
-    return codec.encode(stamped(message, -PAST_S), topic.type) if hasattr(message, "header") else payload
+    return codec.encode(shift_stamp(message, -PAST_S), topic.type) if hasattr(message, "header") else payload
 
 
 CHANGES: Final[dict[str, Callable[[bytes, Topic], bytes]]] = {

@@ -22,9 +22,9 @@ from __future__ import annotations
 import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from itertools import islice
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -65,8 +65,7 @@ ORDER_KINDS: Final = ("late", "repeated", "disordered", "stale")
 KINDS: Final = (*CHANGES, "delayed", *ORDER_KINDS)
 
 
-@dataclass(frozen=True)
-class Lie:
+class Lie(NamedTuple):
     """A lie in the messages of a topic."""
 
     topic: str
@@ -130,9 +129,9 @@ class LyingTopic:
             self._odd = not self._odd
             return self._past[-3][1] if self._odd and len(self._past) > 2 else message
         if lie.kind == "stale":
-            return stamped(message, -lie.amount)
+            return shift_stamp(message, -lie.amount)
         old = [one for stamp, one in self._past if stamp <= t - lie.amount * 1e6] or [self._past[0][1]]
-        return old[-1] if lie.kind == "late" else filled(message, lie.field, numbers(old[-1], lie.field))
+        return old[-1] if lie.kind == "late" else fill(message, lie.field, numbers(old[-1], lie.field))
 
     def _changed(self, t: int, message: Message) -> Message:
         lie = self._lie
@@ -144,17 +143,17 @@ class LyingTopic:
         changed = message
         for path in lie.field.split(","):
             values = CHANGES[lie.kind](numbers(message, path), numbers(self._first, path), lie.amount, t / NS - lie.at_s)
-            changed = filled(changed, path, values)
+            changed = fill(changed, path, values)
         return changed
 
 
-def stamped(message: Message, seconds: float) -> Message:
+def shift_stamp(message: Message, seconds: float) -> Message:
     """Return a copy whose stamp is changed by `seconds`."""
     stamp = max(nanoseconds(message.header.stamp) + round(seconds * NS), 0)
     return replace(message, header=replace(message.header, stamp=time_message(stamp)))
 
 
-def filled(message: Message, path: str, values: Array) -> Message:
+def fill(message: Message, path: str, values: Array) -> Message:
     """Return a copy with other numbers at and below a field, in the order of `numbers`."""
     return _with(message, path.split("."), iter(values.tolist()))
 
@@ -176,7 +175,7 @@ def _in(lie: Lie, topic: str) -> Lie:
     """Return the lie in a topic of the sensor; noise is averaged over the longer period of a twin."""
     periods = contract().topics[lie.topic].period_ms, contract().topics[topic].period_ms
     averaged = (periods[0] / periods[1]) ** 0.5 if lie.kind in NOISES else 1.0
-    return replace(lie, topic=topic, amount=averaged * lie.amount)
+    return lie._replace(topic=topic, amount=averaged * lie.amount)
 
 
 class Liar(Service):

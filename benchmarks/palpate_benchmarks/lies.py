@@ -13,16 +13,16 @@ from random import Random
 from time import monotonic
 from typing import Any, Final, NamedTuple
 
-from palpate.apart import guarded
-from palpate.environment import given
+from palpate.apart import run_guarded
+from palpate.environment import set_environment
 from palpate.run.composed import load_services
 from palpate.run.distributed import run_distributed
 from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
 from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
+from palpate_benchmarks.injection import SETTINGS, FaultLog, sustained_rate
 from palpate_benchmarks.liar import WHOLE, Lie
-from palpate_benchmarks.struck import SETTINGS, Watched, kept_rate
 from palpate_bus.contract import Edge, Topic, contract
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.fields import leaves
@@ -184,7 +184,7 @@ def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
             yield FaultCase(LIE, where, wallclock=True)
 
 
-def drawn(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
+def draw_lies(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
     """Yield `count` random lies: a cell, an amount of 0.1 to 3 times its own, and a share of the twin's time."""
     draw, known = Random(seed), list(cells())
     for _ in range(count):
@@ -220,7 +220,7 @@ class Lockstep:
         scenario = load_scenario("clean", SETTINGS)
         self._collector = Collector(tree=FrameTree(exam_input(scenario)))
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
-        self.twin = guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
+        self.twin = run_guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
 
     def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
         """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
@@ -228,15 +228,15 @@ class Lockstep:
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
         try:
-            return guarded(str(lie), lambda: judged(finding, lie, self._finished(lie), self.twin), LIES.case_s)
+            return run_guarded(str(lie), lambda: judge(finding, lie, self._finished(lie), self.twin), LIES.case_s)
         except RunError as error:  # one case must not end the campaign
             finding.hung, finding.outcome, finding.ended = True, CaseOutcome.ENDED, str(error)
             return finding
 
-    def _finished(self, lie: Lie | None) -> Watched:
+    def _finished(self, lie: Lie | None) -> FaultLog:
         """Run to the end, in a child process."""
         run, collected = self._run, self._collector.collected
-        watched = Watched(RunResult("composed", collected))
+        log = FaultLog(RunResult("composed", collected))
         since = LIES.never_ns if lie is None else lie.at_s * NS
         if lie is not None:
             stepper = run.steppers[lie.role]
@@ -244,7 +244,7 @@ class Lockstep:
 
         def end() -> int | None:
             if run.t >= since and not run.t % (10 * MS):
-                watched.add(RunProgress(run.t, 1.0, collected), (run.t - since) / 1e6)
+                log.add(RunProgress(run.t, 1.0, collected), (run.t - since) / 1e6)
             return collected.end_tick
 
         failure: Failure | None
@@ -255,22 +255,22 @@ class Lockstep:
                 failure = Failure(FailureCode.BLOCKED, HANGS)
         except ServiceFailed as error:
             failure = error.failure
-        watched.result = RunResult("composed", collected, sim_time_s=run.t / NS, failure=failure)
-        return watched
+        log.result = RunResult("composed", collected, sim_time_s=run.t / NS, failure=failure)
+        return log
 
 
-def by_wall_clock(lie: Lie, folder: Path) -> Watched:
+def by_wall_clock(lie: Lie, folder: Path) -> FaultLog:
     """Return an examination with a lie in wall-clock mode, at the rate that this machine keeps."""
-    watched = Watched(RunResult("wallclock", Collected()))
+    log = FaultLog(RunResult("wallclock", Collected()))
 
     def on_progress(progress: RunProgress) -> None:
         if progress.t >= lie.at_s * NS:
-            watched.add(progress, progress.t / 1e6 - lie.at_s * 1e3)
+            log.add(progress, progress.t / 1e6 - lie.at_s * 1e3)
 
-    with given({liar.VARIABLE: str(lie)}):
+    with set_environment({liar.VARIABLE: str(lie)}):
         scenario = load_scenario("clean", (*SETTINGS, f"services.{lie.role}={liar.__file__}"))
-        watched.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=kept_rate()))
-    return watched
+        log.result = run_distributed(scenario, folder, on_progress, (), Timing(wallclock=True, rate=sustained_rate()))
+    return log
 
 
 def healthy(result: RunResult) -> Healthy:
@@ -313,16 +313,16 @@ def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
         begin, lie = monotonic(), lie_of(case.where, twin)
         finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
         if case.wallclock:
-            finding = judged(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+            finding = judge(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
         else:
             finding = lockstep.judged(finding, lie)
         finding.wall_s = round(monotonic() - begin, 1)
         yield finding
 
 
-def judged(finding: FaultFinding, lie: Lie, watched: Watched, twin: Healthy) -> FaultFinding:
+def judge(finding: FaultFinding, lie: Lie, log: FaultLog, twin: Healthy) -> FaultFinding:
     """Return the finding with forces, signs and outcome."""
-    collected, failure = watched.result.collected, watched.result.failure
+    collected, failure = log.result.collected, log.result.failure
     finding.hung = failure is not None and failure.text == HANGS
     felt, findings, background = _felt(collected)
     if failure is not None:
@@ -334,9 +334,9 @@ def judged(finding: FaultFinding, lie: Lie, watched: Watched, twin: Healthy) -> 
         finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
         finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
-    if failure is not None and watched.detected_ms is None:
-        watched.detected_ms = round((watched.result.sim_time_s - lie.at_s) * 1e3, 1)
-    enter(finding, watched, lie.topics, lie.at_s * NS)
+    if failure is not None and log.detected_ms is None:
+        log.detected_ms = round((log.result.sim_time_s - lie.at_s) * 1e3, 1)
+    enter(finding, log, lie.topics, lie.at_s * NS)
     if not finding.named and (reason := undetectable(lie)):
         finding.named, finding.sign = True, f"not detectable: {reason}"
     return finding

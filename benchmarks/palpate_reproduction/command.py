@@ -23,8 +23,8 @@ def reproduce(
     as_json: Annotated[bool, typer.Option("--json", help="Print the figures as JSON.")] = False,
 ) -> None:
     """Reproduce figures 3, 5, 6, 7 and 8 and the claims of the seed paper from new runs. This takes about ten minutes."""
-    from palpate.report.archive import EvidenceError, completed
-    from palpate.run.inputs import usable
+    from palpate.report.archive import EvidenceError, read_completed
+    from palpate.run.inputs import check_usable
     from palpate_reproduction.page import write_page
     from palpate_reproduction.runs import CASES, GRAPH, POINTS, SCENARIO, SNAKE, ReproductionError, perform, record_graph
 
@@ -34,7 +34,7 @@ def reproduce(
     chosen = tuple(settings or ())
     page = docs or out / "reproduction.md"
     images = page.parent / "images" / "reproduction"
-    usable(SCENARIO, chosen)
+    check_usable(SCENARIO, chosen)
     begun, steps = count(), len(cases) + 5
     try:
         with CaseDisplay(console, quiet, "steps") as display:
@@ -43,7 +43,7 @@ def reproduce(
                 display.show(next(begun), steps, step)
 
             for case in cases:
-                if again or completed(out / case.name) is None:
+                if again or read_completed(out / case.name) is None:
                     show(f"examining: {case.pattern}, {case.mode}")
                     perform(case, out / case.name, chosen)
             if again or not (out / "bus" / GRAPH).is_file():

@@ -10,7 +10,7 @@ from pathlib import Path
 from time import sleep
 from typing import Final, NamedTuple
 
-from palpate.report.archive import completed
+from palpate.report.archive import read_completed
 from palpate_bus.runs.announcement import Run, live
 from palpate_bus.wire.liveliness import EntityKind, GraphWatch
 from palpate_bus.wire.zenoh_config import session
@@ -56,7 +56,7 @@ def perform(case: ReproductionCase, folder: Path, settings: tuple[str, ...]) -> 
         process.wait()
     finally:
         _stop(process)
-    if process.returncode or completed(folder) is None:
+    if process.returncode or read_completed(folder) is None:
         raise ReproductionError(f"{case.name} ended with status {process.returncode}: {_last_line(folder)} ({folder})")
 
 
@@ -65,7 +65,7 @@ def record_graph(folder: Path) -> None:
     process = _start(folder, ["--quiet", "--json"])
     try:
         while process.poll() is None:
-            run = _announced(folder, process.pid)
+            run = _await_run(folder, process.pid)
             if run is not None:
                 rows = listen(run)
                 if {row["node"] for row in rows} >= set(run.endpoints) and _has_started(folder):
@@ -112,7 +112,7 @@ def _last_line(folder: Path) -> str:
     return lines[-1] if lines else "no output"
 
 
-def _announced(folder: Path, pid: int) -> Run | None:
+def _await_run(folder: Path, pid: int) -> Run | None:
     """Return the run of a process once it is announced."""
     return next((run for run in live() if run.pid == pid or Path(run.out) == folder.resolve()), None)
 

@@ -33,7 +33,7 @@ KINDS = {
 }
 
 
-def sampled(breathing: Breathing, seed: int, until_s: float = TABLE_S) -> Array:
+def sample_excursion(breathing: Breathing, seed: int, until_s: float = TABLE_S) -> Array:
     """Return the excursion [m] of a patient at every `SETUP.step_s` [s]."""
     curve = BreathingCurve(breathing, seed)
     return np.array([curve.excursion(t) for t in np.arange(0, until_s, SETUP.step_s)])
@@ -57,10 +57,10 @@ def read(excursion: Array) -> pd.DataFrame:
 def section() -> PageSection:
     """Return the comparison of breathing curves of several patients with measurements on people, with bounds."""
     breaths = {
-        kind: pd.concat([read(sampled(KINDS[kind], seed)).assign(patient=seed) for seed in range(SETUP.patients)])
+        kind: pd.concat([read(sample_excursion(KINDS[kind], seed)).assign(patient=seed) for seed in range(SETUP.patients)])
         for kind in ("quiet", "deep")
     }
-    curves = {name: sampled(breathing, 0, SETUP.shown_s) for name, breathing in KINDS.items()}
+    curves = {name: sample_excursion(breathing, 0, SETUP.shown_s) for name, breathing in KINDS.items()}
     speed = np.diff(curves["quiet"])
     jump = float(np.abs(np.diff(speed)).max() / np.abs(speed).max())
     body = build_phantom(Phantom(), 0)

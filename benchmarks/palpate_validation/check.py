@@ -2,10 +2,9 @@
 
 import json
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
 from math import isfinite
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
@@ -16,8 +15,7 @@ from palpate.console import number
 Draw = Callable[[Figure], None]
 
 
-@dataclass(frozen=True)
-class Check:
+class Check(NamedTuple):
     """One measured figure with its bounds. A bound of None is open; without bounds the figure is only reported."""
 
     name: str
@@ -47,8 +45,7 @@ class Check:
         return "" if self.low is None else f"at least {self.low:g}"
 
 
-@dataclass(frozen=True)
-class PageSection:
+class PageSection(NamedTuple):
     """One comparison: its text, its checks and its figure."""
 
     name: str
@@ -114,7 +111,7 @@ def write(sections: Sequence[PageSection], out: Path) -> None:
         section.name: {
             "title": section.title,
             "text": section.text,
-            "checks": [asdict(c) | {"measured": _number(c.measured), "passed": c.passed} for c in section.checks],
+            "checks": [c._asdict() | {"measured": _number(c.measured), "passed": c.passed} for c in section.checks],
         }
         for section in sections
     }

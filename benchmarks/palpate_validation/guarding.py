@@ -1,7 +1,7 @@
 """Validation of guarding: its effect on the force of the standard press and of the strokes of an examination."""
 
 import math
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -54,8 +54,7 @@ class GuardedTouch(NamedTuple):
     """Contraction of the muscle [1], shape (n,)."""
 
 
-@dataclass(frozen=True)
-class GuardingFelt:
+class GuardingFelt(NamedTuple):
     """The standard press and the strokes on the three walls of `KINDS`."""
 
     presses: dict[str, GuardedTouch]
@@ -84,7 +83,7 @@ def wall(kind: str) -> WinklerTissue:
     )
 
 
-def touched(kind: str, x: Array, depth: Array) -> GuardedTouch:
+def touch(kind: str, x: Array, depth: Array) -> GuardedTouch:
     """Move the sphere along the wall to the next `x` [m] and `depth` [m] per millisecond; negative depth is above the skin."""
     tissue = wall(kind)
     force, contracted = np.zeros(len(x)), np.zeros(len(x))
@@ -115,8 +114,8 @@ def measure() -> GuardingFelt:
     depth = press.depths(press.times(SETUP.step_s))
     x, below, sliding = strokes()
     return GuardingFelt(
-        {kind: touched(kind, np.zeros(len(depth)), depth) for kind in KINDS},
-        {kind: touched(kind, x, below) for kind in KINDS},
+        {kind: touch(kind, np.zeros(len(depth)), depth) for kind in KINDS},
+        {kind: touch(kind, x, below) for kind in KINDS},
         sliding,
     )
 

@@ -189,7 +189,7 @@ def section(found: People | None = None) -> PageSection:
         f"{MEDIAN.stiffening_per_m:g} per m); no measurement of loss on a living abdomen was found. "
         "Tensed muscles are a parallel spring with the measured force ratio at 10 mm."
     )
-    checks = (*_errors(found), *_exponents(found.places), _tensed(found.places), *_losses(found.loops))
+    checks = (*_errors(found), *_exponents(found.places), _tension_ratio(found.places), *_losses(found.loops))
     return PageSection("people", "Living people", text, checks, lambda f: draw(f, found), (7.0, 4.4))
 
 
@@ -218,7 +218,7 @@ def _exponents(places: Sequence[Place]) -> Iterator[Check]:
         yield Check(name, simulated, "", least, most, f"measured: {measured:.2f}")
 
 
-def _tensed(places: Sequence[Place]) -> Check:
+def _tension_ratio(places: Sequence[Place]) -> Check:
     """Return the force ratio of tensed muscles."""
     measured = float(np.median([p.fit.activated_ratio for p in places]))
     simulated = float(np.median([p.tensed_ratio for p in places]))

@@ -13,7 +13,7 @@ from palpate_models.numerics.frames import Array
 from palpate_models.numerics.seeds import generator
 from palpate_models.patient import remus2024
 from palpate_models.patient.healthy import belly, healthy_wall
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Build, Phantom
 from palpate_models.patient.tension import pressed_force
 from palpate_validation.check import COLOURS, INK, Check, PageSection
@@ -63,14 +63,14 @@ def sample_of(person: Sequence[int], force: Array) -> pd.DataFrame:
     return pd.DataFrame(force, columns=DEPTHS_M).assign(person=person)
 
 
-def measured() -> pd.DataFrame:
+def read_measured() -> pd.DataFrame:
     """Return the 48 relaxed positions of the file."""
     places = remus2024.relaxed_people()
     force = np.array([remus2024.curve(*place).force(np.array(DEPTHS_M)) for place in places])
     return sample_of([remus2024.PEOPLE.index(person) for _, person in places], force)
 
 
-def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> pd.DataFrame:
+def sample_persons(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> pd.DataFrame:
     """Return persons of the seeds 0, 1, 2 .., each pressed at `SETUP.places` random positions of the belly away from bone.
 
     The force is that of a flat wall with the stiffness and stiffening of the place, quasi-static and axisymmetric
@@ -80,7 +80,7 @@ def sampled(persons: int = SETUP.persons, build: Build = Build.MEDIAN) -> pd.Dat
     offset = float(np.median([fit.zero_offset_m for fit in remus2024.fitted().values()]))
     force = []
     for seed in range(persons):
-        phantom = drawn(Phantom(kind="person", build=build), seed)
+        phantom = draw_person(Phantom(kind="person", build=build), seed)
         assert phantom.anatomy is not None
         usual = phantom.stiffness
         at = _places(belly(phantom.size_m, phantom.anatomy), generator(seed, "places"))
@@ -120,7 +120,7 @@ def _places(points: Array, rng: np.random.Generator) -> Array:
 
 def section(found: pd.DataFrame | None = None) -> PageSection:
     """Return the comparison with its bounds."""
-    found, people = sampled() if found is None else found, measured()
+    found, people = sample_persons() if found is None else found, read_measured()
     checks = tuple(
         Check(name, ours, "", round(theirs * (1 - within), 3), round(theirs * (1 + within), 3), f"measured: {theirs:.3g}")
         for (name, ours), theirs, within in zip(figures(found).items(), figures(people).values(), WITHIN, strict=True)

@@ -24,16 +24,16 @@ def page() -> str:
     for group, words in GROUPS.items():
         parts.append(f"## {group}\n")
         for word in words:
-            for path, command in walked(typer.main.get_command(app_for(word, PAGE_COLUMNS))):
+            for path, command in walk(typer.main.get_command(app_for(word, PAGE_COLUMNS))):
                 parts += _command(path, command)
     return "\n".join(parts).rstrip() + "\n"
 
 
-def walked(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
+def walk(command: Any, path: str = "") -> Iterator[tuple[str, Any]]:
     """Yield a Typer command, or its subcommands, each with its path."""
     if getattr(command, "commands", None):
         for name, inner in command.commands.items():
-            yield from walked(inner, f"{path} {name}".strip())
+            yield from walk(inner, f"{path} {name}".strip())
     else:
         yield path, command
 

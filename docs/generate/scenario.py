@@ -63,7 +63,7 @@ def _section(path: str, model: type[Section], given: Section | None) -> Iterator
             if isinstance(item, type) and issubclass(item, Section)
         ]
         shown = "required" if given is None and field.is_required() else _default(default)
-        rows.append((f"`{name}`", shown, _allowed(schema["properties"][name], schema.get("$defs", {})), meaning))
+        rows.append((f"`{name}`", shown, _values(schema["properties"][name], schema.get("$defs", {})), meaning))
     yield "\n" + table(("field", "default", "allowed", "meaning"), rows)
     for place, section, instance in inner:
         yield from _section(place, section, instance)
@@ -77,18 +77,18 @@ def _default(value: Any) -> str:
     return f"`{value if isinstance(value, str) else json.dumps(value)}`" if value != "" else ""
 
 
-def _allowed(schema: dict[str, Any], parts: dict[str, Any]) -> str:
+def _values(schema: dict[str, Any], parts: dict[str, Any]) -> str:
     """Return the allowed values of a field as text."""
     if "$ref" in schema:
-        return _allowed(parts[schema["$ref"].rpartition("/")[2]], parts)
+        return _values(parts[schema["$ref"].rpartition("/")[2]], parts)
     if "anyOf" in schema:
-        return " or ".join(_allowed(choice, parts) for choice in schema["anyOf"])
+        return " or ".join(_values(choice, parts) for choice in schema["anyOf"])
     if "enum" in schema or "const" in schema:
         return ", ".join(f"`{value}`" for value in schema.get("enum", [schema.get("const")]))
     if schema.get("type") == "array":
         items = schema.get("prefixItems")
         return (
-            f"{len(items)} of: {_allowed(items[0], parts)}" if items else f"a list of: {_allowed(schema.get('items', {}), parts)}"
+            f"{len(items)} of: {_values(items[0], parts)}" if items else f"a list of: {_values(schema.get('items', {}), parts)}"
         )
     if schema.get("type") == "object":
         return f"a section ({schema.get('title', 'any fields')})"

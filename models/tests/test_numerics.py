@@ -11,7 +11,7 @@ import pytest
 from scipy.spatial import cKDTree
 
 from palpate_models.numerics import cache
-from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.cache import content_key, remember
 from palpate_models.numerics.vectors import nearest_vertex
 
 CALLER = """
@@ -103,21 +103,21 @@ def test_the_cache_survives_a_broken_file_and_a_folder_that_cannot_be_written(tm
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     key = content_key("test", (), np.arange(3.0), (1, "a"))
     assert key != content_key("test", (), np.arange(3.0), (1, "b"))
-    assert set(remembered(key, lambda: np.ones(300))) == {1.0}
+    assert set(remember(key, lambda: np.ones(300))) == {1.0}
     path = cache.folder() / f"{key}.npy"
     for number, damage in enumerate((lambda whole: b"broken", lambda whole: b"", flipped, lambda whole: whole[:-1]), start=2):
         path.write_bytes(damage(path.read_bytes()))
-        assert set(remembered(key, lambda value=number: np.full(300, float(value)))) == {number}
-        assert set(remembered(key, lambda: np.zeros(300))) == {number}
+        assert set(remember(key, lambda value=number: np.full(300, float(value)))) == {number}
+        assert set(remember(key, lambda: np.zeros(300))) == {number}
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "file"))
-    assert remembered(key, lambda: np.zeros(3)).tolist() == [0, 0, 0]
+    assert remember(key, lambda: np.zeros(3)).tolist() == [0, 0, 0]
 
 
 def test_the_cache_forgets_what_was_not_used_for_longest(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     monkeypatch.setattr(cache, "MOST_BYTES", 3000)
     for k in range(6):
-        remembered(f"k{k}", lambda: np.zeros(100))
+        remember(f"k{k}", lambda: np.zeros(100))
     assert len(list(cache.folder().glob("*.npy"))) <= 3
     assert (cache.folder() / "k5.npy").exists()

@@ -9,7 +9,7 @@ from pydantic import ValidationError
 from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.healthy import belly, healthy_wall
-from palpate_models.patient.person import PEOPLE, drawn, under_fat
+from palpate_models.patient.person import PEOPLE, draw_person, under_fat
 from palpate_models.patient.phantom import build_phantom
 from palpate_models.patient.remus2024 import fitted
 from palpate_models.patient.schema import Anatomy, Build, Draw, Muscles, Phantom, Skeleton, Stiffness, Variation
@@ -26,13 +26,13 @@ def person(**fields: Any) -> Phantom:
 
 
 def test_a_person_is_the_seeds() -> None:
-    assert drawn(PERSON, 3) == drawn(PERSON, 3) != drawn(PERSON, 4)
-    assert drawn(Phantom(), 3) == Phantom()
+    assert draw_person(PERSON, 3) == draw_person(PERSON, 3) != draw_person(PERSON, 4)
+    assert draw_person(Phantom(), 3) == Phantom()
 
 
 def test_a_drawn_person_is_whole_and_stays() -> None:
-    whole = drawn(person(draw=LUMPY), 5)
-    assert drawn(whole, 5) == whole == drawn(whole, 6)
+    whole = draw_person(person(draw=LUMPY), 5)
+    assert draw_person(whole, 5) == whole == draw_person(whole, 6)
     assert Phantom.model_validate(whole.model_dump()) == whole
     first, second = build_phantom(person(draw=LUMPY), 5), build_phantom(whole, 5)
     for name in ("vertices", "stiffness", "background", "stiffening", "tension", "breathing"):
@@ -40,14 +40,14 @@ def test_a_drawn_person_is_whole_and_stays() -> None:
 
 
 def test_lumps_and_guarding_leave_the_body_as_it_is() -> None:
-    plain, lumpy = drawn(PERSON, 7), drawn(person(draw=LUMPY), 7)
+    plain, lumpy = draw_person(PERSON, 7), draw_person(person(draw=LUMPY), 7)
     assert lumpy.lesions
     assert lumpy.guarding
     assert plain.model_copy(update={"draw": LUMPY, "lesions": lumpy.lesions, "guarding": lumpy.guarding}) == lumpy
 
 
 def test_persons_breathe_each_in_their_own_way() -> None:
-    breaths = [drawn(PERSON, seed).breathing for seed in range(200)]
+    breaths = [draw_person(PERSON, seed).breathing for seed in range(200)]
     rates, depths = (np.array([getattr(breath, name) for breath in breaths]) for name in ("rate_per_min", "peak_to_peak_m"))
     assert 12 <= rates.min() < 12.6 and 18.5 < rates.max() <= 20
     assert 0.005 <= depths.min() < 0.0053 and 0.0117 < depths.max() <= 0.012
@@ -57,14 +57,14 @@ def test_persons_breathe_each_in_their_own_way() -> None:
 def test_breathing_that_is_given_is_not_drawn() -> None:
     given = PERSON.model_copy(update={"breathing": Breathing(rate_per_min=13)})
     deep = PERSON.model_copy(update={"breathing": Breathing(kind="deep")})
-    assert drawn(given, 3).breathing.rate_per_min == 13
-    assert drawn(given, 3).breathing.peak_to_peak_m == drawn(PERSON, 3).breathing.peak_to_peak_m
-    assert drawn(deep, 3).breathing == deep.breathing
+    assert draw_person(given, 3).breathing.rate_per_min == 13
+    assert draw_person(given, 3).breathing.peak_to_peak_m == draw_person(PERSON, 3).breathing.peak_to_peak_m
+    assert draw_person(deep, 3).breathing == deep.breathing
 
 
 def test_a_scenario_has_the_person_of_its_seed() -> None:
     scenario = load_scenario("person", seed=11)
-    assert scenario.phantom == drawn(PERSON, 11) == Scenario(seed=11, phantom=PERSON).phantom
+    assert scenario.phantom == draw_person(PERSON, 11) == Scenario(seed=11, phantom=PERSON).phantom
     assert Scenario.model_validate(scenario.model_dump()) == scenario
     assert "anatomy" in dump_scenario(scenario)
 
@@ -80,7 +80,9 @@ def test_builds_can_be_examined(build: Build) -> None:
 
 
 def test_builds_differ_as_they_are_called() -> None:
-    slim, median, obese = ([drawn(person(build=build), seed) for seed in range(20)] for build in ("slim", "median", "obese"))
+    slim, median, obese = (
+        [draw_person(person(build=build), seed) for seed in range(20)] for build in ("slim", "median", "obese")
+    )
 
     def mean(people: list[Phantom], of: Any) -> float:
         return float(np.mean([of(one) for one in people]))
@@ -145,7 +147,7 @@ def test_lumps_are_within_their_ranges() -> None:
     draw = Draw(lumps=(1, 5), radius_m=(0.01, 0.02), elongation=(3, 4), depth_m=(0.005, 0.01), contrast=(0.2, 0.5), pairs=0.5)
     counts = set()
     for seed in range(60):
-        lumps = drawn(person(draw=draw), seed).lesions
+        lumps = draw_person(person(draw=draw), seed).lesions
         counts.add(len(lumps))
         for lump in lumps:
             assert 0.01 <= min(lump.radii_m) <= 0.02
@@ -157,14 +159,14 @@ def test_lumps_are_within_their_ranges() -> None:
 
 
 def test_pairs_are_beside_each_other() -> None:
-    first, second = drawn(person(draw=Draw(lumps=(2, 2), elongation=(1, 1), pairs=1.0)), 1).lesions
+    first, second = draw_person(person(draw=Draw(lumps=(2, 2), elongation=(1, 1), pairs=1.0)), 1).lesions
     gap = np.linalg.norm(np.subtract(first.centre_m, second.centre_m)) - first.radii_m[0] - second.radii_m[0]
     assert 0.002 <= gap <= 0.020
 
 
 def test_guarding_has_a_measured_ratio() -> None:
     ratios = [fit.activated_ratio for fit in fitted().values()]
-    found = [drawn(person(draw=Draw(guarding="involuntary")), seed).guarding[0] for seed in range(200)]
+    found = [draw_person(person(draw=Draw(guarding="involuntary")), seed).guarding[0] for seed in range(200)]
     assert {area.kind for area in found} == {"involuntary"}
     assert min(ratios) <= min(area.ratio for area in found) <= max(area.ratio for area in found) <= max(ratios)
     assert np.median([area.ratio for area in found]) == pytest.approx(np.median(ratios), abs=0.3)

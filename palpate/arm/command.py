@@ -25,9 +25,9 @@ def check(arm: Name) -> None:
 
     from palpate.console import say
     from palpate_errors import ExitStatus
-    from palpate_models.robot.arm import checked_arm
+    from palpate_models.robot.arm import check_arm
 
-    found, faults = checked_arm(arm)
+    found, faults = check_arm(arm)
     if found is not None and (pairs := _touching(arm)):
         advice = "is the flange in front of the arm, with z out of it?"
         found, faults = None, [f"home_rad: {pair} touch: {advice}" for pair in pairs]
@@ -61,13 +61,13 @@ def place(
 
     from palpate.arm.placement import PLACEMENT, best_placement, describe, scan_targets
     from palpate.console import say
-    from palpate.run.inputs import usable
+    from palpate.run.inputs import check_usable
     from palpate_models.robot.arm import arm_of
     from palpate_models.scenario.load import exam_input
     from palpate_planning.placement.redundancy import plan_redundancy
     from palpate_planning.strokes.plan import look_postures
 
-    chosen = usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
+    chosen = check_usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
     console = Console()
     with Console(stderr=True).status("optimising: about a minute"):
         robot = best_placement(chosen).robot

@@ -4,8 +4,7 @@ The targets cover the examined region of the abdomen and a border around it, in 
 approach and retreat, other patients and registration errors.
 """
 
-from dataclasses import dataclass
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -20,8 +19,7 @@ from palpate_planning.placement.redundancy import POSTURES, Mask, PostureSequenc
 from palpate_planning.placement.symbolic import arm, base_of, casadi, surface_frames
 
 
-@dataclass(frozen=True)
-class PlacementTuning:
+class PlacementTuning(NamedTuple):
     """Settings of the search for a place of the base."""
 
     border_m: float = 0.005
@@ -43,8 +41,7 @@ STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (
 """Placements to start from; the best result counts, as the problem is not convex."""
 
 
-@dataclass(frozen=True, slots=True)
-class Placement:
+class Placement(NamedTuple):
     """A base placement and what it achieves."""
 
     robot: Robot

@@ -8,16 +8,15 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic, sleep, time_ns
-from typing import Any
+from typing import Any, NamedTuple
 
 import typer
 import zenoh
 from rich.text import Text
 
-from palpate.apart import guarded, shared_numbers
+from palpate.apart import run_guarded, shared_numbers
 from palpate.check.rig import ConformanceReport, Feed, ReceivedMessage, Rig, RigSettings, ServiceRig, Verdict
 from palpate.check.suites import SUITES, check
 from palpate.console import TimeLeft, table, wide_console
@@ -38,8 +37,7 @@ from palpate_inputs import parse_json
 from palpate_models.scenario.load import dump_scenario, view_of
 
 
-@dataclass(frozen=True)
-class ProtocolTiming:
+class ProtocolTiming(NamedTuple):
     """Intervals and limits of the run protocol."""
 
     hello_s: float = 0.05
@@ -251,7 +249,7 @@ class LiveRig(Rig):
 
 
 @contextmanager
-def started(command: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
+def start_implementation(command: str | None, role: str, settings: RigSettings, endpoint: str, domain: int) -> Iterator[None]:
     """Start the implementation for the duration of the check, if a command was given."""
     if command is None:
         yield
@@ -302,7 +300,7 @@ def check_here(role: str, choice: str, settings: RigSettings) -> ConformanceRepo
             return check(rig)
 
     limits = Settings.read()
-    return guarded(f"services.{role} = {choice!r}", perform, limits.start_limit_s, place=lambda: (steps[0],))
+    return run_guarded(f"services.{role} = {choice!r}", perform, limits.start_limit_s, place=lambda: (steps[0],))
 
 
 def check_live(
@@ -315,7 +313,7 @@ def check_live(
         typer.echo(f"waiting for {role} at {where}, domain {domain}", err=True)
         rig = LiveRig(bus, role, settings, domain)
         try:
-            with started(start, role, settings, where, domain):
+            with start_implementation(start, role, settings, where, domain):
                 rig.await_implementation(wait)
                 with _shown(rig):
                     check(rig)

@@ -6,7 +6,7 @@ a bus, in wall-clock mode. The same suites run on both.
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, MutableSequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import Any, NamedTuple
 
@@ -27,7 +27,7 @@ Feed = Mapping[str, Source]
 """Messages that the suite sends, by topic; other topics are silent."""
 
 
-def sensed(values: Any, t: int) -> Any:
+def sense(values: Any, t: int) -> Any:
     """Return the values as a live sensor reads them at `t` [ns]: ports refuse what repeats."""
     return np.asarray(values, dtype=float) + 1e-15 * t
 
@@ -36,8 +36,8 @@ def robot_status(
     t: int, q: Any, qd: Any, force: Any, torque: Any, mode: int = RobotStatus.MODE_ACTIVE, cause: int = 0, reason: str = ""
 ) -> Message:
     """Return the status of an arm at `t` [ns] as a live one sends it: joints, force on the F/T sensor, joint torques."""
-    wrench = Wrench(Vector3(*sensed(force, t).tolist()), Vector3(*sensed(np.zeros(3), t).tolist()))
-    q, qd, torque = sensed(q, t), sensed(qd, t), sensed(torque, t)
+    wrench = Wrench(Vector3(*sense(force, t).tolist()), Vector3(*sense(np.zeros(3), t).tolist()))
+    q, qd, torque = sense(q, t), sense(qd, t), sense(torque, t)
     return RobotStatus(header(t), mode, cause, reason, q, qd, wrench, np.zeros_like(q), 0, "", torque)
 
 
@@ -49,8 +49,7 @@ class Verdict(StrEnum):
     SKIPPED = "skipped"
 
 
-@dataclass(frozen=True)
-class Result:
+class Result(NamedTuple):
     """One check."""
 
     group: str
@@ -81,7 +80,7 @@ class ConformanceReport:
 
     def as_json(self) -> dict[str, Any]:
         """Return the report as JSON data."""
-        return {"role": self.role, "passed": self.passed, "results": [asdict(result) for result in self.results]}
+        return {"role": self.role, "passed": self.passed, "results": [result._asdict() for result in self.results]}
 
 
 class ReceivedMessage(NamedTuple):
@@ -95,8 +94,7 @@ class ReceivedMessage(NamedTuple):
     """Source time [ns]: of the wall clock on a live bus, else `t`."""
 
 
-@dataclass(frozen=True)
-class RigSettings:
+class RigSettings(NamedTuple):
     """Settings of a check."""
 
     scenario: Scenario

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 from scipy.stats import bootstrap, spearmanr
 
-from palpate.recording.assessed import collected
+from palpate.recording.assessed import collect_assessed
 from palpate.recording.read import read_recording
 from palpate.report.archive import FILE, read_evidence
 from palpate.report.evidence import map_of, sample_columns
@@ -43,8 +43,7 @@ TUNING: Final = CompareTuning()
 Interval = tuple[float, float]
 
 
-@dataclass(frozen=True, eq=False)
-class ComparedPalpation:
+class ComparedPalpation(NamedTuple):
     """Map of a body, and the forces that were measured; k places, in the body frame A."""
 
     name: str
@@ -60,7 +59,7 @@ class ComparedPalpation:
 
     def moved(self, X: Array) -> ComparedPalpation:
         """Return this in another frame; `X`: pose of the present frame in it, shape (4, 4)."""
-        return replace(self, map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
+        return self._replace(map=replace(self.map, vertices=apply(X, self.map.vertices)), places=apply(X, self.places))
 
 
 def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None) -> ComparedPalpation:
@@ -76,7 +75,7 @@ def read_palpated(path: Path, mapping: Path | None, depth_m: float | None = None
         table = np.genfromtxt(path / "samples.csv", delimiter=",", names=True, encoding="utf-8", ndmin=1)
     else:
         recording = read_recording(path, mapping)
-        found, faults = collected(recording), tuple(fault.text for fault in recording.faults)
+        found, faults = collect_assessed(recording), tuple(fault.text for fault in recording.faults)
         message, table = found.stiffness_map, sample_columns(found.samples)
         at_depth = None if depth_m is None else recording.samples(depth_m)
     if at_depth is None:

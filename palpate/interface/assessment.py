@@ -18,11 +18,11 @@ from matplotlib.tri import Triangulation
 from numpy.typing import NDArray
 from threadpoolctl import threadpool_limits
 
-from palpate.apart import guarded
+from palpate.apart import run_guarded
 from palpate.exam_state import exam_state
 from palpate.quick.case import assess as have_assessed
 from palpate.quick.patient import PERIOD_S, Seen, Touch
-from palpate.recording.assessed import collected
+from palpate.recording.assessed import collect_assessed
 from palpate.recording.recording import PalpationRecording
 from palpate.report.evidence import map_of, sample_columns
 from palpate.report.rows import FindingRow, finding_rows
@@ -117,7 +117,7 @@ class Assessment:
         return f"Assessment({len(self.samples)} samples, {len(self.findings)} findings{'' if self.map else ', no map yet'})"
 
     def _repr_html_(self) -> str:
-        picture = "" if self.map is None else html_of(drawn(self.map, self.samples))
+        picture = "" if self.map is None else html_of(draw_png(self.map, self.samples))
         return f"<p>{len(self.samples)} samples</p>{findings_html(self.findings)}{picture}"
 
 
@@ -156,14 +156,14 @@ def assess(touches: Touch | Iterable[Touch] | PalpationRecording) -> Assessment:
     True
     """
     if isinstance(touches, PalpationRecording):
-        return _assessment(collected(touches), {})
+        return _assessment(collect_assessed(touches), {})
     felt = sorted([touches] if isinstance(touches, Touch) else touches, key=lambda touch: float(touch.time[0]))
     if not felt:
         raise ValueError("touches: there are none; want the results of Patient.press and Patient.slide")
     seen = felt[0].seen
     if any(touch.seen is not seen for touch in felt):
         raise ValueError("touches: they are of several patients; want touches of one patient")
-    gathered = _gathered(seen, felt)
+    gathered = _gather(seen, felt)
 
     def work() -> tuple[Collected, dict[str, Any]]:
         (service,) = load_services(seen.scenario, ("assessment",))
@@ -171,7 +171,7 @@ def assess(touches: Touch | Iterable[Touch] | PalpationRecording) -> Assessment:
             return gathered, have_assessed(service, gathered)
 
     foreign = "assessment" in foreign_roles(seen.scenario)
-    return _assessment(*(guarded("services.assessment", work, math.inf) if foreign else work()))
+    return _assessment(*(run_guarded("services.assessment", work, math.inf) if foreign else work()))
 
 
 def _assessment(gathered: Collected, facts: dict[str, Any]) -> Assessment:
@@ -180,7 +180,7 @@ def _assessment(gathered: Collected, facts: dict[str, Any]) -> Assessment:
     return Assessment(pd.DataFrame(sample_columns(gathered.samples)), stiffness, found, facts)
 
 
-def _gathered(seen: Seen, touches: Sequence[Touch]) -> Collected:
+def _gather(seen: Seen, touches: Sequence[Touch]) -> Collected:
     """Return the touches as messages of an examination, in the world frame, with the patient as registered."""
     X_WA = np.array(exam_input(seen.scenario).X_WA)
     R_WA = X_WA[:3, :3]
@@ -225,7 +225,7 @@ def findings_html(findings: pd.DataFrame) -> str:
     return str(findings.to_html(index=False, float_format="{:.3g}".format)) if len(findings) else "<p>no finding</p>"
 
 
-def drawn(found: StiffnessMap, samples: pd.DataFrame) -> bytes:
+def draw_png(found: StiffnessMap, samples: pd.DataFrame) -> bytes:
     """Return a PNG of the map with the positions of the samples."""
     figure = Figure(figsize=(5.2, 4.2), dpi=110, layout="constrained")
     axes = found.plot(figure.add_subplot())

@@ -4,7 +4,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from palpate.run.inputs import examinable
+from palpate.run.inputs import check_examinable
 from palpate.run.options import DEFAULT_SCENARIO
 from palpate_models.scenario.load import ScenarioError, as_settings, load_scenario, whole_scenario
 from palpate_models.scenario.schema import Scenario
@@ -52,8 +52,8 @@ def scenario(source: str | Path | Scenario = DEFAULT_SCENARIO, /, *, seed: int |
     if isinstance(source, Scenario):
         if given:
             raise ScenarioError(f"{source.name}: {given[0]}: settings need the name or file of a scenario, not a Scenario object")
-        return examinable(whole_scenario(source, seed))
-    return examinable(load_scenario(str(source), given, seed))
+        return check_examinable(whole_scenario(source, seed))
+    return check_examinable(load_scenario(str(source), given, seed))
 
 
 def paths(settings: Mapping[str, Any], above: str = "") -> Iterator[tuple[str, Any]]:

@@ -9,7 +9,7 @@ import pandas as pd
 
 from palpate.interface.scenarios import paths
 from palpate.study.cases import Request, cases_of, command_of
-from palpate.study.folder import RunRecord, default_folder, opened
+from palpate.study.folder import RunRecord, default_folder, open_folder
 from palpate.study.runner import cluster, cores, run_cases
 from palpate.study.spec import Split, StudyError, load_study, with_methods
 from palpate.study.summary import PAGE, conclude
@@ -104,7 +104,7 @@ def study(
     request = Request(split, number, as_settings(dict(paths(settings))))
     cases = cases_of(chosen, request)
     path = default_folder(chosen.name, split) if out is None else Path(out)
-    folder, manifest = opened(path, chosen.name, cases, command_of(str(source), request, methods or ()))
+    folder, manifest = open_folder(path, chosen.name, cases, command_of(str(source), request, methods or ()))
     if folder.missing(cases):
         with cluster(workers or cores()) as client:
             run_cases(folder, cases, client, lambda _: None)

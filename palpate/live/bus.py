@@ -29,7 +29,7 @@ class Joined(NamedTuple):
 
 
 @contextmanager
-def joined(connect: Sequence[str] | None, run: str | None, domain: int | None) -> Iterator[Joined]:
+def join_bus(connect: Sequence[str] | None, run: str | None, domain: int | None) -> Iterator[Joined]:
     """Join a bus for a `with` block: by endpoints, or of a run, by default the only one on this machine.
 
     Ctrl-C ends the command with status 0. Raises UserError if there is no such bus.

@@ -67,7 +67,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
             _follow(run, port, native, show, leave, console)
         else:
             with tempfile.TemporaryDirectory(prefix="palpate-dashboard-") as place:
-                _view(_drawn(Path(source), Path(place)), port, native, show, console)
+                _view(_draw_recording(Path(source), Path(place)), port, native, show, console)
     except KeyboardInterrupt:
         raise typer.Exit from None
 
@@ -103,7 +103,7 @@ def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console:
             viewer.terminate()
 
 
-def _drawn(source: Path, place: Path) -> Path:
+def _draw_recording(source: Path, place: Path) -> Path:
     """Return the .rrd of a source, drawn from the MCAP recording if there is none (into `place` for a single file)."""
     from palpate_dashboard import replay
     from palpate_dashboard.service import FILE

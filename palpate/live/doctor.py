@@ -14,19 +14,17 @@ from rich.text import Text
 
 from palpate.console import SteadyConsole, bandwidth, number, print_json, print_line, table, wide_console
 from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, join_bus
 from palpate_bus.contract import contract
 from palpate_bus.monitor.health import TopicHealth, Violation
 from palpate_bus.monitor.monitor import LiveMonitor
-from palpate_bus.runs.announcement import live as live_runs, versions
-from palpate_bus.runs.run_folder import remove_leftovers
+from palpate_bus.runs.announcement import versions
 from palpate_bus.security.access import public
 from palpate_bus.wire.liveliness import mismatches
 from palpate_errors import ExitStatus
 
 
-@dataclass(frozen=True)
-class DoctorLimits:
+class DoctorLimits(NamedTuple):
     """Limits beyond which the doctor reports a fault."""
 
     poll_s: float = 0.04
@@ -197,18 +195,12 @@ def doctor(
     as_json: AsJson = False,
     seconds: Annotated[float, typer.Option(min=1, help="Duration of the check, in seconds.")] = 3.0,
     watch: Annotated[bool, typer.Option("--watch", help="Print every violation when it occurs, until Ctrl-C.")] = False,
-    clean: Annotated[bool, typer.Option("--clean", help="Only remove leftovers of killed runs on this machine.")] = False,
 ) -> None:
     """Check a live bus: versions, endpoints, shared memory, clocks, missing roles, and every topic against the contract.
 
     The exit status is 0 when all is well, 1 when something is wrong, 2 when there is no bus.
     """
-    if clean:
-        left = remove_leftovers()
-        live_runs()
-        wide_console().print("\n".join(f"removed {path}" for path in left) or "nothing left of killed runs", highlight=False)
-        return
-    with joined(connect, run, domain) as bus:
+    with join_bus(connect, run, domain) as bus:
         if watch:
             _watch(_monitor(bus), as_json)
         with SteadyConsole(stderr=True).status(f"listening for {seconds:g} s"):

@@ -10,7 +10,7 @@ import typer
 from rich.text import Text
 
 from palpate.console import print_json, table, wide_console
-from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, Joined, join_bus
 from palpate_bus.contract import Contract, contract
 from palpate_bus.runs.announcement import Run
 from palpate_bus.wire.liveliness import Endpoint, Entity, EntityKind, GraphWatch
@@ -63,7 +63,7 @@ def _group() -> None:
 @app.command("list")
 def list_nodes(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the nodes on the bus, with what each publishes and subscribes to, and the roles that are missing."""
-    with joined(connect, run, domain) as bus:
+    with join_bus(connect, run, domain) as bus:
         found = present(bus)
         rules = contract()
         absent = missing(rules, found, bus.target.run)

@@ -3,10 +3,10 @@
 from collections import deque
 from collections.abc import Iterator, Sequence
 from contextlib import closing, contextmanager
-from dataclasses import dataclass, fields, is_dataclass
+from dataclasses import fields, is_dataclass
 from math import inf
 from time import monotonic
-from typing import Annotated, Any, Final
+from typing import Annotated, Any, Final, NamedTuple
 
 import numpy as np
 import typer
@@ -16,7 +16,7 @@ from rich.text import Text
 
 from palpate.console import bandwidth, print_json, print_line, say, table, wide_console
 from palpate.live import graph
-from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, joined
+from palpate.live.bus import AsJson, ChosenRun, Connect, Domain, join_bus
 from palpate_bus.contract import Topic, contract
 from palpate_bus.messages import codec
 from palpate_bus.messages.stamps import nanoseconds
@@ -26,8 +26,7 @@ from palpate_bus.wire.rmw import parse_key, topic_key
 from palpate_bus.wire.transport import ReceivedSample, Subscription
 
 
-@dataclass(frozen=True)
-class TopicTimes:
+class TopicTimes(NamedTuple):
     """Windows of the statistics, and limits of the output."""
 
     report_period_s: float = 1.0
@@ -51,7 +50,7 @@ Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop af
 @app.command("list")
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
-    with joined(connect, run, domain) as bus:
+    with join_bus(connect, run, domain) as bus:
         rows = _topic_rows(graph.present(bus))
     if as_json:
         print_json(rows)
@@ -88,7 +87,7 @@ def _topic_rows(found: Sequence[Entity]) -> list[dict[str, Any]]:
 def info(name: Name, connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """Show a topic: its row of the contract, and who publishes and subscribes on the bus with which type hash."""
     name = name.strip("/")
-    with joined(connect, run, domain) as bus:
+    with join_bus(connect, run, domain) as bus:
         found = [e for e in graph.present(bus) if e.endpoint is not None and e.endpoint.topic == name]
     row = contract().topics.get(name)
     if not found and row is None:
@@ -129,7 +128,7 @@ def echo(  # noqa: PLR0913 - the options of a command
 ) -> None:
     """Print the messages of a topic as they arrive."""
     left = 1 if once else count
-    with _subscribed(name, connect, run, domain) as (topic, reader):
+    with _subscribe(name, connect, run, domain) as (topic, reader):
         for received in _until(reader, seconds):
             value = plain(_message(received, topic), full=full or as_json, path=field)
             if as_json:
@@ -151,7 +150,7 @@ def hz(
     seconds: Seconds = None,
 ) -> None:
     """Measure a topic's rate, once a second: messages per second of real and of simulated time, and their spacing."""
-    with _subscribed(name, connect, run, domain) as (topic, reader):
+    with _subscribe(name, connect, run, domain) as (topic, reader):
         rows: deque[tuple[int, int | None]] = deque(maxlen=TOPIC.spacing_messages)
         for received in _each_period(reader, seconds):
             rows.extend((message.sent, _stamp_ns(message, topic)) for message in received)
@@ -170,7 +169,7 @@ def bw(
     seconds: Seconds = None,
 ) -> None:
     """Measure a topic's bandwidth, once a second: payload bytes per second and per message."""
-    with _subscribed(name, connect, run, domain) as (topic, reader):
+    with _subscribe(name, connect, run, domain) as (topic, reader):
         window: deque[list[int]] = deque(maxlen=TOPIC.bandwidth_periods)
         for received in _each_period(reader, seconds):
             window.append([len(message.payload) for message in received])
@@ -203,11 +202,9 @@ def spacing(rows: Sequence[tuple[int, int | None]]) -> dict[str, Any]:
 
 
 @contextmanager
-def _subscribed(
-    name: str, connect: list[str] | None, run: str | None, domain: int | None
-) -> Iterator[tuple[Topic, Subscription]]:
+def _subscribe(name: str, connect: list[str] | None, run: str | None, domain: int | None) -> Iterator[tuple[Topic, Subscription]]:
     """Join the bus and subscribes to a topic: the contract's, or any that is there with a known message type."""
-    with joined(connect, run, domain) as bus:
+    with join_bus(connect, run, domain) as bus:
         name = name.strip("/")
         row = contract().topics.get(name)
         if row is None:

@@ -34,7 +34,7 @@ LEAVES_S: Final = 1.0
 """Time from the last stroke to the request for findings."""
 
 
-def collected(examination: QuickExamination, rows: list[PeriodRow]) -> Collected:
+def collect_messages(examination: QuickExamination, rows: list[PeriodRow]) -> Collected:
     """Return what a conductor would have collected before the assessment. The last state is in phase ASSESS."""
     X_WA = examination.patient.X_WA
     model = examination.patient.tissue.model
@@ -111,7 +111,7 @@ class QuickCase(NamedTuple):
 
     report: Report
     """The rows of report.json; its run hash is over samples, map and findings."""
-    collected: Collected
+    collect_messages: Collected
     """The messages behind it."""
     simulate_s: float
     """Building and examining the patient."""
@@ -127,7 +127,7 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     none, NoTissueError for a tissue of which there is no copy, PluginError for an assessment that cannot be made.
     """
     begin, clock = process_time(), perf_counter()
-    gathered = examined(scenario, errors, drawn)
+    gathered = examine_quickly(scenario, errors, drawn)
     simulated, elapsed_s = process_time(), perf_counter() - clock
     (service,) = load_services(scenario, ("assessment",))
     facts = assess(service, gathered)
@@ -146,11 +146,11 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     return QuickCase(report, gathered, simulated - begin, assessed - simulated, process_time() - assessed)
 
 
-def examined(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> Collected:
+def examine_quickly(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn | None = None) -> Collected:
     """Return what a conductor would have collected before the assessment. Arguments and errors as of `run_quick`."""
     with _no_garbage_collection():
         examination = QuickExamination(scenario, Loop(scenario, errors or loop_errors(scenario), drawn))
-        return collected(examination, examination.run())
+        return collect_messages(examination, examination.run())
 
 
 @contextmanager

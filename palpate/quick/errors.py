@@ -11,11 +11,10 @@ each stroke. The error of registration is simulated as it is, without a distribu
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from functools import cache
 from importlib import resources
 from math import exp
-from typing import Annotated, Final, Literal
+from typing import Annotated, Final, Literal, NamedTuple
 
 import numpy as np
 import yaml
@@ -111,8 +110,7 @@ class LoopErrors(Section):
         return Drawn(offset, tilt, self.followed.draw(rng), aside, self.zero_m * rng.standard_normal(_STROKES))
 
 
-@dataclass(frozen=True, eq=False)
-class Drawn:
+class Drawn(NamedTuple):
     """Constant errors of one examination."""
 
     offset_m: float

@@ -14,7 +14,7 @@ from scipy.signal import fftconvolve
 from scipy.special import k0, k1
 
 from palpate_models.numerics.frames import Array
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom, Stiffness
 from palpate_models.patient.tension import pressed_force
@@ -56,7 +56,7 @@ class FeltPatient(NamedTuple):
 
 def felt_patient(phantom: Phantom, seed: int) -> FeltPatient:
     """Return the person of a seed with the lumps of the phantom. Raises MeshError as `build_phantom` does."""
-    phantom = drawn(phantom, seed)
+    phantom = draw_person(phantom, seed)
     model = build_phantom(phantom, seed)
     axis = np.arange(-HALF_M, HALF_M + 1e-9, PITCH_M)
     footprint = _footprint(phantom.stiffness.length_m)

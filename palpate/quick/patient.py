@@ -11,22 +11,21 @@ breathes, guards and moves as in the scenario; earlier presses have lasting effe
 """
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from palpate.apart import guarded
+from palpate.apart import run_guarded
 from palpate.truth.pressed import TrueBody, TrueSurface, true_tissue
 from palpate_bus.implementations import kind
 from palpate_bus.settings import Settings
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array, inverse, matrix
 from palpate_models.patient.motion import BodyMotion
-from palpate_models.scenario.load import seen, true_pose, whole_scenario
+from palpate_models.scenario.load import restrict_to_view, true_pose, whole_scenario
 from palpate_models.scenario.patterns import stations
 from palpate_models.scenario.schema import Exam, Following, Scenario
 from palpate_perception.pipeline import PIPELINE
@@ -43,8 +42,7 @@ class NoTissueError(UserError):
     """The tissue of the scenario has no copy that can be pressed. Names the field and the allowed values."""
 
 
-@dataclass(frozen=True, eq=False)
-class Seen:
+class Seen(NamedTuple):
     """A patient as seen before the first touch, without the truth inside."""
 
     scenario: Scenario
@@ -55,8 +53,7 @@ class Seen:
     """Outward unit normals there, shape (n, 3)."""
 
 
-@dataclass(frozen=True, eq=False)
-class Touch:
+class Touch(NamedTuple):
     """Measurements of an indenter at n instants, PERIOD_S apart."""
 
     time: Array
@@ -72,7 +69,7 @@ class Touch:
     """Along the outward normal [N], shape (n,)."""
     steady: NDArray[np.bool_]
     """True at the requested depth, shape (n,); with `exam.breathing: gate` only within a millimetre of the end of expiration."""
-    seen: Seen
+    restrict_to_view: Seen
     """The patient as seen."""
 
     def __repr__(self) -> str:
@@ -94,7 +91,7 @@ class Patient:
         choice = scenario.services.tissue
         if kind("tissue").foreign(choice):
             part = f"services.tissue = {choice!r}"
-            guarded(part, lambda: _try_tissue(scenario), Settings.read().start_limit_s, PluginError)
+            run_guarded(part, lambda: _try_tissue(scenario), Settings.read().start_limit_s, PluginError)
         tissue = true_tissue(scenario)
         if tissue is None:
             raise NoTissueError(
@@ -126,7 +123,7 @@ class Patient:
         """The patient as seen before the first touch: the true skin at rest."""
         places, normals = self.surface.points(seen_lattice(self.scenario.exam))
         there = np.isfinite(places).all(axis=1)
-        return Seen(seen(self.scenario, "exam"), places[there], normals[there])
+        return Seen(restrict_to_view(self.scenario, "exam"), places[there], normals[there])
 
     @cached_property
     def _follows(self) -> Callable[[Array], Array]:

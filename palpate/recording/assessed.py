@@ -23,7 +23,7 @@ _SHOWN: Final = 5000
 _FALSE_FINDINGS: Final = Exam().false_findings
 
 
-def collected(recording: PalpationRecording) -> Collected:
+def collect_assessed(recording: PalpationRecording) -> Collected:
     """Return samples, map and findings of a recording, and its readings, as a conductor collects them."""
     samples = recording.samples()
     gathered = Collected(exam_states=_states(recording), samples=[sample_message(sample) for sample in samples])

@@ -32,7 +32,7 @@ def assess(
         for line in propose(recording, out):
             print(line)
         return
-    from palpate.recording.assessed import collected
+    from palpate.recording.assessed import collect_assessed
     from palpate.recording.read import read_recording
     from palpate.run.folder import results_folder
 
@@ -40,7 +40,7 @@ def assess(
     for fault in read.faults:
         say(fault.text)
     with results_folder(out, overwrite=overwrite) as folder:
-        gathered = collected(read)
+        gathered = collect_assessed(read)
         from palpate.recording.written import write_assessed  # figures take memory that the assessment needs before
 
         report, page = write_assessed(folder, read, gathered)

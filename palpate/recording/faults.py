@@ -81,6 +81,6 @@ class Fault:
         return f"{self.code.text.format(count=self.count, of=self.of, value=self.value)}; {self.remedy}"
 
 
-def refused(faults: Iterable[Fault]) -> bool:
+def is_refused(faults: Iterable[Fault]) -> bool:
     """Return True if nothing is assessed for one of the faults."""
     return any(fault.remedy is Remedy.REFUSED for fault in faults)

@@ -11,9 +11,9 @@ import yaml
 from matplotlib.figure import Figure
 
 from palpate.recording.mapping import SCALES, ForceSource, MappedColumns, MappedTool, Mapping, Topics, Transform, Units
-from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tared
+from palpate.recording.motion import Axis, blocks, delay, free_air, noise, pressing_axis, tare
 from palpate.recording.probes import probes
-from palpate.recording.read import LIMITS, cleaned, recording_of
+from palpate.recording.read import LIMITS, clean_readings, recording_of
 from palpate.recording.readings import (
     KINDS,
     TABLES,
@@ -22,9 +22,9 @@ from palpate.recording.readings import (
     from_bag,
     from_table,
     is_date,
-    moved,
+    move_to_mapped,
     numbers_of,
-    opened,
+    open_bag,
     read_table,
 )
 from palpate.recording.recording import implied_young
@@ -56,7 +56,7 @@ def propose(path: Path, out: Path) -> list[str]:
     else:
         mapping = _of_bag(path, lines)
         raw = from_bag(path, mapping)
-    clean = cleaned(raw, _UNKNOWN_RADIUS_M)[0]
+    clean = clean_readings(raw, _UNKNOWN_RADIUS_M)[0]
     mapping, axis = _with_force(mapping, clean, lines)
     lines.append(f"not sure: tool.radius_m: {_UNKNOWN_RADIUS_M} is a guess; measure the ball")
     lines.append("not sure: tool.point: centre; write tip if the positions are of the lowest point of the ball")
@@ -64,7 +64,7 @@ def propose(path: Path, out: Path) -> list[str]:
     text = yaml.safe_dump(mapping.model_dump(mode="json", exclude_defaults=True), sort_keys=False, default_flow_style=None)
     write_text(out, f"# Proposed for {path.name}.\n" + "".join(f"# {line}\n" for line in lines) + text)
     picture = out.with_suffix(".png")
-    _draw(picture, moved(clean, mapping), axis)
+    _draw(picture, move_to_mapped(clean, mapping), axis)
     return [*lines, f"to check: {out}, and the picture {picture}"]
 
 
@@ -168,7 +168,7 @@ def _four(names: list[str], letters: str) -> tuple[str, str, str, str] | None:
 
 
 def _of_bag(path: Path, lines: list[str]) -> Mapping:
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         topics = {kind: sorted({c.topic for c in bag.connections if c.msgtype == name}) for kind, name in KINDS.items()}
         frames = _frames(bag) if not topics["pose"] and topics["tf"] else ([], [])
     if not topics["wrench"]:
@@ -208,7 +208,7 @@ def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapp
     tried: list[tuple[float, Mapping, Readings, Axis]] = []
     for axes in ("recording", "tool") if raw.rotation is not None else ("recording",):
         candidate = mapping.model_copy(update={"force": ForceSource(axes=axes)})
-        readings = moved(raw, candidate)
+        readings = move_to_mapped(raw, candidate)
         axis = pressing_axis(readings.position, readings.force, probes(readings) if raw.time is None else blocks(raw.time))
         if axis is not None:
             tried.append((axis.angle_deg, candidate, readings, axis))
@@ -231,7 +231,7 @@ def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapp
         free = free_air(raw.time, height, along, axis.stiffness)
         if free.any():
             zero = np.median(readings.force[free], axis=0)
-            drift = np.abs(tared(raw.time, readings.force, free)[1]).max()
+            drift = np.abs(tare(raw.time, readings.force, free)[1]).max()
             lines.append(f"sure: {100 * free.mean():.0f} % is free air; zero {np.round(zero, 2).tolist()} N, drift {drift:.2g} N")
             mapping = _with_mass(mapping, raw, free, lines)
         else:

@@ -5,7 +5,7 @@ the sensor's range or on the stiffness of the body.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -52,8 +52,7 @@ def noise(values: Array) -> float:
     return 1.4826 * float(np.median(np.abs(second))) / np.sqrt(6) if len(second) else 0.0
 
 
-@dataclass(frozen=True)
-class Axis:
+class Axis(NamedTuple):
     """The axis along which a recording presses."""
 
     outward: Array
@@ -183,7 +182,7 @@ def free_air(time: Array, height: Array, force: Array, stiffness: float) -> Mask
     return free
 
 
-def tared(time: Array, force: Array, free: Mask) -> tuple[Array, Array, Array]:
+def tare(time: Array, force: Array, free: Mask) -> tuple[Array, Array, Array]:
     """Return the force without its zero (n, c), its drift (c,), and its SD in free air (c,), all in newtons.
 
     The zero at any time is that of the free motion around it.
@@ -200,7 +199,7 @@ def tared(time: Array, force: Array, free: Mask) -> tuple[Array, Array, Array]:
     return force - base, levels[-tenth:].mean(axis=0) - levels[:tenth].mean(axis=0), np.maximum(spread, 1e-4)
 
 
-def shifted(readings: Readings, by: float) -> Readings:
+def delay_force(readings: Readings, by: float) -> Readings:
     """Return the readings with the force taken `by` [s] later."""
     assert readings.time is not None
     t = readings.time

@@ -9,7 +9,7 @@ from palpate.recording.faults import Fault, FaultCode, Remedy
 from palpate.recording.motion import Axis, noise
 from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Palpated, width
-from palpate.recording.skin import fitted, grid_over
+from palpate.recording.skin import fit_skin, grid_over
 from palpate.recording.timed import implausible_unit, normal_force
 
 _AWAY: Final = 3.0
@@ -89,5 +89,5 @@ def contacts_of_probes(readings: Readings, axis: Axis, radius: float, rows: list
     if normals is not None and len(points) >= _MANY and width(points) > reach:
         at = np.array([contact.normal[0] for contact in contacts])
         return Palpated(contacts, points, at, power, len(kept) - len(contacts))
-    skin = fitted(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
+    skin = fit_skin(points, np.full(len(points), max(scatter, 1e-5)), grid_over(points[:, :2], reach), 2 * reach)
     return Palpated(contacts, *skin.points(), power, len(kept) - len(contacts))

@@ -9,11 +9,11 @@ import numpy as np
 from scipy.ndimage import find_objects, label, median_filter
 from scipy.spatial import cKDTree
 
-from palpate.recording.faults import Fault, FaultCode, Remedy, refused
+from palpate.recording.faults import Fault, FaultCode, Remedy, is_refused
 from palpate.recording.mapping import Mapping, MappingError, read_mapping
 from palpate.recording.motion import Axis, Mask, blocks, pressing_axis
 from palpate.recording.probes import contacts_of_probes, probes
-from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, moved, read_table
+from palpate.recording.readings import TABLES, ReadingError, Readings, from_bag, from_table, move_to_mapped, read_table
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording, implied_young, loading, width
 from palpate.recording.timed import contacts_over_time
 from palpate.report.archive import FILE, read_evidence
@@ -82,7 +82,7 @@ class ReadingLimits(NamedTuple):
 LIMITS: Final = ReadingLimits()
 
 
-def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
+def clean_readings(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
     """Return the readings without invalid, repeated, frozen and displaced ones, clipped ones marked, and the faults."""
     faults: list[Fault] = []
     if readings.probe is not None and 2 * len(np.unique(readings.probe)) < np.count_nonzero(np.diff(readings.probe)):
@@ -126,7 +126,7 @@ def cleaned(readings: Readings, radius: float) -> tuple[Readings, list[Fault]]:
         drop(FaultCode.SPIKE, spike > most, float(spike.max(initial=0.0)))
     if (step := _resolution(readings.force)) > LIMITS.resolution * float(np.ptp(readings.force, axis=0).max(initial=0.0)):
         faults.append(Fault(FaultCode.RESOLUTION, 1, 1, Remedy.KEPT, step))
-    clipped, limit = _clipped(readings.force, readings.position)
+    clipped, limit = _find_clipped(readings.force, readings.position)
     if clipped.any():
         faults.append(Fault(FaultCode.CLIPPED, int(clipped.sum()), len(clipped), Remedy.LEFT_OUT, limit))
     return replace(readings, clipped=clipped), faults
@@ -203,7 +203,7 @@ def _frozen(values: Array, others: Array) -> Mask:
     return frozen
 
 
-def _clipped(force: Array, position: Array) -> tuple[Mask, float]:
+def _find_clipped(force: Array, position: Array) -> tuple[Mask, float]:
     """Return True where a component stays at an extreme while the tool moves, shape (n,), and that force [N].
 
     An extreme near zero is none, and neither is one that is about as frequent as the next value: that is the sensor's resolution.
@@ -276,7 +276,7 @@ def own_recording(folder: Path) -> PalpationRecording:
     )
 
 
-def usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
+def select_usable(contacts: list[Contact], radius: float, undeep_ones: int, faults: list[Fault]) -> list[Contact]:
     """Return the contacts that can be assessed; adds faults. `undeep_ones`: contacts that are left out already."""
     usual = float(np.median([contact.depth.max() for contact in contacts])) if contacts else 0.0
 
@@ -349,12 +349,12 @@ def read_recording(path: str | Path, mapping: Mapping | str | Path | None = None
 
 def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecording:
     """Return the recording of readings as a file has them. Raises UserError."""
-    readings, faults = cleaned(raw, mapping.tool.radius_m)
-    readings = moved(readings, mapping)
+    readings, faults = clean_readings(raw, mapping.tool.radius_m)
+    readings = move_to_mapped(readings, mapping)
     if len(readings.position) < LIMITS.rows:
         raise ReadingError(f"{name}: {len(readings.position)} usable rows; want at least {LIMITS.rows}")
     faults += _implausible(readings)
-    if refused(faults):
+    if is_refused(faults):
         return _refused(name, mapping, faults)
     parts = probes(readings) if readings.time is None else blocks(readings.time)
     if readings.normal is not None and _inward(readings, parts):
@@ -386,9 +386,9 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         if in_A.time is None
         else contacts_over_time(in_A, axis, mapping, X_WA, faults)
     )
-    if palpated.contacts and not refused(faults):
+    if palpated.contacts and not is_refused(faults):
         faults += _implausible_force(palpated.contacts, mapping.tool.radius_m)
-    touches = [] if refused(faults) else usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
+    touches = [] if is_refused(faults) else select_usable(palpated.contacts, mapping.tool.radius_m, palpated.untold, faults)
     return PalpationRecording(
         name=name,
         indenter_radius_m=mapping.tool.radius_m,

@@ -186,12 +186,12 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     """Return the readings of a bag at the stamps of its wrenches. Raises ReadingError."""
     topics = mapping.topics
     assert isinstance(topics, Topics)
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         forces = ((*t, w.wrench.force) for t, w in _messages(bag, path, topics.wrench, "wrench"))
         rows: Array = np.fromiter(((t, log, f.x, f.y, f.z) for t, log, f in forces), np.dtype((float, 5))).view(float)
         clocks, position, rotation = _poses(bag, path, topics.pose)
     repeats = any(2 * len(np.unique(stamps)) < len(stamps) for stamps in (rows[:, 0], clocks[:, 0]))
-    times, force = _averaged(rows[:, [int(repeats), 2, 3, 4]])
+    times, force = _average(rows[:, [int(repeats), 2, 3, 4]])
     stamps, first = np.unique(clocks[:, int(repeats)], return_index=True)
     if len(stamps) < 2:
         raise ReadingError(f"{path}: {len(stamps)} poses; want at least 2")
@@ -207,7 +207,7 @@ def from_bag(path: Path, mapping: Mapping) -> Readings:
     return Readings(between, force, times - times[0], rotation=turn)
 
 
-def _averaged(rows: Array) -> tuple[Array, Array]:
+def _average(rows: Array) -> tuple[Array, Array]:
     """Return stamps [s] and forces [N], averaged over _SHORTEST_S where they are more frequent; rows of both, shape (n, 4)."""
     rows = rows[np.argsort(rows[:, 0], kind="stable")]
     step = float(np.ptp(rows[:, 0])) / (len(rows) - 1) if len(rows) > 1 else 0.0
@@ -217,7 +217,7 @@ def _averaged(rows: Array) -> tuple[Array, Array]:
 
 
 @contextmanager
-def opened(path: Path) -> Iterator[AnyReader]:
+def open_bag(path: Path) -> Iterator[AnyReader]:
     """Open a bag. Raises ReadingError, also for what is found while it is read."""
     for file in recorded_files(path)[1]:
         InputFile(file, ReadingError).close()
@@ -309,7 +309,7 @@ def _kinematics(states: list[tuple[tuple[float, float], Any]], source: Joints) -
     return np.array([t for t, _ in states]), X[:, :3, 3], Rotation.from_matrix(X[:, :3, :3])
 
 
-def moved(readings: Readings, mapping: Mapping) -> Readings:
+def move_to_mapped(readings: Readings, mapping: Mapping) -> Readings:
     """Return the readings of the mapped point, with the force on the tool in the axes of the positions, without weight."""
     force, turn, position = readings.force, readings.rotation, readings.position
     if force.shape[1] == 3:

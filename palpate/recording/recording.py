@@ -53,8 +53,7 @@ class Contact:
     """[s], shape (k,); None for a probe."""
 
 
-@dataclass(frozen=True, eq=False)
-class Palpated:
+class Palpated(NamedTuple):
     """Contacts and skin found in readings, in A."""
 
     contacts: list[Contact]
@@ -161,12 +160,12 @@ class PalpationRecording:
         ends = [min(nominal, float(touch.depth.max())) for touch in presses.values()]
         loads = loading(list(presses.values()), ends)
         samples = [
-            _pressed(touch, number, *load)
+            _press_sample(touch, number, *load)
             for (number, touch), load in zip(presses.items(), zip(loads.force, loads.noise, ends, strict=True), strict=True)
         ]
         for number, touch in enumerate(self.touches, start=1):
             if touch.kind is ContactKind.SLIDE:
-                samples += _slid(touch, number, FOOTPRINT_SHARE * sqrt(self.indenter_radius_m * nominal))
+                samples += _slide_samples(touch, number, FOOTPRINT_SHARE * sqrt(self.indenter_radius_m * nominal))
         return sorted(samples, key=lambda sample: sample.stroke)
 
     @property
@@ -199,7 +198,7 @@ def implied_young(touches: Sequence[Contact], radius: float) -> tuple[float, flo
     return float(np.median(moduli)), float(np.median([force for _, force in most]))
 
 
-def _pressed(touch: Contact, number: int, force: float, noise: float, depth: float) -> ForceSample:
+def _press_sample(touch: Contact, number: int, force: float, noise: float, depth: float) -> ForceSample:
     """Return the sample of a press or probe."""
     last = int(np.flatnonzero(touch.depth >= 0.95 * depth)[0])
     # probes without time are 10 s apart: their errors of one moment are unrelated
@@ -219,7 +218,7 @@ def _pressed(touch: Contact, number: int, force: float, noise: float, depth: flo
     )
 
 
-def _slid(touch: Contact, number: int, travel: float) -> list[ForceSample]:
+def _slide_samples(touch: Contact, number: int, travel: float) -> list[ForceSample]:
     """Return a sample per `travel` [m] of a slide: the force at the mean depth, by regression over the depths there."""
     assert touch.time is not None
     samples = []

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 from scipy.interpolate import LinearNDInterpolator, NearestNDInterpolator, RectBivariateSpline
@@ -30,8 +30,7 @@ _PLANE: Final = 4
 """Least number of points that a plane is fitted to."""
 
 
-@dataclass(frozen=True)
-class RecordedSkin:
+class RecordedSkin(NamedTuple):
     """Heights of the tool's centre at first contact over the xy plane of A, on a grid."""
 
     x: Array
@@ -60,7 +59,7 @@ class RecordedSkin:
         """Return the skin moved outward or inward to points of standard deviation `sd` [m], by their weighted mean."""
         off = points[:, 2] - self.at(points[:, :2])[0]
         near = np.abs(off - np.median(off)) <= 5 * np.median(np.abs(off - np.median(off))) + 1e-9
-        return replace(self, z=self.z + float(np.average(off[near], weights=sd[near] ** -2)))
+        return self._replace(z=self.z + float(np.average(off[near], weights=sd[near] ** -2)))
 
 
 def of_mesh(file: Path, scale: float, X_AW: Array, radius: float, stations: tuple[Array, Array]) -> RecordedSkin:
@@ -85,7 +84,7 @@ def grid_over(xy: Array, margin: float) -> tuple[Array, Array]:
     return x, y
 
 
-def fitted(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> RecordedSkin:
+def fit_skin(points: Array, sd: Array, stations: tuple[Array, Array], least: float) -> RecordedSkin:
     """Return the skin through points [m], shape (n, 3), of standard deviation `sd` [m], shape (n,).
 
     `least`: shortest length over which the skin varies [m].

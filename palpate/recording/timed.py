@@ -10,12 +10,12 @@ from scipy.interpolate import make_interp_spline
 
 from palpate.recording import cutting
 from palpate.recording.cutting import ContactOnset, across
-from palpate.recording.faults import Fault, FaultCode, Remedy, refused
+from palpate.recording.faults import Fault, FaultCode, Remedy, is_refused
 from palpate.recording.mapping import SCALES, Mapping
-from palpate.recording.motion import TUNING, Axis, delay, free_air, noise, shifted, tared
+from palpate.recording.motion import TUNING, Axis, delay, delay_force, free_air, noise, tare
 from palpate.recording.readings import Readings
 from palpate.recording.recording import Contact, ContactKind, Palpated
-from palpate.recording.skin import RecordedSkin, fitted, grid_over, of_mesh
+from palpate.recording.skin import RecordedSkin, fit_skin, grid_over, of_mesh
 from palpate_models.numerics.frames import Array, inverse
 
 _TRAVEL: Final = (0.005, 4.0)
@@ -43,7 +43,7 @@ def implausible_unit(travel: float, radius: float) -> list[Fault]:
 
 def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: Array, faults: list[Fault]) -> Palpated:
     """Return the contacts of readings in A, and the skin; adds faults."""
-    readings, sigma = _prepared(readings, axis, mapping, faults)
+    readings, sigma = _prepare(readings, axis, mapping, faults)
     assert readings.time is not None
     height, force = readings.position @ axis.outward, normal_force(readings.force, axis.outward)
     found = cutting.cut(readings.time, height, force, sigma)
@@ -61,16 +61,16 @@ def contacts_over_time(readings: Readings, axis: Axis, mapping: Mapping, X_WA: A
     return work.palpated(faults)
 
 
-def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fault]) -> tuple[Readings, float]:
+def _prepare(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fault]) -> tuple[Readings, float]:
     """Return the readings with force and position aligned and the force tared, and the SD of the force [N]."""
     assert readings.time is not None
     time = readings.time
     if mapping.force.delay_s:
-        readings = shifted(readings, mapping.force.delay_s)
+        readings = delay_force(readings, mapping.force.delay_s)
     late = delay(time, readings.position @ axis.outward, normal_force(readings.force, axis.outward))
     if abs(late) > max(_DELAY_S, 2 * float(np.median(np.diff(time)))):
         faults.append(Fault(FaultCode.CLOCK, 1, 1, Remedy.CORRECTED, late))
-        readings = shifted(readings, late)
+        readings = delay_force(readings, late)
     height, force = readings.position @ axis.outward, normal_force(readings.force, axis.outward)
     if not mapping.force.tare:
         return readings, max(noise(force), 1e-4)
@@ -78,7 +78,7 @@ def _prepared(readings: Readings, axis: Axis, mapping: Mapping, faults: list[Fau
     if not free.any():
         faults.append(Fault(FaultCode.NO_FREE_AIR, 1, 1, Remedy.NOT_TARED))
         return readings, max(noise(force), 1e-4)
-    level, drift, spread = tared(time, readings.force, free)
+    level, drift, spread = tare(time, readings.force, free)
     sigma = float(spread.max())
     pressed = normal_force(level, axis.outward)
     pressed = pressed[pressed > TUNING.sigmas * sigma]
@@ -150,7 +150,7 @@ class _Measured:
             if not len(points):
                 return replace(Palpated.nothing(), untold=len(self.touching))
             if not given:
-                self.skin = fitted(points, sd, self.stations, 2 * self.reach)
+                self.skin = fit_skin(points, sd, self.stations, 2 * self.reach)
         assert self.skin is not None
         if given:
             self.skin, kept = self.skin.through(points, sd), {}
@@ -159,12 +159,12 @@ class _Measured:
         if (
             kept
             and len(off)
-            and not refused(faults)
+            and not is_refused(faults)
             and (apart := float(np.sqrt(np.mean(off**2)))) > _MOVES * float(sd[begun:].mean())
         ):
             faults.append(Fault(FaultCode.MOVES, 1, 1, Remedy.ONE_DEPTH, apart))
             kept = dict.fromkeys(kept, float(np.median(list(kept.values()))))
-            self.skin = fitted(*self._skin_points(loads, onsets, kept), self.stations, 2 * self.reach)
+            self.skin = fit_skin(*self._skin_points(loads, onsets, kept), self.stations, 2 * self.reach)
         contacts: list[Contact] = []
         for k, ((one, motion), load, begin) in enumerate(zip(self.touching, loads, onsets, strict=True)):
             if motion is _Motion.SLIDE:

@@ -9,15 +9,15 @@ import logging
 import math
 import tempfile
 from collections.abc import Iterable, Iterator, Mapping, MutableSequence
-from dataclasses import dataclass, fields, is_dataclass, replace
+from dataclasses import fields, is_dataclass, replace
 from itertools import chain
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from mcap.writer import CompressionType, Writer
 
-from palpate.apart import guarded, shared_numbers
+from palpate.apart import run_guarded, shared_numbers
 from palpate.console import SteadyConsole, TimeLeft, fail, print_json, wide_console
 from palpate.replay.compare import Tolerance, TopicResult, as_dict, compare, parse_tolerance, result_table
 from palpate_bus import implementations
@@ -88,22 +88,22 @@ def cut(recording: Recording, rules: Contract, topics: Iterable[str], begin: int
         numbers[topic.name] += 1
         stamp = message.stamp - begin
         sequence = stamp // topic.period + 1 if topic.periodic else numbers[topic.name]
-        yield RecordedMessage(stamp, topic.name, rounded(topic, message.payload, begin), sequence)
+        yield RecordedMessage(stamp, topic.name, round_message(topic, message.payload, begin), sequence)
 
 
-def rounded(topic: Topic, payload: bytes, shift: int = 0) -> bytes:
+def round_message(topic: Topic, payload: bytes, shift: int = 0) -> bytes:
     """Return a message with rounded doubles and with time stamps `shift` [ns] earlier (not below zero)."""
-    return codec.encode(_rounded_value(codec.decode(payload, topic.type), shift), topic.type)
+    return codec.encode(_round_value(codec.decode(payload, topic.type), shift), topic.type)
 
 
-def _rounded_value(value: Any, shift: int) -> Any:
+def _round_value(value: Any, shift: int) -> Any:
     if getattr(value, "__msgtype__", "") == "builtin_interfaces/msg/Time":
         return time_message(max(nanoseconds(value) - shift, 0))
     if is_dataclass(value) and not isinstance(value, type):
-        changed = {f.name: _rounded_value(getattr(value, f.name), shift) for f in fields(value) if not f.name.startswith("__")}
+        changed = {f.name: _round_value(getattr(value, f.name), shift) for f in fields(value) if not f.name.startswith("__")}
         return replace(value, **changed)
     if isinstance(value, list):
-        return [_rounded_value(item, shift) for item in value]
+        return [_round_value(item, shift) for item in value]
     if isinstance(value, float):
         return float(_round(np.array([value]))[0])
     if isinstance(value, np.ndarray) and value.dtype == np.float64:
@@ -144,8 +144,7 @@ def _register(writer: Writer, topic: Topic) -> int:
     return channel
 
 
-@dataclass(frozen=True)
-class GoldenCase:
+class GoldenCase(NamedTuple):
     """A service and the recording that it is compared with."""
 
     recording: Recording
@@ -240,7 +239,7 @@ def make_reference(case: GoldenCase, path: Path, begin: int, end: int) -> None:
     end = min(end, case.end)
     given = list(cut(case.recording, case.rules, case.inputs, begin, end))
     sent = rerun(case.service, case.rules, iter(given), (end - begin) // period * period)
-    answers = (message._replace(payload=rounded(case.rules.topics[message.topic], message.payload)) for message in sent)
+    answers = (message._replace(payload=round_message(case.rules.topics[message.topic], message.payload)) for message in sent)
     attached = {SCENARIO: ("application/yaml", case.scenario.encode())}
     write_recording(path, case.rules, chain(given, answers), attached)
 
@@ -252,7 +251,7 @@ def write_reference(file: Path, service: str, scenario: Path | None, start: int,
         case = prepare(file, service, scenario)
         make_reference(case, target, start, case.end if end is None else end)
 
-    guarded(f"--service {service}", write, math.inf)
+    run_guarded(f"--service {service}", write, math.inf)
     SteadyConsole(stderr=True).print(f"{target}: {target.stat().st_size} bytes", highlight=False)
 
 
@@ -266,7 +265,7 @@ def run_again(file: Path, service: str, scenario: Path | None, tolerance: list[s
         with TimeLeft(lambda: f"running {role} again", lambda: reached[0], 0, case.end):
             return replay_service(case, allowed, reached)
 
-    results = guarded(f"--service {service}", perform, Settings.read().start_limit_s, place=lambda: (reached[0],))
+    results = run_guarded(f"--service {service}", perform, Settings.read().start_limit_s, place=lambda: (reached[0],))
     if as_json:
         print_json({name: as_dict(result) for name, result in results.items()})
     else:

@@ -2,11 +2,10 @@
 
 import logging
 from collections.abc import Collection
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns, sleep
 from types import TracebackType
-from typing import Final, Self
+from typing import Final, NamedTuple, Self
 
 from palpate.console import SteadyConsole, TimeLeft
 from palpate_bus.contract import Contract, contract
@@ -26,8 +25,7 @@ LOOK_NS = NS
 """The bus is watched this long before anything is played, and checked at this interval during it [ns]."""
 
 
-@dataclass(frozen=True)
-class PlayTimes:
+class PlayTimes(NamedTuple):
     """Times of a replay."""
 
     longest_ns: int = 7 * 86400 * NS

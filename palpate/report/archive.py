@@ -171,7 +171,7 @@ def _messages(c: Collected) -> Iterator[RecordedMessage]:
 _SEQUENCES: Final = ("exam_states", "indentation", "motions", "samples", "status_changes")
 
 
-def _collected(evidence: Recording) -> Collected:
+def _read_collected(evidence: Recording) -> Collected:
     """Return the messages that `_messages` wrote."""
     evidence.check(contract(), list(evidence.types))
     fields = {topic: field for field, topic in _TOPICS.items()}
@@ -222,7 +222,7 @@ def read_evidence(folder: Path) -> Evidence:
             attached = {a.name: a.data for a in reader.iter_attachments()}
             summary = reader.get_summary()
         known = read_arrays(attached[_TRUTH], path, EvidenceError)
-        collected = _collected(open_recording(path)) if summary is not None and summary.channels else Collected()
+        collected = _read_collected(open_recording(path)) if summary is not None and summary.channels else Collected()
         nowhere = np.empty((0, 3))
         touched = Touched(known.get("touched_believed", nowhere), known.get("touched_true", nowhere))
         named = {name: known[f"pressed_{name}"] for name in Pressed._fields if f"pressed_{name}" in known}
@@ -233,7 +233,7 @@ def read_evidence(folder: Path) -> Evidence:
         raise EvidenceError(f"{path} cannot be read ({error}): run the examination again") from error
 
 
-def completed(folder: Path) -> dict[str, Any] | None:
+def read_completed(folder: Path) -> dict[str, Any] | None:
     """Return report.json of a completed run with its evidence; None if there is none."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         report: dict[str, Any] = read_json(folder / "report.json")
@@ -252,7 +252,7 @@ class InterruptedRun(NamedTuple):
     collected: Collected
 
 
-def interrupted_run(folder: Path) -> InterruptedRun:
+def read_interrupted(folder: Path) -> InterruptedRun:
     """Read the folder of a run.
 
     Raises EvidenceError if the run is still active or its files cannot be read, NothingRecordedError if it has no recording.
@@ -265,7 +265,7 @@ def interrupted_run(folder: Path) -> InterruptedRun:
     try:
         scenario = load_scenario(str(folder / "scenario.yaml"))
         recording = _recording(folder)
-        collected = _collected(recording) if recording.path.name == FILE else collect(recording)
+        collected = _read_collected(recording) if recording.path.name == FILE else collect(recording)
         return InterruptedRun(folder, scenario, recording, collected)
     except (RecordingError, ScenarioError) as error:
         raise EvidenceError(f"{folder}: nothing can be recovered: {error}") from error

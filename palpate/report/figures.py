@@ -31,7 +31,7 @@ APPARENT = "force of the standard press"
 _LOG_TICKS = [m * 10.0**e for e in range(-1, 3) for m in (1, 1.2, 1.5, 2, 2.5, 3, 4, 5, 6, 8)]
 
 
-def drawable(message: Any) -> bool:
+def is_drawable(message: Any) -> bool:
     """Return True if a `palpation_msgs/StiffnessMap` has a scanned triangle."""
     triangles = np.asarray(message.triangles, dtype=np.int64).reshape(-1, 3)
     return bool(np.asarray(message.scanned, dtype=bool)[triangles].all(axis=1).any())
@@ -207,9 +207,9 @@ def draw_map(
     """Draw `palpation_msgs/StiffnessMap` and `Findings` (in A), with the truth if known, into a PNG file.
 
     `samples_xy`: places of the samples [m], shape (m, 2). The file's metadata has the name of the run. Writes nothing for a map
-    that is not `drawable`.
+    that is not `is_drawable`.
     """
-    if not drawable(message):
+    if not is_drawable(message):
         return
     drawing = Drawing(message, findings, truth, abdomen)
     figure = Figure(figsize=(16.5, 10.2), dpi=130, facecolor="white")

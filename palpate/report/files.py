@@ -48,7 +48,7 @@ def fingerprint() -> dict[str, Any]:
 
 
 @contextmanager
-def drafted(path: Path) -> Iterator[Path]:
+def write_draft(path: Path) -> Iterator[Path]:
     """Yield the path of a draft that replaces `path` at the end: readers see the old file or the new one, even after a kill."""
     draft = path.with_name(f".{path.name}.{os.getpid()}")
     try:
@@ -60,7 +60,7 @@ def drafted(path: Path) -> Iterator[Path]:
 
 def write_text(path: Path, text: str) -> None:
     """Write a text file atomically. Raises OSError."""
-    with drafted(path) as draft:
+    with write_draft(path) as draft:
         draft.write_text(text, encoding="utf-8")
 
 

@@ -18,7 +18,7 @@ from palpate.report import page_figures, rows
 from palpate.report.archive import FILE as EVIDENCE, Evidence, EvidenceError, read_evidence
 from palpate.report.evidence import body_of, felt_truth
 from palpate.report.files import write_text
-from palpate.report.results import clean_world_note, unassessed
+from palpate.report.results import clean_world_note, describe_unassessed
 from palpate.report.rows import FindingRow, Report
 from palpate.report.scoring import Truth
 from palpate_inputs import read_text
@@ -83,7 +83,7 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
     environment = Environment(loader=PackageLoader("palpate.report"), autoescape=True, undefined=StrictUndefined)
     environment.filters["mm"] = lambda metres, digits=0: f"{1e3 * metres:.{digits}f} mm"
     environment.filters["plus_mm"] = lambda metres: f"{1e3 * metres:+.0f}"
-    skipped = _skipped(scenario, report, evidence)
+    skipped = _list_skipped(scenario, report, evidence)
     places = np.array([row["place"] for row in skipped if row["place"] is not None], dtype=np.float64).reshape(-1, 2)
     solid = (
         None
@@ -101,7 +101,7 @@ def render(scenario: Scenario, report: Report, evidence: Evidence, samples_xy: A
         skipped=skipped,
         safety=_safety(report, evidence),
         targets=evidence.target_count,
-        reached=_reached(report, evidence),
+        reached=_count_reached(report, evidence),
         layers=None if solid is None else solid[0],
         surface=None if solid is None else Markup(json.dumps(solid[1])),
         viewer=Markup((Path(__file__).parent / "templates" / "surface.js").read_text(encoding="utf-8")),
@@ -122,7 +122,7 @@ def known_truth(scenario: Scenario, evidence: Evidence) -> Truth | None:
 
 def verdict(report: Report) -> str:
     """Return the result as a sentence."""
-    found, unknown = " ".join(map(_finding_text, report.findings)), unassessed(report)
+    found, unknown = " ".join(map(_finding_text, report.findings)), describe_unassessed(report)
     if report.failure:
         return f"The examination did not complete: {report.failure}. {unknown}{found}".strip()
     refused = [fault.text for fault in report.recorded.faults if fault.refused] if report.recorded else []
@@ -133,7 +133,7 @@ def verdict(report: Report) -> str:
     return f"{found or 'No lump was found.'} {rows.of_whom(report)}{rows.other_causes(report.candidates)} {unknown}".strip()
 
 
-def _reached(report: Report, evidence: Evidence) -> int:
+def _count_reached(report: Report, evidence: Evidence) -> int:
     """Return the number of targets that the indenter reached."""
     if not report.failure:
         return evidence.target_count - report.skipped_targets
@@ -156,7 +156,7 @@ def _image(png: bytes | None) -> str | None:
     return None if png is None else "data:image/png;base64," + base64.b64encode(png).decode("ascii")
 
 
-def _skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dict[str, Any]]:
+def _list_skipped(scenario: Scenario, report: Report, evidence: Evidence) -> list[dict[str, Any]]:
     """Return the skipped targets: number, reason, and position in A if known."""
     reasons = report.services.get("planning", {}).get("facts", {}).get("skipped_targets", {})
     X_AW = inverse(np.array(exam_input(scenario).X_WA))

@@ -81,7 +81,7 @@ def maps(evidence: Evidence, samples_xy: Array, skipped_xy: Array, abdomen: bool
     None if there is no map.
     """
     message = evidence.collected.stiffness_map
-    if message is None or not figures.drawable(message):
+    if message is None or not figures.is_drawable(message):
         return None
     drawing = figures.Drawing(message, evidence.collected.findings, None, abdomen)
     figure = _figure(15.5, 5.0)
@@ -140,7 +140,7 @@ def record(evidence: Evidence, limit_n: float | None) -> bytes | None:
 def truth(evidence: Evidence, known: Truth | None) -> bytes | None:
     """Return true apparent stiffness with outlines of findings, and the error of the estimate; None if either is unknown."""
     message = evidence.collected.stiffness_map
-    if known is None or message is None or not figures.drawable(message):
+    if known is None or message is None or not figures.is_drawable(message):
         return None
     drawing = figures.Drawing(message, evidence.collected.findings, known)
     if drawing.true is None:

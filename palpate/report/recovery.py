@@ -14,7 +14,7 @@ from typing import Final, NamedTuple
 
 import numpy as np
 
-from palpate.environment import given
+from palpate.environment import set_environment
 from palpate.replay.golden import rerun
 from palpate.report import archive
 from palpate.report.evidence import points
@@ -32,7 +32,7 @@ from palpate_conductor.collector import Collected
 from palpate_conductor.outcome import RunResult, gave_up
 from palpate_models.numerics.frames import apply, inverse
 from palpate_models.scenario.checkpoint import Checkpoint
-from palpate_models.scenario.load import exam_input, seen, view_of
+from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
 from palpate_models.scenario.schema import Scenario
 
 FOLDER: Final = "resumed"
@@ -40,18 +40,18 @@ FOLDER: Final = "resumed"
 RUNTIME: Final = "recovered"
 
 
-def recovered(folder: Path) -> tuple[Scenario, RunResult]:
+def recover_run(folder: Path) -> tuple[Scenario, RunResult]:
     """Return the scenario and the results of the interrupted run in `folder`, without a run hash.
 
     If it ended before the findings, the assessment that the scenario names processes the recorded examination again.
 
     Raises EvidenceError if the run is still active, is complete, or has no recording.
     """
-    if archive.completed(folder) is not None:
+    if archive.read_completed(folder) is not None:
         raise archive.EvidenceError(f"{folder}: its run was completed; there is nothing to recover")
     *continued, run = _runs(folder)
     note = ""
-    checkpoint = _reached(continued) if continued else None
+    checkpoint = _last_checkpoint(continued) if continued else None
     collected, recording = run.collected, run.recording
     if collected.findings is None or not collected.findings.final:
         try:
@@ -85,7 +85,7 @@ def _assess(run: archive.InterruptedRun) -> None:
     end = archive.tick_after(recording.last, "assessment")
     aborted = codec.encode(replace(exam, phase=ExamState.PHASE_ABORTED), row.type)
     over = RecordedMessage(end, row.name, aborted, len(collected.exam_states) + 1)
-    service = create("assessment", scenario.services.assessment, seen(scenario, view_of("assessment")))
+    service = create("assessment", scenario.services.assessment, restrict_to_view(scenario, view_of("assessment")))
     received = chain(archive.inputs(recording, "assessment"), [over])
     for sent in rerun(service, rules, received, end + 2 * row.period, begin=end):  # all at once: earlier maps are not needed
         if sent.topic == "assessment/map":
@@ -122,10 +122,10 @@ def resumption(folder: Path) -> Resumption:
     """
     while _holds_run(folder / FOLDER):
         folder /= FOLDER
-    if archive.completed(folder) is not None:
+    if archive.read_completed(folder) is not None:
         raise archive.EvidenceError(f"--resume {folder}: its run was completed")
     runs = _runs(folder)
-    reached = _reached(runs)
+    reached = _last_checkpoint(runs)
     if not len(reached.felt.time):
         raise archive.EvidenceError(f"--resume {folder}: no samples recorded; start a new run")
     if not len(reached.left) and not runs[-1].scenario.exam.searched:
@@ -141,7 +141,7 @@ def _holds_run(folder: Path) -> bool:
     if not (folder / "scenario.yaml").is_file():
         return False
     try:
-        return archive.completed(folder) is not None or archive.interrupted_run(folder) is not None
+        return archive.read_completed(folder) is not None or archive.read_interrupted(folder) is not None
     except archive.NothingRecordedError:
         return False
 
@@ -155,7 +155,7 @@ def checkpoint_given(checkpoint: Checkpoint | None) -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="palpate-") as place:
         path = Path(place) / "checkpoint.npz"
         path.write_bytes(checkpoint.bytes())
-        with given({variable("checkpoint"): str(path)}):
+        with set_environment({variable("checkpoint"): str(path)}):
             yield
 
 
@@ -164,19 +164,19 @@ def _runs(folder: Path) -> list[archive.InterruptedRun]:
     folders = [folder.resolve()]
     while folders[0].name == FOLDER and (folders[0].parent / "scenario.yaml").is_file():
         folders.insert(0, folders[0].parent)
-    return [archive.interrupted_run(one) for one in folders]
+    return [archive.read_interrupted(one) for one in folders]
 
 
-def _reached(runs: list[archive.InterruptedRun]) -> Checkpoint:
+def _last_checkpoint(runs: list[archive.InterruptedRun]) -> Checkpoint:
     """Return the checkpoint at the end of a sequence of runs, each of which continued its predecessor."""
     reached: Checkpoint | None = None
     for run in runs:
-        reached = _extended(run, reached)
+        reached = _extend(run, reached)
     assert reached is not None
     return reached
 
 
-def _extended(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
+def _extend(run: archive.InterruptedRun, earlier: Checkpoint | None) -> Checkpoint:
     """Return the checkpoint at the end of a run that continued from `earlier`: its samples, remaining targets and surface."""
     known, c = exam_input(run.scenario), run.collected
     assessment = AssessmentService(known, earlier)

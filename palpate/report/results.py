@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from rich.console import Console
 from rich.table import Table
 
-from palpate.apart import guarded
+from palpate.apart import run_guarded
 from palpate.report import archive, evidence, rows, scoring
 from palpate.report.files import fingerprint, write_text
 from palpate.report.rows import DepthRow, LumpRow, RecordedRow, Report, Scores, TruthRow
@@ -62,7 +62,7 @@ def _pressed(scenario: Scenario) -> Pressed | None:
     tissue = scenario.services.tissue
     if not implementations.kind("tissue").foreign(tissue):
         return press_patient(scenario)
-    return guarded(f"services.tissue = {tissue!r}", lambda: press_patient(scenario), Settings.read().start_limit_s)
+    return run_guarded(f"services.tissue = {tissue!r}", lambda: press_patient(scenario), Settings.read().start_limit_s)
 
 
 def clean_world(scenario: Scenario) -> bool:
@@ -183,7 +183,7 @@ USUAL_N = (1.2, 4.8)
 between the measured people, who are similar, 0.2 between places of one person (Remus et al. 2024), and an assumed margin."""
 
 
-def unassessed(report: Report) -> str:
+def describe_unassessed(report: Report) -> str:
     """Return sentences on unassessed areas and on an unusual level of stiffness; empty without either."""
     parts = report.unassessed_m2.items()
     return "".join(f"Not assessed: {1e4 * area:.0f} cm², {REASONS[reason]}. " for reason, area in parts) + _level(report)
@@ -202,7 +202,7 @@ def _level(report: Report) -> str:
 
 def print_findings(console: Console, report: Report) -> None:
     """Print unassessed areas, the findings as a table, and their scores in a line."""
-    if unknown := unassessed(report):
+    if unknown := describe_unassessed(report):
         console.print(unknown.rstrip(), highlight=False, soft_wrap=True)
     if report.findings:
         table = Table("finding", "where (x, y)", "area", "apparent stiffness", "90 % band", "confidence", box=None)

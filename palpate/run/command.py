@@ -44,7 +44,7 @@ def run(options: RunOptions) -> None:
     The exit status is 0 when the examination was completed, 2 when it was not started, 3 when it failed or was interrupted,
     130 when it was interrupted before it began.
     """
-    from palpate.run.inputs import usable
+    from palpate.run.inputs import check_usable
     from palpate_errors import UserError
 
     if options.resume is not None:
@@ -55,7 +55,7 @@ def run(options: RunOptions) -> None:
 
         resume(options)
     else:
-        chosen = usable(options.scenario, options.settings, options.seed, options.services)
+        chosen = check_usable(options.scenario, options.settings, options.seed, options.services)
         from palpate.run.examine import examine  # only now, so that bad input is reported a second sooner
 
         examine(chosen, options)
@@ -74,11 +74,11 @@ def prepare(
     """
     from palpate.console import say
     from palpate.run.folder import set_aside
-    from palpate.run.inputs import usable
+    from palpate.run.inputs import check_usable
     from palpate.run.roles import write_scenario_files
     from palpate_errors import UserError
 
-    chosen = usable(scenario, settings, seed, elsewhere=True)
+    chosen = check_usable(scenario, settings, seed, elsewhere=True)
     try:
         if (earlier := set_aside(out)) is not None:
             say(f"the results of the earlier run were moved to {earlier}")

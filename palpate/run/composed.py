@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from collections.abc import Mapping, MutableSequence
 from contextlib import nullcontext, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from enum import IntEnum
 from pathlib import Path
 from time import perf_counter
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 from palpate.apart import ChildLost, Send, TimeLimit, run_apart, shared_numbers
-from palpate.environment import given
+from palpate.environment import set_environment
 from palpate.run.interrupts import all_is_measured
-from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, foreign_roles, read_record, workers, write_scenario_files
 from palpate_bus.contract import contract
 from palpate_bus.implementations import create
 from palpate_bus.messages.stamps import NS
@@ -26,7 +26,7 @@ from palpate_bus.settings import Settings, variable
 from palpate_conductor.collector import Collected, CollectedNews, Collector, FrameTree, collect
 from palpate_conductor.outcome import SIM_LIMIT, Patience, RunProgress, RunResult, Tell, failure_of, gave_up
 from palpate_errors import RunError, UserError
-from palpate_models.scenario.load import exam_input, seen, view_of
+from palpate_models.scenario.load import exam_input, restrict_to_view, view_of
 from palpate_models.scenario.schema import Scenario
 
 REPORT_S: Final = 0.1
@@ -92,8 +92,7 @@ class ChildPlace:
         return Failure(code, text, () if role is None else (role,))
 
 
-@dataclass(frozen=True)
-class News:
+class News(NamedTuple):
     """A report of the child."""
 
     t: int
@@ -101,6 +100,7 @@ class News:
     """When the first tick began, by `perf_counter` [s]."""
     collected: Mapping[str, Any]
     trouble: tuple[str, ...]
+    """Messages for the user since the last report."""
     measured: bool
 
 
@@ -113,7 +113,7 @@ def load_services(scenario: Scenario, roles: tuple[str, ...], place: ChildPlace 
     for role in roles:
         if place is not None:
             place.enter(ChildStage.LOAD, role)
-        services.append(create(role, choice(scenario, role), seen(scenario, view_of(role))))
+        services.append(create(role, choice(scenario, role), restrict_to_view(scenario, view_of(role))))
     return services
 
 
@@ -124,9 +124,8 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
     place = ChildPlace(foreign_roles(scenario))
     collected = Collector().collected
     start = 0.0
-    waits: list[str] = []
     trouble: list[str] = []
-    """Messages for the user so far: those of the child and of its waits."""
+    """Messages for the user so far, from the child and about what it waits for."""
 
     def show(t: int) -> None:
         tell(RunProgress(t, t / NS / max(perf_counter() - start, 1e-9), collected, tuple(trouble)))
@@ -137,14 +136,13 @@ def run_composed(scenario: Scenario, out: Path, tell: Tell, observers: tuple[str
         collect(collected, news.collected)
         if news.measured:
             all_is_measured()
-        trouble.extend(news.trouble[len(trouble) - len(waits) :])
+        trouble.extend(news.trouble)
         show(news.t)
 
     limit = TimeLimit(place.now, place.limit_s)
 
     def check() -> None:
-        if limit.there_s > place.patience.quiet and (text := place.wait_text()) not in waits:
-            waits.append(text)
+        if limit.there_s > place.patience.quiet and (text := place.wait_text()) not in trouble:
             trouble.append(text)
             show(place.now()[1])
         limit.check()
@@ -172,7 +170,8 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
     """Run all services in this process. What is collected and the start go to `send`, as `News`, and not into the result."""
     collector = Collector(tree=FrameTree(exam_input(scenario)))
     news = CollectedNews(collector.collected)
-    with given({"PALPATE_OUT": str(out), "PALPATE_RECORD": kept(observers)}):  # only observers: the name may reveal the patient
+    # only observers: the name of the folder may reveal the patient
+    with set_environment({"PALPATE_OUT": str(out), "PALPATE_RECORD": read_record(observers)}):
         observing = load_services(scenario, observers, place)
     recorders = [service for service in observing if isinstance(service, RawRecorder)]
     viewers = [service for service in observing if service not in recorders]
@@ -182,9 +181,12 @@ def run_here(scenario: Scenario, out: Path, observers: tuple[str, ...], place: C
     failure: Failure | None = None
     last = 0
     shown = start
+    messages = 0
 
     def report(measured: bool = False) -> None:
-        send(News(run.t, start, news.take(), tuple(run.trouble), measured))
+        nonlocal messages
+        send(News(run.t, start, news.take(), tuple(run.trouble[messages:]), measured))
+        messages = len(run.trouble)
 
     def end() -> int | None:
         nonlocal shown

@@ -8,7 +8,7 @@ from palpate.run.group import Groups, one_per_process
 from palpate.run.interrupts import all_is_measured
 from palpate.run.places import Absent, ServicePlace, write_places
 from palpate.run.processes import LocalProcesses, SecureBus, ServiceProcess, compose_file, read_processes
-from palpate.run.roles import OBSERVERS, choice, foreign_roles, kept, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, choice, foreign_roles, read_record, workers, write_scenario_files
 from palpate_bus import implementations
 from palpate_bus.settings import Settings
 from palpate_bus.wire.zenoh_config import WALL_CLOCK_DROP_WAIT_US, close_session, open_session
@@ -51,7 +51,7 @@ def run_distributed(
     for role in (role for group in groups if len(group) > 1 for role in group):
         _check_shares(processes[role], absent)
     files = write_scenario_files(scenario, out)
-    local = LocalProcesses(groups, out, files, timing, kept(observers), secure)
+    local = LocalProcesses(groups, out, files, timing, read_record(observers), secure)
     at_once = True
 
     def ended() -> dict[str, str]:

@@ -9,7 +9,7 @@ from rich.console import Console
 from rich.text import Text
 
 from palpate.console import SteadyConsole, say
-from palpate.environment import given
+from palpate.environment import set_environment
 from palpate.report.files import bring_back
 from palpate.report.recovery import Resumption, checkpoint_given, resumption
 from palpate.run.composed import run_composed
@@ -57,7 +57,7 @@ def examine(scenario: Scenario, options: RunOptions, before: Resumption | None =
     with results_first(), results_folder(folder, overwrite=options.overwrite):
         if not options.silent:
             _announce(console, scenario, options, folder)
-        with RunDisplay(console, options.silent, scenario.exam) as display, given({"PALPATE_RECORD": options.record}):
+        with RunDisplay(console, options.silent, scenario.exam) as display, set_environment({"PALPATE_RECORD": options.record}):
             tell = WatchedRoom(folder, display.show, say).check
             with unless_begun(folder, lambda: display.begun), checkpoint_given(None if before is None else before.checkpoint):
                 check_room(folder, scenario.exam, options.record)

@@ -72,13 +72,13 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
     as a run that could not begin. Raises UserError if the folder is in use, not empty, or cannot be made.
     """
     bring_back(path)
-    earlier = _moved_away(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
+    earlier = _move_away(path) if overwrite and path.is_dir() and any(path.iterdir()) else None
     try:
         try:
             path.mkdir(parents=True, exist_ok=True)
         except OSError as error:
             raise UserError(f"--out {path}: cannot be made a folder: {error.strerror}") from None
-        with locked(path):
+        with lock_folder(path):
             if left := sorted(entry.name for entry in path.iterdir() if entry.name != LOCK):
                 what = ", ".join(left[:3]) + (" and more" if len(left) > 3 else "")
                 raise UserError(f"--out {path}: it holds {what}; name another folder, or --overwrite to remove it first")
@@ -91,12 +91,12 @@ def results_folder(path: Path, *, overwrite: bool = False) -> Iterator[Path]:
             (path / LOCK).unlink(missing_ok=True)
 
 
-def _moved_away(path: Path) -> Path:
+def _move_away(path: Path) -> Path:
     """Move the results of an earlier run away and return their folder. Raises UserError if there are none."""
     if path.is_symlink() or not (run_of(path) or (path / LOCK).exists()):
         raise UserError(f"--out {path} --overwrite: it does not hold the results of a run, so it is not removed")
     aside = path.with_name(f".{path.name}.{os.getpid()}")
-    with locked(path):
+    with lock_folder(path):
         try:
             return path.rename(aside)
         except OSError as error:
@@ -104,7 +104,7 @@ def _moved_away(path: Path) -> Path:
 
 
 @contextmanager
-def locked(folder: Path) -> Iterator[None]:
+def lock_folder(folder: Path) -> Iterator[None]:
     """Lock a results folder. A killed run leaves the file of the lock. Raises UserError if another run holds it."""
     try:
         file = os.open(folder / LOCK, os.O_RDWR | os.O_CREAT | os.O_CLOEXEC, 0o644)

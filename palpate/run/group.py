@@ -9,7 +9,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from palpate.environment import given
+from palpate.environment import set_environment
 from palpate_bus.contract import contract
 from palpate_bus.run import Hosted, choose_service, host
 from palpate_bus.service import Service
@@ -85,10 +85,10 @@ def group_command(file: Path, words: Mapping[str, Sequence[str]], own: Mapping[s
 
 def _hosted(role: str, words: Sequence[str], environment: Mapping[str, str]) -> Hosted:
     def make() -> Service:
-        with given(environment):
+        with set_environment(environment):
             return choose_service(role, load_scenario, words)
 
-    with given(environment):
+    with set_environment(environment):
         return Hosted(role, BusOptions.from_settings(Settings.read()), make)
 
 

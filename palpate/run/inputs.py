@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
-from palpate.apart import guarded
-from palpate.run.roles import NONE, checked, settings_of
+from palpate.apart import run_guarded
+from palpate.run.roles import NONE, check_choices, settings_of
 from palpate.truth.pressed import TrueBody, TrueSurface
 from palpate_bus.settings import Settings
 from palpate_errors import UserError
@@ -28,11 +28,10 @@ def scan_safely(exam: Exam, surface: Surface) -> Scan:
     if not PATTERN.foreign(exam.pattern):
         return scan_of(exam, surface)
     part = f"exam.pattern = {exam.pattern!r}"
-    return guarded(part, lambda: scan_of(exam, surface), Settings.read().start_limit_s, PluginError)
+    return run_guarded(part, lambda: scan_of(exam, surface), Settings.read().start_limit_s, PluginError)
 
 
-@dataclass(frozen=True)
-class ExamTiming:
+class ExamTiming(NamedTuple):
     """Durations in simulated time."""
 
     approach_and_return_s: float = 12.0
@@ -51,8 +50,7 @@ class ExamTiming:
 TIMING = ExamTiming()
 
 
-@dataclass(frozen=True)
-class Outlook:
+class Outlook(NamedTuple):
     """Expected duration, touches, lines and presses."""
 
     duration_s: float
@@ -121,7 +119,7 @@ def scan_over(scenario: Scenario, phantom: PhantomModel) -> Scan:
     return scan
 
 
-def usable(
+def check_usable(
     name: str,
     settings: Sequence[str] | None = None,
     seed: int | None = None,
@@ -134,12 +132,12 @@ def usable(
     checked here.
     """
     try:
-        return examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
+        return check_examinable(load_scenario(name, [*(settings or ()), *settings_of(services or ())], seed), elsewhere)
     except MeshError as error:
         raise UserError(f"{name}: {error}") from error
 
 
-def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
+def check_examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
     """Return the scenario after its phantom, its scan and, unless they run `elsewhere`, its services were checked.
 
     Raises MeshError for the phantom, PluginError for a scan that leaves the body and for a missing service.
@@ -149,4 +147,4 @@ def examinable(scenario: Scenario, elsewhere: bool = False) -> Scenario:
         scenario = scenario.model_copy(update={"exam": exam})
     if scenario.services.tissue != NONE:
         scan_over(scenario, build_phantom(scenario.phantom, scenario.seed))
-    return scenario if elsewhere else checked(scenario)
+    return scenario if elsewhere else check_choices(scenario)

@@ -11,14 +11,14 @@ import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from time import monotonic
 from types import TracebackType
-from typing import IO, Any, Self
+from typing import IO, Any, NamedTuple, Self
 
-from palpate.apart import ended
-from palpate.environment import FIXED, given
+from palpate.apart import describe_end
+from palpate.environment import FIXED, set_environment
 from palpate.run.group import Groups, group_command
 from palpate.run.options import Record
 from palpate.service import command as service_command
@@ -80,8 +80,7 @@ BARRIER = frozenset(("robot", "control", "tissue"))
 """Roles of the 1 kHz loop. Processes with only these use the low-latency transport (see palpate_bus.wire.zenoh_config)."""
 
 
-@dataclass(frozen=True)
-class ServiceProcess:
+class ServiceProcess(NamedTuple):
     """A service of the compose file: its role, command and environment."""
 
     role: str
@@ -126,7 +125,7 @@ def read_processes(path: Path, roles: tuple[str, ...], overrides: Sequence[Path]
             if service is None and role not in found:
                 raise UserError(f"{file}: no service {role!r}; it has {', '.join(services)}")
             if service is not None:
-                found[role] = _merged(file, role, service, found.get(role, ServiceProcess(role, (), {})))
+                found[role] = _merge(file, role, service, found.get(role, ServiceProcess(role, (), {})))
     return found
 
 
@@ -144,7 +143,7 @@ def _mapping(value: Any, name: str) -> dict[str, Any]:
     return value
 
 
-def _merged(path: Path, role: str, service: Any, earlier: ServiceProcess) -> ServiceProcess:
+def _merge(path: Path, role: str, service: Any, earlier: ServiceProcess) -> ServiceProcess:
     name = f"{path}: services.{role}"
     command = _mapping(service, name).get("command", list(earlier.command))
     if not command or not isinstance(command, list) or not all(isinstance(word, str) for word in command):
@@ -163,13 +162,13 @@ MESSAGE_LINES = 20
 def how(code: int, log: Path) -> str:
     """Return how a process ended as text: its signal, or its exit status `code` and the last message of its log."""
     if code < 0:
-        return ended(code)
+        return describe_end(code)
     text = ""
     with suppress(OSError):
         text = log.read_text(encoding="utf-8", errors="replace")
     hint = "" if code else ": does it call palpate_bus.run.run_service?"
     said = _last_message(text) or f"its log is empty{hint}"
-    return f"{ended(code)}: {said}"
+    return f"{describe_end(code)}: {said}"
 
 
 def _last_message(text: str) -> str:
@@ -251,7 +250,7 @@ class LocalProcesses:
 
     def as_conductor(self) -> AbstractContextManager[None]:
         """Set the run's key in the environment of this process within a `with` block."""
-        return given({variable("key"): str(self._given["key"])})
+        return set_environment({variable("key"): str(self._given["key"])})
 
     def start(self, *processes: ServiceProcess) -> None:
         """Start a service, or several in one process. Raises UserError for a program that cannot share one."""

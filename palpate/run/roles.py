@@ -4,7 +4,7 @@ import json
 from collections.abc import Sequence
 from pathlib import Path
 
-from palpate.apart import guarded
+from palpate.apart import run_guarded
 from palpate.run.options import Record
 from palpate_bus import implementations
 from palpate_bus.contract import contract
@@ -33,7 +33,7 @@ def workers(scenario: Scenario) -> tuple[str, ...]:
     return (*(role for role in WORKERS if role != "tissue" or scenario.services.tissue != NONE), *searching, *chosen)
 
 
-def kept(observers: Sequence[str]) -> Record:
+def read_record(observers: Sequence[str]) -> Record:
     """Return what the recorder of a run keeps: the setting, by default `normal`; `none` without a recorder."""
     if "recorder" not in observers:
         return "none"
@@ -58,7 +58,7 @@ def settings_of(options: Sequence[str]) -> list[str]:
     return settings
 
 
-def checked(scenario: Scenario) -> Scenario:
+def check_choices(scenario: Scenario) -> Scenario:
     """Return the scenario with absolute paths of user-defined services, after all its choices were checked.
 
     Raises PluginError that names the scenario, the field, its value and what is allowed, RecordingError for a camera's recording.
@@ -100,7 +100,7 @@ def _check_policy(scenario: Scenario) -> None:
         policy(name)
         return
     part = f"search.policy = {name!r}"
-    guarded(part, lambda: try_policy(scenario), Settings.read().start_limit_s, PluginError)
+    run_guarded(part, lambda: try_policy(scenario), Settings.read().start_limit_s, PluginError)
 
 
 def foreign_roles(scenario: Scenario) -> frozenset[str]:

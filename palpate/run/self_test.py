@@ -9,7 +9,6 @@ milliseconds for a tick; ages and deadlines are stretched alike.
 import json
 import subprocess
 import sys
-from dataclasses import dataclass
 from pathlib import Path
 from time import monotonic_ns, sleep
 from typing import Final, NamedTuple
@@ -17,8 +16,7 @@ from typing import Final, NamedTuple
 MS: Final = 1_000_000
 
 
-@dataclass(frozen=True)
-class LoadTest:
+class LoadTest(NamedTuple):
     """Work of the test, and what an examination needs."""
 
     ticks: int = 1000

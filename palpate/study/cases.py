@@ -13,8 +13,8 @@ from itertools import count as count_from
 from pathlib import Path
 from typing import Any, Final, NamedTuple
 
-from palpate.run.roles import checked
-from palpate.study.shift import Family, shifted
+from palpate.run.roles import check_choices
+from palpate.study.shift import Family, shift_patient
 from palpate.study.spec import Method, Population, Runtime, Split, Study, StudyError, Tier
 from palpate_errors import UserError
 from palpate_models.patient.mesh_file import MeshError
@@ -147,7 +147,7 @@ def _cases(study: Study, request: Request) -> Iterator[Case]:
                     where = f"{study.name}: populations.{name} by methods.{key}"
                     scenario = _scenario(where, (population, method, wrong), (number, seed), request.settings, family)
                     if where not in usable:  # the search for installed services takes 0.1 s
-                        usable[where] = _usable(where, scenario)
+                        usable[where] = _check_usable(where, scenario)
                     scenario = scenario.model_copy(update={"services": usable[where].services, "search": usable[where].search})
                     files, content = _files(scenario), scenario.model_dump(mode="json")
                     yield Case(
@@ -195,17 +195,17 @@ def _scenario(
     changes |= {f"services.{role}": name for role, name in method.services.items()}
     try:
         if family is not None:
-            changes |= shifted(load_scenario(population.scenario, as_settings(changes), seed), family, number)
+            changes |= shift_patient(load_scenario(population.scenario, as_settings(changes), seed), family, number)
         return load_scenario(population.scenario, [*as_settings(changes), *settings], seed)
     except UserError as error:
         raise StudyError(f"{where}: {error}") from error
 
 
-def _usable(where: str, scenario: Scenario) -> Scenario:
+def _check_usable(where: str, scenario: Scenario) -> Scenario:
     """Return the scenario with absolute paths of services, after its phantom and its services were checked."""
     try:
         build_phantom(scenario.phantom, scenario.seed)
-        return checked(scenario)
+        return check_choices(scenario)
     except (PluginError, MeshError) as error:
         raise StudyError(f"{where}: {error}") from error
 

@@ -99,18 +99,18 @@ def run(  # noqa: PLR0913 - the options of a command
     if shard and scheduler:
         refuse("--shard and --scheduler cannot be combined")
     from palpate.study.cases import Request, cases_of, command_of, secret_of
-    from palpate.study.folder import default_folder, opened
+    from palpate.study.folder import default_folder, open_folder
     from palpate.study.runner import part_of
     from palpate.study.spec import load_study
 
     console = SteadyConsole(stderr=True, quiet=quiet)
-    study = _chosen(load_study(name), method, services)
+    study = _choose(load_study(name), method, services)
     secret = None if seeds_file is None else secret_of(seeds_file, study)
     request = Request(cast("Split", split), number, settings or (), secret)
     cases = cases_of(study, request)
     own = part_of(cases, shard) if shard else cases
     path = out or default_folder(study.name, split)
-    folder, manifest = opened(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
+    folder, manifest = open_folder(path, study.name, cases, command_of(name, request, method or (), services or ()), keep)
     _examine(console, folder, own, (workers, scheduler), runs)
     if shard and folder.missing(cases):
         console.print(f"shard {shard} is done; when all are: palpate study merge DIR...", highlight=False)
@@ -155,7 +155,7 @@ def scenario_of_case(
     print(dump_scenario(Scenario.model_validate(outcome.case.scenario)), end="")
 
 
-def _chosen(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:
+def _choose(study: Study, only: Sequence[str] | None, services: Sequence[str] | None) -> Study:
     """Return the study with the chosen methods and one of the given services. Raises UserError."""
     from palpate.run.roles import settings_of
     from palpate.study.spec import with_methods, with_services
@@ -207,8 +207,7 @@ def _conclude(folder: Folder, manifest: Manifest) -> None:
     out.print(_result(found), highlight=False, soft_wrap=True)
     incomplete = [outcome for outcome in outcomes if not outcome.completed]
     for outcome in incomplete[:SHOWN]:
-        failures = folder.failures(outcome.case.case_id) if outcome.status == "failed" else ()
-        tried = f" (attempts: {'; '.join(failures)})" if failures else ""
+        tried = f" (attempts: {'; '.join(outcome.failures)})" if outcome.status == "failed" else ""
         why = outcome.why or "nothing was assessed"
         out.print(f"{outcome.case.label}: {why}{tried}", highlight=False, soft_wrap=True)
     if len(incomplete) > SHOWN:

@@ -4,7 +4,6 @@ study.json, study.html     figures and page (`palpate.study.summary`)
 run.json                   what was run, where, with which code, and the digest
 manifest.json              all cases, without their scenarios
 cases/ID.json              the outcome of a case
-failures/ID.json           causes of failed attempts at a case
 cases.parquet, findings.parquet, lumps.parquet
 sessions.jsonl             duration of each call of the command
 real_time.md               lateness in wall-clock mode
@@ -18,7 +17,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Final, Literal
 
-from pydantic import BaseModel, ConfigDict, TypeAdapter, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from palpate.report.files import write_text
 from palpate.report.rows import Report
@@ -46,7 +45,6 @@ PACKAGES: Final = (
 """Packages whose code decides results."""
 HASH: Final = "sha256"
 """Field of an outcome's file: SHA-256 over the other fields."""
-_CAUSES: Final = TypeAdapter(list[str])
 SUFFIXES: Final = (".py", ".yaml", ".csv", ".npz", ".c", ".h")
 
 
@@ -105,6 +103,8 @@ class Outcome(Attempt):
     status: Literal["done", "failed"]
     """`failed`: no report after three attempts. An examination that was aborted is done, and not completed."""
     attempts: int
+    failures: list[str] = []
+    """Causes of its failed attempts."""
 
     @property
     def completed(self) -> bool:
@@ -167,8 +167,7 @@ class Folder:
             raise StudyError(
                 f"{self.path} holds {old.study} with other settings or patients: give this one another folder with -o"
             )
-        for name in ("cases", "failures"):
-            (self.path / name).mkdir(parents=True, exist_ok=True)
+        (self.path / "cases").mkdir(parents=True, exist_ok=True)
         write_text(self.path / MANIFEST, manifest.model_dump_json(indent=1) + "\n")
 
     def manifest(self) -> Manifest | None:
@@ -228,20 +227,6 @@ class Folder:
         found = ((case, self.outcome(case.case_id)) for case in cases)
         return [case for case, outcome in found if outcome is not None and outcome.code not in ("", code_digest())]
 
-    def failures(self, case_id: str) -> list[str]:
-        """Return the causes of failed attempts at a case."""
-        path = self._failures_file(case_id)
-        try:
-            return _CAUSES.validate_json(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            return []
-        except (OSError, ValueError) as error:
-            raise StudyError(f"{path} is not a list of causes ({error}): remove it") from error
-
-    def write_failures(self, case_id: str, causes: Sequence[str]) -> None:
-        """Write the causes of all failed attempts at a case, atomically."""
-        write_text(self._failures_file(case_id), json.dumps(causes) + "\n")
-
     def sessions(self) -> list[Session]:
         """Return all calls of the command, without a last one whose line a kill or a full disk cut.
 
@@ -262,9 +247,6 @@ class Folder:
         """Write all calls of the command, atomically."""
         write_text(self.path / SESSIONS, "".join(f"{session.model_dump_json()}\n" for session in sessions))
 
-    def _failures_file(self, case_id: str) -> Path:
-        return self.path / "failures" / f"{case_id}.json"
-
 
 def _hash(content: Any) -> str:
     return hashlib.sha256(canonical(content)).hexdigest()
@@ -281,7 +263,7 @@ def manifest_of(study: str, cases: Sequence[Case], command: str = "") -> Manifes
     return Manifest(study=study, split=cases[0].split, tier=cases[0].tier, cases=rows, command=command)
 
 
-def opened(path: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> tuple[Folder, Manifest]:
+def open_folder(path: Path, study: str, cases: Sequence[Case], command: str, keep: bool = False) -> tuple[Folder, Manifest]:
     """Create or reopen the folder of a study of these cases, which `command` runs again.
 
     Raises StudyError for the folder of another study and, unless `keep`, for cases of another version of the code.
@@ -311,7 +293,6 @@ def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
             raise StudyError(f"{part} holds another study, split or number of patients than {parts[0]}")
     folder, places = Folder(path), [Folder(place) for place in (path, *parts)]
     outcomes = {outcome.case.case_id: outcome for place in places for outcome in place.outcomes(first)}
-    failures = {row.case_id: causes for place in places for row in first.cases if (causes := place.failures(row.case_id))}
     sessions = dict.fromkeys(session for place in places for session in place.sessions())
     absent = [row.case_id for row in first.cases if row.case_id not in outcomes]
     if absent:
@@ -320,8 +301,6 @@ def merge(parts: Sequence[Path], path: Path) -> tuple[Folder, Manifest]:
     folder.write_sessions(sessions)
     for outcome in outcomes.values():
         folder.write(outcome)
-    for case_id, causes in failures.items():
-        folder.write_failures(case_id, causes)
     return folder, first
 
 

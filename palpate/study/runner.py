@@ -14,10 +14,10 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -181,8 +181,7 @@ class StudyStopped(RunError):
     """The workers are gone or cannot work. Finished cases are kept."""
 
 
-@dataclass(frozen=True)
-class Workers:
+class Workers(NamedTuple):
     """Dask workers."""
 
     client: Any
@@ -257,6 +256,7 @@ def run_cases(
     begin, finished = monotonic(), 0
     todo, kept = folder.missing(cases), str((folder.path / "runs").resolve()) if runs else None
     running: dict[Future[list[str]], list[Case]] = {}
+    failures: defaultdict[str, list[str]] = defaultdict(list)
 
     def submit(batch: list[Case]) -> None:
         running[workers.executor.submit(run_batch, [case.model_dump_json() for case in batch], kept)] = batch
@@ -272,7 +272,7 @@ def run_cases(
                 batch = running.pop(future)
                 attempts = _attempts(future, batch)
                 for case, attempt in zip(batch, attempts, strict=False):
-                    outcome = _outcome(folder, case, attempt)
+                    outcome = _outcome(case, attempt, failures[case.case_id])
                     if outcome is None:
                         submit([case])
                     else:
@@ -309,17 +309,15 @@ def _attempts(future: Future[list[str]], batch: Sequence[Case]) -> list[Attempt]
     raise StudyStopped(f"a worker cannot examine: {type(error).__name__}: {error}") from error
 
 
-def _outcome(folder: Folder, case: Case, attempt: Attempt) -> Outcome | None:
-    """Return the outcome of a case after an attempt; None if it is to be tried again."""
-    failures = folder.failures(case.case_id)
+def _outcome(case: Case, attempt: Attempt, failures: list[str]) -> Outcome | None:
+    """Return the outcome of a case after an attempt; None if it is to be tried again. Adds its failure to `failures`."""
     if attempt.why is not None:
         failures.append(attempt.why)
-        folder.write_failures(case.case_id, failures)
         if len(failures) < ATTEMPTS:
             return None
     stated = dict(attempt) if attempt.report is None else {**dict(attempt), "why": attempt.report.failure}
     status: Literal["done", "failed"] = "done" if attempt.why is None else "failed"
-    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), **stated)
+    return Outcome(case=case, status=status, attempts=len(failures) + (attempt.why is None), failures=failures, **stated)
 
 
 if __name__ == "__main__":

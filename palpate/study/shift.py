@@ -36,7 +36,7 @@ class Family(StrEnum):
     EQUIPMENT = "equipment"
 
 
-def shifted(scenario: Scenario, family: Family, number: int) -> Settings:
+def shift_patient(scenario: Scenario, family: Family, number: int) -> Settings:
     """Return the changes, as fields by path, that make patient `number` of a family from a scenario with a drawn person.
 
     Raises UserError for a scenario of another kind.
@@ -52,7 +52,7 @@ def _log(rng: Rng, low: float, high: float) -> float:
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _changed(phantom: Phantom, **changes: Any) -> Settings:
+def _change(phantom: Phantom, **changes: Any) -> Settings:
     return {"phantom": phantom.model_copy(update=changes).model_dump(mode="json")}
 
 
@@ -73,7 +73,7 @@ def _prony(relaxation: Array) -> tuple[tuple[float, ...], tuple[float, ...]]:
 def _relaxing(series: Callable[[Rng], tuple[tuple[float, ...], tuple[float, ...]]]) -> Callable[..., Settings]:
     def change(phantom: Phantom, _: Anatomy, rng: Rng) -> Settings:
         g, tau = series(rng)
-        return _changed(phantom, stiffness=phantom.stiffness.model_copy(update={"prony_g": g, "prony_tau_s": tau}))
+        return _change(phantom, stiffness=phantom.stiffness.model_copy(update={"prony_g": g, "prony_tau_s": tau}))
 
     return change
 
@@ -120,7 +120,7 @@ def _skeletal(change: Callable[[Skeleton, float, Rng], Mapping[str, Any]]) -> Ca
         x, y = _USUAL.iliac_crest_m
         usual = _USUAL.model_copy(update={"costal_arch_m": scale * _USUAL.costal_arch_m, "iliac_crest_m": (scale * x, scale * y)})
         skeleton = usual.model_copy(update=change(usual, float(rng.uniform(*_DISPLACED_M)), rng))
-        return _changed(phantom, anatomy=anatomy.model_copy(update={"skeleton": skeleton}))
+        return _change(phantom, anatomy=anatomy.model_copy(update={"skeleton": skeleton}))
 
     return apply
 
@@ -162,7 +162,7 @@ def _asymmetric(usual: Skeleton, by: float, rng: Rng) -> Mapping[str, Any]:
 
 def _with(make: Callable[[Skeleton, Rng], list[Structure]]) -> Callable[..., Settings]:
     def change(phantom: Phantom, anatomy: Anatomy, rng: Rng) -> Settings:
-        return _changed(phantom, structures=tuple(make(anatomy.skeleton, rng)))
+        return _change(phantom, structures=tuple(make(anatomy.skeleton, rng)))
 
     return change
 
@@ -246,7 +246,7 @@ def _stool(_: Skeleton, rng: Rng) -> list[Structure]:
 
 def _pulse(phantom: Phantom, _: Anatomy, rng: Rng) -> Settings:
     beats = {"pulse_m": float(rng.uniform(0.0003, 0.0015)), "pulse_per_min": float(rng.uniform(55, 95))}
-    return _changed(phantom, breathing=phantom.breathing.model_copy(update=beats))
+    return _change(phantom, breathing=phantom.breathing.model_copy(update=beats))
 
 
 # --- variation of the wall ------------------------------------------------------------------------------------------------
@@ -260,7 +260,7 @@ def _varying(correlation_m: Span, natural_m: Span) -> Callable[..., Settings]:
         variation = given.model_copy(update={"stiffness": 0.4 * given.stiffness, "length_m": natural_m})
         field = {"cv": float(rng.uniform(0.12, 0.30)), "correlation_m": _log(rng, *correlation_m)}
         background = phantom.background.model_copy(update=field)
-        return _changed(phantom, background=background, anatomy=anatomy.model_copy(update={"variation": variation}))
+        return _change(phantom, background=background, anatomy=anatomy.model_copy(update={"variation": variation}))
 
     return change
 

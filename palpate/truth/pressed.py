@@ -16,7 +16,7 @@ from scipy.interpolate import LinearNDInterpolator
 from scipy.spatial import Delaunay, cKDTree
 
 import palpate_models
-from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.cache import content_key, remember
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import Breathing
 from palpate_models.patient.field import edge_distance
@@ -201,7 +201,7 @@ def press_patient(scenario: Scenario) -> Pressed | None:
         plain = force if bare is None else press(bare, np.asarray(_near(places, structures).any(axis=0)), force)
         return np.stack((force, limited, healthy, relaxed, plain, *alone))
 
-    rows = np.asarray(remembered(key, compute))
+    rows = np.asarray(remember(key, compute))
     return Pressed(places, rows[0], rows[1] > 0, rows[2], rows[5:], rows[3], rows[4])
 
 

@@ -31,7 +31,7 @@ def fit(
     from json import dumps
 
     from palpate.console import print_json, say
-    from palpate.recording.assessed import collected
+    from palpate.recording.assessed import collect_assessed
     from palpate.recording.read import read_recording
     from palpate.report.evidence import map_of
     from palpate.report.files import write_text
@@ -40,7 +40,7 @@ def fit(
     read = read_recording(recording, mapping)
     for fault in read.faults:
         say(fault.text)
-    message = collected(read).stiffness_map
+    message = collect_assessed(read).stiffness_map
     found = None if message is None else map_of(message)
     quality = write_twin(read, out, found, elastic, thickness_m)
     figures = quality._asdict()

@@ -124,7 +124,7 @@ def _slid(sample: ForceSample, radius: float) -> FittedPress:
     return FittedPress(sample.position, share * footprint / speed, sample.depth * (1 - (1 - share) ** 2), force, True)
 
 
-def simulated(
+def simulate(
     model: PhantomModel,
     stiffness: Stiffness,
     presses: Sequence[FittedPress],
@@ -183,7 +183,7 @@ def fit_wall(recording: PalpationRecording, draft: Path) -> FittedWall:
     field = _Field(at[0][~held_out, :2], level)
     for _ in range(TUNING.rounds):
         k_w = field(model.vertices[:, :2])
-        forces = simulated(replace(model, stiffness=k_w, background=k_w), stiffness, presses, at, radius, onset)
+        forces = simulate(replace(model, stiffness=k_w, background=k_w), stiffness, presses, at, radius, onset)
         ratio = np.array([amplitude(press.force, force) for press, force in zip(presses, forces, strict=True)])
         field.correct(ratio[~held_out])
     nodes = np.column_stack((grid.x_m, grid.y_m))
@@ -252,7 +252,7 @@ def _form(presses: Sequence[FittedPress], radius: float) -> tuple[Stiffness, flo
             }
         )
         model = replace(flat, stiffening=np.full(len(flat.vertices), made.stiffening_per_m))
-        return made, simulated(model, made, sample, at, radius, float(form[2]) * depth)
+        return made, simulate(model, made, sample, at, radius, float(form[2]) * depth)
 
     def misfit(form: Array) -> Array:
         rows = []

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from palpate.recording.recording import PalpationRecording
 from palpate.report.files import write_text
 from palpate.report.scoring import Map
-from palpate.twin.fit import FittedWall, fit_wall, simulated, skin_at
+from palpate.twin.fit import FittedWall, fit_wall, simulate, skin_at
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.field import lesion_field
@@ -62,7 +62,7 @@ class Quality(NamedTuple):
     """Origin of the twin's frame in the body frame of the recording [m]."""
 
 
-def centred(recording: PalpationRecording) -> tuple[PalpationRecording, Array]:
+def centre_on_skin(recording: PalpationRecording) -> tuple[PalpationRecording, Array]:
     """Return the recording with the origin on the skin in the middle of the contacts, and that origin [m], shape (3,).
 
     Raises UserError without contacts.
@@ -80,7 +80,7 @@ def write_twin(
     recording: PalpationRecording, folder: Path, found: Map | None = None, elastic: bool = False, thickness_m: float = 0.05
 ) -> Quality:
     """Fit a twin to a recording, whose findings become its lumps, and write it into a folder. Raises UserError."""
-    own, origin = centred(recording)
+    own, origin = centre_on_skin(recording)
     grid_file, file = folder / GRID, folder / "twin.yaml"
     wall = fit_wall(own, grid_file)
     lesions = [] if found is None else _lumps(found.vertices - origin, found.finding, wall)
@@ -92,7 +92,7 @@ def write_twin(
     if elastic:
         felt, expected = _elastic(load_scenario(str(file)), wall, own.indenter_radius_m)
         replace(grid, young_pa=grid.young_pa * float(np.median(felt / expected))).write(grid_file)
-    return _compared(load_scenario(str(file)), wall, own, folder, origin)
+    return _compare(load_scenario(str(file)), wall, own, folder, origin)
 
 
 def _lumps(vertices: Array, finding: NDArray[np.int32], wall: FittedWall) -> list[Lesion]:
@@ -165,11 +165,11 @@ def _elastic(scenario: Scenario, wall: FittedWall, radius: float) -> tuple[Array
     return np.array([press.felt for press in presses]), np.array(expected)
 
 
-def _compared(scenario: Scenario, wall: FittedWall, recording: PalpationRecording, folder: Path, origin: Array) -> Quality:
+def _compare(scenario: Scenario, wall: FittedWall, recording: PalpationRecording, folder: Path, origin: Array) -> Quality:
     """Press the written twin as the recording was, and draw both."""
     model = build_phantom(scenario.phantom, scenario.seed)
     at = skin_at(model, wall.presses)
-    forces = simulated(model, scenario.phantom.stiffness, wall.presses, at, recording.indenter_radius_m, wall.onset_m)
+    forces = simulate(model, scenario.phantom.stiffness, wall.presses, at, recording.indenter_radius_m, wall.onset_m)
     felt = np.array([press.felt for press in wall.presses])
     expected = np.array([force[press.deepest] for press, force in zip(wall.presses, forces, strict=True)])
 

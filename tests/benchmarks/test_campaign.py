@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 from conductor_messages import collected, result
 
-from palpate_benchmarks.campaign import drawn, judge, prepared, run_case
+from palpate_benchmarks.campaign import draw_cases, judge, prepare, run_case
 from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
-from palpate_benchmarks.struck import CONDUCTOR, ROLES, CaseOver, FaultWatch, Struck, StruckRun, Watched
+from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch
 from palpate_bus.contract import contract
 from palpate_bus.messages import ExamState, JointTorqueCommand, codec
 from palpate_bus.messages.stamps import NS, duration_message, header, nanoseconds
@@ -82,7 +82,7 @@ def test_a_transport_is_faulty_in_its_topic_only_and_from_the_signal_on() -> Non
 
 def watch(**options: Any) -> FaultWatch:
     """Return the watch of a run whose fault was due long ago."""
-    due = FaultWatch(StruckRun(Path(), **{"early": True, **options}))
+    due = FaultWatch(FaultRun(Path(), **{"early": True, **options}))
     due.since = 0.0
     return due
 
@@ -94,9 +94,9 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
     return RunProgress(0, 1.0, messages)
 
 
-def judged(watched: Watched | None, folder: Path, kind: str, where: str, status: int = 0) -> FaultFinding:
+def judged(log: FaultLog | None, folder: Path, kind: str, where: str, status: int = 0) -> FaultFinding:
     finding = FaultFinding(kind, where, "lockstep")
-    judge(finding, Struck(folder, folder / "gone", status, watched, 8.0), where.split("+"))
+    judge(finding, FaultResult(folder, folder / "gone", status, log, 8.0), where.split("+"))
     return finding
 
 
@@ -113,22 +113,22 @@ def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: Cas
     case = watch()
     with pytest.raises(CaseOver) as over:
         case.on_progress(progress)
-    watched = case.finished(replace(result(progress.collected), failure=over.value.failure))
-    finding = judged(watched, tmp_path, "nan", "planning/setpoint")
+    log = case.finish(replace(result(progress.collected), failure=over.value.failure))
+    finding = judged(log, tmp_path, "nan", "planning/setpoint")
     assert finding.outcome is outcome
     assert finding.good
     assert (finding.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
 
 
 def test_a_fault_of_the_assessment_shows_after_the_scan(tmp_path: Path) -> None:
-    assert not prepared(FaultCase("nan", "assessment/map", False), tmp_path, 1.0)[0].early
-    assert prepared(FaultCase("nan", "planning/setpoint", False), tmp_path, 1.0)[0].early
+    assert not prepare(FaultCase("nan", "assessment/map", False), tmp_path, 1.0)[0].early
+    assert prepare(FaultCase("nan", "planning/setpoint", False), tmp_path, 1.0)[0].early
     watch(early=False).on_progress(in_phase(ExamState.PHASE_RETURN))
     watch().on_progress(in_phase(ExamState.PHASE_SCAN))
 
 
 def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> None:
-    case = FaultWatch(StruckRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
+    case = FaultWatch(FaultRun(Path(), phase=ExamState.PHASE_SCAN, at_s=0.5))
     for t, phase in ((6.0, ExamState.PHASE_INDENT), (7.0, ExamState.PHASE_SCAN), (7.4, ExamState.PHASE_SCAN)):
         case.on_progress(in_phase(phase)._replace(t=round(t * NS)))
     assert not capsys.readouterr().out
@@ -138,7 +138,7 @@ def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_an_end_that_names_no_role_is_bad(tmp_path: Path) -> None:
     failed = replace(result(collected()), failure=Failure(FailureCode.BLOCKED, "something went wrong"))
-    assert not judged(watch().finished(failed), tmp_path, "nan", "planning/setpoint").good
+    assert not judged(watch().finish(failed), tmp_path, "nan", "planning/setpoint").good
 
 
 def test_findings_are_read_back_from_their_file() -> None:
@@ -153,7 +153,7 @@ def test_a_file_of_other_columns_is_refused() -> None:
 
 
 def test_drawn_cases_follow_their_seed() -> None:
-    first, again, other = (list(drawn(40, seed, ["lockstep"])) for seed in (1000, 1000, 1001))
+    first, again, other = (list(draw_cases(40, seed, ["lockstep"])) for seed in (1000, 1000, 1001))
     assert first == again != other
     assert {len(case.where.split("+")) for case in first} == {1, 2, 3}
     assert {role for case in first for role in case.where.split("+")} <= {*ROLES, CONDUCTOR}
@@ -178,7 +178,7 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
 @pytest.mark.parametrize("named", [True, False])
 def test_the_failure_of_the_run_is_judged(named: bool, tmp_path: Path) -> None:
     failure = Failure(FailureCode.ROLE_LOST, "something failed", ("control",) if named else ())
-    finding = judged(Watched(replace(result(collected()), failure=failure)), tmp_path, "kill", "control+recorder")
+    finding = judged(FaultLog(replace(result(collected()), failure=failure)), tmp_path, "kill", "control+recorder")
     assert finding.good == named
     assert finding.ended == "something failed"
 

@@ -10,9 +10,9 @@ from conductor_messages import collected, result
 from toy_runs import toy_services
 
 from palpate_benchmarks.fault_cases import LIE, FaultFinding, LieVerdict
+from palpate_benchmarks.injection import FaultLog
 from palpate_benchmarks.liar import KINDS, Liar, Lie
-from palpate_benchmarks.lies import Healthy, cases, cells, judged, left_out, run_lies
-from palpate_benchmarks.struck import Watched
+from palpate_benchmarks.lies import Healthy, cases, cells, judge, left_out, run_lies
 from palpate_bus.contract import Edge, contract
 from palpate_bus.messages.stamps import MS, NS, nanoseconds
 from palpate_bus.runtime.failure import Failure, FailureCode
@@ -86,12 +86,12 @@ def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float
     seen.exam.targets_skipped = lost * seen.exam.target_count
     for message in seen.indentation:
         message.normal_force, message.tangential_force, message.peak_force = force, 0.0, force
-    watched = Watched(result(seen))
+    log = FaultLog(result(seen))
     twin = Healthy({}, int(seen.exam.target_count), len(seen.findings.findings), float(seen.stiffness_map.background), 10.0)
     if failure is not None:
-        watched.result = replace(watched.result, failure=Failure(FailureCode.GAVE_UP, "held", topics=(failure,)))
+        log.result = replace(log.result, failure=Failure(FailureCode.GAVE_UP, "held", topics=(failure,)))
     finding = FaultFinding(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
-    assert judged(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), watched, twin).lie_verdict is verdict
+    assert judge(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), log, twin).lie_verdict is verdict
 
 
 @pytest.mark.slow

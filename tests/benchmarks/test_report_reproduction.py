@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 from PIL import Image
 
 from palpate.exam_state import exam_state
-from palpate.report.archive import Evidence, completed, write_evidence
+from palpate.report.archive import Evidence, read_completed, write_evidence
 from palpate.truth.pressed import Touched
 from palpate_bus.messages.stamps import NS
 from palpate_conductor.collector import Collected
@@ -70,15 +70,15 @@ def test_the_moments_are_of_their_phases() -> None:
 
 
 def test_a_run_that_failed_is_not_finished(tmp_path: Path) -> None:
-    assert completed(tmp_path) is None
+    assert read_completed(tmp_path) is None
     write_evidence(tmp_path / "evidence.mcap", Collected())
     (tmp_path / "report.json").write_text('{"failure": "robot lost"}', encoding="utf-8")
-    assert completed(tmp_path) is None
+    assert read_completed(tmp_path) is None
     (tmp_path / "report.json").write_text('{"failure": null}', encoding="utf-8")
-    assert completed(tmp_path) is not None
+    assert read_completed(tmp_path) is not None
     whole = (tmp_path / "evidence.mcap").read_bytes()
     (tmp_path / "evidence.mcap").write_bytes(whole[: len(whole) // 2])
-    assert completed(tmp_path) is None, "killed while it was written"
+    assert read_completed(tmp_path) is None, "killed while it was written"
 
 
 @pytest.mark.slow

@@ -106,7 +106,7 @@ def test_dropped_on_our_surface_it_oscillates_and_settles() -> None:
 
 
 def test_people_all_alike_or_too_stiff_are_detected() -> None:
-    people = population.measured()
+    people = population.read_measured()
     force = people[DEPTHS_M].to_numpy()
     alike = sample_of(people["person"], np.tile(np.median(force, axis=0), (len(people), 1)))
     stiff = sample_of(people["person"], 1.3 * force)

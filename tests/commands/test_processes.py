@@ -16,7 +16,7 @@ from palpate.run import examine
 from palpate.run.group import placement
 from palpate.run.places import Absent, ServicePlace, command_for, place_to_join, place_to_take, write_places
 from palpate.run.processes import LocalProcesses, ServiceProcess, compose_file, how, read_processes
-from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, workers, write_scenario_files
+from palpate.run.roles import OBSERVERS, WORKERS, check_choices, choice, workers, write_scenario_files
 from palpate.run.self_test import RATES, TimingResult
 from palpate.study.spec import load_study
 from palpate_bus.contract import contract
@@ -93,7 +93,9 @@ def test_a_swap_is_an_override_whose_settings_select_the_service(name: str) -> N
         return
     assert name == f"{role}-{chosen}"
     scenario = load_scenario("healthy", words)
-    assert choice(scenario if chosen == "replay" else checked(scenario), role) == chosen  # the recording is in the container
+    assert (
+        choice(scenario if chosen == "replay" else check_choices(scenario), role) == chosen
+    )  # the recording is in the container
     assert read_processes(compose_file(), (role,), (file,))[role].command == service.command(role)
     assert document[role]["build"]["args"]["GROUP"] == name
     assert document[role]["image"].endswith(f"-{name}"), "else `up` would use the image of the default service"

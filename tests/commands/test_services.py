@@ -7,7 +7,7 @@ import pytest
 import palpate_plugins
 from palpate.run import roles
 from palpate.run.composed import load_services
-from palpate.run.roles import OBSERVERS, WORKERS, checked, choice, settings_of
+from palpate.run.roles import OBSERVERS, WORKERS, check_choices, choice, settings_of
 from palpate_bus.implementations import create, kind
 from palpate_bus.runtime.failure import Failure
 from palpate_bus.testing import HandInbox
@@ -19,7 +19,7 @@ EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "threshold_assessmen
 
 
 def chosen(*options: str) -> Scenario:
-    return checked(load_scenario("healthy", settings_of(options)))
+    return check_choices(load_scenario("healthy", settings_of(options)))
 
 
 def test_every_role_has_a_choice_and_its_default_is_installed() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.check.perform import LiveRig, started
+from palpate.check.perform import LiveRig, start_implementation
 from palpate.check.rig import RigSettings, ServiceRig
 from palpate.check.suites import SUITES, check
 from palpate.check.suites.tissue import STILL
@@ -165,7 +165,7 @@ def test_a_process_on_a_live_bus_conforms(role: str, tmp_path: Any) -> None:
     with session(BusOptions(mode="router", listen=(where,))) as bus:
         rig = LiveRig(bus, role, settings)
         try:
-            with started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0):
+            with start_implementation(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0):
                 rig.await_implementation(90)
                 report = check(rig)
                 rig.finish()

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from palpate.check.perform import LiveRig, started
+from palpate.check.perform import LiveRig, start_implementation
 from palpate.check.rig import RigSettings
 from palpate.check.suites.camera import plane
 from palpate.check.suites.robot import quiet
@@ -140,7 +140,9 @@ def test_a_ros_2_user_receives_robot_and_camera_and_stops_the_robot(tmp_path: Pa
         for role in ("camera", "robot"):
             rig = rigs[role] = LiveRig(bus, role, settings)
             stack.callback(rig.close)
-            stack.enter_context(started(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0))
+            stack.enter_context(
+                start_implementation(shlex.join([sys.executable, "-m", "palpate.service", role]), role, settings, where, 0)
+            )
         for rig in rigs.values():
             rig.await_implementation(120)
         reading = threading.Thread(target=lambda: lines.extend(client.stdout or ()), daemon=True)

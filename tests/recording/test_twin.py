@@ -8,7 +8,7 @@ import pytest
 
 from palpate.recording.recording import Contact, ContactKind, PalpationRecording
 from palpate.report.scoring import Map
-from palpate.twin.fit import presses_of, simulated
+from palpate.twin.fit import presses_of, simulate
 from palpate.twin.scenario import write_twin
 from palpate_errors import UserError
 from palpate_models.numerics.frames import Array
@@ -43,7 +43,7 @@ def recording() -> PalpationRecording:
     ridge = RIDGE.model_copy(update={"centre_m": (0.0, 0.003)})
     body = flat_phantom(0.035, 0.0015, 8e5, [ridge])
     material = Stiffness(length_m=0.004, prony_g=(), prony_tau_s=())
-    forces = simulated(body, material, presses_of(blank), (places, normals), RADIUS_M)
+    forces = simulate(body, material, presses_of(blank), (places, normals), RADIUS_M)
     noise = 0.01 * np.random.default_rng(0).standard_normal((64, 8))
     touches = tuple(contact(place + origin, force + e) for place, force, e in zip(places, forces, noise, strict=True))
     return PalpationRecording("body", RADIUS_M, touches, places + origin, normals)

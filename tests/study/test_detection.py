@@ -8,7 +8,7 @@ from sklearn.metrics import roc_auc_score
 
 from palpate.study.statistics.detectability import FELT, Surface, fit, surface
 from palpate.study.statistics.detection import by_contrast, froc, rates, roc
-from palpate.study.statistics.estimate import Bootstrap, bounded, percentiles, wilson
+from palpate.study.statistics.estimate import Bootstrap, bound, percentiles, wilson
 
 
 def test_the_wilson_interval_of_twenty_in_twenty() -> None:
@@ -28,7 +28,7 @@ def test_findings_of_one_patient_are_drawn_together() -> None:
 
 
 def test_a_rate_of_one_has_no_interval_of_width_zero() -> None:
-    found = bounded(1.0, np.ones(1000), 40, "lumps", 20)
+    found = bound(1.0, np.ones(1000), 40, "lumps", 20)
     assert found.low == wilson(20, 20, "patients").low
     assert "Wilson" in found.interval
 

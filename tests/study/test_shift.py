@@ -7,7 +7,7 @@ import pytest
 from synthetic import study
 
 from palpate.study.cases import Request, cases_of, patient_seeds
-from palpate.study.shift import FAMILIES, Family, shifted
+from palpate.study.shift import FAMILIES, Family, shift_patient
 from palpate.study.spec import StudyError, load_study
 from palpate_models.patient.abdomen import bone_share
 from palpate_models.patient.breathing import Breathing, BreathingCurve
@@ -27,7 +27,7 @@ def person(seed: int) -> Scenario:
 
 
 def changed(family: Family, number: int, seed: int) -> Scenario:
-    return load_scenario("person", as_settings(shifted(person(seed), family, number)), seed)
+    return load_scenario("person", as_settings(shift_patient(person(seed), family, number)), seed)
 
 
 def model(scenario: Scenario) -> PhantomModel:
@@ -40,7 +40,7 @@ def test_every_variant_is_valid_and_another_one_than_the_drawn_person(family: Fa
         one = changed(family, number, seed)
         assert one == changed(family, number + len(FAMILIES[family]), seed) != person(seed)
         assert np.isfinite(model(one).stiffness).all()
-    assert shifted(person(0), family, number) != shifted(person(1), family, number) or family is Family.EQUIPMENT
+    assert shift_patient(person(0), family, number) != shift_patient(person(1), family, number) or family is Family.EQUIPMENT
 
 
 @pytest.mark.parametrize("number", range(len(FAMILIES[Family.STRUCTURES]) - 1))

@@ -20,7 +20,7 @@ from synthetic import TOY, study
 
 from palpate.report.rows import FindingRow, FindingScore
 from palpate.study.cases import Case, cases_of
-from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, opened
+from palpate.study.folder import ATTEMPTS, Folder, Session, digest, manifest_of, merge, open_folder
 from palpate.study.runner import StudyStopped, cluster, part_of, run_cases
 from palpate.study.spec import StudyError
 from palpate.study.summary import write_tables
@@ -91,12 +91,10 @@ def test_the_digest_is_that_of_its_parts_put_together(folder: Path, tmp_path: Pa
         for case in own:  # the work of another machine
             Folder(part).case_file(case.case_id).write_bytes(Folder(folder).case_file(case.case_id).read_bytes())
         Folder(part).write_sessions([Session(workers=index, cases=len(own), elapsed_s=60.0)])
-    Folder(parts[0]).write_failures(CASES[0].case_id, ["killed"])
     for _again in range(2):
         whole, manifest = merge(parts, tmp_path / "whole")
         assert manifest == manifest_of("toy", CASES, f"palpate study {parts[0]}/toy.yaml")
         assert [session.workers for session in whole.sessions()] == [1, 2]
-    assert whole.failures(CASES[0].case_id) == ["killed"]
     assert digest_of(tmp_path / "whole") == digest_of(folder)
     with pytest.raises(StudyError, match="1 of 3 cases are in no part"):
         merge(parts[:1], tmp_path / "half")
@@ -163,13 +161,12 @@ def test_a_case_that_fails_three_times_is_reported_and_not_hidden(tmp_path: Path
     own = run(tmp_path, cases, cases)
     outcome = own.outcome(cases[0].case_id)
     assert (outcome.status, outcome.attempts, outcome.completed) == ("failed", ATTEMPTS, False)
-    causes = own.failures(cases[0].case_id)
-    assert len(causes) == ATTEMPTS
-    assert all("bad.py': line 2: RuntimeError: no idea" in cause for cause in causes)
+    assert len(outcome.failures) == ATTEMPTS
+    assert all("bad.py': line 2: RuntimeError: no idea" in cause for cause in outcome.failures)
     write_tables(tmp_path, "toy", [outcome])
     (row,) = pd.read_parquet(tmp_path / "cases.parquet").to_dict("records")
     assert (row["status"], row["attempts"], row["completed"]) == ("failed", ATTEMPTS, False)
-    assert row["why"] == causes[-1]
+    assert row["why"] == outcome.failures[-1]
     lumps = pd.read_parquet(tmp_path / "lumps.parquet")
     assert len(lumps) == 1, "the lump of clean, which was not found"
     assert not lumps["found"].any()
@@ -213,9 +210,9 @@ def test_a_service_that_is_changed_during_a_study_is_not_examined_with(tmp_path:
     own.write_text("from palpate_assessment.service import create\n")
     cases = cases_of(study(methods={"own": {"services": {"assessment": str(own)}}}))[:1]
     own.write_text("from palpate_assessment.service import create  # changed\n")
-    failures = run(tmp_path, cases, cases).failures(cases[0].case_id)
-    assert len(failures) == ATTEMPTS
-    assert all("own.py is not the file that the study was made with" in why for why in failures)
+    outcome = run(tmp_path, cases, cases).outcome(cases[0].case_id)
+    assert len(outcome.failures) == ATTEMPTS
+    assert all("own.py is not the file that the study was made with" in why for why in outcome.failures)
 
 
 def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
@@ -227,7 +224,7 @@ def test_cases_of_other_code_are_seen(folder: Path, tmp_path: Path) -> None:
     own.write(outcome.model_copy(update={"code": "0" * 64}))
     assert own.of_other_code(CASES) == [CASES[0]]
     with pytest.raises(StudyError, match="1 of its cases were made by other code"):
-        opened(tmp_path, "toy", CASES, "palpate study toy.yaml")
+        open_folder(tmp_path, "toy", CASES, "palpate study toy.yaml")
     assert own.manifest() == manifest_of("toy", CASES), "what was refused leaves its command there"
     path.write_text("{}")
     with pytest.raises(StudyError, match=f"{path} is not an outcome of this version"):

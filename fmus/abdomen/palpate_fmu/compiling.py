@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from palpate_errors import UserError
-from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.cache import content_key, remember
 
 WARNINGS = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Werror", "-Wno-strict-prototypes")
 """The one exception is for the standard's own headers."""
@@ -92,4 +92,4 @@ def compile_library(folder: Path, sources: Sequence[str], target: Platform) -> b
                 raise CompileError(f"cannot compile for {target.tuple_3}:\n{done.stderr}")
             return np.frombuffer(out.read_bytes(), np.uint8)
 
-    return remembered(content_key("fmu", code, *inputs), compiled).tobytes()
+    return remember(content_key("fmu", code, *inputs), compiled).tobytes()

@@ -17,7 +17,7 @@ from palpate_fmu.phantom_file import encode_phantom, sample_vertices, sizes_of, 
 from palpate_fmu.variables import Sizes, Variable, VariableKind, VariableRole, c_table, variables
 from palpate_models.numerics.frames import Array
 from palpate_models.patient.breathing import BreathingCurve
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.phantom import PhantomModel, build_phantom
 from palpate_models.patient.schema import Phantom
 from palpate_models.scenario.schema import Scenario
@@ -303,7 +303,7 @@ def build_fmu(
     if version not in (2, 3):
         raise ValueError(f"FMI version {version} is not one of 2, 3")
     wanted = platforms(version, targets)
-    phantom = drawn(phantom, seed)
+    phantom = draw_person(phantom, seed)
     model = model or build_phantom(phantom, seed)
     starts = start_values(phantom, radius_m)
     sizes = sizes_of(model, starts)

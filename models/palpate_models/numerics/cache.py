@@ -43,7 +43,7 @@ def content_key(kind: str, code: Iterable[Path], *parts: object) -> str:
     return f"{kind}-{key.hexdigest()[:32]}"
 
 
-def remembered(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
+def remember(key: str, compute: Callable[[], NDArray[Any]]) -> NDArray[Any]:
     """Return the array under `key`, memory-mapped and read-only; compute it if it is missing or damaged.
 
     If the cache folder cannot be written, the array is computed each time.

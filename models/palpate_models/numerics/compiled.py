@@ -49,15 +49,15 @@ class _CheckedFile(IndexDataCacheFile):
     def _load_index(self) -> dict[Any, str]:
         with suppress(Exception), Path(self._index_path).open("rb") as file:  # what a damaged pickle raises cannot be listed
             if pickle.load(file) == self._version:
-                stamp, overloads = _loaded(file.read())
+                stamp, overloads = _load(file.read())
                 return dict(overloads) if stamp == self._source_stamp else {}
         return {}
 
     def _load_data(self, name: str) -> Any:
-        return _loaded(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
+        return _load(Path(self._data_path(name)).read_bytes())  # type: ignore[no-untyped-call]
 
 
-def _loaded(stored: bytes) -> Any:
+def _load(stored: bytes) -> Any:
     """Return the content of a file. Raises OSError, which numba takes for a missing file, if it is damaged."""
     digest, content = stored[:DIGEST_BYTES], stored[DIGEST_BYTES:]
     if sha256(content).digest() != digest:

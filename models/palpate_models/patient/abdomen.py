@@ -138,7 +138,7 @@ def rings(half_s: float, half_y: float, outer: tuple[float, float], edge: float)
     return np.concatenate(rings)
 
 
-def _graded(half: float, other_distance: float, inner: float, edge: float) -> Array:
+def _grade(half: float, other_distance: float, inner: float, edge: float) -> Array:
     """Coordinates from 0 to `half` along a border, spaced like the rings that end there; shape (k,)."""
     x = np.linspace(0, half, 2001)
     size = edge + SHAPE.growth * np.hypot(np.maximum(x - inner, 0), other_distance)
@@ -162,8 +162,8 @@ def _plan(body: _Body, edge: float) -> tuple[Array, int]:
     )
     outer = (body.half_arc, body.half_length)
     inside = np.concatenate((lattice(half_s, half_y, edge), rings(half_s, half_y, outer, edge)))
-    end = _graded(outer[0], outer[1] - half_y, half_s, edge)
-    side = _graded(outer[1], outer[0] - half_s, half_y, edge)[:-1]
+    end = _grade(outer[0], outer[1] - half_y, half_s, edge)
+    side = _grade(outer[1], outer[0] - half_s, half_y, edge)[:-1]
     s_end = np.concatenate((-end[:0:-1], end))
     y_side = np.concatenate((-side[:0:-1], side))
     border = [np.column_stack((s_end, np.full_like(s_end, sign * outer[1]))) for sign in (-1, 1)]

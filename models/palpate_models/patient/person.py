@@ -47,7 +47,7 @@ def drawn_lumps(draw: schema.Draw, rng: np.random.Generator) -> tuple[schema.Les
         first = _separate_lump(draw, rng, lumps)
         lumps.append(first)
         if len(lumps) < count and rng.random() < draw.pairs:
-            lumps.append(_moved_beside(first, _lump(draw, rng, first.centre_m), rng))
+            lumps.append(_move_beside(first, _lump(draw, rng, first.centre_m), rng))
     return tuple(lumps)
 
 
@@ -90,7 +90,7 @@ def _separate_lump(draw: schema.Draw, rng: np.random.Generator, others: list[sch
     return best
 
 
-def _moved_beside(first: schema.Lesion, second: schema.Lesion, rng: np.random.Generator) -> schema.Lesion:
+def _move_beside(first: schema.Lesion, second: schema.Lesion, rng: np.random.Generator) -> schema.Lesion:
     """Return the second lump of a pair, moved in a random direction from the first to a random gap between the outlines."""
     angle = rng.uniform(0, 2 * np.pi)
     away = np.array((np.cos(angle), np.sin(angle)))
@@ -162,7 +162,7 @@ FIGURES = {
 }
 
 
-def drawn(phantom: schema.Phantom, seed: int) -> schema.Phantom:
+def draw_person(phantom: schema.Phantom, seed: int) -> schema.Phantom:
     """Return the phantom with all random parts of `kind: person` drawn; other phantoms and drawn persons are unchanged.
 
     Equal settings and seeds give equal persons. `draw` and `build` affect only their own parts.

@@ -17,7 +17,7 @@ from palpate_models.patient.grid import read_grid
 from palpate_models.patient.healthy import healthy_wall
 from palpate_models.patient.mesh import boundary_vertices, load_mesh, vertex_normals
 from palpate_models.patient.mesh_file import MeshError
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Lesion, Phantom
 from palpate_models.patient.tension import tension_field
 
@@ -66,7 +66,7 @@ def build_phantom(phantom: Phantom, seed: int) -> PhantomModel:
 
     Raises MeshError or GridError if a user's file or a lesion cannot be used.
     """
-    phantom = drawn(phantom, seed)
+    phantom = draw_person(phantom, seed)
     grid = None if phantom.grid is None else read_grid(Path(phantom.grid))
     if phantom.mesh is not None:
         surface = load_mesh(Path(phantom.mesh), phantom.edge_m)

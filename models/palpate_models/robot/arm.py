@@ -42,7 +42,7 @@ def arm_of(robot: Robot) -> Arm:
     return ARM if robot.arm == ARM.name else load_arm(robot.arm)
 
 
-def checked_arm(name: str) -> tuple[Arm | None, list[str]]:
+def check_arm(name: str) -> tuple[Arm | None, list[str]]:
     """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
     return (ARM, []) if name == ARM.name else read_arm(name)
 
@@ -64,7 +64,7 @@ def mounts(robot: Robot) -> Array:
     return np.column_stack((np.full(3, x), np.full(3, y), np.cumsum((z, TOOL.flange_to_ft_m, TOOL.ft_to_indenter_m))))
 
 
-def mounted(robot: Robot) -> int:
+def count_mounted(robot: Robot) -> int:
     """Return how many links, counted from the base, are always at it: two, and a third that is thicker than its joint is high.
 
     The first joint turns about the vertical, so the second keeps its height.

@@ -59,10 +59,10 @@ def load_arm(name: str) -> Arm:
 def read_arm(name: str) -> tuple[Arm | None, list[str]]:
     """Return an arm, None if it is unusable, and what is wrong with it. Raises UserError if a file cannot be read."""
     given, path = arm_file(name), arm_path(name)
-    return _Reader(given, _resolved(given.urdf, path.parent)).read(path.stem)
+    return _Reader(given, _resolve(given.urdf, path.parent)).read(path.stem)
 
 
-def _resolved(name: str, folder: Path) -> Path:
+def _resolve(name: str, folder: Path) -> Path:
     """Return the path of a file of a URDF: relative to `folder`, or in a package in a folder above it or on Python's path."""
     if not name.startswith("package://"):
         return folder / name.removeprefix("file://")
@@ -111,7 +111,7 @@ class UrdfTree:
             raise UserError(f"{path}: not a URDF: its root element is {root.tag}, want robot")
         self.links = {link.get("name", ""): link for link in root.findall("link")}
         self.joints = root.findall("joint")
-        self.joint_of = {linked(joint, "child"): joint for joint in self.joints}
+        self.joint_of = {link_name(joint, "child"): joint for joint in self.joints}
         """Joint by the link that it carries."""
         self.part = path.name
         """Link or joint that is being read, for messages."""
@@ -130,11 +130,11 @@ class UrdfTree:
         found = []
         for joint in self.joints:
             for end in ("parent", "child"):
-                link = linked(joint, end)
+                link = link_name(joint, end)
                 if link not in self.links:
                     found.append(f"joint {joint.get('name')}: no link {link!r} in the file, its {end}")
-            if self.joint_of[linked(joint, "child")] is not joint:
-                found.append(f"link {linked(joint, 'child')}: has two joints above it, one is {joint.get('name')}")
+            if self.joint_of[link_name(joint, "child")] is not joint:
+                found.append(f"link {link_name(joint, 'child')}: has two joints above it, one is {joint.get('name')}")
         roots = [link for link in self.links if link not in self.joint_of]
         if len(roots) > 1 and not found:
             found.append(f"links {', '.join(roots)}: {len(roots)} roots, want one")
@@ -144,7 +144,7 @@ class UrdfTree:
         """Return the links from the root to the flange. Raises ValueError for a circle."""
         chain = [flange]
         while joint := self.joint_of.get(chain[-1]):
-            parent = linked(joint, "parent")
+            parent = link_name(joint, "parent")
             if parent in chain:
                 raise ValueError(f"link {parent}: its joints form a circle")
             chain.append(parent)
@@ -169,7 +169,7 @@ class UrdfTree:
         return rigid(Rotation.from_euler("xyz", self.numbers(element, "rpy")).as_matrix(), self.numbers(element, "xyz"))
 
 
-def linked(joint: ElementTree.Element, end: str) -> str:
+def link_name(joint: ElementTree.Element, end: str) -> str:
     """Return the name of a joint's `parent` or `child` link."""
     element = joint.find(end)
     return "" if element is None else element.get("link", "")
@@ -204,7 +204,7 @@ class _Reader(UrdfTree):
         lower, upper, velocity, torque = self._limits(moving)
         R_BF = poses[-1][:3, :3] @ Rotation.from_euler("xyz", self._given.flange_rpy_rad).as_matrix()
         groups = self._rigid(chain, dict(zip(chain, poses, strict=True)), moving)
-        frames = [np.eye(4), *(poses[chain.index(linked(joint, "child"))] for joint in moving)]
+        frames = [np.eye(4), *(poses[chain.index(link_name(joint, "child"))] for joint in moving)]
         origins = np.array([X[:3, 3] for X in frames])
         inertias = tuple(self._inertia(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
         capsules = tuple(self._shape(group, R_BF, origin) for group, origin in zip(groups, origins, strict=True))
@@ -216,7 +216,7 @@ class _Reader(UrdfTree):
         if self.faults:
             return None, self.faults
         axes = np.array([X[:3, :3] @ self._axis(joint) for X, joint in zip(frames[1:], moving, strict=True)])
-        given, last = self._given, linked(moving[-1], "child")
+        given, last = self._given, link_name(moving[-1], "child")
         for k in np.flatnonzero((home < lower) | (home > upper)) if given.home_rad else ():
             joint = moving[k].get("name")
             self.faults.append(f"home_rad: {home[k]:.3f} of {joint} is outside {lower[k]:.3f} to {upper[k]:.3f} rad")
@@ -224,7 +224,7 @@ class _Reader(UrdfTree):
         arm = Arm(
             name=name,
             joint_names=tuple(joint.get("name", "") for joint in moving),
-            link_names=(chain[0], *(linked(joint, "child") for joint in moving), flange),
+            link_names=(chain[0], *(link_name(joint, "child") for joint in moving), flange),
             origin_m=np.diff(origins, axis=0) @ R_BF,
             axis=axes @ R_BF,
             flange_m=R_BF.T @ (poses[-1][:3, 3] - origins[-1]),
@@ -307,7 +307,7 @@ class _Reader(UrdfTree):
         A flange that is fixed to the last link is left out, and so is what is behind it; other fixed branches belong to the arm.
         """
         carrier: dict[str, int] = {}
-        movers = {linked(joint, "child"): k + 1 for k, joint in enumerate(moving)}
+        movers = {link_name(joint, "child"): k + 1 for k, joint in enumerate(moving)}
         groups: list[Group] = [[] for _ in range(len(moving) + 1)]
         current = 0
         for link in chain:
@@ -319,7 +319,7 @@ class _Reader(UrdfTree):
         while todo:
             parent = todo.pop()
             for child, joint in self.joint_of.items():
-                if child not in carrier and linked(joint, "parent") == parent and joint.get("type") == "fixed":
+                if child not in carrier and link_name(joint, "parent") == parent and joint.get("type") == "fixed":
                     poses[child] = poses[parent] @ self.pose(joint.find("origin"))
                     carrier[child] = carrier[parent]
                     groups[carrier[parent]].append((child, poses[child]))
@@ -417,7 +417,7 @@ class _Reader(UrdfTree):
     def _mesh(self, link: str, mesh: ElementTree.Element) -> Array:
         """Return the vertices of the convex hull of a mesh [m]."""
         name = mesh.get("filename", "")
-        path = _resolved(name, self._path.parent)
+        path = _resolve(name, self._path.parent)
         if not path.is_file():
             self.faults.append(f"link {link}: mesh {name} is not there")
             return np.zeros((0, 3))

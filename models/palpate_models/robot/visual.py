@@ -64,7 +64,7 @@ def _lbr() -> dict[str, list[VisualMesh]]:
     return meshes
 
 
-def _turned(profile: list[tuple[float, float]], rgba: Rgba) -> VisualMesh:
+def _revolve(profile: list[tuple[float, float]], rgba: Rgba) -> VisualMesh:
     """Return a revolved profile of (radius, height), closed at both ends."""
     closed = [(0.0, profile[0][1]), *profile, (0.0, profile[-1][1])]
     return VisualMesh(*revolve(np.array(closed)), rgba)
@@ -78,12 +78,12 @@ def _tool(robot: Robot) -> dict[str, list[VisualMesh]]:
     sphere[[0, -1], 0] = 0.0
     return {
         arm_of(robot).link_names[-1]: [
-            _turned([(r - 0.002, 0.0), (r, 0.002), (r, sensor - 0.004), (r - 0.002, sensor - 0.002)], DARK),
-            _turned([(r - 0.001, sensor - 0.002), (r - 0.001, sensor)], STEEL),
+            _revolve([(r - 0.002, 0.0), (r, 0.002), (r, sensor - 0.004), (r - 0.002, sensor - 0.002)], DARK),
+            _revolve([(r - 0.001, sensor - 0.002), (r - 0.001, sensor)], STEEL),
         ],
         "ft_sensor": [
-            _turned([(0.028, 0.0), (0.028, 0.006), (0.018, 0.012), (rod, 0.02), (rod, length - 0.02)], STEEL),
-            _turned([(rod, length - 0.02), (0.008, length - 0.008), (0.008, length)], STEEL),
+            _revolve([(0.028, 0.0), (0.028, 0.006), (0.018, 0.012), (rod, 0.02), (rod, length - 0.02)], STEEL),
+            _revolve([(rod, length - 0.02), (0.008, length - 0.008), (0.008, length)], STEEL),
         ],
         "indenter": [VisualMesh(*revolve(sphere), BLUE)],
     }

@@ -208,13 +208,13 @@ def view_of(role: str) -> View:
     return "scenario" if role in _SEES_ALL else "plant" if role in _SEES_ERRORS else "exam"
 
 
-def seen(scenario: Scenario, view: View) -> Scenario:
+def restrict_to_view(scenario: Scenario, view: View) -> Scenario:
     """Return the scenario in a view: hidden fields have their defaults."""
     return Scenario.model_validate(scenario.model_dump(exclude=HIDDEN[view]))
 
 
 def dump_scenario(scenario: Scenario, view: View = "scenario") -> str:
-    """Return a view of the scenario as YAML; `load_scenario` reads it back as `seen` returns it, except for the name."""
+    """Return a view as YAML; `load_scenario` reads it back as `restrict_to_view` returns it, except for the name."""
     given = scenario.model_dump(mode="json", exclude=HIDDEN[view])
     return str(yaml.safe_dump(given, sort_keys=False, allow_unicode=True))
 

@@ -1,7 +1,6 @@
 """Scan patterns: functions of examination and perceived surface that return lines of targets."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -31,8 +30,7 @@ class PatternLimits(NamedTuple):
 LIMITS: Final = PatternLimits()
 
 
-@dataclass(frozen=True)
-class Scan:
+class Scan(NamedTuple):
     """Lines of a scan, in order."""
 
     lines: Sequence[Array]

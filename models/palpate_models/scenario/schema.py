@@ -15,7 +15,7 @@ from typing import Annotated, Any, Final, Literal
 
 from pydantic import AfterValidator, ConfigDict, Field, ValidationInfo, field_validator, model_validator
 
-from palpate_models.patient.person import drawn
+from palpate_models.patient.person import draw_person
 from palpate_models.patient.schema import Phantom
 from palpate_models.scenario.arm_file import DEFAULT_ARM, CommandLevel, placement_of
 from palpate_models.scenario.errors import Errors
@@ -332,7 +332,7 @@ class Scenario(Section):
     def _drawn(cls, phantom: Phantom, info: ValidationInfo) -> Phantom:
         """Draw a person from the seed, so that every scenario has a complete phantom."""
         seed = info.data.get("seed")
-        return phantom if seed is None else drawn(phantom, seed)
+        return phantom if seed is None else draw_person(phantom, seed)
 
     @field_validator("services")
     @classmethod

@@ -3,10 +3,9 @@
 Those of the contract on every implementation are here, checked over all messages that it sent during its suite.
 """
 
-from dataclasses import dataclass
 from importlib import import_module
 from itertools import pairwise
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 
@@ -30,8 +29,7 @@ def check(rig: Rig) -> ConformanceReport:
     return rig.report
 
 
-@dataclass(frozen=True)
-class LiveTolerances:
+class LiveTolerances(NamedTuple):
     """Tolerances of topics of a live implementation."""
 
     rate: float = 0.2

@@ -1,12 +1,11 @@
 """Role assessment: the suite plays an examination of a belly with one stiff area, line by line, to its end."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from palpate.check import shapes
-from palpate.check.rig import Rig, sensed
+from palpate.check.rig import Rig, sense
 from palpate.exam_state import exam_state
 from palpate_bus.messages import ExamState
 from palpate_bus.messages.geometry import mesh_message, vectors
@@ -17,8 +16,7 @@ from palpate_models.scenario.load import exam_input
 SAMPLES, MAP, FINDINGS = "assessment/samples", "assessment/map", "assessment/findings"
 
 
-@dataclass(frozen=True)
-class Belly:
+class Belly(NamedTuple):
     """A belly with one stiff area."""
 
     stiff_at_m: tuple[float, float] = (0.02, -0.015)
@@ -28,8 +26,7 @@ class Belly:
     """Force at the depth of the scan on unremarkable tissue."""
 
 
-@dataclass(frozen=True)
-class ScanSettings:
+class ScanSettings(NamedTuple):
     """The played scan and the wait for findings."""
 
     speed_mps: float = 0.03
@@ -59,7 +56,7 @@ class PlayedScan:
         p_A = np.array([[x, y, shapes.height(np.array(x), np.array(y))]])
         n_A = shapes.normals(np.array([x]), np.array([y]))
         p_W, n_W = apply(self._X_WA, p_A)[0], (n_A @ self._X_WA[:3, :3].T)[0]
-        depth = float(sensed(self._depth, t)) if scanning else -0.01
+        depth = float(sense(self._depth, t)) if scanning else -0.01
         force = BELLY.force_n * self.stiffness(x, y) if scanning else 0.0
         felt = {"depth_setpoint": self._depth, "depth": depth, "normal_force": force, "depth_uncertainty": 0.0005}
         return exam_state(t, phase, p_W, n_W, target_count=1, in_contact=scanning, steady=scanning, stroke=1, **felt)

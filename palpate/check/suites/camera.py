@@ -1,7 +1,6 @@
 """Role camera: frames on request, with intrinsics. If it renders `sim/surface`, the geometry is checked on a plane."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -18,8 +17,7 @@ SMALL_WIDTHS = (48, 192)
 FRAME = "camera_depth_optical_frame"
 
 
-@dataclass(frozen=True)
-class ViewedPlane:
+class ViewedPlane(NamedTuple):
     """The plane in front of the camera, and the burst."""
 
     frames: int = 5

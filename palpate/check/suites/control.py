@@ -4,7 +4,7 @@ from typing import Any
 
 import numpy as np
 
-from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, robot_status, sensed
+from palpate.check.rig import Feed, ReceivedMessage, Rig, Source, robot_status, sense
 from palpate_bus.contract import contract
 from palpate_bus.messages import ImpedanceSetpoint, JointState, Point, Pose, Quaternion, Twist, Vector3, Wrench
 from palpate_bus.messages.geometry import pose_message
@@ -37,7 +37,7 @@ class Played:
         """Return the source of an arm at rest at `q` [rad]."""
         position = np.asarray(self.home if q is None else q, dtype=float)
         listed = list(names or self.arm.joint_names)
-        return lambda t: JointState(header(t), listed, sensed(position, t), sensed(self.rest, t), self.rest)
+        return lambda t: JointState(header(t), listed, sense(position, t), sense(self.rest, t), self.rest)
 
     def status(self, t: int) -> Any:
         """Return the status of the arm: nothing but the tool loads its F/T sensor."""
@@ -77,7 +77,7 @@ def suite(rig: Rig) -> None:
     wanted = arm.home if arm.positions else arm.rest
     off = max((np.max(np.abs(arm.values(item.message) - wanted)) for item in idle), default=np.inf)
     name = "without a set-point it commands no torque, or the arm's position"
-    rig.below(name, 0.0 if _ceased(idle) else off, 1e-6, f"{arm.unit} off")
+    rig.below(name, 0.0 if _has_expired(idle) else off, 1e-6, f"{arm.unit} off")
     _joint_sign(rig, arm)
     _cartesian_sign(rig, arm)
     _limits(rig, arm)
@@ -90,7 +90,7 @@ def suite(rig: Rig) -> None:
     _ceases(rig, arm, "no joint states", received)
 
 
-def _ceased(received: list[ReceivedMessage]) -> bool:
+def _has_expired(received: list[ReceivedMessage]) -> bool:
     """Return True if the last commands have expired or there are none: then the driver holds."""
     return all(nanoseconds(item.message.valid_for) == 0 for item in received[-5:])
 
@@ -152,11 +152,11 @@ def _expiry(rig: Rig, arm: Played) -> None:
     expired = next((item.t - ended for item in received if nanoseconds(item.message.valid_for) == 0), None)
     limit = VALID + 12 * MS + rig.slack
     silent = received[-1].t - ended if received else 0
-    ok = (expired is not None and expired <= limit and _ceased(received)) or (expired is None and silent <= limit)
+    ok = (expired is not None and expired <= limit and _has_expired(received)) or (expired is None and silent <= limit)
     got = f"after {expired / MS:.0f} ms" if expired is not None else f"last command after {silent / MS:.0f} ms"
     rig.expect("stops commanding when set-points cease", ok, f"expired commands or none within {limit / MS:.0f} ms", got)
     command = _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
-    ok = not _ceased(rig.log[COMMAND]) and bool(np.all(np.isfinite(command)))
+    ok = not _has_expired(rig.log[COMMAND]) and bool(np.all(np.isfinite(command)))
     rig.expect("commands again on a new set-point", ok, "valid commands", f"{command.round(2)} {arm.unit}")
 
 
@@ -170,7 +170,7 @@ def _garbage(rig: Rig, arm: Played) -> None:
     finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
     rig.expect("a set-point that is not a number makes no such command", finite, "finite commands")
     still = float(np.max(np.abs(arm.values(received[-1].message) - before))) if received else np.inf
-    calm = still < (0.01 if arm.positions else 1.0) or _ceased(received)
+    calm = still < (0.01 if arm.positions else 1.0) or _has_expired(received)
     rig.expect("and is not followed", calm, "the last good set-point's command, or expired ones", f"{still:.2f} {arm.unit} off")
     received = rig.run(0.3 + rig.slack_s, arm.feed(good, arm.joints(nothing)))[COMMAND]
     finite = all(np.all(np.isfinite(arm.values(item.message))) for item in received)
@@ -180,11 +180,11 @@ def _garbage(rig: Rig, arm: Played) -> None:
     _ceases(rig, arm, "joint states in another order", received)
     _command(rig, arm, arm.feed(arm.joint_target(arm.home, 100.0)))
     received = rig.log[COMMAND]
-    rig.expect("and recovers with good ones", not _ceased(received), "valid commands", _last(arm, received))
+    rig.expect("and recovers with good ones", not _has_expired(received), "valid commands", _last(arm, received))
 
 
 def _ceases(rig: Rig, arm: Played, when: str, received: list[ReceivedMessage], finite: bool = True) -> None:
-    rig.expect(f"{when}: it ceases", finite and _ceased(received), "expired commands or none", _last(arm, received))
+    rig.expect(f"{when}: it ceases", finite and _has_expired(received), "expired commands or none", _last(arm, received))
 
 
 def _last(arm: Played, received: list[ReceivedMessage]) -> str:

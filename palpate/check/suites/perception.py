@@ -1,7 +1,6 @@
 """Conformance of perception: the suite sends depth frames of a belly of known shape, and then none."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from palpate_models.scenario.load import exam_input
 MOTION, SURFACE, TARGETS = "perception/motion", "perception/surface", "perception/targets"
 
 
-@dataclass(frozen=True)
-class SimulatedView:
+class SimulatedView(NamedTuple):
     """Images that the suite sends, and its patience."""
 
     frames: int = 4

@@ -1,7 +1,6 @@
 """Role planning: the suite plays an arm that follows, up to the burst of depth frames; then an operator stops it."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from palpate_models.robot.chain import Arm
 SETPOINT, STATE = "planning/setpoint", "exam/state"
 
 
-@dataclass(frozen=True)
-class PlanningRig:
+class PlanningRig(NamedTuple):
     """The simulated arm and the patience of the suite."""
 
     weight_n: float = 6.0

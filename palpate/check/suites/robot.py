@@ -1,7 +1,6 @@
 """Role robot: a driver or plant of the arm, with its F/T sensor. The order matters, because holds are latched."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -17,8 +16,7 @@ from palpate_models.scenario.arm_file import CommandLevel
 COMMAND = "control/joint_torque"
 
 
-@dataclass(frozen=True)
-class RobotTouches:
+class RobotTouches(NamedTuple):
     """Pushes on the robot, and its largest motion without."""
 
     push_s: float = 0.06

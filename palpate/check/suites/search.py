@@ -1,7 +1,6 @@
 """Role search: the suite plays an examination that carries out each request, on a belly with one stiff area."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -16,8 +15,7 @@ PRESS_S: Final = 0.3
 MOST: Final = 40
 
 
-@dataclass(frozen=True)
-class SoftBelly:
+class SoftBelly(NamedTuple):
     """A belly with one stiff area."""
 
     stiff_radius_m: float = 0.020
@@ -58,7 +56,7 @@ def suite(rig: Rig) -> None:
         asked = rig.last(REQUEST)
         if asked.number <= play.over:
             break
-        rig.send("assessment/samples", pressed(rig.t, asked, stiff_at))
+        rig.send("assessment/samples", press_belly(rig.t, asked, stiff_at))
         early += len(rig.run(PRESS_S / 2, {"exam/state": play.state})[REQUEST])
         play.over = int(asked.number)
         rig.run(PRESS_S / 2, {"exam/state": play.state})
@@ -80,7 +78,7 @@ def suite(rig: Rig) -> None:
         rig.skip("an end", f"it continued beyond {len(presses)} presses")
 
 
-def pressed(t: int, asked: Any, stiff_at: Any) -> Message:
+def press_belly(t: int, asked: Any, stiff_at: Any) -> Message:
     """Return the sample of a press of the belly."""
     xy = np.array((asked.place.x, asked.place.y))
     bump = 1.0 / (1.0 + float(np.exp((np.linalg.norm(xy - stiff_at) - BELLY.stiff_radius_m) / BELLY.edge_m)))

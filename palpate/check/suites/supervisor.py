@@ -1,7 +1,6 @@
 """Role supervisor: the suite plays arm and planning, violates one limit after another, and expects a stop for each."""
 
-from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pinocchio as pin
@@ -19,8 +18,7 @@ from palpate_models.scenario.load import exam_input
 STATE, STATUS, EXAM, SURFACE = "supervisor/state", "robot/status", "exam/state", "perception/surface"
 
 
-@dataclass(frozen=True)
-class Expected:
+class Expected(NamedTuple):
     """Tolerances and time limits of the supervisor, and the rise of the played force."""
 
     force_error_n: float = 3.0
@@ -109,14 +107,14 @@ def suite(rig: Rig) -> None:
     _expect_level(rig, "a soft stop that does not help becomes an emergency stop", received, EMERGENCY)
     rig.send("operator/request", OperatorRequest(header(rig.t), OperatorRequest.RELEASE, "conformance check"))
     _expect_level(rig, "a release is refused while its cause is present", rig.run(0.3, arm.feed())[STATE], STOPPED)
-    _released(rig, arm, "and is released")
+    _expect_release(rig, arm, "and is released")
     arm.push_N = limits.force_emergency_n + 10.0
     _stops(rig, arm, "a force over the emergency limit", EMERGENCY, SupervisorState.CAUSE_FORCE, released="after it")
     _expect_level(rig, "a steady force below the limits is not stopped", _press(rig, arm, limits.force_working_n))
     rig.send(SURFACE, arm.surface(rig.t, limits.depth_m + 0.035))
     _stops(rig, arm, "too deep, pressed", STOPPED, SupervisorState.CAUSE_DEPTH)
     rig.send(SURFACE, arm.surface(rig.t, -0.05))
-    _released(rig, arm, "and is released above the surface")
+    _expect_release(rig, arm, "and is released above the surface")
     arm.qd = _turning(arm, 2.0 * limits.speed_mps)
     jump = (SupervisorState.CAUSE_SPEED, SupervisorState.CAUSE_SENSOR)  # the played arm jumps to that speed without torques
     _stops(rig, arm, "a tool too fast", EMERGENCY, *jump, released="at rest")
@@ -132,11 +130,11 @@ def suite(rig: Rig) -> None:
     received = rig.run(0.5, arm.feed())[STATE]
     ok = _level(received) in EMERGENCY and "enough" in received[-1].message.reason
     rig.expect("it stays, with the operator's reason", ok, "level 2, 'enough'", _text(received))
-    _released(rig, arm, "and is released by the operator")
+    _expect_release(rig, arm, "and is released by the operator")
     for silent in (STATUS, EXAM):
         received = rig.run(EXPECTED.silent_s, arm.feed(silent))[STATE]
         _expect_level(rig, f"stops when {silent} is silent", received, EMERGENCY)
-        _released(rig, arm, f"and is released when {silent} is back")
+        _expect_release(rig, arm, f"and is released when {silent} is back")
     rig.lose("control")
     _stops(rig, arm, "the loss of control", EMERGENCY, SupervisorState.CAUSE_LOST)
 
@@ -205,10 +203,10 @@ def _stops(rig: Rig, arm: PlayedArm, what: str, levels: tuple[int, ...], *causes
         within_ms = EXPECTED.react_ms if levels == EMERGENCY else EXPECTED.soft_ms
         rig.below(f"in time: {what}", (first.t - start - rig.slack) / MS, within_ms + 1, "ms")
     if released:
-        _released(rig, arm, f"and is released {released}")
+        _expect_release(rig, arm, f"and is released {released}")
 
 
-def _released(rig: Rig, arm: PlayedArm, name: str) -> None:
+def _expect_release(rig: Rig, arm: PlayedArm, name: str) -> None:
     """Expect that a stop stays when its cause is gone, and ends on release, which is counted."""
     arm.calm()
     received = rig.run(0.5, arm.feed())[STATE]

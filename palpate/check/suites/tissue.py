@@ -1,7 +1,6 @@
 """Role tissue: the suite moves an indenter above it, into it, along it and out again. The patient holds their breath."""
 
-from dataclasses import dataclass
-from typing import Any, Final
+from typing import Any, Final, NamedTuple
 
 import numpy as np
 
@@ -18,8 +17,7 @@ STILL = ("phantom.breathing.kind=none", "phantom.motion.kind=none")
 """Settings of a scenario whose patient neither breathes nor moves, so that the indenter alone causes forces."""
 
 
-@dataclass(frozen=True)
-class TestPress:
+class TestPress(NamedTuple):
     """The press that the suite makes."""
 
     speed_mps: float = 0.02

@@ -3,7 +3,7 @@
 import pandas as pd
 
 from palpate.study.statistics import accuracy, detection
-from palpate.study.statistics.detectability import FELT, MADE, Surface, observed, surface
+from palpate.study.statistics.detectability import FELT, MADE, Surface, observe_shares, surface
 from palpate.study.statistics.estimate import Bootstrap, Drawn, Estimate, Row
 from palpate.study.statistics.reading import Variant
 
@@ -15,7 +15,7 @@ class MethodRow(Row):
     cases: pd.DataFrame = Drawn
     roc: detection.Roc | None = Drawn
     froc_curve: detection.Froc | None = Drawn
-    observed: dict[str, list[tuple[float, Estimate]]] = Drawn
+    observe_shares: dict[str, list[tuple[float, Estimate]]] = Drawn
     """Share of the lumps found, in bins over each covariate."""
     rates: detection.Rates
     populations: dict[str, detection.Rates]
@@ -44,7 +44,7 @@ def analyse(variant: Variant, bootstrap: Bootstrap) -> MethodRow:
         cases=variant.cases,
         roc=by_threshold,
         froc_curve=by_findings,
-        observed={name: observed(variant, name, bootstrap) for name in dict.fromkeys((*FELT, *MADE))},
+        observed={name: observe_shares(variant, name, bootstrap) for name in dict.fromkeys((*FELT, *MADE))},
         rates=detection.rates(variant, bootstrap),
         populations=detection.by_population(variant, bootstrap),
         contrasts=detection.by_contrast(variant, bootstrap),

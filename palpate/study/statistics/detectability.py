@@ -180,7 +180,7 @@ def fit(z: Array, found: NDArray[np.bool_], count: Array, with_lapse: bool, star
     return np.append(done.x[:k], lapse), 2 * float(done.fun)
 
 
-def observed(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -> list[tuple[float, Estimate]]:
+def observe_shares(variant: Variant, name: str, bootstrap: Bootstrap, bins: int = 6) -> list[tuple[float, Estimate]]:
     """Return the share of found lumps in bins of equal number over the covariate `name`, with the mean of each bin."""
     lumps = variant.lumps.dropna(subset=[name])
     if lumps.empty:

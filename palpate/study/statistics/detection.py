@@ -1,6 +1,5 @@
 """Detection: rates of findings and failures, ROC per patient, FROC over lumps, and rates by felt contrast."""
 
-from dataclasses import dataclass
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -9,7 +8,7 @@ from numpy.typing import NDArray
 from sklearn.metrics import roc_auc_score, roc_curve
 from statsmodels.stats.rates import confint_poisson
 
-from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, bounded, estimate, percentiles, wilson
+from palpate.study.statistics.estimate import LEVEL, Array, Bootstrap, Estimate, Row, bound, estimate, percentiles, wilson
 from palpate.study.statistics.reading import WORST_HEALTHY, Variant
 
 SURE: Final = 0.5
@@ -90,8 +89,7 @@ def _each(cases: pd.DataFrame, bootstrap: Bootstrap) -> Estimate:
 GRID = np.linspace(0, 1, 101)
 
 
-@dataclass(frozen=True)
-class Roc:
+class Roc(NamedTuple):
     """ROC curve of a method."""
 
     auc: Estimate
@@ -123,7 +121,7 @@ def roc(variant: Variant, bootstrap: Bootstrap) -> Roc | None:
     with np.errstate(invalid="ignore"):
         replicates = np.einsum("fb,fb->f", w_a @ greater, w_b) / (w_a.sum(axis=1) * w_b.sum(axis=1))
     band = np.array([percentiles(column) or (np.nan, np.nan) for column in _roc_curves(a, b, w_a, w_b).T])
-    auc = bounded(float(roc_auc_score(truth, scores)), replicates, len(scores), "patients", min(len(a), len(b)))
+    auc = bound(float(roc_auc_score(truth, scores)), replicates, len(scores), "patients", min(len(a), len(b)))
     return Roc(auc, replicates, false_rate, true_rate, band[:, 0], band[:, 1])
 
 
@@ -143,8 +141,7 @@ RATES: Final = (1 / 8, 1 / 4, 1 / 2, 1.0, 2.0, 4.0, 8.0)
 """False findings per examination at which LUNA16 averages the sensitivity (Setio et al., Med Image Anal 2017;42:1)."""
 
 
-@dataclass(frozen=True)
-class Froc:
+class Froc(NamedTuple):
     """FROC curve of a method over the confidence from which an area counts as a finding."""
 
     mean: Estimate
@@ -197,7 +194,7 @@ def froc(variant: Variant, bootstrap: Bootstrap) -> Froc | None:
     patients = int((lumps > 0).sum())
 
     def of_lumps(value: float, replicates: Array) -> Estimate:
-        return bounded(value, replicates, n, "lumps", patients)
+        return bound(value, replicates, n, "lumps", patients)
 
     return Froc(
         mean=of_lumps(float(here.mean()), at.mean(axis=1)),

@@ -90,7 +90,7 @@ class Bootstrap(NamedTuple):
         made = self.sums(np.ones(len(np.asarray(patient))) if out_of is None else out_of, patient)
         n = int(made.sum())
         value = float(found.sum() / n) if n else np.nan
-        return bounded(value, self.ratio(found, made), n, of, int((made > 0).sum()))
+        return bound(value, self.ratio(found, made), n, of, int((made > 0).sum()))
 
     def quantile(self, values: Array, patient: NDArray[np.intp], q: float) -> Array:
         """Return replicates of the quantile `q`, shape (folds,), of values with the index of their patient, shapes (m,)."""
@@ -124,7 +124,7 @@ def estimate(value: float, replicates: Array, n: int, of: str, degenerate: Calla
     return Estimate(value=float(value), low=low, high=high, n=n, of=of)
 
 
-def bounded(value: float, replicates: Array, n: int, of: str, patients: int) -> Estimate:
+def bound(value: float, replicates: Array, n: int, of: str, patients: int) -> Estimate:
     """Return a figure between 0 and 1 with its bootstrap interval; at 0 or 1 with Wilson's, with one trial per patient."""
     if not isfinite(value):
         return Estimate(value=None, n=n, of=of)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Final
+from typing import Final, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -30,8 +30,7 @@ WORST_ILL, WORST_HEALTHY = -1.0, 2.0
 """Scores of failed cases of patients with and without lumps, beyond the range 0 to 1 of confidences."""
 
 
-@dataclass(frozen=True)
-class Variant:
+class Variant(NamedTuple):
     """The cases of one method, at one tier, with one setting of the errors: one per patient, in the order of the patients.
 
     Rows of `cases` have the table's columns, `patient` (index), `failed` (failed or not completed), `lumps` (number of palpable

@@ -11,8 +11,8 @@ import trimesh
 from palpate.check.rig import ReceivedMessage, RigSettings, ServiceRig
 from palpate.check.suites import check
 from palpate.check.suites.camera import plane
-from palpate.perceive import perceived, write
-from palpate.run.roles import checked
+from palpate.perceive import perceive_recording, write
+from palpate.run.roles import check_choices
 from palpate_bus.contract import contract
 from palpate_bus.messages import CameraTrigger
 from palpate_bus.messages.codec import encode
@@ -104,7 +104,7 @@ def test_a_recording_of_ros_pairs_by_the_headers_and_takes_all_poses(
 
 def test_perception_alone_sees_the_recorded_surface(recording: Path, tmp_path: Path) -> None:
     scenario = load_scenario("clean", ["exam.region_m=[0.1,0.1]"])
-    found = perceived(ReplayedCamera(open_recording(recording)), scenario)
+    found = perceive_recording(ReplayedCamera(open_recording(recording)), scenario)
     figures = write(tmp_path, found, scenario)
     mesh = trimesh.load(tmp_path / "surface.ply", process=False)
     height = SCENARIO.camera.look_at_m[2] - SCENARIO.exam.pose.xyz_m[2]
@@ -192,4 +192,4 @@ def test_a_run_checks_the_recording_before_anything_starts(tmp_path: Path) -> No
         "services": SCENARIO.services.model_copy(update={"camera": "replay"}),
     }
     with pytest.raises(RecordingError, match="SQLite bag"):
-        checked(SCENARIO.model_copy(update=changed))
+        check_choices(SCENARIO.model_copy(update=changed))

@@ -19,7 +19,7 @@ from palpate_bus.wire.ros_node import RosNode
 from palpate_bus.wire.zenoh_config import BusOptions
 from palpate_conductor.collector import Collector
 from palpate_models.robot import lbr
-from palpate_models.scenario.load import load_scenario, plant_input, seen
+from palpate_models.scenario.load import load_scenario, plant_input, restrict_to_view
 from palpate_models.scenario.schema import RobotDriver
 from palpate_robot.backends.hardware import TAKE_OVER_NS
 from palpate_robot.backends.lbr.emulator import Emulator
@@ -206,7 +206,7 @@ SHORT = ("exam.region_m=[0.03,0.03]", "exam.centre_m=[-0.055,-0.055]", "camera.f
 @pytest.mark.parametrize("level", ["torque", "setpoint"])
 def test_an_examination_completes(level: str) -> None:
     scenario = load_scenario("clean", SHORT)
-    robot, port = driver_on_emulator(seen(scenario, "plant"), level, gravity_error_nm=0.5)
+    robot, port = driver_on_emulator(restrict_to_view(scenario, "plant"), level, gravity_error_nm=0.5)
     collector = Collector()
     run = Composed([robot, *load_services(scenario, OTHERS), collector])
     run.run(lambda: collector.collected.end_tick, 40_000_000_000)

@@ -10,7 +10,7 @@ from scipy.ndimage import correlate
 from scipy.stats import multivariate_normal
 
 from palpate.check.rig import RigSettings, ServiceRig
-from palpate.check.suites.search import PRESS_S, REQUEST, Play, pressed, suite
+from palpate.check.suites.search import PRESS_S, REQUEST, Play, press_belly, suite
 from palpate_assessment.calibration import load_calibration
 from palpate_assessment.model import natural
 from palpate_assessment.shapes import Bump
@@ -69,10 +69,10 @@ def test_raster_and_latin_hypercube_cover_the_region() -> None:
             posterior.add(Press(float(x), float(y), depth, 4.0, 3.0 * k))
         return (np.array([p.xy for p in posterior.presses]) - TASK.low) / (TASK.high - TASK.low)
 
-    share = pressed(latin_hypercube, TASK.budget.presses)
+    share = press_belly(latin_hypercube, TASK.budget.presses)
     for axis in share.T:
         assert sorted(np.floor(axis * TASK.budget.presses)) == list(range(TASK.budget.presses))
-    lattice = pressed(raster, TASK.budget.presses)
+    lattice = press_belly(raster, TASK.budget.presses)
     assert len(np.unique(lattice.round(6), axis=0)) == TASK.budget.presses
     assert np.abs(np.diff(lattice, axis=0)).max() < 0.3  # to and fro, no long ways back
 
@@ -248,7 +248,7 @@ def test_a_place_that_the_arm_cannot_take_is_not_asked_for_again() -> None:
     for _ in range(12):
         asked = rig.last(REQUEST)
         elsewhere = SimpleNamespace(place=Point(0.04, 0.04, 0.0), depth=asked.depth)
-        rig.send("assessment/samples", pressed(rig.t, elsewhere, np.zeros(2)))
+        rig.send("assessment/samples", press_belly(rig.t, elsewhere, np.zeros(2)))
         play.over = int(asked.number)
         rig.run(0.3, {"exam/state": play.state})
     places = [(m.place.x, m.place.y) for m in (item.message for item in rig.log[REQUEST]) if m.request == SearchRequest.PRESS]

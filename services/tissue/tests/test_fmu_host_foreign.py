@@ -20,7 +20,7 @@ from palpate_fmu.compiling import native
 from palpate_fmu.export import build_scenario_fmu
 from palpate_fmu.reading import FmuError
 from palpate_models.numerics.frames import matrix
-from palpate_models.scenario.load import ScenarioError, load_scenario, seen, true_pose
+from palpate_models.scenario.load import ScenarioError, load_scenario, restrict_to_view, true_pose
 from palpate_models.scenario.schema import Scenario, TissueChoice
 from palpate_tissue.backends.fmu.mapping import FmuMap, MapError, load_map
 from palpate_tissue.backends.fmu.service import create, host, hosted
@@ -118,7 +118,7 @@ def test_a_map_of_another_role_is_for_a_file_of_ones_own(scenario: Scenario, tmp
         create(chosen(scenario, fmu_map=str(path)))
     fmu = build_scenario_fmu(scenario, tmp_path / "a.fmu", 3, [native()])
     with pytest.raises(MapError, match="lacks topics that the role assessment must send"):  # so it was asked as an assessment
-        hosted(fmu, load_map(path), seen(scenario, "exam"))
+        hosted(fmu, load_map(path), restrict_to_view(scenario, "exam"))
 
 
 def test_a_map_of_ones_own_is_read_from_the_scenario(scenario: Scenario, tmp_path: Path) -> None:

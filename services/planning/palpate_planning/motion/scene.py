@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from palpate_models.numerics.frames import Array, apply
 from palpate_models.robot import table
-from palpate_models.robot.arm import capsules, link_names, mounted
+from palpate_models.robot.arm import capsules, count_mounted, link_names
 from palpate_models.scenario.schema import Robot
 from palpate_planning.motion.kinematics import ArmKinematics
 
@@ -103,7 +103,7 @@ class CollisionScene:
                 if links.index(link) - links.index(other) >= COLLISION.links_apart:
                     self._geometry.addCollisionPair(pin.CollisionPair(other_shape, shape))
             for name, obstacle in obstacles:
-                at_base = link == links[0] or (name == "robot_base" and links.index(link) < mounted(robot))
+                at_base = link == links[0] or (name == "robot_base" and links.index(link) < count_mounted(robot))
                 if not at_base and not (name == "abdomen" and tool_may_touch and link in TOOL_LINKS):
                     self._geometry.addCollisionPair(pin.CollisionPair(shape, obstacle))
         self._results = self._geometry.createData()

@@ -23,7 +23,7 @@ import numpy as np
 
 from palpate_errors import RunError
 from palpate_models.numerics.frames import GRAVITY, Array, rigid
-from palpate_models.robot.arm import arm_of, capsules, link_names, mounted, urdf
+from palpate_models.robot.arm import arm_of, capsules, count_mounted, link_names, urdf
 from palpate_models.robot.chain import Capsule
 from palpate_models.robot.table import Box, boxes
 from palpate_models.scenario.errors import DrawnArm
@@ -136,7 +136,7 @@ class DartPlant:
             joint.setVelocityUpperLimit(0, np.inf)
             joint.setLimitEnforcement(True)
             joint.setCoulombFriction(0, 0.0)
-        shapes = dict(list(capsules(robot).items())[mounted(robot) :])
+        shapes = dict(list(capsules(robot).items())[count_mounted(robot) :])
         for link, parts in shapes.items():
             for capsule in parts:
                 self._add_capsule(self._arm.getBodyNode(link), capsule)

@@ -20,7 +20,7 @@ import mujoco
 import numpy as np
 
 from palpate_models.numerics.frames import GRAVITY, Array
-from palpate_models.robot.arm import TOOL, arm_of, base_pose, capsules, inertias, link_names, mounted
+from palpate_models.robot.arm import TOOL, arm_of, base_pose, capsules, count_mounted, inertias, link_names
 from palpate_models.robot.chain import Capsule, Inertia
 from palpate_models.robot.table import boxes
 from palpate_models.scenario.errors import DrawnArm
@@ -92,7 +92,7 @@ def build(robot: Robot, drawn: DrawnArm | None = None) -> Any:
             solimp=_IMPEDANCE,
         )
     true = robot.model_copy(update={"tool_mass_kg": robot.tool_mass_kg * drawn.tool_mass})
-    masses, shapes, at_base = inertias(true), capsules(robot), mounted(robot)
+    masses, shapes, at_base = inertias(true), capsules(robot), count_mounted(robot)
     body = spec.worldbody
     for i, link in enumerate(link_names(robot)):
         if i == 0:

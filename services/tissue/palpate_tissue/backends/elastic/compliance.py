@@ -24,7 +24,7 @@ from scipy.spatial.distance import cdist
 from scipy.special import j0
 
 from palpate_errors import UserError
-from palpate_models.numerics.cache import content_key, remembered
+from palpate_models.numerics.cache import content_key, remember
 from palpate_models.numerics.frames import Array
 from palpate_models.patient import field
 from palpate_models.patient.field import lesion_field, smoothstep
@@ -261,7 +261,7 @@ class _Body(NamedTuple):
             raise UserError("a half-space must be uniform: use a finite thickness_m")
         arrays = (model.vertices, model.normals, model.areas, young, model.fixed)
         key = content_key("compliance", _CODE, *arrays, lesions, self.thickness, self.poisson, self.pitch)
-        return remembered(key, lambda: self._changed(lesions))
+        return remember(key, lambda: self._changed(lesions))
 
     def _changed(self, lesions: tuple[Lesion, ...]) -> Array32:
         """Return S with the last lesion from S without it, or S of the healthy body from that of the uniform layer."""
@@ -279,7 +279,7 @@ class _Body(NamedTuple):
             scale = np.sqrt(uniform / young)
             grid = self._grid()
             key = content_key("uniform", _CODE, grid.x, grid.y, grid.depth, self.poisson)
-            elements = remembered(key, lambda: skin_compliance(grid, lambda points: np.ones(len(points)), self.poisson)) / uniform
+            elements = remember(key, lambda: skin_compliance(grid, lambda points: np.ones(len(points)), self.poisson)) / uniform
         base *= scale[:, None] * scale
         x, y = grid.skin
         nodes = np.column_stack([axis.ravel() for axis in np.meshgrid(x, y, indexing="ij")])

@@ -1,7 +1,7 @@
 """Short examinations with a fault from outside: in a process, in messages, in the conductor, in the machine.
 
-`strike` starts a conductor as a process of its own, which may be hit as well, injects the fault when it says so, and returns what
-it saw. The conductor starts the other processes, prints their process ids, and prints a line when the fault is due.
+`inject_fault` starts a conductor as a process of its own, which may be the target as well, injects the fault when the conductor
+prints that it is due, and returns what it observed. The conductor starts the other processes and prints their process ids.
 """
 
 import os
@@ -45,21 +45,19 @@ SETTINGS: Final = (
 )
 """Two lines over the lesion of `clean` and a short wait for the operator, so that a case is short."""
 PATIENCE: Final = Patience(start=240.0, soft=1.0, hard=5.0)
-Blow = Callable[[Mapping[str, psutil.Process]], None]
+Injector = Callable[[Mapping[str, psutil.Process]], None]
 """Injects the fault; its argument has the processes of the run by role, with the conductor."""
 CONDUCTOR: Final = "conductor"
 ROLES: Final = (*WORKERS, "recorder")
 EACH: Final = one_per_process(ROLES)
 DUE: Final = "the fault is due at "
 PROCESSES: Final = "processes: "
-FILE: Final = "struck.pickle"
+FILE: Final = "fault_log.pickle"
 
 
 class FaultTimes(NamedTuple):
     """Wall times around a fault [s]."""
 
-    freeze_s: float = 10.0
-    """Duration of a freeze that includes the conductor."""
     services_leave_s: float = 30.0
     """Time after which remaining services count as hung."""
     conductor_ends_s: float = 120.0
@@ -69,8 +67,7 @@ class FaultTimes(NamedTuple):
 TIMES: Final = FaultTimes()
 
 
-@dataclass(frozen=True)
-class StruckRun:
+class FaultRun(NamedTuple):
     """A short examination in which a fault is injected."""
 
     folder: Path
@@ -107,7 +104,7 @@ class Sign:
 
 
 @dataclass
-class Watched:
+class FaultLog:
     """Observations of the conductor in a run with a fault."""
 
     result: RunResult
@@ -121,7 +118,7 @@ class Watched:
     """Outcome, if it was known before the run ended."""
 
     def add(self, progress: RunProgress, after_ms: float) -> None:
-        """Add the new signs, seen some time [ms] after the fault."""
+        """Add the new signs, seen `after_ms` after the fault."""
         new = [sign for sign in signs_of(progress) if sign not in (*self.signs, *self.before)]
         if new and self.detected_ms is None:
             self.detected_ms = round(after_ms, 1)
@@ -129,19 +126,19 @@ class Watched:
 
 
 @dataclass
-class Struck:
+class FaultResult:
     """A run after its fault."""
 
     folder: Path
-    own: Path
+    sockets: Path
     """Folder of the run's sockets."""
     status: int | None
     """Exit status of the conductor; None if it hung."""
-    watched: Watched | None
+    log: FaultLog | None
     """None if the conductor was killed."""
-    struck_s: float
+    injected_s: float
     """Simulated time of the fault."""
-    staying: list[str] = field(default_factory=list)
+    hung: list[str] = field(default_factory=list)
     """Services that hung."""
 
 
@@ -170,50 +167,49 @@ def signs_of(progress: RunProgress) -> list[Sign]:
 
 
 @cache
-def kept_rate() -> float:
-    """Return the rate that this machine sustains for a second."""
+def sustained_rate(reserve: bool = False) -> float:
+    """Return the rate that this machine sustains for a second.
+
+    With a `reserve` the next lower one, so that other load does not stop the arm before the fault.
+    """
+    if reserve:
+        return next((rate for rate in RATES if rate < sustained_rate()), sustained_rate())
     return measure(TEST.simulated_processes).rate or RATES[-1]
 
 
-def calm_rate() -> float:
-    """Return the next lower rate, so that other load does not stop the arm before the fault."""
-    kept = kept_rate()
-    return next((rate for rate in RATES if rate < kept), kept)
-
-
-def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
+def inject_fault(run: FaultRun, inject: Injector, namespace: str = "") -> FaultResult | None:
     """Run a short examination, in a network `namespace` if it is given, and inject the fault when it is due.
 
     Returns None if it never was: on a busy machine a run in wall-clock mode may be stopped before contact.
     """
-    program = "from palpate_benchmarks.struck import serve; serve()"
-    arguments = [sys.executable, "-c", program, TypeAdapter(StruckRun).dump_json(run).decode()]
+    program = "from palpate_benchmarks.injection import serve; serve()"
+    arguments = [sys.executable, "-c", program, TypeAdapter(FaultRun).dump_json(run).decode()]
     if namespace:
         arguments = ["ip", "netns", "exec", namespace, *arguments]
-    log = run.folder / "logs" / f"{CONDUCTOR}.log"
-    log.parent.mkdir(parents=True, exist_ok=True)
-    with log.open("w") as stderr:
+    output = run.folder / "logs" / f"{CONDUCTOR}.log"
+    output.parent.mkdir(parents=True, exist_ok=True)
+    with output.open("w") as stderr:
         child = subprocess.Popen(arguments, stdout=subprocess.PIPE, stderr=stderr, text=True, env={**os.environ, **FIXED})
     assert child.stdout is not None
-    own, struck_s = Path(), 0.0
+    sockets, injected_s = Path(), 0.0
     processes: dict[str, psutil.Process] = {}
-    hung = threading.Event()
+    conductor_hung = threading.Event()
 
     def end_hanging() -> None:
-        hung.set()
+        conductor_hung.set()
         child.kill()
 
     alarm = threading.Timer(TIMES.conductor_ends_s, end_hanging)
     try:
         for line in child.stdout:
             if line.startswith(PROCESSES):
-                own, pids = TypeAdapter(tuple[Path, dict[str, int]]).validate_json(line.removeprefix(PROCESSES))
+                sockets, pids = TypeAdapter(tuple[Path, dict[str, int]]).validate_json(line.removeprefix(PROCESSES))
                 processes = {CONDUCTOR: psutil.Process(child.pid), **{role: psutil.Process(pid) for role, pid in pids.items()}}
             elif line.startswith(DUE):
-                struck_s = float(line.removeprefix(DUE))
-                blow(processes)
+                injected_s = float(line.removeprefix(DUE))
+                inject(processes)
                 alarm.start()
-        code = child.wait()
+        child.wait()
     finally:
         alarm.cancel()
         if child.poll() is None:  # an exception must not leave the run behind
@@ -222,30 +218,31 @@ def strike(run: StruckRun, blow: Blow, namespace: str = "") -> Struck | None:
                     process.kill()
             child.kill()
     services = {role: process for role, process in processes.items() if role != CONDUCTOR}
-    _, staying = psutil.wait_procs(services.values(), timeout=TIMES.services_leave_s)
-    stuck = [role for role, process in services.items() if process in staying and process.status() != psutil.STATUS_STOPPED]
-    for process in staying:
+    _, left = psutil.wait_procs(services.values(), timeout=TIMES.services_leave_s)
+    hung = [role for role, process in services.items() if process in left and process.status() != psutil.STATUS_STOPPED]
+    for process in left:
         process.kill()
-    watched: Watched | None = None
+    log: FaultLog | None = None
     with suppress(FileNotFoundError):
-        watched = pickle.loads((run.folder / FILE).read_bytes())
-    if watched is not None and watched.result.interrupted:
+        log = pickle.loads((run.folder / FILE).read_bytes())
+    if log is not None and log.result.interrupted:
         raise KeyboardInterrupt
-    if not struck_s:
-        print(f"the fault was never due: {watched and watched.result.failure}", file=sys.stderr)
+    if not injected_s:
+        print(f"the fault was never due: {log and log.result.failure}", file=sys.stderr)
         return None
-    return Struck(run.folder, own, None if hung.is_set() else code, watched, struck_s, stuck)
+    status = None if conductor_hung.is_set() else child.wait()
+    return FaultResult(run.folder, sockets, status, log, injected_s, hung)
 
 
 class FaultWatch:
     """Says when the fault is due, collects its signs and ends a run early."""
 
-    def __init__(self, run: StruckRun) -> None:
+    def __init__(self, run: FaultRun) -> None:
         self._run = run
         self._phase_since: int | None = None
         self.since: float | None = None
         """Wall time of the fault [s], from `monotonic`; None before it is due."""
-        self.watched = Watched(RunResult("", Collected()))
+        self.log = FaultLog(RunResult("", Collected()))
 
     def on_progress(self, progress: RunProgress) -> None:
         """Called every 20 ms of wall time. Raises CaseOver once the outcome is known, if the run ends early."""
@@ -253,7 +250,7 @@ class FaultWatch:
         if exam is None:
             return
         if self.since is not None:
-            self.watched.add(progress, self._after_ms)
+            self.log.add(progress, self._after_ms)
             if self._run.early and not progress.trouble:  # with trouble the conductor ends the run, after it recorded reactions
                 self._end(exam)
             return
@@ -263,7 +260,7 @@ class FaultWatch:
             self._phase_since = progress.t
         if exam.phase == ExamState.PHASE_SCAN and progress.t - self._phase_since < self._run.at_s * NS:
             return
-        self.since, self.watched.before = time.monotonic(), signs_of(progress)
+        self.since, self.log.before = time.monotonic(), signs_of(progress)
         received = progress.t / NS
         if self._run.wallclock:  # messages may be late
             received = max(received, received / progress.real_time_factor - GRANTS.wallclock_lead_ns / NS)
@@ -279,35 +276,35 @@ class FaultWatch:
             ExamState.PHASE_DONE: (CaseOutcome.COMPLETED, "complete"),
             ExamState.PHASE_ABORTED: (CaseOutcome.ENDED, str(exam.message)),
         }
-        if not self.watched.signs:
+        if not self.log.signs:
             over[ExamState.PHASE_RETURN] = CaseOutcome.CONTINUED, "the scan was finished"
         if exam.phase in over:
-            self.watched.outcome, text = over[exam.phase]
+            self.log.outcome, text = over[exam.phase]
             raise CaseOver(text)
 
-    def finished(self, result: RunResult) -> Watched:
-        """Return what was seen, with the result of the run."""
-        watched = self.watched
+    def finish(self, result: RunResult) -> FaultLog:
+        """Return the observations, with the result of the run."""
+        log = self.log
         columns: dict[str, Any] = {
             name: list(kept) if isinstance(kept, Sequence) else kept for name, kept in vars(result.collected).items()
         }
-        watched.result = replace(result, collected=Collected(**columns))
+        log.result = replace(result, collected=Collected(**columns))
         if self.since is not None:
-            watched.add(RunProgress(0, 0.0, result.collected), self._after_ms)
-            failed = result.failure is not None and not (watched.outcome and watched.outcome.unharmed)
-            if failed and watched.detected_ms is None:
-                watched.detected_ms = round(self._after_ms, 1)
-        return watched
+            log.add(RunProgress(0, 0.0, result.collected), self._after_ms)
+            failed = result.failure is not None and not (log.outcome and log.outcome.unharmed)
+            if failed and log.detected_ms is None:
+                log.detected_ms = round(self._after_ms, 1)
+        return log
 
 
 def serve() -> None:
-    """Conduct the run of the command line; write what was seen into its folder."""
-    run = TypeAdapter(StruckRun).validate_json(sys.argv[1])
+    """Conduct the run of the command line; write the observations into its folder."""
+    run = TypeAdapter(FaultRun).validate_json(sys.argv[1])
     with SecureBus() if run.secure else nullcontext() as bus:
         _conduct(run, bus)
 
 
-def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
+def _conduct(run: FaultRun, secure: SecureBus | None) -> None:
     roles = tuple(role for group in run.groups for role in group)
     scenario = load_scenario("clean", SETTINGS)
     timing = Timing(run.wallclock, rate=run.rate)
@@ -318,7 +315,7 @@ def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
     processes = read_processes(compose_file(), roles)
     if run.faulty:
         role, *command = run.faulty
-        processes[role] = replace(processes[role], command=tuple(command))
+        processes[role] = processes[role]._replace(command=tuple(command))
     for group in run.groups:
         local.start(*(processes[role] for role in group))
     pids = {role: child.pid for role, child in local.running.items()}
@@ -326,6 +323,6 @@ def _conduct(run: StruckRun, secure: SecureBus | None) -> None:
     watch = FaultWatch(run)
     with local.as_conductor():
         result = conduct(session, roles, watch.on_progress, local.ended, timing, PATIENCE)
-    (run.folder / FILE).write_bytes(pickle.dumps(watch.finished(result)))
+    (run.folder / FILE).write_bytes(pickle.dumps(watch.finish(result)))
     close_session(session)
     local.stop(patience_s=3.0)
