@@ -10,7 +10,6 @@ reactions of the arm to the lie are not in it.
 
 import sys
 from collections import defaultdict
-from dataclasses import replace
 from pathlib import Path
 
 from palpate_benchmarks.liar import Lie, LyingTopic
@@ -27,7 +26,7 @@ def refused_after(lie: Lie, sent: dict[str, list[tuple[int, Message]]]) -> float
     found = []
     for name in lie.topics:
         row = contract().topics[name]
-        lying, check = LyingTopic(replace(lie, topic=name)), PortCheck(row, sends=True)
+        lying, check = LyingTopic(lie._replace(topic=name)), PortCheck(row, sends=True)
         try:
             for t, message in sent[name]:
                 for changed in lying.messages(t, [message], row.event):

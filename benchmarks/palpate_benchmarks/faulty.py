@@ -20,8 +20,9 @@ messages, 0 for all. `palpate faults` starts its processes in this way.
 import signal
 import sys
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from time import sleep
-from typing import Final, NamedTuple
+from typing import Final
 
 import numpy as np
 import zenoh
@@ -39,7 +40,8 @@ PAST_S: Final = 3600
 JUMP_NS: Final = 3600 * NS
 
 
-class InjectedFault(NamedTuple):
+@dataclass(frozen=True)
+class InjectedFault:
     """Fault in the messages of one topic."""
 
     topic: str

@@ -1,6 +1,7 @@
 """Figures of docs/reproduction.md: 3, 5, 6, 7 and 8 of the paper, from our runs. Each function writes one PNG."""
 
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any, Final
 
@@ -59,16 +60,15 @@ _PLACES: Final = {
 _BEND: Final = 0.13
 
 
-def graph(path: Path, rows: Sequence[dict[str, str]], watching: Sequence[str]) -> tuple[int, int]:
-    """Draw figure 5, nodes and topics of a live graph, without arrows of the `watching` nodes; return the number of both."""
-    nodes = sorted({row["node"] for row in rows})
-    topics = sorted({row["topic"] for row in rows if not row["topic"].startswith("palpate/")})
-    writers = {row["topic"]: row["node"] for row in rows if row["kind"] == "MP"}
+def graph(path: Path, rows: Sequence[dict[str, Any]], watching: Sequence[str]) -> tuple[int, int]:
+    """Draw figure 5, nodes and topics of a live bus, without arrows of the `watching` nodes; return the number of both."""
+    nodes = sorted({node for row in rows for node in (*row["publishers"], *row["subscribers"])})
+    topics = [row for row in rows if not row["topic"].startswith("palpate/")]
     arrows: dict[tuple[str, str], list[str]] = {}
-    for row in rows:
-        source = writers.get(row["topic"])
-        if row["kind"] == "MS" and row["topic"] in topics and source and row["node"] not in watching and source not in watching:
-            arrows.setdefault((source, row["node"]), []).append(row["topic"])
+    for row in topics:
+        for source, reader in product(row["publishers"][-1:], row["subscribers"]):
+            if not {source, reader} & set(watching):
+                arrows.setdefault((source, reader), []).append(row["topic"])
     beyond = [name for name in nodes if name not in _PLACES]
     places = _PLACES | {name: (3.2 * i, -1.6) for i, name in enumerate(beyond)}
     figure = _figure(13.0, 6.4)

@@ -10,15 +10,14 @@ from pathlib import Path
 from time import sleep
 from typing import Final, NamedTuple
 
+from palpate.live.bus import join_bus
+from palpate.live.graph import present
+from palpate.live.topic import topic_rows
 from palpate.report.archive import read_completed
 from palpate_bus.runs.announcement import Run, live
-from palpate_bus.wire.liveliness import EntityKind, GraphWatch
-from palpate_bus.wire.zenoh_config import session
 
 GRAPH: Final = "graph.json"
 SCENARIO: Final = "clean"
-LISTEN_S: Final = 3.0
-"""Observation time of the graph of a running examination."""
 STOP_S: Final = 30.0
 """Time for a run to end after SIGINT."""
 
@@ -67,8 +66,10 @@ def record_graph(folder: Path) -> None:
         while process.poll() is None:
             run = _await_run(folder, process.pid)
             if run is not None:
-                rows = listen(run)
-                if {row["node"] for row in rows} >= set(run.endpoints) and _has_started(folder):
+                with join_bus(None, run.name, None) as bus:
+                    rows = topic_rows(present(bus))
+                nodes = {node for row in rows for node in (*row["publishers"], *row["subscribers"])}
+                if nodes >= set(run.endpoints) and _has_started(folder):
                     (folder / GRAPH).write_text(json.dumps(rows, indent=1), encoding="utf-8")
                     return
             sleep(0.5)
@@ -115,19 +116,3 @@ def _last_line(folder: Path) -> str:
 def _await_run(folder: Path, pid: int) -> Run | None:
     """Return the run of a process once it is announced."""
     return next((run for run in live() if run.pid == pid or Path(run.out) == folder.resolve()), None)
-
-
-def listen(run: Run) -> list[dict[str, str]]:
-    """Return the graph of a run from its liveliness tokens: one row per publisher and subscription."""
-    with session(run.options()) as bus:
-        watch = GraphWatch(bus, run.domain)
-        for _ in range(round(LISTEN_S / 0.1)):
-            watch.changes()
-            sleep(0.1)
-        rows = [
-            {"node": entity.node, "kind": entity.kind.value, "topic": entity.endpoint.topic, "type": entity.endpoint.type}
-            for entity in watch.alive.values()
-            if entity.endpoint is not None and entity.kind in (EntityKind.PUBLISHER, EntityKind.SUBSCRIPTION)
-        ]
-        watch.close()
-    return sorted(rows, key=lambda row: tuple(row.values()))

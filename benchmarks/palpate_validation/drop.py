@@ -82,48 +82,6 @@ _GROUND = """<skeleton name="flesh"><mobile>false</mobile>
   </skeleton>"""
 
 
-class DartScene:
-    """A sphere on a vertical rail over flesh, or over a rigid block without flesh."""
-
-    def __init__(self, flesh: Flesh | None) -> None:
-        """The sphere starts above z = 0, the flesh's top."""
-        body = _GROUND
-        if flesh is not None:
-            body = _FLESH.format(
-                centre=-flesh.size_m[2] / 2, heavy=HEAVY_KG, total=flesh.mass * flesh.vertices, k_v=flesh.k_v,
-                size=" ".join(map(str, flesh.size_m)), counts=" ".join(map(str, flesh.counts)), damping=flesh.damping,
-            )  # fmt: skip
-        start, d = SETUP.radius_m + SETUP.height_m, 2 * SETUP.radius_m
-        xml = _SCENE.format(dt=SETUP.step_s, flesh=body, start=start, mass=SETUP.mass_kg, d=d)
-        self.world: Any = dart.utils.SkelParser.readWorldXML(xml)
-        if self.world is None:
-            raise RuntimeError("DART could not read the scene")
-        awake = self.world.getDeactivationOptions()
-        awake.mEnabled = False
-        self.world.setDeactivationOptions(awake)
-        self._probe = self.world.getSkeleton("probe")
-        for name in ("flesh", "probe"):
-            node = self.world.getSkeleton(name).getBodyNode(0)
-            for k in range(node.getNumShapeNodes()):
-                node.getShapeNode(k).getDynamicsAspect().setFrictionCoeff(1.0)
-                node.getShapeNode(k).getDynamicsAspect().setRestitutionCoeff(0.0)
-
-    @property
-    def depth(self) -> float:
-        """Depth of the sphere's lowest point below z = 0 [m]."""
-        return -(SETUP.height_m + float(self._probe.getPositions()[0]))
-
-    def force(self) -> float:
-        """Return the upward force on the sphere in the last step [N]."""
-        contacts = self.world.getLastCollisionResult().getContacts()
-        return abs(float(sum(contact.force[2] for contact in contacts)))
-
-    def fall(self, weight: float) -> None:
-        """Step with only `weight` [N] and contact acting on the sphere."""
-        self._probe.setForces([-weight])
-        self.world.step()
-
-
 SURFACE = Stiffness(k_w_n_per_m3=3.3e7, length_m=0.004, dashpot_s=0.004, prony_g=(), prony_tau_s=(), friction=0.0)
 """Surface of Palpate in the figure."""
 FLESH = Flesh((0.03, 0.03, 0.02), (13, 13, 3), k_v=560.0, damping=0.7, mass=1e-3)
@@ -181,13 +139,33 @@ def drop_on_tissue() -> Drop:
 
 
 def drop_in_dart(flesh: Flesh | None) -> Drop:
-    """Drop the sphere in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
-    scene = DartScene(flesh)
+    """Drop the sphere on a vertical rail in DART, on its soft body or, without `flesh`, on a rigid block without restitution."""
+    body = _GROUND
+    if flesh is not None:
+        body = _FLESH.format(
+            centre=-flesh.size_m[2] / 2, heavy=HEAVY_KG, total=flesh.mass * flesh.vertices, k_v=flesh.k_v,
+            size=" ".join(map(str, flesh.size_m)), counts=" ".join(map(str, flesh.counts)), damping=flesh.damping,
+        )  # fmt: skip
+    start, d = SETUP.radius_m + SETUP.height_m, 2 * SETUP.radius_m
+    xml = _SCENE.format(dt=SETUP.step_s, flesh=body, start=start, mass=SETUP.mass_kg, d=d)
+    world: Any = dart.utils.SkelParser.readWorldXML(xml)
+    if world is None:
+        raise RuntimeError("DART could not read the scene")
+    awake = world.getDeactivationOptions()
+    awake.mEnabled = False
+    world.setDeactivationOptions(awake)
+    for name in ("flesh", "probe"):
+        node = world.getSkeleton(name).getBodyNode(0)
+        for k in range(node.getNumShapeNodes()):
+            node.getShapeNode(k).getDynamicsAspect().setFrictionCoeff(1.0)
+            node.getShapeNode(k).getDynamicsAspect().setRestitutionCoeff(0.0)
+    probe = world.getSkeleton("probe")
     depth, force = [], []
     for _ in range(SETUP.steps):
-        scene.fall(SETUP.mass_kg * GRAVITY)
-        depth.append(scene.depth)
-        force.append(scene.force())
+        probe.setForces([-SETUP.mass_kg * GRAVITY])
+        world.step()
+        depth.append(-(SETUP.height_m + float(probe.getPositions()[0])))
+        force.append(abs(float(sum(contact.force[2] for contact in world.getLastCollisionResult().getContacts()))))
     return _since_contact("soft, DART" if flesh else "rigid, DART", np.array(depth), np.array(force))
 
 

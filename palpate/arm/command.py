@@ -70,7 +70,7 @@ def place(
     chosen = check_usable(scenario, [*(settings or ()), f"robot.arm={arm}"], None)
     console = Console()
     with Console(stderr=True).status("optimising: about a minute"):
-        robot = best_placement(chosen).robot
+        robot = best_placement(chosen)
         targets = [scan_targets(chosen, chosen.exam.spacing_m, raised=raised) for raised in (0.0, PLACEMENT.raised_m)]
         home = arm_of(robot).home_rad
         deep, raised = (plan_redundancy(robot, *pair, home) for pair in targets)

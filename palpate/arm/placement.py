@@ -4,6 +4,7 @@ The targets cover the examined region of the abdomen and a border around it, in 
 approach and retreat, other patients and registration errors.
 """
 
+from operator import itemgetter
 from typing import Final, NamedTuple
 
 import numpy as np
@@ -41,17 +42,6 @@ STARTS: tuple[tuple[float, float, float, float], ...] = ((0.0, 0.0, 0.6, 0.0), (
 """Placements to start from; the best result counts, as the problem is not convex."""
 
 
-class Placement(NamedTuple):
-    """A base placement and what it achieves."""
-
-    robot: Robot
-    """The robot there, rounded to centimetres and hundredths of a radian."""
-    cost: float
-    """Objective before rounding [1]."""
-    postures: PostureSequence
-    """Postures at the grid's targets, in contact first, then raised."""
-
-
 def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised: float = 0.0) -> tuple[Array, Array]:
     """Return origins of the indenter [m] at `exam.depth_m` below the surface and outward normals, in world, shapes (n, 3).
 
@@ -75,8 +65,11 @@ def scan_targets(scenario: Scenario, spacing: float, border: float = 0.0, raised
     return apply(X_WA, np.column_stack((xy, z)) + offset * n), n @ X_WA[:3, :3].T
 
 
-def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
-    """Return the base placement with the least cost over the scenario's region. Raises RunError if no start converges."""
+def best_placement(scenario: Scenario, spacing: float = 0.06) -> Robot:
+    """Return the robot on the base placement with the least cost over the scenario's region.
+
+    It is rounded to centimetres and hundredths of a radian. Raises RunError if no start converges.
+    """
     contact = scan_targets(scenario, spacing, PLACEMENT.border_m)
     raised = scan_targets(scenario, spacing, PLACEMENT.border_m, PLACEMENT.raised_m)
     positions, normals = (np.concatenate(pair) for pair in zip(contact, raised, strict=True))
@@ -84,11 +77,11 @@ def best_placement(scenario: Scenario, spacing: float = 0.06) -> Placement:
     placements = [placement for placement in found if placement is not None]
     if not placements:
         raise RunError("no base placement found from any start")
-    return min(placements, key=lambda placement: placement.cost)
+    return min(placements, key=itemgetter(0))[1]
 
 
-def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> Placement | None:
-    """Return base placement and postures from one start by Ipopt; None if it does not converge."""
+def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> tuple[float, Robot] | None:
+    """Return the cost [1] before rounding and the placed robot from one start by Ipopt; None if it does not converge."""
     ca = casadi()
     count = len(positions)
     model, functions = arm_of(robot), arm(robot)
@@ -125,8 +118,7 @@ def _optimise(robot: Robot, positions: Array, normals: Array, start: Array) -> P
     if not solver.stats()["success"]:
         return None
     solution = np.array(result["x"])[:, 0]
-    placed = _standing(robot, np.round(solution[:4], 2))
-    return Placement(placed, float(result["f"]), plan_redundancy(placed, positions, normals, model.home_rad))
+    return float(result["f"]), _standing(robot, np.round(solution[:4], 2))
 
 
 def _standing(robot: Robot, base: Array) -> Robot:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import subprocess
 import tempfile
-import webbrowser
 from functools import partial
 from importlib.util import find_spec
 from pathlib import Path
@@ -26,7 +25,7 @@ if TYPE_CHECKING:
 PICTURE_PX = (1500, 940)
 
 
-def dashboard(  # noqa: PLR0913 - the options of a command
+def dashboard(
     source: Annotated[
         str | None, typer.Argument(metavar="[DIR|FILE]", help="Results folder, .rrd or .mcap; by default the current run.")
     ] = None,
@@ -34,9 +33,7 @@ def dashboard(  # noqa: PLR0913 - the options of a command
         int, typer.Option(min=1024, max=65534, help="Port for viewers; the browser's page is at the next port.")
     ] = 9876,
     native: Annotated[bool, typer.Option("--native", help="Use rerun's own window, not the browser.")] = False,
-    show: Annotated[bool, typer.Option("--open/--no-open", help="Open the browser.")] = False,
     chosen: ChosenRun = None,
-    leave: Annotated[bool, typer.Option("--leave", help="End with the run; by default the picture stays until Ctrl+C.")] = False,
     picture: Annotated[
         Path | None, typer.Option(metavar="PNG", help="Write a picture of a recorded run at the time --at; needs Chromium.")
     ] = None,
@@ -64,16 +61,16 @@ def dashboard(  # noqa: PLR0913 - the options of a command
                 film(Path(source), film_file, port, PICTURE_PX, console.print)
         elif source is None:
             run = named_runs(chosen, "or give a results folder, a .rrd or a .mcap file")[-1]
-            _follow(run, port, native, show, leave, console)
+            _follow(run, port, native, console)
         else:
             with tempfile.TemporaryDirectory(prefix="palpate-dashboard-") as place:
-                _view(_draw_recording(Path(source), Path(place)), port, native, show, console)
+                _view(_draw_recording(Path(source), Path(place)), port, native, console)
     except KeyboardInterrupt:
         raise typer.Exit from None
 
 
-def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console: Console) -> None:
-    """Follow a run to its end; unless `leave`, keep showing it afterwards."""
+def _follow(run: Run, port: int, native: bool, console: Console) -> None:
+    """Follow a run to its end and keep showing it afterwards."""
     from palpate_bus.runs.operator import HINT, OperatorKeys
     from palpate_dashboard.replay import follow
     from palpate_dashboard.service import DashboardService
@@ -86,17 +83,14 @@ def _follow(run: Run, port: int, native: bool, show: bool, leave: bool, console:
     service = DashboardService(load_scenario(str(scenario)), None, Live(serve_port=port))
     viewer = subprocess.Popen(_rerun(f"rerun+http://127.0.0.1:{port}/proxy")) if native else None
     console.print(f"{run.name} (process {run.pid}): {address(port)}")
-    if show:
-        webbrowser.open(address(port))
     try:
         with OperatorKeys() as keys:
             if keys.attached:
                 console.print(HINT, style="dim")
             console.print(follow(run, service, console.print, keys))
-        if not leave:
-            console.print("its picture stays until Ctrl+C")
-            while viewer is None or viewer.poll() is None:
-                sleep(0.5)
+        console.print("its picture stays until Ctrl+C")
+        while viewer is None or viewer.poll() is None:
+            sleep(0.5)
     finally:
         service.finish()
         if viewer is not None:
@@ -124,7 +118,7 @@ def _draw_recording(source: Path, place: Path) -> Path:
         return replay.replay(files, scenario, (place if alone else source) / FILE, partial(reached.__setitem__, 0))
 
 
-def _view(recording: Path, port: int, native: bool, show: bool, console: Console) -> None:
+def _view(recording: Path, port: int, native: bool, console: Console) -> None:
     """Show a .rrd file until Ctrl+C, or until the native viewer is closed."""
     from palpate_dashboard.sinks import MEMORY_LIMIT, address
 
@@ -132,8 +126,6 @@ def _view(recording: Path, port: int, native: bool, show: bool, console: Console
         subprocess.run(_rerun(str(recording)), check=False)
         return
     console.print(f"{recording}: {address(port)}  (Ctrl+C ends it)")
-    if show:
-        webbrowser.open(address(port))
     ports = ("--bind", "127.0.0.1", "--port", str(port), "--web-viewer-port", str(port + 1))
     words = [*_rerun(str(recording)), "--serve-web", *ports, "--server-memory-limit", MEMORY_LIMIT]
     server = subprocess.Popen(words, env={"RUST_LOG": "warn", **os.environ})  # its notices would bury the address

@@ -51,7 +51,7 @@ Seconds = Annotated[float | None, typer.Option("--seconds", min=0, help="Stop af
 def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain = None, as_json: AsJson = False) -> None:
     """List the topics on the bus: type, who publishes, who subscribes, and whether the contract has it."""
     with join_bus(connect, run, domain) as bus:
-        rows = _topic_rows(graph.present(bus))
+        rows = topic_rows(graph.present(bus))
     if as_json:
         print_json(rows)
         return
@@ -67,7 +67,7 @@ def list_topics(connect: Connect = None, run: ChosenRun = None, domain: Domain =
     wide_console().print(out)
 
 
-def _topic_rows(found: Sequence[Entity]) -> list[dict[str, Any]]:
+def topic_rows(found: Sequence[Entity]) -> list[dict[str, Any]]:
     """Return a row per topic, sorted: its types with their hashes, of which more than one is a mismatch, and its nodes."""
     rows: dict[str, dict[str, Any]] = {}
     for side, kind in (("publishers", EntityKind.PUBLISHER), ("subscribers", EntityKind.SUBSCRIPTION)):

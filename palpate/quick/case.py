@@ -103,7 +103,6 @@ def _indentations(patient: Patient, rows: list[PeriodRow]) -> list[Any]:
 
 
 RUNTIME: Final = "quick"
-_HASHED: Final = ("assessment/samples", "assessment/map", "assessment/findings")
 
 
 class QuickCase(NamedTuple):
@@ -111,7 +110,7 @@ class QuickCase(NamedTuple):
 
     report: Report
     """The rows of report.json; its run hash is over samples, map and findings."""
-    collect_messages: Collected
+    collected: Collected
     """The messages behind it."""
     simulate_s: float
     """Building and examining the patient."""
@@ -132,7 +131,16 @@ def run_quick(scenario: Scenario, errors: LoopErrors | None = None, drawn: Drawn
     (service,) = load_services(scenario, ("assessment",))
     facts = assess(service, gathered)
     assessed = process_time()
-    digests = {topic: digest for topic in _HASHED if (digest := _digest(topic, gathered))}
+    sent: dict[str, list[Any]] = {
+        "assessment/samples": gathered.samples,
+        "assessment/map": [gathered.stiffness_map],
+        "assessment/findings": [gathered.findings],
+    }
+    digests = {
+        topic: hashlib.sha256(b"".join(codec.encode(each, contract().topics[topic].type) for each in messages)).hexdigest()
+        for topic, messages in sent.items()
+        if None not in messages
+    }
     result = RunResult(
         runtime=RUNTIME,
         collected=gathered,
@@ -191,18 +199,3 @@ class _Inbox(HandInbox):
 
     def new(self, topic: str) -> list[Message]:
         return self.events.get(topic, [])
-
-
-def _digest(topic: str, gathered: Collected) -> str | None:
-    """Return the SHA-256 over the messages of a topic; None without messages."""
-    sent = {
-        "assessment/samples": gathered.samples,
-        "assessment/map": [gathered.stiffness_map],
-        "assessment/findings": [gathered.findings],
-    }[topic]
-    digest = hashlib.sha256()
-    for message in sent:
-        if message is None:
-            return None
-        digest.update(codec.encode(message, contract().topics[topic].type))
-    return digest.hexdigest()

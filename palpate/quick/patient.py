@@ -69,7 +69,7 @@ class Touch(NamedTuple):
     """Along the outward normal [N], shape (n,)."""
     steady: NDArray[np.bool_]
     """True at the requested depth, shape (n,); with `exam.breathing: gate` only within a millimetre of the end of expiration."""
-    restrict_to_view: Seen
+    seen: Seen
     """The patient as seen."""
 
     def __repr__(self) -> str:

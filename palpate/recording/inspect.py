@@ -1,7 +1,6 @@
 """Proposes a mapping from the data: what is sure, what is not, and a picture."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, Final
 
@@ -216,7 +215,7 @@ def _with_force(mapping: Mapping, raw: Readings, lines: list[str]) -> tuple[Mapp
         raise ReadingError("the force does not change with the motion of the tool; check the columns of position and force")
     angle, mapping, readings, axis = min(tried, key=lambda one: one[0])
     if raw.normal is not None and float(axis.outward @ raw.normal.mean(axis=0)) < 0:
-        axis = replace(axis, outward=-axis.outward)
+        axis = axis._replace(outward=-axis.outward)
     force = mapping.force.model_copy(update={"on": "body" if axis.flipped else "tool"})
     clear = angle < 20 and (len(tried) == 1 or max(one[0] for one in tried) > angle + 20)
     lines.append(f"{'sure' if clear else 'not sure'}: force in the axes of the {force.axes}: {angle:.0f} deg off the motion's")

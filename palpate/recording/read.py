@@ -372,12 +372,12 @@ def recording_of(raw: Readings, mapping: Mapping, name: str) -> PalpationRecordi
         faults.append(Fault(FaultCode.FRAME, 1, 1, Remedy.KEPT, axis.angle_deg))
     if axis.flipped:
         faults.append(Fault(FaultCode.SIGN, 1, 1, Remedy.CORRECTED))
-        readings, axis = replace(readings, force=-readings.force), replace(axis, force=-axis.force)
+        readings, axis = replace(readings, force=-readings.force), axis._replace(force=-axis.force)
     if readings.force.shape[1] == 3:
-        axis = replace(axis, outward=axis.force)  # more exact: sideways motion does not tilt it
+        axis = axis._replace(outward=axis.force)  # more exact: sideways motion does not tilt it
     X_WA = _body_frame(mapping, axis, readings.position)
     in_A = _in_frame(readings, X_WA)
-    axis = replace(axis, outward=X_WA[:3, :3].T @ axis.outward)
+    axis = axis._replace(outward=X_WA[:3, :3].T @ axis.outward)
     lift = mapping.tool.radius_m if mapping.tool.point == "tip" else 0.0
     touch = None if in_A.touch is None else in_A.touch + lift * axis.outward
     in_A = replace(in_A, position=in_A.position + lift * axis.outward, touch=touch)

@@ -148,7 +148,7 @@ class _Measured:
             kept = self._kept(loads, onsets)
             points, sd = self._skin_points(loads, onsets, kept)
             if not len(points):
-                return replace(Palpated.nothing(), untold=len(self.touching))
+                return Palpated.nothing()._replace(untold=len(self.touching))
             if not given:
                 self.skin = fit_skin(points, sd, self.stations, 2 * self.reach)
         assert self.skin is not None

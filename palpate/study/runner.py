@@ -18,6 +18,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, wait
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
 from itertools import groupby
 from operator import attrgetter
 from pathlib import Path
@@ -181,7 +182,8 @@ class StudyStopped(RunError):
     """The workers are gone or cannot work. Finished cases are kept."""
 
 
-class Workers(NamedTuple):
+@dataclass(frozen=True)
+class Workers:
     """Dask workers."""
 
     client: Any

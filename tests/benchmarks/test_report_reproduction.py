@@ -41,12 +41,8 @@ def test_a_picture_shows_what_is_nearest() -> None:
 
 def test_the_graph_counts_what_was_there(tmp_path: Path) -> None:
     rows = [
-        {"node": "robot", "kind": "MP", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
-        {"node": "control", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
-        {"node": "control", "kind": "MP", "topic": "control/joint_torque", "type": "palpation_msgs/msg/JointTorqueCommand"},
-        {"node": "robot", "kind": "MS", "topic": "control/joint_torque", "type": "palpation_msgs/msg/JointTorqueCommand"},
-        {"node": "recorder", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
-        {"node": "stranger", "kind": "MS", "topic": "joint_states", "type": "sensor_msgs/msg/JointState"},
+        {"topic": "joint_states", "publishers": ["robot"], "subscribers": ["control", "recorder", "stranger"]},
+        {"topic": "control/joint_torque", "publishers": ["control"], "subscribers": ["robot"]},
     ]
     path = tmp_path / "graph.png"
     assert figures.graph(path, rows, ("recorder",)) == (4, 2)

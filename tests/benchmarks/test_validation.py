@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -118,7 +117,7 @@ def test_voluntary_guarding_fades_and_one_that_never_fades_is_detected() -> None
     fading = guarding.measure()
     assert_bounds(guarding.section(fading))
     constant = {**fading.strokes, "voluntary": fading.strokes["involuntary"]}
-    assert any(check.passed is False for check in guarding.section(replace(fading, strokes=constant)).checks)
+    assert any(check.passed is False for check in guarding.section(fading._replace(strokes=constant)).checks)
 
 
 @pytest.mark.slow

@@ -1,7 +1,6 @@
 """study.json and study.html of synthetic studies; reading of their tables and errors of findings."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -209,7 +208,7 @@ def test_candidates_and_false_findings_are_no_matched_findings() -> None:
     findings = tables.variants[0].findings.copy()
     findings.loc[findings.index[:10], "reported"] = False
     findings.loc[findings.index[10:15], "lump"] = -1
-    errors = finding_errors(replace(tables.variants[0], findings=findings), tables.bootstrap)
+    errors = finding_errors(tables.variants[0]._replace(findings=findings), tables.bootstrap)
     assert errors.place_mean_m.n == 15
 
 

@@ -15,7 +15,7 @@ class MethodRow(Row):
     cases: pd.DataFrame = Drawn
     roc: detection.Roc | None = Drawn
     froc_curve: detection.Froc | None = Drawn
-    observe_shares: dict[str, list[tuple[float, Estimate]]] = Drawn
+    observed: dict[str, list[tuple[float, Estimate]]] = Drawn
     """Share of the lumps found, in bins over each covariate."""
     rates: detection.Rates
     populations: dict[str, detection.Rates]

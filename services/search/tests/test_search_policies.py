@@ -69,10 +69,10 @@ def test_raster_and_latin_hypercube_cover_the_region() -> None:
             posterior.add(Press(float(x), float(y), depth, 4.0, 3.0 * k))
         return (np.array([p.xy for p in posterior.presses]) - TASK.low) / (TASK.high - TASK.low)
 
-    share = press_belly(latin_hypercube, TASK.budget.presses)
+    share = pressed(latin_hypercube, TASK.budget.presses)
     for axis in share.T:
         assert sorted(np.floor(axis * TASK.budget.presses)) == list(range(TASK.budget.presses))
-    lattice = press_belly(raster, TASK.budget.presses)
+    lattice = pressed(raster, TASK.budget.presses)
     assert len(np.unique(lattice.round(6), axis=0)) == TASK.budget.presses
     assert np.abs(np.diff(lattice, axis=0)).max() < 0.3  # to and fro, no long ways back
 
