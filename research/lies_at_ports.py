@@ -54,7 +54,7 @@ def main(folder: Path) -> None:
     after: dict[tuple[str, str], list[float | None]] = defaultdict(list)
     windows = {moment: window(recording, moments[moment]) for moment in MOMENTS}
     for case in cases(("lockstep",), ()):
-        topic, path, kind, amount, moment = case.where.split()
+        topic, path, kind, amount, moment = case.target.split()
         lie = Lie(topic, path, kind, float(amount), moments[moment])
         if windows[moment][topic]:
             after[topic, kind].append(refused_after(lie, windows[moment]))

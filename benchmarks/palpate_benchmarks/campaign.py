@@ -1,8 +1,8 @@
-"""Fault campaign: one short examination per fault, injected in contact, and its finding.
+"""Fault campaign: one short examination per fault, injected in contact, and its result.
 
 A case hits one service or its messages, or the whole run: the conductor, the recorder, several roles, the network, the machine.
 There is a list of cases, and random ones: a seed determines roles, kind and time in contact. Faults in messages that are sent
-only before contact are injected during the camera burst. The finding has the first sign of the fault and its delay, the peak true
+only before contact are injected during the camera burst. The result has the first sign of the fault and its delay, the peak true
 force, and the outcome of the run. Delays are wall times with a resolution of 20 ms.
 """
 
@@ -25,7 +25,7 @@ from palpate.report.evidence import peak_force
 from palpate.report.recovery import recover_run
 from palpate.run.group import one_per_process
 from palpate.run.roles import WORKERS
-from palpate_benchmarks.fault_cases import MESSAGE_KINDS, PROCESS_KINDS, SCARCE_KINDS, CaseOutcome, FaultCase, FaultFinding
+from palpate_benchmarks.fault_cases import MESSAGE_KINDS, PROCESS_KINDS, SCARCE_KINDS, CaseOutcome, CaseResult, FaultCase
 from palpate_benchmarks.faulty import InjectedFault, command
 from palpate_benchmarks.injection import CONDUCTOR, ROLES, FaultLog, FaultResult, FaultRun, Injector, inject_fault, sustained_rate
 from palpate_bus.contract import contract
@@ -93,14 +93,14 @@ CASES: Final = CaseTuning()
 def cases(modes: Sequence[str], kinds: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
     """Yield the listed cases of these modes and kinds; `only` restricts them to those that hit one of these roles and topics."""
     for mode in modes:
-        for kind, where in _list_faults():
-            if kind in kinds and (not only or set(where.split(",")[0].split(TOGETHER)) & set(only)):
-                yield FaultCase(kind, where, mode == "wallclock")
+        for kind, target in _list_faults():
+            if kind in kinds and (not only or set(target.split(",")[0].split(TOGETHER)) & set(only)):
+                yield FaultCase(kind, target, mode == "wallclock")
 
 
 def _list_faults() -> Iterator[tuple[str, str]]:
-    """Yield kind and place of every fault; those of whole runs first."""
-    yield from ((kind, where) for kind in ENDING for where in FIXED)
+    """Yield kind and target of every fault; those of whole runs first."""
+    yield from ((kind, target) for kind in ENDING for target in FIXED)
     yield from (("memory", role) for role in ROLES)
     yield "disk", "recorder"
     yield from (("starve", f"{MACHINE}, {seconds} s") for seconds in CASES.starved_s)
@@ -119,55 +119,55 @@ def draw_cases(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCas
         yield FaultCase(draw.choice(ENDING), TOGETHER.join(sorted(roles)), draw.choice(modes) == "wallclock", at_s)
 
 
-def run_case(case: FaultCase, folder: Path) -> FaultFinding:
+def run_case(case: FaultCase, folder: Path) -> CaseResult:
     """Run one case; its logs stay in a subfolder of `folder`."""
-    finding = FaultFinding(case.kind, case.where, case.mode, at_s=case.at_s)
+    result = CaseResult(case.kind, case.target, case.mode, at_s=case.at_s)
     begin = monotonic()
     run, inject = prepare(case, (folder / case.name).resolve(), sustained_rate() if case.wallclock else 1.0)
     with _network(case) as name:
         ended = inject_fault(run, inject, name)
         if ended is None and case.wallclock:
             ended = inject_fault(prepare(case, run.folder, sustained_rate(reserve=True))[0], inject, name)
-    finding.wall_s = round(monotonic() - begin, 1)
+    result.wall_s = round(monotonic() - begin, 1)
     if ended is None:
-        finding.ended = "the fault was not injected: the indenter did not reach the depth"
+        result.ended = "the fault was not injected: the indenter did not reach the depth"
     else:
-        judge(finding, ended, _culprits(case))
-    return finding
+        judge(result, ended, _culprits(case))
+    return result
 
 
 def prepare(case: FaultCase, folder: Path, rate: float) -> tuple[FaultRun, Injector]:
     """Return the run of a case and the function that injects its fault."""
-    if case.kind in MESSAGE_KINDS or (case.kind in PROCESS_KINDS and case.where in WORKERS):
+    if case.kind in MESSAGE_KINDS or (case.kind in PROCESS_KINDS and case.target in WORKERS):
         return _of_one_service(case, folder, rate)
-    roles = (*ROLES, DASHBOARD) if case.where == DASHBOARD else ROLES
+    roles = (*ROLES, DASHBOARD) if case.target == DASHBOARD else ROLES
     run = FaultRun(folder, case.wallclock, rate, one_per_process(roles), at_s=case.at_s, secure=case.kind == PARTITION)
     return run, _injector(case)
 
 
 def _of_one_service(case: FaultCase, folder: Path, rate: float) -> tuple[FaultRun, Injector]:
-    target = contract().topics[case.where].producer if case.kind in MESSAGE_KINDS else case.where
-    groups, early, phase = one_per_process(WORKERS), target != AFTER_SCAN, ExamState.PHASE_SCAN
+    role = contract().topics[case.target].producer if case.kind in MESSAGE_KINDS else case.target
+    groups, early, phase = one_per_process(WORKERS), role != AFTER_SCAN, ExamState.PHASE_SCAN
     faulty: tuple[str, ...] = ()
     if case.kind == "jump":
-        faulty = (target, *command(target, InjectedFault("clock", "jump")))
+        faulty = (role, *command(role, InjectedFault("clock", "jump")))
     elif case.kind in MESSAGE_KINDS:
         lasting = case.kind in LASTING or (case.wallclock and case.kind == "drop")
-        faulty = (target, *command(target, InjectedFault(case.where, case.kind, count=0 if lasting else 1)))
-        if target in BEFORE_CONTACT:
+        faulty = (role, *command(role, InjectedFault(case.target, case.kind, count=0 if lasting else 1)))
+        if role in BEFORE_CONTACT:
             phase = ExamState.PHASE_LOOK
         if not case.wallclock:  # in lockstep messages do not depend on the placement of the other services
-            groups = (target,), tuple(role for role in WORKERS if role != target)
+            groups = (role,), tuple(other for other in WORKERS if other != role)
     number = {"kill": signal.SIGKILL, "freeze": signal.SIGSTOP}.get(case.kind, signal.SIGUSR1)
     run = FaultRun(folder, case.wallclock, rate, groups, phase, case.at_s, faulty, early)
-    return run, lambda processes: processes[target].send_signal(number)
+    return run, lambda processes: processes[role].send_signal(number)
 
 
 def _culprits(case: FaultCase) -> list[str]:
     """Return roles, topics or failure codes; the reported cause has to name one of them."""
     if case.kind == PARTITION:
         return [FailureCode.TRANSPORT_LOST]
-    return [MACHINE, FailureCode.BLOCKED] if case.kind == "starve" else case.where.split(TOGETHER)
+    return [MACHINE, FailureCode.BLOCKED] if case.kind == "starve" else case.target.split(TOGETHER)
 
 
 def _injector(case: FaultCase) -> Injector:
@@ -178,13 +178,13 @@ def _injector(case: FaultCase) -> Injector:
         return lambda _: _part(_seconds(case))
     if case.kind in SCARCE_KINDS:
         resource = {"memory": psutil.RLIMIT_AS, "disk": psutil.RLIMIT_FSIZE}[case.kind]
-        return lambda processes: freeze_usage(processes[case.where], resource)
+        return lambda processes: freeze_usage(processes[case.target], resource)
     return lambda processes: _signal(case, processes)
 
 
 def _signal(case: FaultCase, processes: Mapping[str, psutil.Process]) -> None:
     """Kill or freeze the roles of a case; roles frozen together with the conductor resume after `CASES.freeze_s`."""
-    roles = case.where.split(TOGETHER)
+    roles = case.target.split(TOGETHER)
     for role in roles:
         processes[role].send_signal(signal.SIGKILL if case.kind == "kill" else signal.SIGSTOP)
     if case.kind == "freeze" and CONDUCTOR in roles:  # otherwise the conductor ends the frozen processes
@@ -214,7 +214,7 @@ def starve(seconds: float) -> None:
 
 def _seconds(case: FaultCase) -> float:
     """Return the duration of the fault of a case [s]."""
-    return float(case.where.split()[1])
+    return float(case.target.split()[1])
 
 
 def _ip(*arguments: str) -> None:
@@ -242,37 +242,37 @@ def _part(seconds: float) -> None:
     _ip("-n", NETWORK, "link", "set", "lo", "up")
 
 
-def judge(finding: FaultFinding, ended: FaultResult, culprits: Sequence[str]) -> None:
-    """Enter outcome, signs, forces and reaction into the finding of a case."""
-    finding.injected_s = ended.injected_s
-    finding.hung = ended.status is None or bool(ended.hung)
+def judge(result: CaseResult, ended: FaultResult, culprits: Sequence[str]) -> None:
+    """Enter outcome, signs, forces and reaction into the result of a case."""
+    result.injected_s = ended.injected_s
+    result.hung = ended.status is None or bool(ended.hung)
     log = ended.log
     if log is None:
-        log = FaultLog(_recover(finding, ended.folder))
-    result = log.result
+        log = FaultLog(_recover(result, ended.folder))
+    run = log.result
     if log.outcome is not None:
-        finding.outcome = log.outcome
-    elif result.failure is not None:
-        finding.outcome = CaseOutcome.ENDED
+        result.outcome = log.outcome
+    elif run.failure is not None:
+        result.outcome = CaseOutcome.ENDED
     else:
-        finding.outcome = CaseOutcome.CONTINUED_WITHOUT if finding.kind in ENDING else CaseOutcome.COMPLETED
-    finding.ended = "complete" if result.failure is None else result.failure.text
-    enter(finding, log, culprits, ended.injected_s * NS)
+        result.outcome = CaseOutcome.CONTINUED_WITHOUT if result.kind in ENDING else CaseOutcome.COMPLETED
+    result.ended = "complete" if run.failure is None else run.failure.text
+    enter(result, log, culprits, ended.injected_s * NS)
     if CONDUCTOR in culprits:
-        finding.sign = _conductor_lost(ended.folder)
-        finding.named = finding.named or bool(finding.sign)
+        result.sign = _conductor_lost(ended.folder)
+        result.named = result.named or bool(result.sign)
     remove_leftovers()
-    finding.left_behind = str(ended.sockets) if ended.sockets.exists() else ""
+    result.left_behind = str(ended.sockets) if ended.sockets.exists() else ""
 
 
-def _recover(finding: FaultFinding, folder: Path) -> RunResult:
+def _recover(result: CaseResult, folder: Path) -> RunResult:
     """Return the result of a run whose conductor was killed, from its recording."""
     try:
-        _, result = recover_run(folder)
+        _, run = recover_run(folder)
     except EvidenceError as error:
-        result = RunResult("", Collected(), failure=Failure(FailureCode.UNFINISHED, str(error)))
-    finding.kept = bool(result.collected.exam_states)
-    return result
+        run = RunResult("", Collected(), failure=Failure(FailureCode.UNFINISHED, str(error)))
+    result.kept = bool(run.collected.exam_states)
+    return run
 
 
 def _conductor_lost(folder: Path) -> str:
@@ -285,26 +285,27 @@ def _conductor_lost(folder: Path) -> str:
     return ""
 
 
-def enter(finding: FaultFinding, log: FaultLog, culprits: Iterable[str], at: float) -> None:
+def enter(result: CaseResult, log: FaultLog, culprits: Iterable[str], at: float) -> None:
     """Enter signs, forces, reaction and blame of a run with a fault at `at` [ns], whose outcome is known."""
-    result, collected = log.result, log.result.collected
+    run, collected = log.result, log.result.collected
     forces = [(nanoseconds(m.header.stamp), peak_force(m)) for m in collected.indentation]
     forces = [(t, force) for t, force in forces if isfinite(force)]  # the fault may be NaN in this message
-    finding.peak_force_before_n = round(max((force for t, force in forces if t < at), default=0.0), 2)
+    result.peak_force_before_n = round(max((force for t, force in forces if t < at), default=0.0), 2)
     after = [force for t, force in forces if t >= at]
-    finding.peak_force_n = round(max(after), 2) if after else None
-    finding.detected_ms = log.detected_ms
+    result.peak_force_n = round(max(after), 2) if after else None
+    result.detected_ms = log.detected_ms
     if log.signs:
-        finding.sign = str(log.signs[0])
-    elif result.failure is not None and not finding.outcome.unharmed:
-        finding.sign = str(result.failure)
-    blamed: set[Any] = {*result.lost, *(sign.culprit for sign in log.signs), *(s.culprit for s in collected.exam_states)}
-    if result.failure is not None:
-        blamed |= {result.failure.code, *result.failure.roles, *result.failure.topics}
+        result.sign = str(log.signs[0])
+    elif run.failure is not None and not result.outcome.unharmed:
+        result.sign = str(run.failure)
+    blamed: set[Any] = {*run.lost, *(sign.culprit for sign in log.signs), *(s.culprit for s in collected.exam_states)}
+    if run.failure is not None:
+        result.refused = run.failure.code is FailureCode.CONTRACT_BROKEN
+        blamed |= {run.failure.code, *run.failure.roles, *run.failure.topics}
     if any((sign.source, sign.code) in LATE for sign in log.signs):
         blamed.add(MACHINE)
-    finding.named = not _with_producers(blamed).isdisjoint(_with_producers(culprits))
-    finding.reaction = _reaction(collected, finding.outcome)
+    result.named = not _with_producers(blamed).isdisjoint(_with_producers(culprits))
+    result.reaction = _reaction(collected, result.outcome)
 
 
 def _with_producers(names: Iterable[str]) -> set[str]:

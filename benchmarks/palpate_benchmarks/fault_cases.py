@@ -1,4 +1,4 @@
-"""Cases of the fault campaign and their findings: kinds of faults, outcomes, and the CSV file of the findings."""
+"""Cases of the fault campaign and their results: kinds of faults, outcomes, and the CSV file of the results."""
 
 import csv
 from collections.abc import Sequence
@@ -15,9 +15,11 @@ CHANGE_KINDS: Final = ("corrupt", "truncate", "nan", "stamp")
 MESSAGE_KINDS: Final = ("delay", "drop", "duplicate", *CHANGE_KINDS)
 SCARCE_KINDS: Final = ("memory", "disk", "starve")
 """Shortages: of memory for a service, of disk space for the recorder, of processor time for all."""
+WHOLE_RUN_KINDS: Final = (*SCARCE_KINDS, "partition")
+"""Kinds that apply to a whole run; so do `kill` and `freeze` of conductor, recorder, dashboard or several roles."""
 LIE: Final = "lie"
-KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *SCARCE_KINDS, "partition", LIE)
-"""Process and message kinds apply to one service; `kill`, `freeze` and the last four apply to whole runs."""
+KINDS: Final = (*PROCESS_KINDS, *MESSAGE_KINDS, *WHOLE_RUN_KINDS, LIE)
+"""Of the others, process kinds apply to one service, message kinds and `lie` to one topic."""
 
 
 class CampaignLimits(NamedTuple):
@@ -28,7 +30,7 @@ class CampaignLimits(NamedTuple):
     force_n: float = 15.0
     """Largest true contact force."""
     caused_force_n: float = 20.0
-    """The same where the liar makes the force: tissue or torque."""
+    """Largest true contact force if the liar makes the force: tissue or torque."""
     causes_force: tuple[str, ...] = ("sim/", "control/joint_torque")
     """Topics of such liars."""
     force_rise_n: float = 2.0
@@ -49,7 +51,7 @@ class CaseOutcome(StrEnum):
     CONTINUED_WITHOUT = "continued_without"
     """Completed without the disabled role."""
     ENDED = "ended"
-    """Ended early; `FaultFinding.ended` has the cause."""
+    """Ended early; `CaseResult.ended` has the cause."""
 
     @property
     def unharmed(self) -> bool:
@@ -71,7 +73,7 @@ class FaultCase(NamedTuple):
     """One fault."""
 
     kind: str
-    where: str
+    target: str
     """Role for faults of a process, topic for those of a message."""
     wallclock: bool
     at_s: float = LIMITS.at_depth_s
@@ -79,27 +81,27 @@ class FaultCase(NamedTuple):
 
     @property
     def identity(self) -> tuple[str, str, str, float]:
-        """That of its finding."""
-        return self.kind, self.where, self.mode, self.at_s
+        """Kind, target, mode and time, as in its result."""
+        return self.kind, self.target, self.mode, self.at_s
 
     @property
     def mode(self) -> str:
-        """Runtime mode as in the findings."""
+        """Runtime mode as in the results."""
         return "wall clock" if self.wallclock else "lockstep"
 
     @property
     def name(self) -> str:
         """File name."""
         moment = "" if self.at_s == LIMITS.at_depth_s else f"-{self.at_s:g}"
-        return f"{self.mode.replace(' ', '')}-{self.kind}-{self.where.replace('/', '_').replace(' ', '-')}{moment}"
+        return f"{self.mode.replace(' ', '')}-{self.kind}-{self.target.replace('/', '_').replace(' ', '-')}{moment}"
 
 
 @dataclass
-class FaultFinding:
+class CaseResult:
     """Result of a case."""
 
     kind: str
-    where: str
+    target: str
     mode: str
     injected_s: float | None = None
     """Simulated time of the fault; None if it was not injected."""
@@ -125,22 +127,26 @@ class FaultFinding:
     """True if the results up to the fault were saved."""
     left_behind: str = ""
     """Files left on the machine that the next command does not remove."""
+    refused: bool = False
+    """True if a port refused a message and the run ended for that."""
+    undetectable: bool = False
+    """True if no other input contradicts the lie."""
     code: str = ""
     """Digest of the code that ran; empty for cases that are older than this field."""
 
     @property
     def identity(self) -> tuple[str, str, str, float]:
-        """Kind, place, mode and time, which identify the case."""
-        return self.kind, self.where, self.mode, self.at_s
+        """Kind, target, mode and time, which identify the case."""
+        return self.kind, self.target, self.mode, self.at_s
 
     @property
-    def good(self) -> bool:
+    def passed(self) -> bool:
         """True if the case was injected, ended, kept forces within the limits, saved its results and left nothing behind.
 
         The cause must be named unless the examination was unharmed.
         """
         limit = LIMITS.force_n
-        if self.kind == LIE and self.where.startswith(LIMITS.causes_force):
+        if self.kind == LIE and self.target.startswith(LIMITS.causes_force):
             limit = LIMITS.caused_force_n
         ended_early = self.outcome is CaseOutcome.ENDED  # otherwise later forces are those of the scan
         if self.kind != LIE and self.peak_force_before_n > LIMITS.in_contact_n and ended_early:
@@ -157,38 +163,38 @@ class FaultFinding:
     @property
     def lie_verdict(self) -> LieVerdict:
         """Verdict on a lie."""
-        if not self.good:
+        if not self.passed:
             return LieVerdict.BAD
         if self.outcome.unharmed:
             return LieVerdict.HARMLESS
-        if self.sign.startswith("not detectable"):
+        if self.undetectable:
             return LieVerdict.UNDETECTABLE
-        return LieVerdict.REFUSED if " refused: " in self.ended else LieVerdict.NAMED
+        return LieVerdict.REFUSED if self.refused else LieVerdict.NAMED
 
 
-FIELDS: Final = tuple(field.name for field in fields(FaultFinding))
-GOOD: Final = "good"
+FIELDS: Final = tuple(field.name for field in fields(CaseResult))
+PASSED: Final = "passed"
 """Last column of the file, computed from the others."""
 
 
-def in_order(findings: Sequence[FaultFinding]) -> list[FaultFinding]:
-    """Return the findings sorted by mode, kind and place."""
-    return sorted(findings, key=lambda f: (f.mode, KINDS.index(f.kind), f.where))
+def in_order(results: Sequence[CaseResult]) -> list[CaseResult]:
+    """Return the results sorted by mode, kind and target."""
+    return sorted(results, key=lambda f: (f.mode, KINDS.index(f.kind), f.target))
 
 
-def csv_text(findings: Sequence[FaultFinding]) -> str:
-    """Return the findings as CSV, one row per case; None becomes an empty cell."""
+def csv_text(results: Sequence[CaseResult]) -> str:
+    """Return the results as CSV, one row per case; None becomes an empty cell."""
     file = StringIO()
     writer = csv.writer(file, lineterminator="\n")
-    writer.writerow((*FIELDS, GOOD))
-    writer.writerows((*(getattr(f, name) for name in FIELDS), f.good) for f in in_order(findings))
+    writer.writerow((*FIELDS, PASSED))
+    writer.writerows((*(getattr(f, name) for name in FIELDS), f.passed) for f in in_order(results))
     return file.getvalue()
 
 
-def from_csv(text: str) -> list[FaultFinding]:
-    """Return the findings of `csv_text`. Raises ValueError."""
+def from_csv(text: str) -> list[CaseResult]:
+    """Return the results of `csv_text`. Raises ValueError."""
     rows = csv.DictReader(StringIO(text))
-    if tuple(rows.fieldnames or ()) != (*FIELDS, GOOD):
-        raise ValueError(f"the first line must have the columns {', '.join((*FIELDS, GOOD))}")
-    values = [{name: value for name, value in row.items() if value and name != GOOD} for row in rows]
-    return TypeAdapter(list[FaultFinding]).validate_python(values)
+    if tuple(rows.fieldnames or ()) != (*FIELDS, PASSED):
+        raise ValueError(f"the first line must have the columns {', '.join((*FIELDS, PASSED))}")
+    values = [{name: value for name, value in row.items() if value and name != PASSED} for row in rows]
+    return TypeAdapter(list[CaseResult]).validate_python(values)

@@ -1,4 +1,4 @@
-"""`palpate faults`: runs the fault campaign and shows its findings; `make docs` makes docs/fault-tables.md from its CSV files."""
+"""`palpate faults`: runs the fault campaign and shows its results; `make docs` makes docs/fault-tables.md from its CSV files."""
 
 import tempfile
 from collections.abc import Sequence
@@ -11,26 +11,26 @@ from rich.table import Table
 
 from palpate.console import CaseDisplay, SteadyConsole, output_file, refuse, wide_console
 from palpate.report.files import write_text
-from palpate_benchmarks.fault_cases import KINDS, LIE, FaultFinding, csv_text, from_csv, in_order
+from palpate_benchmarks.fault_cases import KINDS, LIE, CaseResult, csv_text, from_csv, in_order
 from palpate_errors import ExitStatus
 
 MODES = ("lockstep", "wallclock")
-COLUMNS = ("mode", "fault", "where", "after", "first sign", "arm", "force", "end")
+COLUMNS = ("mode", "fault", "target", "after", "first sign", "arm", "force", "end")
 
 
 def faults(
     mode: Annotated[list[str] | None, typer.Option(help=f"{', '.join(MODES)}; both by default.")] = None,
     kind: Annotated[list[str] | None, typer.Option(help=f"One of {', '.join(KINDS)}; all but {LIE} by default.")] = None,
     only: Annotated[list[str] | None, typer.Option("--only", help="Only these roles and topics; may be repeated.")] = None,
-    out: Annotated[
-        Path, output_file("File for the findings; cases in it by the present code are skipped.", "--out", "-o")
-    ] = Path("faults.csv"),
+    out: Annotated[Path, output_file("File for the results; cases in it by the present code are skipped.", "--out", "-o")] = Path(
+        "faults.csv"
+    ),
     again: Annotated[bool, typer.Option("--again", help="Repeat cases that are in the file.")] = False,
     limit: Annotated[int | None, typer.Option(min=0, help="Run at most N cases.")] = None,
     random: Annotated[int, typer.Option(metavar="N", min=0, help="In addition, N random cases.")] = 0,
     seed: Annotated[int, typer.Option(min=0, help="For --random.")] = 0,
 ) -> None:
-    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the findings.
+    """Inject faults (kill, freeze, delay, drop, corrupt...) into every service and topic in contact, and print the results.
 
     `--kind lie`: services that send wrong values.
     """
@@ -53,45 +53,45 @@ def faults(
     if not todo:
         refuse(f"--only {', '.join(only or ())}: no role or topic of this name has a fault of these kinds")
     code = code_digest()[:8]
-    done = {finding.identity: finding.code for finding in found}
+    done = {result.identity: result.code for result in found}
     if not again:
         todo = [case for case in todo if done.get(case.identity) != code]
     todo = sorted(todo, key=lambda case: case.identity in done)[:limit]
     with tempfile.TemporaryDirectory(prefix="palpate-faults-") as folder, CaseDisplay(console, False, "faults") as display:
         display.show(0, len(todo), "")
-        findings = (run_case(case, Path(folder)) for case in todo if case.kind != LIE)
+        results = (run_case(case, Path(folder)) for case in todo if case.kind != LIE)
         lying = lies.run_lies([case for case in todo if case.kind == LIE], Path(folder)) if LIE in kinds else ()
-        for number, finding in enumerate(chain(findings, lying), 1):
-            finding.code = code
-            found = [f for f in found if f.identity != finding.identity] + [finding]
+        for number, result in enumerate(chain(results, lying), 1):
+            result.code = code
+            found = [f for f in found if f.identity != result.identity] + [result]
             write_text(out, csv_text(found))
-            display.show(number, len(todo), f"{'ok' if finding.good else 'bad'} {finding.where}: {finding.sign or finding.ended}")
+            display.show(number, len(todo), f"{'ok' if result.passed else 'bad'} {result.target}: {result.sign or result.ended}")
     wide_console(200).print(table(found))
-    if any(not finding.good for finding in found):
+    if any(not result.passed for result in found):
         raise typer.Exit(ExitStatus.FAILED)
 
 
-def _load(path: Path) -> list[FaultFinding]:
-    """Return the findings in a file, without those whose fault was not injected: they are run again."""
+def _load(path: Path) -> list[CaseResult]:
+    """Return the results in a file, without those whose fault was not injected: they are run again."""
     if not path.exists():
         return []
     try:
         found = from_csv(path.read_text(encoding="utf-8"))
     except ValueError as error:
-        refuse(f"--out {path}: holds no findings of this command: {error}")
-    return [finding for finding in found if finding.injected_s is not None]
+        refuse(f"--out {path}: holds no results of this command: {error}")
+    return [result for result in found if result.injected_s is not None]
 
 
-def table(findings: Sequence[FaultFinding]) -> Table:
+def table(results: Sequence[CaseResult]) -> Table:
     """Return the table for a terminal, one row per case."""
     shown = Table(*COLUMNS, box=None)
-    for finding in in_order(findings):
-        shown.add_row(*_row(finding), style=None if finding.good else "bold red")
+    for result in in_order(results):
+        shown.add_row(*_row(result), style=None if result.passed else "bold red")
     return shown
 
 
-def _row(finding: FaultFinding) -> tuple[str, ...]:
-    after = "" if finding.detected_ms is None else f"{finding.detected_ms:.0f} ms"
-    peak = "not measured" if finding.peak_force_n is None else f"{finding.peak_force_n:.1f} N"
-    force = f"{finding.peak_force_before_n:.1f}, {peak}"
-    return (finding.mode, finding.kind, finding.where, after, finding.sign, finding.reaction, force, finding.ended)
+def _row(result: CaseResult) -> tuple[str, ...]:
+    after = "" if result.detected_ms is None else f"{result.detected_ms:.0f} ms"
+    peak = "not measured" if result.peak_force_n is None else f"{result.peak_force_n:.1f} N"
+    force = f"{result.peak_force_before_n:.1f}, {peak}"
+    return (result.mode, result.kind, result.target, after, result.sign, result.reaction, force, result.ended)

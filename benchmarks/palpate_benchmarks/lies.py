@@ -20,7 +20,7 @@ from palpate.run.distributed import run_distributed
 from palpate.run.roles import WORKERS, workers
 from palpate_benchmarks import liar
 from palpate_benchmarks.campaign import enter
-from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, FaultCase, FaultFinding
+from palpate_benchmarks.fault_cases import LIE, LIMITS, CaseOutcome, CaseResult, FaultCase
 from palpate_benchmarks.injection import SETTINGS, FaultLog, sustained_rate
 from palpate_benchmarks.liar import WHOLE, Lie
 from palpate_bus.contract import Edge, Topic, contract
@@ -173,15 +173,15 @@ def cases(modes: Sequence[str], only: Sequence[str]) -> Iterator[FaultCase]:
             rank = 2 if k else int((topic.name, kind) in seen)
             ranked.append((rank, topic, kind, f"{topic.name} {path} {kind} {amount:g} {moment}"))
         seen.add((topic.name, kind))
-    for _, topic, kind, where in sorted(ranked, key=lambda case: case[0]):
-        moment = where.split()[-1]
+    for _, topic, kind, target in sorted(ranked, key=lambda case: case[0]):
+        moment = target.split()[-1]
         if only and not {topic.name, topic.producer, kind, moment} & set(only):
             continue
         if "lockstep" in modes:
-            yield FaultCase(LIE, where, wallclock=False)
+            yield FaultCase(LIE, target, wallclock=False)
         live = kind in ("frozen", "repeated") or (topic.name in SENSED and kind in LIVE_KINDS)
         if "wallclock" in modes and live and moment == "depth":
-            yield FaultCase(LIE, where, wallclock=True)
+            yield FaultCase(LIE, target, wallclock=True)
 
 
 def draw_lies(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase]:
@@ -190,13 +190,13 @@ def draw_lies(count: int, seed: int, modes: Sequence[str]) -> Iterator[FaultCase
     for _ in range(count):
         topic, path, kind, amount = draw.choice(known)
         amount = float(f"{amount * 10 ** draw.uniform(-1, 0.5):.2g}")
-        where = f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}"
-        yield FaultCase(LIE, where, draw.choice(modes) == "wallclock")
+        target = f"{topic.name} {path} {kind} {amount:g} {draw.uniform(0, 0.9):.3f}"
+        yield FaultCase(LIE, target, draw.choice(modes) == "wallclock")
 
 
-def lie_of(where: str, healthy: Healthy) -> Lie:
+def lie_of(target: str, healthy: Healthy) -> Lie:
     """Return the lie of a case: the moment is a name, or a share of the twin's simulated time."""
-    topic, path, kind, amount, moment = where.split()
+    topic, path, kind, amount, moment = target.split()
     at_s = healthy.moments_s.get(moment)
     return Lie(topic, path, kind, float(amount), float(moment) * healthy.length_s if at_s is None else at_s)
 
@@ -222,16 +222,16 @@ class Lockstep:
         self._run = Composed([*load_services(scenario, workers(scenario)), self._collector])
         self.twin = run_guarded("the examination without a lie", lambda: healthy(self._finished(None).result), LIES.case_s)
 
-    def judged(self, finding: FaultFinding, lie: Lie) -> FaultFinding:
-        """Return the finding, judged by an examination with the lie; the times of the lies must not decrease."""
+    def judged(self, result: CaseResult, lie: Lie) -> CaseResult:
+        """Return the result, judged by an examination with the lie; the times of the lies must not decrease."""
         start = round(start_s(lie) * 1e3) * MS
         if start > self._run.t and not contract().topics[lie.topic].latched:
             self._run.run(lambda: None, start)
         try:
-            return run_guarded(str(lie), lambda: judge(finding, lie, self._finished(lie), self.twin), LIES.case_s)
+            return run_guarded(str(lie), lambda: judge(result, lie, self._finished(lie), self.twin), LIES.case_s)
         except RunError as error:  # one case must not end the campaign
-            finding.hung, finding.outcome, finding.ended = True, CaseOutcome.ENDED, str(error)
-            return finding
+            result.hung, result.outcome, result.ended = True, CaseOutcome.ENDED, str(error)
+            return result
 
     def _finished(self, lie: Lie | None) -> FaultLog:
         """Run to the end, in a child process."""
@@ -305,38 +305,38 @@ def _felt(c: Collected) -> tuple[int, int, float]:
     return felt, 0 if c.findings is None else len(c.findings.findings), background
 
 
-def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[FaultFinding]:
-    """Yield the findings of the cases, those in lockstep in the order of their times."""
+def run_lies(todo: Sequence[FaultCase], folder: Path) -> Iterator[CaseResult]:
+    """Yield the results of the cases, those in lockstep in the order of their times."""
     lockstep = Lockstep()
     twin = lockstep.twin
-    for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.where, twin)))):
-        begin, lie = monotonic(), lie_of(case.where, twin)
-        finding = FaultFinding(case.kind, case.where, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
+    for case in sorted(todo, key=lambda case: (case.wallclock, start_s(lie_of(case.target, twin)))):
+        begin, lie = monotonic(), lie_of(case.target, twin)
+        result = CaseResult(case.kind, case.target, case.mode, injected_s=round(lie.at_s, 3), at_s=case.at_s)
         if case.wallclock:
-            finding = judge(finding, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
+            result = judge(result, lie, by_wall_clock(lie, (folder / case.name).resolve()), twin)
         else:
-            finding = lockstep.judged(finding, lie)
-        finding.wall_s = round(monotonic() - begin, 1)
-        yield finding
+            result = lockstep.judged(result, lie)
+        result.wall_s = round(monotonic() - begin, 1)
+        yield result
 
 
-def judge(finding: FaultFinding, lie: Lie, log: FaultLog, twin: Healthy) -> FaultFinding:
-    """Return the finding with forces, signs and outcome."""
+def judge(result: CaseResult, lie: Lie, log: FaultLog, twin: Healthy) -> CaseResult:
+    """Return the result with forces, signs and outcome."""
     collected, failure = log.result.collected, log.result.failure
-    finding.hung = failure is not None and failure.text == HANGS
+    result.hung = failure is not None and failure.text == HANGS
     felt, findings, background = _felt(collected)
     if failure is not None:
-        finding.ended = str(failure)
+        result.ended = str(failure)
     elif felt < LIES.least_share * twin.felt:
         message = collected.exam.message if collected.exam else ""
-        finding.ended = f"without a failure, {felt} of {twin.felt} targets felt: {message}"
+        result.ended = f"without a failure, {felt} of {twin.felt} targets felt: {message}"
     elif findings == twin.findings and abs(background - twin.background) <= LIES.same_background * twin.background:
-        finding.outcome, finding.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
+        result.outcome, result.ended = CaseOutcome.CONTINUED, "complete, as without the lie"
     else:
-        finding.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
+        result.ended = f"complete, background {background:.2f} N, without the lie {twin.background:.2f} N"
     if failure is not None and log.detected_ms is None:
         log.detected_ms = round((log.result.sim_time_s - lie.at_s) * 1e3, 1)
-    enter(finding, log, lie.topics, lie.at_s * NS)
-    if not finding.named and (reason := undetectable(lie)):
-        finding.named, finding.sign = True, f"not detectable: {reason}"
-    return finding
+    enter(result, log, lie.topics, lie.at_s * NS)
+    if not result.named and (reason := undetectable(lie)):
+        result.named, result.undetectable, result.sign = True, True, f"not detectable: {reason}"
+    return result

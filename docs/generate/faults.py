@@ -12,7 +12,7 @@ from matplotlib.figure import Figure
 
 from generate import table
 from palpate_benchmarks import liar
-from palpate_benchmarks.fault_cases import KINDS, CaseOutcome, FaultFinding, LieVerdict, from_csv, in_order
+from palpate_benchmarks.fault_cases import KINDS, CaseOutcome, CaseResult, LieVerdict, from_csv, in_order
 from palpate_benchmarks.lies import LEFT_OUT, UNDETECTABLE, left_out
 from palpate_bus.contract import contract
 
@@ -34,38 +34,38 @@ def page() -> str:
     return "\n".join([*parts, lies(_read("lies")), "![Verdict by topic and lie, with the number of cases](images/lies.png)\n"])
 
 
-def _read(name: str) -> list[FaultFinding]:
+def _read(name: str) -> list[CaseResult]:
     return from_csv((DOCS / f"{name}.csv").read_text(encoding="utf-8"))
 
 
-def faults(findings: Sequence[FaultFinding]) -> str:
+def faults(results: Sequence[CaseResult]) -> str:
     """Return one row per mode and kind, and the bad cases."""
     rows = []
-    for mode, kind in sorted({(f.mode, f.kind) for f in findings}, key=lambda key: (key[0], KINDS.index(key[1]))):
-        cases = [f for f in findings if (f.mode, f.kind) == (mode, kind)]
+    for mode, kind in sorted({(f.mode, f.kind) for f in results}, key=lambda key: (key[0], KINDS.index(key[1]))):
+        cases = [f for f in results if (f.mode, f.kind) == (mode, kind)]
         after = [f.detected_ms for f in cases if f.detected_ms is not None]
         outcomes = Counter(f.reaction if f.outcome is CaseOutcome.ENDED else "continued" for f in cases).most_common()
         shown = f"{median(after):.0f}, {max(after):.0f}" if after else ""
-        numbers = (str(len(cases)), str(sum(f.good for f in cases)), str(len(after)), shown, f"{_largest(cases):.1f}")
+        numbers = (str(len(cases)), str(sum(f.passed for f in cases)), str(len(after)), shown, f"{_largest(cases):.1f}")
         rows.append((mode, kind, *numbers, ", ".join(f"{outcome} {count}" for outcome, count in outcomes)))
     head = ("mode", "fault", "cases", "passed", "detected", "after: median, longest [ms]", "largest force [N]", "outcomes")
-    bad = [f"- **!** {f.mode}, {f.kind} {f.where}: {f.ended}" for f in in_order(findings) if not f.good]
-    return "\n".join([f"{_passed(findings)}; the largest force was {_largest(findings):.1f} N.\n", table(head, rows), *bad])
+    bad = [f"- **!** {f.mode}, {f.kind} {f.target}: {f.ended}" for f in in_order(results) if not f.passed]
+    return "\n".join([f"{_passed(results)}; the largest force was {_largest(results):.1f} N.\n", table(head, rows), *bad])
 
 
-def lies(findings: Sequence[FaultFinding]) -> str:
+def lies(results: Sequence[CaseResult]) -> str:
     """Return the table by kind of lie, the bad cases, and what was left out or cannot be detected."""
     rows = []
     for kind in liar.KINDS:
-        if mine := [f for f in findings if f.where.split()[2] == kind]:
+        if mine := [f for f in results if f.target.split()[2] == kind]:
             counts = Counter(f.lie_verdict for f in mine)
             rows.append((kind, str(len(mine)), *(str(counts[one]) for one in RANKS), f"{_largest(mine):.1f}"))
-    wallclock = sum(f.mode == "wall clock" for f in findings)
-    codes = Counter(f.code or "earlier code" for f in findings).most_common()
-    lines = [f"{_passed(findings)}, {wallclock} of them in wall-clock mode. Cases by code: "
+    wallclock = sum(f.mode == "wall clock" for f in results)
+    codes = Counter(f.code or "earlier code" for f in results).most_common()
+    lines = [f"{_passed(results)}, {wallclock} of them in wall-clock mode. Cases by code: "
              f"{', '.join(f'{code} {count}' for code, count in codes)}.\n",
              table(("lie", "cases", *RANKS, "largest force [N]"), rows)]  # fmt: skip
-    lines += [f"- **!** {f.where}: {f.ended}" for f in findings if not f.good]
+    lines += [f"- **!** {f.target}: {f.ended}" for f in results if not f.passed]
     lines += [f"- not detectable: {topic} {kinds or 'all'}: {why}" for topic, kinds, why in UNDETECTABLE]
     out = {topic.name: left_out(topic) for topic in contract().topics.values() if left_out(topic)} | LEFT_OUT
     reasons = {why: [name for name in out if out[name] == why] for why in out.values()}
@@ -75,14 +75,14 @@ def lies(findings: Sequence[FaultFinding]) -> str:
 
 def figure(path: Path) -> None:
     """Write the matrix of topics and lies: in each cell the number of cases, in the colour of the worst."""
-    findings = _read("lies")
-    topics = [name for name in contract().topics if any(f.where.split()[0] == name for f in findings)]
+    results = _read("lies")
+    topics = [name for name in contract().topics if any(f.target.split()[0] == name for f in results)]
     worst, count = np.full((len(topics), len(liar.KINDS)), np.nan), np.zeros((len(topics), len(liar.KINDS)), int)
-    for finding in findings:
-        topic, _, kind, *_ = finding.where.split()
+    for result in results:
+        topic, _, kind, *_ = result.target.split()
         cell = topics.index(topic), liar.KINDS.index(kind)
         count[cell] += 1
-        worst[cell] = np.nanmax((worst[cell], RANKS.index(finding.lie_verdict)))
+        worst[cell] = np.nanmax((worst[cell], RANKS.index(result.lie_verdict)))
     shown = Figure(figsize=(12, 0.34 * len(topics) + 2), layout="constrained")
     axes = shown.subplots()
     axes.imshow(worst, cmap=ListedColormap(COLOURS), vmin=0, vmax=len(RANKS) - 1, aspect="auto")
@@ -96,9 +96,9 @@ def figure(path: Path) -> None:
     shown.savefig(path, dpi=110)
 
 
-def _passed(findings: Sequence[FaultFinding]) -> str:
-    return f"{sum(f.good for f in findings)} of {len(findings)} cases passed"
+def _passed(results: Sequence[CaseResult]) -> str:
+    return f"{sum(f.passed for f in results)} of {len(results)} cases passed"
 
 
-def _largest(findings: Sequence[FaultFinding]) -> float:
-    return max((f.peak_force_n or 0.0 for f in findings), default=0.0)
+def _largest(results: Sequence[CaseResult]) -> float:
+    return max((f.peak_force_n or 0.0 for f in results), default=0.0)

@@ -10,7 +10,7 @@ import pytest
 from conductor_messages import collected, result
 
 from palpate_benchmarks.campaign import draw_cases, judge, prepare, run_case
-from palpate_benchmarks.fault_cases import CaseOutcome, FaultCase, FaultFinding, csv_text, from_csv
+from palpate_benchmarks.fault_cases import CaseOutcome, CaseResult, FaultCase, csv_text, from_csv
 from palpate_benchmarks.faulty import JUMP_NS, FaultySender, FaultyTransport, InjectedFault
 from palpate_benchmarks.injection import CONDUCTOR, ROLES, CaseOver, FaultLog, FaultResult, FaultRun, FaultWatch
 from palpate_bus.contract import contract
@@ -94,10 +94,10 @@ def in_phase(phase: int, culprit: str = "") -> RunProgress:
     return RunProgress(0, 1.0, messages)
 
 
-def judged(log: FaultLog | None, folder: Path, kind: str, where: str, status: int = 0) -> FaultFinding:
-    finding = FaultFinding(kind, where, "lockstep")
-    judge(finding, FaultResult(folder, folder / "gone", status, log, 8.0), where.split("+"))
-    return finding
+def judged(log: FaultLog | None, folder: Path, kind: str, where: str, status: int = 0) -> CaseResult:
+    case = CaseResult(kind, where, "lockstep")
+    judge(case, FaultResult(folder, folder / "gone", status, log, 8.0), where.split("+"))
+    return case
 
 
 @pytest.mark.parametrize(
@@ -110,14 +110,14 @@ def judged(log: FaultLog | None, folder: Path, kind: str, where: str, status: in
 )
 def test_a_case_is_over_as_soon_as_its_outcome_is_known(phase: int, outcome: CaseOutcome, tmp_path: Path) -> None:
     progress = in_phase(phase, "planning/setpoint")
-    case = watch()
+    watched = watch()
     with pytest.raises(CaseOver) as over:
-        case.on_progress(progress)
-    log = case.finish(replace(result(progress.collected), failure=over.value.failure))
-    finding = judged(log, tmp_path, "nan", "planning/setpoint")
-    assert finding.outcome is outcome
-    assert finding.good
-    assert (finding.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
+        watched.on_progress(progress)
+    log = watched.finish(replace(result(progress.collected), failure=over.value.failure))
+    case = judged(log, tmp_path, "nan", "planning/setpoint")
+    assert case.outcome is outcome
+    assert case.passed
+    assert (case.sign == "") == outcome.unharmed, "a fault without effect was not noticed"
 
 
 def test_a_fault_of_the_assessment_shows_after_the_scan(tmp_path: Path) -> None:
@@ -138,32 +138,32 @@ def test_the_fault_is_due_in_its_phase(capsys: pytest.CaptureFixture[str]) -> No
 
 def test_an_end_that_names_no_role_is_bad(tmp_path: Path) -> None:
     failed = replace(result(collected()), failure=Failure(FailureCode.BLOCKED, "something went wrong"))
-    assert not judged(watch().finish(failed), tmp_path, "nan", "planning/setpoint").good
+    assert not judged(watch().finish(failed), tmp_path, "nan", "planning/setpoint").passed
 
 
-def test_findings_are_read_back_from_their_file() -> None:
-    killed = FaultFinding("kill", "robot", "lockstep", 8.0, 33.2, 'robot, "gone"\nat once', "run ended", 5.0, named=True)
-    hung = FaultFinding("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False)
+def test_results_are_read_back_from_their_file() -> None:
+    killed = CaseResult("kill", "robot", "lockstep", 8.0, 33.2, 'robot, "gone"\nat once', "run ended", 5.0, named=True)
+    hung = CaseResult("nan", "exam/state", "wall clock", hung=True, left_behind="/tmp/x", kept=False)
     assert from_csv(csv_text([killed, hung])) == [killed, hung]
 
 
 def test_a_file_of_other_columns_is_refused() -> None:
-    with pytest.raises(ValueError, match="must have the columns kind, where"):
+    with pytest.raises(ValueError, match="must have the columns kind, target"):
         from_csv("mode,fault\nlockstep,kill\n")
 
 
 def test_drawn_cases_follow_their_seed() -> None:
     first, again, other = (list(draw_cases(40, seed, ["lockstep"])) for seed in (1000, 1000, 1001))
     assert first == again != other
-    assert {len(case.where.split("+")) for case in first} == {1, 2, 3}
-    assert {role for case in first for role in case.where.split("+")} <= {*ROLES, CONDUCTOR}
+    assert {len(case.target.split("+")) for case in first} == {1, 2, 3}
+    assert {role for case in first for role in case.target.split("+")} <= {*ROLES, CONDUCTOR}
     assert len({case.name for case in first}) == 40
 
 
 def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> None:
-    good = FaultFinding("kill", "x", "lockstep", 8.0, peak_force_before_n=5.0, peak_force_n=6.9, ended="x lost", named=True)
-    assert good.good
-    assert replace(good, peak_force_before_n=0.0, peak_force_n=14.0).good, "before contact the force has yet to rise"
+    good = CaseResult("kill", "x", "lockstep", 8.0, peak_force_before_n=5.0, peak_force_n=6.9, ended="x lost", named=True)
+    assert good.passed
+    assert replace(good, peak_force_before_n=0.0, peak_force_n=14.0).passed, "before contact the force has yet to rise"
     for bad in (
         replace(good, peak_force_n=7.1),
         replace(good, peak_force_before_n=14.0, peak_force_n=15.5),
@@ -172,29 +172,29 @@ def test_a_row_is_bad_when_the_force_rises_or_something_is_lost_or_left() -> Non
         replace(good, named=False),
         replace(good, hung=True),
     ):
-        assert not bad.good
+        assert not bad.passed
 
 
 @pytest.mark.parametrize("named", [True, False])
 def test_the_failure_of_the_run_is_judged(named: bool, tmp_path: Path) -> None:
     failure = Failure(FailureCode.ROLE_LOST, "something failed", ("control",) if named else ())
-    finding = judged(FaultLog(replace(result(collected()), failure=failure)), tmp_path, "kill", "control+recorder")
-    assert finding.good == named
-    assert finding.ended == "something failed"
+    case = judged(FaultLog(replace(result(collected()), failure=failure)), tmp_path, "kill", "control+recorder")
+    assert case.passed == named
+    assert case.ended == "something failed"
 
 
 def test_without_conductor_and_recording_nothing_is_kept(tmp_path: Path) -> None:
     (tmp_path / "logs").mkdir()
     (tmp_path / "logs" / "planning.log").write_text(f"2026 planning WARNING {CONDUCTOR_LOST_LOG % 'gone'}\n", encoding="utf-8")
-    finding = judged(None, tmp_path, "kill", CONDUCTOR, -9)
-    assert finding.sign == "planning: conductor lost: gone"
-    assert finding.named
-    assert not finding.kept
+    case = judged(None, tmp_path, "kill", CONDUCTOR, -9)
+    assert case.sign == "planning: conductor lost: gone"
+    assert case.named
+    assert not case.kept
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("kind", "where"), [("kill", "control"), ("nan", "planning/setpoint"), ("kill", CONDUCTOR)])
 def test_a_case_is_run_and_judged(kind: str, where: str, tmp_path: Path) -> None:
-    finding = run_case(FaultCase(kind, where, wallclock=False), tmp_path)
-    assert finding.good, finding
-    assert finding.outcome is CaseOutcome.ENDED
+    case = run_case(FaultCase(kind, where, wallclock=False), tmp_path)
+    assert case.passed, case
+    assert case.outcome is CaseOutcome.ENDED

@@ -9,7 +9,7 @@ import pytest
 from conductor_messages import collected, result
 from toy_runs import toy_services
 
-from palpate_benchmarks.fault_cases import LIE, FaultFinding, LieVerdict
+from palpate_benchmarks.fault_cases import LIE, CaseResult, LieVerdict
 from palpate_benchmarks.injection import FaultLog
 from palpate_benchmarks.liar import KINDS, Liar, Lie
 from palpate_benchmarks.lies import Healthy, cases, cells, judge, left_out, run_lies
@@ -90,12 +90,12 @@ def test_a_case_is_judged_by_force_completeness_and_name(lost: int, force: float
     twin = Healthy({}, int(seen.exam.target_count), len(seen.findings.findings), float(seen.stiffness_map.background), 10.0)
     if failure is not None:
         log.result = replace(log.result, failure=Failure(FailureCode.GAVE_UP, "held", topics=(failure,)))
-    finding = FaultFinding(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
-    assert judge(finding, Lie.parse("ft/wrench wrench.force gain 0.3 0"), log, twin).lie_verdict is verdict
+    case = CaseResult(LIE, "ft/wrench wrench.force gain 0.3 depth", "lockstep", injected_s=0.0)
+    assert judge(case, Lie.parse("ft/wrench wrench.force gain 0.3 0"), log, twin).lie_verdict is verdict
 
 
 @pytest.mark.slow
 def test_ten_lies(tmp_path: Path) -> None:
-    chosen = [case for case in cases(("lockstep",), ("ft/wrench",)) if case.where.endswith(("descent", "depth"))][:10]
-    bad = [finding.where for finding in run_lies(chosen, tmp_path) if not finding.good]
+    chosen = [case for case in cases(("lockstep",), ("ft/wrench",)) if case.target.endswith(("descent", "depth"))][:10]
+    bad = [case.target for case in run_lies(chosen, tmp_path) if not case.passed]
     assert bad == []

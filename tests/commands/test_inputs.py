@@ -91,7 +91,7 @@ def test_a_run_that_cannot_be_is_refused(words: str, said: tuple[str, ...], tmp_
         ("reproduce --out file", "file: cannot be made a folder"),
         ("reproduce --docs file/page.md", "file: cannot be made a folder"),
         ("bench --out .", "is not a writable file"),
-        ("faults", "faults.csv: holds no findings"),
+        ("faults", "faults.csv: holds no results"),
     ],
 )
 def test_other_commands_refuse_bad_input(words: str, said: str, tmp_path: Path) -> None:
